@@ -1,0 +1,31 @@
+# `make demo` and `make test` do everything on a machine with Python >= 3.10 and make.
+PYTHON ?= python3
+VENV ?= .venv
+# installed versions are those that CI tested; PIP_FLAGS= takes the newest
+PIP_FLAGS ?= --constraint constraints.txt
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint clean
+.DELETE_ON_ERROR:
+
+demo: $(VENV)/installed
+	$(BIN)/python -m pipelines.aachen --feature sift_sv64 --demo
+
+test: $(VENV)/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m pytest
+
+# torch by itself first: a pinned version is a CPU build where an index offers one
+$(VENV)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet $$(grep '^torch==' constraints.txt)
+	$(BIN)/pip install --quiet $(PIP_FLAGS) --editable '.[dev]'
+	touch $@
+
+lint: $(VENV)/installed
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info

@@ -1,0 +1,57 @@
+"""Compact local descriptors for hierarchical localization."""
+
+import logging
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
+
+__version__ = "0.1.0"
+
+logger = logging.getLogger("hloc_reduce")
+if not logger.handlers:
+    _handler = logging.StreamHandler()
+    _handler.setFormatter(
+        logging.Formatter("[%(asctime)s %(name)s %(levelname)s] %(message)s", "%Y/%m/%d %H:%M:%S")
+    )
+    logger.addHandler(_handler)
+    logger.setLevel(logging.INFO)
+    logger.propagate = False
+
+
+def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "torch.Tensor":
+    """Describe image patches.
+
+    Args:
+        patches: (N, 1, 32, 32) float in [0, 1], on any device.
+        feature: a base descriptor, for example "sift", or one with a projection that ships.
+
+    Returns:
+        (N, D) float32 of unit norm, on the same device.
+
+    Raises:
+        InputError: for an unknown feature.
+        ValueError: for patches of another shape or type.
+
+    Example:
+        >>> import torch
+        >>> describe_patches(torch.rand(10, 1, 32, 32), "sift_sv64").shape
+        torch.Size([10, 64])
+    """
+    from confs.features import confs
+
+    from . import projections
+    from .cli import choose
+    from .descriptors import Descriptor
+
+    if patches.ndim != 4 or patches.shape[1:] != (1, 32, 32) or not patches.is_floating_point():
+        raise ValueError(
+            f"Patches are (N, 1, 32, 32) float in [0, 1], not {tuple(patches.shape)} "
+            f"{patches.dtype}."
+        )
+    model = confs[choose("feature", feature, confs)]["model"]
+    base = model.get("base", model)["descriptor"]
+    descriptors = Descriptor(base).to(patches.device)(patches.float())
+    if "projection" in model:
+        descriptors = projections.load(model["projection"]).to(patches.device)(descriptors)
+    return descriptors

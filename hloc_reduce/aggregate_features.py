@@ -1,0 +1,100 @@
+"""Aggregate local features into global descriptors, for retrieval without any weights."""
+
+import argparse
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from tqdm import tqdm
+
+from confs import retrieval as retrieval_confs
+
+from . import cli, colmap, extractors, logger
+from .base_model import dynamic_load
+from .cli import InputError
+from .io import GroupWriter, get_features, list_h5_names, open_h5, replacing
+
+confs = retrieval_confs.confs
+
+
+def main(
+    conf: dict,
+    features: Path,
+    vocabulary_images: list[str],
+    export_dir: Path | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Compute a global descriptor of every image of a feature file.
+
+    Args:
+        conf: an entry of `confs`.
+        features: feature file.
+        vocabulary_images: the images whose features the vocabulary is learned from: the map's.
+        export_dir: where `<conf["output"]>_<features>.h5` and the vocabulary go; default: beside
+            the features.
+        overwrite: learn and compute anew what is there.
+
+    Returns:
+        The h5 file of global descriptors, `global_descriptor` (G,) float16 of unit norm.
+
+    Raises:
+        InputError: when the images have no features to learn a vocabulary from.
+    """
+    output = Path(export_dir or features.parent) / f"{conf['output']}_{features.stem}.h5"
+    model = dynamic_load(extractors, conf["model"]["name"])(conf["model"]).eval()
+    with open_h5(features) as file:
+        made_by = {"model": conf["model"], "features": file.attrs.get("conf", features.name)}
+        with GroupWriter(output, made_by, overwrite) as writer:
+            todo = [name for name in list_h5_names(features) if name not in writer]
+            if not todo:
+                return output
+            vocabulary = output.with_suffix(".vocabulary.safetensors")
+            if overwrite or not vocabulary.exists():
+                if writer.names:
+                    raise InputError(f"The vocabulary {vocabulary} of {output} is gone: overwrite.")
+                model.fit(_sample(file, vocabulary_images, conf["model"]["max_samples"]))
+                with replacing(vocabulary) as temporary:
+                    save_file({"vocabulary": model.vocabulary}, temporary)
+            model.vocabulary = load_file(vocabulary)["vocabulary"]
+            for name in tqdm(todo, desc="Aggregating", unit="image"):
+                local = torch.from_numpy(get_features(file, name)["descriptors"][()])
+                descriptor = model({"descriptors": local[None]})["global_descriptor"][0]
+                writer.add(name, {"global_descriptor": descriptor.half().numpy()})
+    logger.info("Global descriptors are in %s.", output)
+    return output
+
+
+def _sample(file: h5py.File, names: list[str], max_samples: int) -> np.ndarray:
+    """Read an even share of each image's descriptors: (N, D), about `max_samples` at most."""
+    share = -(-max_samples // max(len(names), 1))
+    samples = []
+    for name in names:
+        descriptors = get_features(file, name)["descriptors"][()].T
+        samples.append(descriptors[:: -(-len(descriptors) // share) or 1])
+    if not sum(map(len, samples)):
+        raise InputError(f"No image for the vocabulary has features in {file.filename}.")
+    return np.concatenate(samples)
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.aggregate_features "
+        "--features outputs/feats-dog-sift_sv64.h5 --model outputs/sfm",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--features", type=Path, required=True, help="feature file")
+    parser.add_argument("--model", type=Path, required=True, help="COLMAP model of the map images")
+    parser.add_argument("--conf", default="vlad", help="way of aggregation")
+    parser.add_argument("--export_dir", type=Path, help="folder for the output")
+    parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
+    args = parser.parse_args()
+    images = [image.name for image in colmap.read_model(args.model).images.values()]
+    conf = confs[cli.choose("aggregation", args.conf, confs)]
+    main(conf, args.features, images, args.export_dir, args.overwrite)
+
+
+if __name__ == "__main__":
+    cli.run(_main)

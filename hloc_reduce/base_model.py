@@ -1,0 +1,55 @@
+"""What extractors and matchers have in common; the same contract as hloc's BaseModel."""
+
+import importlib
+import inspect
+from types import ModuleType
+
+from torch import nn
+
+from .cli import InputError
+
+
+class BaseModel(nn.Module):
+    """A model with a `default_conf` whose subclasses write `_init` and `_forward`.
+
+    Args:
+        conf: overrides of `default_conf`, and optionally the key `name`.
+
+    Raises:
+        InputError: for a configuration key that the model does not have.
+    """
+
+    default_conf: dict = {}
+    required_inputs: tuple[str, ...] = ()
+
+    def __init__(self, conf: dict):
+        super().__init__()
+        unknown = set(conf) - set(self.default_conf) - {"name"}
+        if unknown:
+            raise InputError(
+                f"{type(self).__name__} has no option {', '.join(sorted(unknown))}. "
+                f"It has: {', '.join(self.default_conf)}."
+            )
+        self.conf = {**self.default_conf, **conf}
+        self._init(self.conf)
+
+    def forward(self, data: dict) -> dict:
+        """Check that the required inputs are there and compute the predictions."""
+        missing = [key for key in self.required_inputs if key not in data]
+        if missing:
+            raise KeyError(f"{type(self).__name__} needs {', '.join(missing)}.")
+        return self._forward(data)
+
+    def _init(self, conf: dict) -> None:
+        pass
+
+
+def dynamic_load(root: ModuleType, name: str) -> type[BaseModel]:
+    """Return the one BaseModel that the module `name` of the package `root` defines."""
+    module = importlib.import_module(f"{root.__name__}.{name}")
+    (model,) = (
+        value
+        for _, value in inspect.getmembers(module, inspect.isclass)
+        if value.__module__ == module.__name__ and issubclass(value, BaseModel)
+    )
+    return model

@@ -1,0 +1,42 @@
+"""What all command lines share: how a user's mistake ends a program."""
+
+import argparse
+import difflib
+import sys
+from collections.abc import Callable, Iterable
+
+from . import logger
+
+
+class InputError(ValueError):
+    """Something the user gave is wrong; the message says what and how to mend it."""
+
+
+def run(main: Callable[[], None]) -> None:
+    """Run a command line: an `InputError` becomes one logged line and exit code 2."""
+    try:
+        main()
+    except InputError as error:
+        logger.error(error)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        logger.error("Interrupted. Run the same command again to go on from here.")
+        sys.exit(130)
+
+
+def choose(kind: str, name: str, names: Iterable[str]) -> str:
+    """Return `name` if it is one of `names`, else raise an InputError, nearest names first."""
+    names = list(names)
+    if name not in names:
+        near = difflib.get_close_matches(name, names, n=len(names), cutoff=0)
+        raise InputError(f"Unknown {kind} '{name}'. There are: {', '.join(near)}.")
+    return name
+
+
+class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows defaults, except of options that have none, and keeps the example's line."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        if action.default in (None, False):
+            return action.help
+        return super()._get_help_string(action)

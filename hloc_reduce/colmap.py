@@ -1,0 +1,152 @@
+"""The parts of pycolmap whose interface or behaviour differs between versions."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from .cli import InputError
+
+pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
+
+
+def dog_detector(options: dict) -> Callable[[np.ndarray], np.ndarray]:
+    """Make COLMAP's DoG detector on the CPU.
+
+    Args:
+        options: of pycolmap's SiftExtractionOptions.
+
+    Returns:
+        A function from an image (H, W) float32 in [0, 1] to keypoints (N, 4) float32: x, y with
+        pixel centres at integers, scale in pixels, orientation in degrees from x towards y.
+    """
+    extraction = pycolmap.FeatureExtractionOptions(sift=pycolmap.SiftExtractionOptions(options))
+    extractor = pycolmap.FeatureExtractor.create(extraction, pycolmap.Device.cpu)
+
+    def detect(image: np.ndarray) -> np.ndarray:
+        found, _ = extractor.extract_from_float32_array(image)
+        keypoints = np.array(
+            [(k.x, k.y, k.compute_scale(), np.rad2deg(k.compute_orientation())) for k in found],
+            np.float32,
+        ).reshape(-1, 4)
+        keypoints[:, :2] -= 0.5  # this interface has COLMAP's origin, the corner
+        return keypoints
+
+    return detect
+
+
+def read_model(path: Path) -> pycolmap.Reconstruction:
+    """Read a COLMAP model, binary or text, with or without rigs and frames.
+
+    Raises:
+        InputError: when it is not there or broken.
+    """
+    if not path.is_dir():
+        raise InputError(f"There is no COLMAP model folder {path}.")
+    try:
+        return pycolmap.Reconstruction(path)
+    except Exception as error:  # pycolmap raises RuntimeError, ValueError, IndexError, ...
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"{path} is not a COLMAP model ({reason}).") from None
+
+
+def point3D_ids(image: pycolmap.Image) -> np.ndarray:
+    """Return the ids of the 3D points of an image's keypoints (N,) int64, -1 where none."""
+    return np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
+
+
+def cam_from_img(camera: pycolmap.Camera, points2D: np.ndarray) -> np.ndarray:
+    """Undistort image points (N, 2), COLMAP's pixels, onto the normalized image plane.
+
+    A point that the camera model cannot undistort is infinite.
+    """
+    if len(points2D) == 0:
+        return np.zeros((0, 2))
+    points = camera.cam_from_img(np.asarray(points2D, np.float64))
+    return np.nan_to_num(np.asarray(points, np.float64), nan=np.inf)
+
+
+def write_database(
+    path: Path,
+    reference: pycolmap.Reconstruction,
+    keypoints: dict[str, np.ndarray],
+    matches: dict[tuple[str, str], tuple[np.ndarray, np.ndarray]],
+) -> None:
+    """Write a COLMAP database with the ids of a reference model.
+
+    Args:
+        path: the new database.
+        reference: model with cameras, rigs, frames and images.
+        keypoints: from image name to (N, 2), COLMAP's pixels.
+        matches: from two image names to all and to the verified matches, both (M, 2).
+    """
+    image_ids = {image.name: image.image_id for image in reference.images.values()}
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for camera in reference.cameras.values():
+            database.write_camera(camera, use_camera_id=True)
+        for rig in reference.rigs.values():
+            database.write_rig(rig, use_rig_id=True)
+        for frame in reference.frames.values():
+            database.write_frame(frame, use_frame_id=True)
+        for image in reference.images.values():
+            database.write_image(image, use_image_id=True)
+        for name, points in keypoints.items():
+            database.write_keypoints(image_ids[name], points.astype(np.float32))
+        for (name0, name1), (all_matches, verified) in matches.items():
+            ids = image_ids[name0], image_ids[name1]
+            database.write_matches(*ids, all_matches.astype(np.uint32))
+            # from 4.2.1 on COLMAP skips a geometry whose configuration is undefined
+            geometry = pycolmap.TwoViewGeometry(
+                config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
+                inlier_matches=verified.astype(np.uint32),
+            )
+            database.write_two_view_geometry(*ids, geometry)
+
+
+def triangulate_points(
+    reference: pycolmap.Reconstruction,
+    database: Path,
+    image_dir: Path,
+    output: Path,
+    options: dict,
+    verbose: bool,
+) -> pycolmap.Reconstruction:
+    """Triangulate the verified matches of a database into `output`; poses stay as they are."""
+    level = pycolmap.logging.minloglevel
+    if verbose:
+        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.INFO)
+    try:
+        return pycolmap.triangulate_points(
+            reference,
+            database,
+            image_dir,
+            output,
+            options=pycolmap.IncrementalPipelineOptions(options),
+        )
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def estimate_pose(
+    points2D: np.ndarray, points3D: np.ndarray, camera: pycolmap.Camera, config: dict, seed: int
+) -> dict | None:
+    """Estimate an absolute pose by PnP + LO-RANSAC and refine it, the same way every time.
+
+    Args:
+        points2D: (M, 2) image points, COLMAP's pixels.
+        points3D: (M, 3) world points.
+        camera: intrinsics.
+        config: hloc's dict, options under "estimation" and "refinement".
+        seed: of RANSAC.
+
+    Returns:
+        cam_from_world, num_inliers and inlier_mask (M,), or None.
+    """
+    estimation = {**config.get("estimation", {})}
+    estimation["ransac"] = {"random_seed": seed, **estimation.get("ransac", {})}
+    if len(points2D) == 0:
+        return None
+    return pycolmap.estimate_and_refine_absolute_pose(
+        points2D, points3D, camera, estimation, config.get("refinement", {})
+    )

@@ -1,0 +1,1 @@
+"""Measures of matching and localization."""

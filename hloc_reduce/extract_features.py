@@ -1,0 +1,175 @@
+"""Extract local features from images into an h5 file."""
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from confs import features as features_confs
+
+from . import cli, extractors, logger, projections
+from .base_model import dynamic_load
+from .cli import InputError
+from .io import GroupWriter, read_image
+from .parsers import parse_image_list
+
+confs = features_confs.confs
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
+
+
+def main(
+    conf: dict,
+    image_dir: Path,
+    export_dir: Path | None = None,
+    as_half: bool = True,
+    image_list: Path | Iterable[str] | None = None,
+    feature_path: Path | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Extract the features of all images of a folder, or of a list of them.
+
+    Args:
+        conf: an entry of `confs`.
+        image_dir: the folder that the image names are relative to.
+        export_dir: where `<conf["output"]>.h5` goes.
+        as_half: store everything but keypoints as float16.
+        image_list: names, or a text file of them; default: every image of the folder.
+        feature_path: the h5 file itself, instead of `export_dir`.
+        overwrite: extract anew what is there.
+
+    Returns:
+        The feature file; images it holds already are skipped.
+
+    Raises:
+        InputError: for an image that is not there or cannot be read.
+    """
+    if feature_path is None:
+        feature_path = Path(export_dir) / f"{conf['output']}.h5"
+    image_names = list_images(image_dir, image_list)
+    with GroupWriter(feature_path, provenance(conf, as_half), overwrite) as writer:
+        todo = [name for name in image_names if name not in writer]
+        if not todo:
+            logger.info("All %d images are in %s.", len(image_names), feature_path)
+            return feature_path
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+        model = load_extractor(conf["model"]).to(device)
+        for name in tqdm(todo, desc="Extracting features", unit="image"):
+            features = extract(model, image_dir / name, conf["preprocessing"], device)
+            uncertainty = features.pop("uncertainty")
+            if as_half:
+                for key in features.keys() - {"keypoints", "image_size"}:
+                    features[key] = features[key].astype(np.float16)
+            if len(features["keypoints"]) == 0:
+                logger.warning("Image %s has no keypoints.", name)
+            writer.add(name, features, {"keypoints": {"uncertainty": uncertainty}})
+    logger.info("Features of %d images are in %s.", len(image_names), feature_path)
+    return feature_path
+
+
+def load_extractor(conf: dict) -> torch.nn.Module:
+    """Make the extractor of a model configuration, ready to compute."""
+    return dynamic_load(extractors, conf["name"])(conf).eval()
+
+
+def provenance(conf: dict, as_half: bool) -> dict:
+    """Return what determines the features: the configuration and the projection's checksum."""
+    made_by = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
+    if "projection" in conf["model"]:
+        made_by["projection_sha256"] = projections.checksum(conf["model"]["projection"])
+    return made_by
+
+
+def list_images(image_dir: Path, image_list: Path | Iterable[str] | None = None) -> list[str]:
+    """Return the names of the images of a folder, or of a list, checked to be there."""
+    if image_list is None:
+        image_names = sorted(
+            path.relative_to(image_dir).as_posix()
+            for path in Path(image_dir).rglob("*")
+            if path.suffix.lower() in IMAGE_SUFFIXES
+        )
+        if not image_names:
+            raise InputError(f"There is no image in {image_dir}.")
+        return image_names
+    image_names = parse_image_list(image_list) if isinstance(image_list, Path) else list(image_list)
+    missing = [name for name in image_names if not (image_dir / name).is_file()]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(image_names)} images are not in {image_dir}: "
+            f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+        )
+    return image_names
+
+
+def load_image(path: Path, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:
+    """Read an image and resize it to at most `resize_max` pixels on its longer side.
+
+    Returns:
+        The image (1, C, H, W) float32 in [0, 1], and its original (width, height).
+    """
+    image = read_image(path, preprocessing.get("grayscale", False)).astype(np.float32)
+    size = np.array(image.shape[1::-1])
+    resize_max = preprocessing.get("resize_max")
+    if resize_max and size.max() > resize_max:
+        # one pixel at least: a panorama may be a thousand times wider than high
+        new_size = np.maximum(1, np.round(size * (resize_max / size.max())).astype(int))
+        image = cv2.resize(image, new_size.tolist(), interpolation=cv2.INTER_AREA)
+    image = np.atleast_3d(image).transpose(2, 0, 1) / 255
+    return torch.from_numpy(np.ascontiguousarray(image))[None], size
+
+
+@torch.no_grad()
+def extract(
+    model: torch.nn.Module, path: Path, preprocessing: dict, device: str = "cpu"
+) -> dict[str, np.ndarray]:
+    """Extract the features of one image.
+
+    Returns:
+        keypoints (N, 2) float32 (x, y) in pixels of the original image, centres at integers;
+        descriptors (D, N); scores, scales (pixels), oris (degrees) (N,); image_size (2,) width,
+        height; and the uncertainty of the keypoints in pixels.
+    """
+    image, size = load_image(path, preprocessing)
+    features = {
+        key: value[0].cpu().numpy() for key, value in model({"image": image.to(device)}).items()
+    }
+    ratio = (size / np.array(image.shape[:1:-1])).astype(np.float32)
+    features["keypoints"] = (features["keypoints"] + 0.5) * ratio - 0.5
+    features["scales"] = features["scales"] * ratio.mean()
+    features["image_size"] = size
+    features["uncertainty"] = model.detection_noise * ratio.mean()
+    return features
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.extract_features --conf sift_sv64 "
+        "--image_dir photos --export_dir outputs",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--image_dir", type=Path, required=True, help="folder of images")
+    parser.add_argument("--export_dir", type=Path, help="folder for the feature file")
+    parser.add_argument("--feature_path", type=Path, help="the feature file itself")
+    parser.add_argument("--conf", default="sift_sv64", help="feature to extract")
+    parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
+    parser.add_argument("--overwrite", action="store_true", help="extract anew what is there")
+    args = parser.parse_args()
+    if args.export_dir is None and args.feature_path is None:
+        raise InputError("Give --export_dir or --feature_path.")
+    conf = confs[cli.choose("feature", args.conf, confs)]
+    main(
+        conf,
+        args.image_dir,
+        args.export_dir,
+        image_list=args.image_list,
+        feature_path=args.feature_path,
+        overwrite=args.overwrite,
+    )
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,1 @@
+"""Extractors: image to features."""

@@ -1,0 +1,234 @@
+"""Images and h5 files, and how files are written so that a killed run loses little."""
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+
+from .cli import InputError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path` and move it into place when the block succeeds."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_image(path: Path, grayscale: bool = False) -> np.ndarray:
+    """Read an image as uint8, (H, W) or (H, W, 3) RGB, without applying EXIF's rotation.
+
+    Raises:
+        InputError: when the file is no image that OpenCV can read.
+    """
+    mode = cv2.IMREAD_GRAYSCALE if grayscale else cv2.IMREAD_COLOR
+    data = np.fromfile(path, np.uint8) if path.is_file() else np.empty(0, np.uint8)
+    image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    if image is None:
+        raise InputError(f"Cannot read image {path}.")
+    return image if grayscale else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+@contextmanager
+def open_h5(path: Path) -> Iterator[h5py.File]:
+    """Open an h5 file for reading; one that is absent or broken raises an InputError."""
+    try:
+        file = h5py.File(path, "r", libver="latest")
+    except OSError as error:
+        reason = "it is not there" if not path.exists() else "not a whole h5 file"
+        raise InputError(f"Cannot open {path}: {reason}.") from error
+    with file:
+        yield file
+
+
+def list_h5_names(path: Path) -> list[str]:
+    """List the groups of an h5 file that hold data sets, in the order of their names."""
+    names: dict[str, None] = {}
+
+    def visit(_: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset):
+            names[item.parent.name.strip("/")] = None
+
+    with open_h5(path) as file:
+        file.visititems(visit)
+    return list(names)
+
+
+class GroupWriter:
+    """Adds groups of arrays to an h5 file; a killed run loses its last seconds of work only.
+
+    Groups gather in memory and go into pieces beside the file, each moved into place when it is
+    whole. Leaving the context merges the pieces into the file. What a piece holds is never
+    computed again, and the file itself is whole at any instant.
+
+    Args:
+        path: the h5 file, new or to be extended.
+        conf: what makes the arrays; kept in the file and refused when it differs.
+        overwrite: start anew instead of extending.
+        compression: h5py's name of a compression filter for all arrays.
+
+    Raises:
+        InputError: when the file is broken or was made with another conf.
+    """
+
+    piece_seconds = 5.0
+    piece_bytes = 64 * 2**20
+
+    def __init__(
+        self, path: Path, conf: dict, overwrite: bool = False, compression: str | None = None
+    ):
+        self.path = path
+        self.conf = json.dumps(conf, sort_keys=True)
+        self.compression = compression
+        self.pieces = path.with_name(path.name + ".pieces")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if overwrite:
+            path.unlink(missing_ok=True)
+            shutil.rmtree(self.pieces, ignore_errors=True)
+        self.names: set[str] = set()
+        for part in [path] * path.exists() + self._finished():
+            with open_h5(part) as file:
+                self._check(file, part)
+            self.names.update(list_h5_names(part))
+        self.buffer: dict[str, tuple[dict, dict]] = {}
+        self.buffer_bytes = 0
+        self.flushed = time.monotonic()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    def __enter__(self) -> "GroupWriter":
+        return self
+
+    def __exit__(self, error: type | None, *_) -> None:
+        self._flush()
+        if error is None:
+            self._merge()
+
+    def add(self, name: str, arrays: dict[str, np.ndarray], attrs: dict | None = None) -> None:
+        """Add a group of arrays; `attrs` maps the name of an array to its attributes."""
+        self.buffer[name] = arrays, attrs or {}
+        self.names.add(name)
+        self.buffer_bytes += sum(array.nbytes for array in arrays.values())
+        late = time.monotonic() - self.flushed > self.piece_seconds
+        if late or self.buffer_bytes > self.piece_bytes:
+            self._flush()
+
+    def _finished(self) -> list[Path]:
+        return sorted(self.pieces.glob("*.h5"))
+
+    def _check(self, file: h5py.File, path: Path) -> None:
+        before = file.attrs.get("conf", self.conf)  # hloc's own files say nothing
+        if before != self.conf:
+            old, new = json.loads(before), json.loads(self.conf)
+            keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+            changes = "; ".join(f"{key}: {old.get(key)} before, {new.get(key)} now" for key in keys)
+            raise InputError(
+                f"{path} was made with another configuration ({changes}). "
+                "Choose another output or overwrite it."
+            )
+
+    def _flush(self) -> None:
+        if self.buffer:
+            number = len(self._finished())
+            with replacing(self.pieces / f"{number:06d}.h5") as temporary:
+                self._write(temporary)
+        self.buffer.clear()
+        self.buffer_bytes = 0
+        self.flushed = time.monotonic()
+
+    def _write(self, path: Path) -> None:
+        with h5py.File(path, "w", libver="latest") as file:
+            file.attrs["conf"] = self.conf
+            for name, (arrays, attrs) in self.buffer.items():
+                group = file.create_group(name)
+                for key, array in arrays.items():
+                    compression = self.compression if array.size else None
+                    dataset = group.create_dataset(key, data=array, compression=compression)
+                    dataset.attrs.update(attrs.get(key, {}))
+
+    def _merge(self) -> None:
+        pieces = self._finished()
+        if not pieces and self.path.exists():
+            return
+        with replacing(self.path) as temporary:
+            if self.path.exists():
+                shutil.copyfile(self.path, temporary)
+            with h5py.File(temporary, "a", libver="latest") as merged:
+                merged.attrs["conf"] = self.conf
+                for piece in pieces:
+                    names = list_h5_names(piece)
+                    with open_h5(piece) as file:
+                        for name in names:
+                            if name not in merged:  # killed between moving and clearing
+                                file.copy(name, merged, name)
+        shutil.rmtree(self.pieces, ignore_errors=True)
+
+
+def get_features(file: h5py.File, name: str) -> h5py.Group:
+    """Return the group of an image in an open feature file, or raise an InputError."""
+    if name not in file:
+        raise InputError(f"Image {name} is not in the feature file {file.filename}.")
+    return file[name]
+
+
+def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
+    """Read keypoints (N, 2) float64, pixel centres at integers, and their uncertainty in pixels."""
+    dataset = get_features(file, name)["keypoints"]
+    return dataset[:, :2].astype(np.float64), float(dataset.attrs.get("uncertainty", 1.0))
+
+
+def get_colmap_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
+    """Read keypoints as `get_keypoints` does, with COLMAP's pixel origin: the corner, not centre.
+
+    The only place where the half pixel is added.
+    """
+    keypoints, uncertainty = get_keypoints(file, name)
+    return keypoints + 0.5, uncertainty
+
+
+def names_to_pair(name0: str, name1: str, separator: str = "/") -> str:
+    """Return the name of a pair's group in a match file."""
+    return separator.join((name0.replace("/", "-"), name1.replace("/", "-")))
+
+
+def find_pair(file: h5py.File, name0: str, name1: str) -> tuple[str | None, bool]:
+    """Return the group of a pair in an open match file (None if absent) and if it is reversed."""
+    for separator in "/_":  # the second is hloc's old format
+        for reverse in (False, True):
+            names = (name1, name0) if reverse else (name0, name1)
+            pair = names_to_pair(*names, separator)
+            if pair in file:
+                return pair, reverse
+    return None, False
+
+
+def get_matches(file: h5py.File, name0: str, name1: str) -> tuple[np.ndarray, np.ndarray]:
+    """Read the matches of a pair, stored in either order.
+
+    Returns:
+        matches (M, 2) int64, indices of the keypoints of name0 and name1, and scores (M,).
+
+    Raises:
+        InputError: when the pair was not matched.
+    """
+    pair, reverse = find_pair(file, name0, name1)
+    if pair is None:
+        raise InputError(f"The pair {name0}, {name1} is not in the match file {file.filename}.")
+    matches0 = file[pair]["matches0"][()]
+    matched = np.flatnonzero(matches0 != -1)
+    matches = np.stack([matched, matches0[matched].astype(np.int64)], -1)
+    scores = file[pair]["matching_scores0"][()][matched]
+    return (matches[:, ::-1] if reverse else matches), scores

@@ -1,0 +1,142 @@
+"""Match the local features of image pairs into an h5 file."""
+
+import argparse
+from functools import lru_cache
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from confs import matchers as matchers_confs
+
+from . import cli, logger, matchers
+from .base_model import dynamic_load
+from .cli import InputError
+from .io import GroupWriter, get_features, names_to_pair, open_h5
+from .parsers import parse_retrieval
+
+confs = matchers_confs.confs
+CACHED_IMAGES = 128  # descriptors of so many images stay in memory: 1 GB at 8,000 x 128
+
+
+def main(
+    conf: dict,
+    pairs: Path,
+    features: Path | str,
+    export_dir: Path | None = None,
+    matches: Path | None = None,
+    features_ref: Path | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Match all pairs of a list, each unordered pair once.
+
+    Args:
+        conf: an entry of `confs`.
+        pairs: text file of pairs.
+        features: feature file, or its name in `export_dir` without suffix.
+        export_dir: folder of the features and of `<features>_<conf["output"]>_<pairs>.h5`.
+        matches: the match file itself; needed where `features` is a path.
+        features_ref: feature file of the second images; default: `features`.
+        overwrite: match anew what is there.
+
+    Returns:
+        The match file; pairs it holds already, in either order, are skipped.
+
+    Raises:
+        InputError: for an image without features, or no path for the matches.
+    """
+    if isinstance(features, Path) or Path(features).exists():
+        feature_path = Path(features)
+        if matches is None:
+            raise InputError("Give the path of the matches when the features are given as a path.")
+    elif export_dir is None:
+        raise InputError(f"There is no feature file {features}, and no export_dir to look in.")
+    else:
+        feature_path = Path(export_dir, f"{features}.h5")
+        matches = matches or Path(export_dir, f"{features}_{conf['output']}_{pairs.stem}.h5")
+    with (
+        open_h5(feature_path) as file0,
+        open_h5(features_ref or feature_path) as file1,
+        GroupWriter(
+            matches, provenance(conf, file0, file1), overwrite, compression="gzip"
+        ) as writer,
+    ):
+        todo = unmatched_pairs(pairs, writer)
+        if todo:
+            _match(conf, todo, file0, file1, writer)
+    logger.info("Matches of the pairs %s are in %s.", pairs.name, matches)
+    return matches
+
+
+def provenance(conf: dict, *feature_files: h5py.File) -> dict:
+    """Return what determines the matches: the configurations of matcher and features."""
+    made_by = {"model": conf["model"]}
+    for i, file in enumerate(feature_files):
+        made_by[f"features{i}"] = file.attrs.get("conf", Path(file.filename).name)
+    return made_by
+
+
+def unmatched_pairs(pairs: Path, matched: GroupWriter) -> list[tuple[str, str]]:
+    """List the unordered pairs of a file that are not matched yet, in the file's order."""
+    todo: dict[tuple[str, str], None] = {}
+    for name0, names1 in parse_retrieval(pairs).items():
+        for name1 in names1:
+            seen = (name1, name0) in todo or any(
+                names_to_pair(*names, separator) in matched
+                for names in ((name0, name1), (name1, name0))
+                for separator in "/_"
+            )
+            if not seen:
+                todo[name0, name1] = None
+    return list(todo)
+
+
+@torch.no_grad()
+def _match(
+    conf: dict,
+    pairs: list[tuple[str, str]],
+    file0: h5py.File,
+    file1: h5py.File,
+    writer: GroupWriter,
+) -> None:
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    matcher = dynamic_load(matchers, conf["model"]["name"])(conf["model"]).eval().to(device)
+
+    @lru_cache(CACHED_IMAGES)
+    def descriptors(file: h5py.File, name: str) -> torch.Tensor:
+        array = get_features(file, name)["descriptors"][()]
+        return torch.from_numpy(array).to(device).float()[None]
+
+    for name0, name1 in tqdm(pairs, desc="Matching", unit="pair", smoothing=0.1):
+        prediction = matcher(
+            {"descriptors0": descriptors(file0, name0), "descriptors1": descriptors(file1, name1)}
+        )
+        arrays = {
+            "matches0": prediction["matches0"][0].cpu().numpy().astype(np.int32),
+            "matching_scores0": prediction["matching_scores0"][0].cpu().numpy().astype(np.float16),
+        }
+        writer.add(names_to_pair(name0, name1), arrays)
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.match_features --pairs pairs.txt "
+        "--features feats-dog-sift_sv64 --export_dir outputs",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
+    parser.add_argument("--features", default="feats-dog-sift_sv64", help="name of the features")
+    parser.add_argument("--export_dir", type=Path, required=True, help="folder of the features")
+    parser.add_argument("--matches", type=Path, help="the match file itself")
+    parser.add_argument("--conf", default="NN-ratio", help="matcher")
+    parser.add_argument("--overwrite", action="store_true", help="match anew what is there")
+    args = parser.parse_args()
+    conf = confs[cli.choose("matcher", args.conf, confs)]
+    main(conf, args.pairs, args.features, args.export_dir, args.matches, overwrite=args.overwrite)
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,1 @@
+"""Matchers: descriptors of two images to matches."""

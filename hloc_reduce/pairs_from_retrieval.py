@@ -1,0 +1,149 @@
+"""Pair each query with the database images of the most similar global descriptors."""
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from . import cli, colmap, logger
+from .cli import InputError
+from .io import get_features, list_h5_names, open_h5
+from .parsers import parse_image_list, parse_retrieval, write_pairs
+
+QUERY_BLOCK = 1024  # rows of the similarity matrix in memory at once
+
+
+def main(
+    descriptors: Path,
+    output: Path,
+    num_matched: int,
+    query_prefix: str | tuple[str, ...] | None = None,
+    query_list: Path | Iterable[str] | None = None,
+    db_prefix: str | tuple[str, ...] | None = None,
+    db_list: Path | Iterable[str] | None = None,
+    db_model: Path | None = None,
+    db_descriptors: Path | None = None,
+) -> Path:
+    """Write the `num_matched` most similar database images of every query, best first.
+
+    Args:
+        descriptors: h5 file with a `global_descriptor` (G,) of every image.
+        output: text file of pairs.
+        num_matched: pairs a query, at most.
+        query_prefix: queries are the names that begin so ...
+        query_list: ... or those of this list; default: all names.
+        db_prefix: likewise for the database.
+        db_list: likewise for the database.
+        db_model: the database is the images of this COLMAP model.
+        db_descriptors: h5 file of the database; default: `descriptors`.
+
+    Returns:
+        `output`.
+
+    Raises:
+        InputError: for an image without a global descriptor, or no image at all.
+    """
+    db_descriptors = db_descriptors or descriptors
+    if db_model is not None:
+        db_list = [image.name for image in colmap.read_model(db_model).images.values()]
+    query_names = _select(descriptors, query_prefix, query_list)
+    db_names = _select(db_descriptors, db_prefix, db_list)
+    queries, database = _read(descriptors, query_names), _read(db_descriptors, db_names)
+    if queries.shape[1] != database.shape[1]:
+        raise InputError(
+            f"Global descriptors of {queries.shape[1]} numbers in {descriptors} and of "
+            f"{database.shape[1]} in {db_descriptors} cannot be compared."
+        )
+    pairs = []
+    for start in range(0, len(queries), QUERY_BLOCK):
+        similarity = queries[start : start + QUERY_BLOCK] @ database.T
+        similarity[:, ~database.any(axis=1)] = -np.inf  # images without features come last
+        ranking = np.argsort(-similarity, axis=1, kind="stable")[:, : num_matched + 1]
+        for name, row in zip(query_names[start:], ranking, strict=False):
+            others = [db_names[j] for j in row if db_names[j] != name]
+            pairs += [(name, other) for other in others[:num_matched]]
+    write_pairs(pairs, output)
+    logger.info("Retrieved %d pairs for %d queries.", len(pairs), len(query_names))
+    return output
+
+
+def select(
+    pairs: Path,
+    output: Path,
+    num_matched: int,
+    query_list: Iterable[str],
+    db_list: Iterable[str],
+) -> Path:
+    """Take the first `num_matched` pairs of every query from a list made elsewhere.
+
+    Args:
+        pairs: text file of pairs, best first.
+        output: text file of those selected.
+        num_matched: pairs a query, at most.
+        query_list: the queries.
+        db_list: the database images; pairs with others are left out.
+
+    Returns:
+        `output`.
+
+    Raises:
+        InputError: when no pair is left.
+    """
+    retrieved, database = parse_retrieval(pairs), set(db_list)
+    selected = []
+    for query in query_list:
+        names = [name for name in retrieved.get(query, []) if name in database]
+        if not names:
+            logger.warning("%s has no pair for query %s.", pairs, query)
+        selected += [(query, name) for name in names[:num_matched]]
+    if not selected:
+        raise InputError(f"{pairs} has no pair of a query and a map image.")
+    write_pairs(selected, output)
+    return output
+
+
+def _select(
+    path: Path,
+    prefix: str | tuple[str, ...] | None,
+    names: Path | Iterable[str] | None,
+) -> list[str]:
+    if prefix is not None:
+        prefix = prefix if isinstance(prefix, str) else tuple(prefix)
+        selected = [name for name in list_h5_names(path) if name.startswith(prefix)]
+    elif names is not None:
+        selected = parse_image_list(names) if isinstance(names, Path) else list(names)
+    else:
+        selected = list_h5_names(path)
+    if not selected:
+        raise InputError(f"No image is selected from the global descriptors {path}.")
+    return selected
+
+
+def _read(path: Path, names: list[str]) -> np.ndarray:
+    with open_h5(path) as file:
+        rows = [get_features(file, name)["global_descriptor"][()] for name in names]
+    return np.stack(rows).astype(np.float32)
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.pairs_from_retrieval --descriptors global.h5 "
+        "--output pairs.txt --query_prefix query/ --db_prefix db/",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--descriptors", type=Path, required=True, help="global descriptors")
+    parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
+    parser.add_argument("--num_matched", type=int, default=50, help="pairs a query, at most")
+    parser.add_argument("--query_prefix", nargs="+", help="beginning of the queries' names")
+    parser.add_argument("--query_list", type=Path, help="text file of the queries' names")
+    parser.add_argument("--db_prefix", nargs="+", help="beginning of the database's names")
+    parser.add_argument("--db_list", type=Path, help="text file of the database's names")
+    parser.add_argument("--db_model", type=Path, help="COLMAP model of the database")
+    parser.add_argument("--db_descriptors", type=Path, help="global descriptors of the database")
+    main(**vars(parser.parse_args()))
+
+
+if __name__ == "__main__":
+    cli.run(_main)

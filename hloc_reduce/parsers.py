@@ -1,0 +1,128 @@
+"""The text files of hloc: image lists, query lists with intrinsics, pairs, poses."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from .cli import InputError
+from .io import replacing
+
+
+def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield ("file:number", words) of every line that is neither empty nor a comment."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"Cannot read {path}: {error}.") from None
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            yield f"{path}:{number}", words
+
+
+def parse_image_list(path: Path) -> list[str]:
+    """Read image names, the first word of every line."""
+    return [words[0] for _, words in _lines(path)]
+
+
+def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
+    """Read queries with intrinsics, one `name MODEL width height params...` a line.
+
+    Raises:
+        InputError: for a broken line, with file and line number, or an empty list.
+    """
+    queries = []
+    for place, words in _lines(path):
+        try:
+            name, model, width, height, *params = words
+            camera = pycolmap.Camera(
+                model=model,
+                width=int(width),
+                height=int(height),
+                params=np.array(params, float),
+            )
+            if not (
+                camera.verify_params() and np.isfinite(camera.params).all() and camera.width > 0
+            ):
+                raise ValueError(f"wrong number of parameters for {model}")
+        except (ValueError, TypeError, AttributeError, RuntimeError) as error:
+            reason = str(error).strip().splitlines()[0]
+            raise InputError(
+                f"{place}: not a query `name MODEL width height params...` ({reason})."
+            ) from None
+        queries.append((name, camera))
+    if not queries:
+        raise InputError(f"{path} lists no query.")
+    return queries
+
+
+def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]]]:
+    """Read all query lists that match a glob, for example `queries/*_with_intrinsics.txt`.
+
+    Returns:
+        From the stem of each list to its queries, in the order of the file names.
+
+    Raises:
+        InputError: when no file matches or a name is listed twice.
+    """
+    files = sorted(paths.parent.glob(paths.name))
+    if not files:
+        raise InputError(f"There is no query list {paths}.")
+    lists = {path.stem: parse_query_list(path) for path in files}
+    seen: set[str] = set()
+    for path in files:
+        for name, _ in lists[path.stem]:
+            if name in seen:
+                raise InputError(f"{path}: query {name} is listed twice.")
+            seen.add(name)
+    return lists
+
+
+def parse_retrieval(path: Path) -> dict[str, list[str]]:
+    """Read pairs, one `name0 name1` a line, as name0 -> [name1, ...] in the order of the file."""
+    retrieval: dict[str, list[str]] = {}
+    for place, words in _lines(path):
+        if len(words) != 2:
+            raise InputError(f"{place}: not a pair `name0 name1`.")
+        retrieval.setdefault(words[0], []).append(words[1])
+    return retrieval
+
+
+def write_pairs(pairs: list[tuple[str, str]], path: Path) -> None:
+    """Write pairs, one `name0 name1` a line."""
+    with replacing(path) as temporary:
+        temporary.write_text("".join(f"{name0} {name1}\n" for name0, name1 in pairs))
+
+
+def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
+    """Read poses, one `name qw qx qy qz tx ty tz` (camera from world, metres) a line."""
+    poses = {}
+    for place, (name, *values) in _lines(path):
+        try:
+            qw, qx, qy, qz, *translation = map(float, values)
+            rotation = pycolmap.Rotation3d(Rotation.from_quat([qx, qy, qz, qw]).as_matrix())
+            poses[name] = pycolmap.Rigid3d(rotation, np.array(translation).reshape(3))
+        except ValueError:
+            raise InputError(f"{place}: not a pose `name qw qx qy qz tx ty tz`.") from None
+    return poses
+
+
+def write_poses(
+    poses: Mapping[str, pycolmap.Rigid3d], path: Path, prepend_camera_name: bool = False
+) -> None:
+    """Write poses (camera from world) in the submission format of visuallocalization.net.
+
+    Args:
+        poses: from image name to pose.
+        path: the text file, one `basename qw qx qy qz tx ty tz` a line.
+        prepend_camera_name: write `folder/basename` (RobotCar's format).
+    """
+    with replacing(path) as temporary, temporary.open("w") as file:
+        for name, pose in poses.items():
+            parts = Path(name).parts[-2:] if prepend_camera_name else [Path(name).name]
+            x, y, z, w = pose.rotation.quat
+            numbers = " ".join(repr(float(value)) for value in (w, x, y, z, *pose.translation))
+            file.write(f"{'/'.join(parts)} {numbers}\n")

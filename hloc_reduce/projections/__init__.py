@@ -1,0 +1,137 @@
+"""Frozen projections of descriptors: load, fold, apply, save."""
+
+import hashlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import nn
+
+from ..cli import InputError, choose
+from ..io import replacing
+
+WEIGHTS = Path(__file__).parent / "weights"
+
+
+class MLP(nn.Module):
+    """Linear layers, each but the last followed by ReLU, then batch normalization (Sec. III-D).
+
+    Args:
+        sizes: of the input, the hidden layers and the output, for example (128, 512, 512, 64).
+    """
+
+    def __init__(self, sizes: Iterable[int]):
+        super().__init__()
+        self.sizes = tuple(sizes)
+        self.linears = nn.ModuleList(map(nn.Linear, self.sizes[:-1], self.sizes[1:]))
+        self.norms = nn.ModuleList(map(nn.BatchNorm1d, self.sizes[1:-1]))
+
+    def forward(self, descriptors: torch.Tensor) -> torch.Tensor:
+        """Map descriptors (N, sizes[0]) to (N, sizes[-1]) of unit norm."""
+        for linear, norm in zip(self.linears, self.norms, strict=False):
+            descriptors = norm(linear(descriptors).relu())
+        return nn.functional.normalize(self.linears[-1](descriptors), dim=1)
+
+
+class Projection(nn.Module):
+    """A frozen MLP: two or three matrix products, with the batch normalizations folded in.
+
+    Args:
+        mlp: the trained network; only its running statistics are used.
+        metadata: what is known of its training: descriptor, scheme, dim, ...
+    """
+
+    def __init__(self, mlp: MLP, metadata: dict | None = None):
+        super().__init__()
+        self.sizes = mlp.sizes
+        self.metadata = metadata or {}
+        self.linears = nn.ModuleList(map(nn.Linear, mlp.sizes[:-1], mlp.sizes[1:]))
+        scale, shift = torch.ones(mlp.sizes[0]), torch.zeros(mlp.sizes[0])
+        for folded, linear, norm in zip(self.linears, mlp.linears, [*mlp.norms, None], strict=True):
+            # the normalization before a layer, x * scale + shift, goes into its weight and bias
+            folded.weight.data = linear.weight.detach() * scale
+            folded.bias.data = linear.bias.detach() + linear.weight.detach() @ shift
+            if norm is not None:
+                scale = norm.weight.detach() / (norm.running_var + norm.eps).sqrt()
+                shift = norm.bias.detach() - norm.running_mean * scale
+        self.requires_grad_(False).eval()
+
+    @property
+    def dim(self) -> int:
+        """The number of output dimensions."""
+        return self.sizes[-1]
+
+    @torch.no_grad()
+    def forward(self, descriptors: torch.Tensor) -> torch.Tensor:
+        """Map descriptors (N, 128) of unit norm to (N, dim) of unit norm."""
+        for linear in self.linears[:-1]:
+            descriptors = linear(descriptors).relu_()
+        return nn.functional.normalize(self.linears[-1](descriptors), dim=1)
+
+
+def names() -> list[str]:
+    """List the projections that ship."""
+    return sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
+
+
+def find(projection: str | Path) -> Path:
+    """Return the file of a projection, given by the name of one that ships or by its path.
+
+    Raises:
+        InputError: when there is neither.
+    """
+    path = Path(projection)
+    if path.suffix:
+        if not path.is_file():
+            raise InputError(f"There is no projection file {path}.")
+        return path
+    return WEIGHTS / f"{choose('projection', str(projection), names())}.safetensors"
+
+
+def checksum(projection: str | Path) -> str:
+    """Return the sha256 of a projection's file, to tell which one made a feature file."""
+    return hashlib.sha256(find(projection).read_bytes()).hexdigest()
+
+
+def save(mlp: MLP, metadata: dict, path: Path) -> None:
+    """Write a trained network as safetensors; weights as float16, statistics as float32.
+
+    `metadata` holds strings, numbers, lists and dicts of these.
+    """
+    tensors = {
+        key: value.half() if key.startswith("linears.") else value.float()
+        for key, value in mlp.state_dict().items()
+        if not key.endswith("num_batches_tracked")
+    }
+    metadata = {**metadata, "layers": list(mlp.sizes)}
+    header = {key: json.dumps(value) for key, value in metadata.items()}
+    with replacing(path) as temporary:
+        save_file({key: value.contiguous() for key, value in tensors.items()}, temporary, header)
+
+
+def load(projection: str | Path) -> Projection:
+    """Load a projection that ships, by name, or any other, by the path of its file.
+
+    Returns:
+        The projection, frozen and folded, float32, on the CPU.
+
+    Raises:
+        InputError: when it is not there or is not a projection.
+    """
+    path = find(projection)
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
+            state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
+        mlp = MLP(metadata["layers"])
+        missing, unexpected = mlp.load_state_dict(state, strict=False)
+        missing = [key for key in missing if not key.endswith("num_batches_tracked")]
+        if missing or unexpected:
+            raise ValueError(f"tensors {missing + unexpected} missing or unknown")
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"{path} is not a projection ({reason}).") from None
+    return Projection(mlp, metadata)

@@ -1,0 +1,196 @@
+"""What a localization run leaves behind: queries.csv, summary.json and the recall table."""
+
+import csv
+import json
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from .cli import InputError
+from .evaluation.poses import pose_error, recall
+from .io import open_h5, replacing
+from .localize_sfm import pose
+
+COLUMNS = (
+    "query",
+    "list",
+    "status",
+    "num_matches",
+    "num_inliers",
+    "inlier_ratio",
+    "position_error_m",
+    "rotation_error_deg",
+    "retrieved",
+)
+FAILED = (float("inf"), float("inf"))
+
+
+class RunFolder:
+    """An output folder that belongs to one configuration and knows how long its stages took.
+
+    Args:
+        path: the folder; made if need be.
+        conf: what determines the results.
+        overwrite: begin anew, with this configuration.
+
+    Raises:
+        InputError: when the folder holds results of another configuration.
+    """
+
+    def __init__(self, path: Path, conf: dict, overwrite: bool):
+        self.path = path
+        conf_file, self._seconds_file = path / "conf.json", path / "seconds.json"
+        conf = json.loads(json.dumps(conf))
+        if conf_file.exists() and not overwrite:
+            try:
+                before = json.loads(conf_file.read_text())
+            except ValueError:
+                raise InputError(f"{conf_file} is broken: use --overwrite.") from None
+            keys = [key for key in {**before, **conf} if before.get(key) != conf.get(key)]
+            if keys:
+                key = keys[0]
+                raise InputError(
+                    f"{path} holds results of another configuration ({key}: {before.get(key)} "
+                    f"before, {conf.get(key)} now). Choose other --outputs, or --overwrite."
+                )
+        if overwrite:
+            self._seconds_file.unlink(missing_ok=True)
+        with replacing(conf_file) as temporary:
+            temporary.write_text(json.dumps(conf, indent=1))
+
+    def seconds(self) -> dict[str, float]:
+        """Return how long each stage took, all runs together."""
+        return json.loads(self._seconds_file.read_text()) if self._seconds_file.exists() else {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Measure a stage; what a run that failed spent counts too."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            seconds = self.seconds()
+            spent = seconds.get(name, 0.0) + time.perf_counter() - start
+            with replacing(self._seconds_file) as temporary:
+                temporary.write_text(json.dumps({**seconds, name: round(spent, 3)}, indent=1))
+
+
+def query_table(
+    lists: Mapping[str, list[tuple[str, pycolmap.Camera]]],
+    records: Mapping[str, dict],
+    truth: Mapping[str, pycolmap.Rigid3d],
+) -> list[dict]:
+    """Make the rows of queries.csv.
+
+    Args:
+        lists: the queries of each list.
+        records: of each query, as from `localize_sfm.main`.
+        truth: true poses, camera from world, by full name; may lack some or all.
+
+    Returns:
+        A dict of `COLUMNS` for each query. The error of a query is that of the submitted pose,
+        be it localized or a fallback; it is None where the truth is not known.
+    """
+    rows = []
+    for list_name, queries in lists.items():
+        for name, _ in queries:
+            record = records[name]
+            matches, inliers = record["num_matches"], record["num_inliers"]
+            known = name in truth
+            errors = pose_error(pose(record), truth[name]) if known else (None, None)
+            values = (
+                name,
+                list_name,
+                "localized" if record["localized"] else "fallback",
+                matches,
+                inliers,
+                round(inliers / matches, 4) if matches else 0.0,
+                *errors,
+                record["db"],
+            )
+            rows.append(dict(zip(COLUMNS, values, strict=True)))
+    return rows
+
+
+def write_csv(rows: list[dict], path: Path) -> None:
+    """Write the rows of `query_table`."""
+    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def summarize_list(rows: list[dict], thresholds: tuple[tuple[float, float], ...]) -> dict:
+    """Summarize the rows of one list.
+
+    Returns:
+        Counts, mean inliers, and where the truth is known recall in percent at each of the
+        thresholds, and median errors. Recall counts a fallback as a failure; medians are of the
+        submitted poses.
+    """
+    summary = {
+        "queries": len(rows),
+        "localized": sum(row["status"] == "localized" for row in rows),
+        "mean_inliers": round(float(np.mean([row["num_inliers"] for row in rows])), 1),
+    }
+    known = [row for row in rows if row["position_error_m"] is not None]
+    if known:
+        errors = [(row["position_error_m"], row["rotation_error_deg"]) for row in known]
+        counted = [
+            error if row["status"] == "localized" else FAILED
+            for row, error in zip(known, errors, strict=True)
+        ]
+        position, rotation = np.median(errors, axis=0)
+        summary |= {
+            "with_ground_truth": len(known),
+            "thresholds_m_deg": [list(limits) for limits in thresholds],
+            "recall_percent": [round(value, 2) for value in recall(counted, thresholds)],
+            "median_position_error_m": float(position),
+            "median_rotation_error_deg": float(rotation),
+        }
+    return summary
+
+
+def bytes_per_keypoint(features: Path, names: list[str]) -> dict[str, float]:
+    """Measure the size of a feature file: bytes of one descriptor, and of all per keypoint."""
+    with open_h5(features) as file:
+        descriptors = [file[name]["descriptors"] for name in names]
+        total = sum(dataset.shape[1] for dataset in descriptors)
+        size = descriptors[0].shape[0] * descriptors[0].dtype.itemsize
+    return {
+        "descriptor": size,
+        "feature_file": round(features.stat().st_size / total, 1) if total else 0.0,
+        "keypoints": total,
+    }
+
+
+def write_summary(summary: dict, path: Path) -> None:
+    """Write summary.json."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(summary, indent=1) + "\n")
+
+
+def recall_table(feature: str, lists: Mapping[str, dict]) -> str:
+    """Format recall in the form of the paper's tables, a column for each list."""
+    columns = [[feature, "distance [m]", "orient. [deg]", "recall [%]"]]
+    for name, summary in lists.items():
+        if "recall_percent" in summary:
+            metres, degrees = zip(*summary["thresholds_m_deg"], strict=True)
+            columns.append(
+                [
+                    name.split("_")[0],
+                    " / ".join(f"{value:g}" for value in metres),
+                    " / ".join(f"{value:g}" for value in degrees),
+                    " / ".join(f"{value:.1f}" for value in summary["recall_percent"]),
+                ]
+            )
+    widths = [max(map(len, column)) for column in columns]
+    lines = [
+        " | ".join(cell.center(width) for cell, width in zip(row, widths, strict=True))
+        for row in zip(*columns, strict=True)
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Training of projections on the tracks of COLMAP maps."""

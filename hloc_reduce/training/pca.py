@@ -1,0 +1,30 @@
+"""Principal component analysis, the paper's baseline, as a projection of one linear layer."""
+
+import numpy as np
+import torch
+from sklearn.decomposition import PCA
+
+from ..projections import MLP
+from .tracks import Tracks
+
+RECIPES = {"best": {}, "paper": {}}
+
+
+def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, **_) -> MLP:
+    """Fit the observations as they were seen.
+
+    Args:
+        maps: tracks of one or more maps.
+        dim: number of output dimensions.
+        recipe: has no entries.
+        seed: of scikit-learn's solver.
+
+    Returns:
+        One linear layer: the projection of the centred descriptors.
+    """
+    descriptors = np.concatenate([tracks.descriptors[0, 0] for tracks in maps]).astype(np.float32)
+    pca = PCA(dim, random_state=seed).fit(descriptors)
+    mlp = MLP([descriptors.shape[1], dim])
+    mlp.linears[0].weight.data = torch.from_numpy(pca.components_).float()
+    mlp.linears[0].bias.data = torch.from_numpy(-pca.components_ @ pca.mean_).float()
+    return mlp.eval()

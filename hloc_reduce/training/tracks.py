@@ -1,0 +1,177 @@
+"""Training data: base descriptors of the observations of a map's points, labelled by point."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from safetensors.numpy import load_file, save_file
+from tqdm import tqdm
+
+from confs import features as features_confs
+
+from .. import (
+    extract_features,
+    logger,
+    match_features,
+    pairs_from_covisibility,
+    stamps,
+    triangulation,
+)
+from ..cli import InputError
+from ..colmap import point3D_ids
+from ..descriptors import Descriptor
+from ..extractors.dog import extract_patches
+from ..io import get_features, open_h5, replacing
+
+NUM_COVIS = 20
+# The photo as it is and five photometric variants, each as seen and transposed.
+VARIANTS = 6
+
+
+@dataclass
+class Tracks:
+    """Descriptors of the observations of 3D points.
+
+    Args:
+        descriptors: (2, V, M, 128) float16 of unit norm: as seen and transposed, V photometric
+            variants (the first is the photo itself), M observations.
+        track: (M,) int64, which of the map's points an observation sees, sorted, from 0 on.
+        image: (M,) int64, in which image.
+        xy: (M, 2) float32, where in it, in pixels.
+    """
+
+    descriptors: np.ndarray
+    track: np.ndarray
+    image: np.ndarray
+    xy: np.ndarray
+
+    @property
+    def num_tracks(self) -> int:
+        """The number of points."""
+        return int(self.track[-1]) + 1
+
+
+def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed: int = 0) -> Path:
+    """Triangulate the tracks of a map with known poses and describe their observations.
+
+    Args:
+        images: folder of the images.
+        model: COLMAP model with their poses.
+        output: folder for all files; what it holds already is used.
+        descriptor: the base descriptor.
+        seed: of the photometric variants.
+
+    Returns:
+        The file of `load`.
+
+    Raises:
+        InputError: when the map cannot be read or gives no tracks.
+    """
+    conf = features_confs.feature(descriptor, features_confs.base(descriptor))
+    pairs = pairs_from_covisibility.main(
+        model, output / f"pairs-db-covis{NUM_COVIS}.txt", NUM_COVIS
+    )
+    names = sorted({name for pair in pairs.read_text().splitlines() for name in pair.split()})
+    features = extract_features.main(conf, images, output, image_list=names)
+    matcher = match_features.confs["NN-ratio"]
+    matches = match_features.main(matcher, pairs, features.stem, output)
+    sfm = output / f"sfm_{descriptor}"
+    reconstruction = triangulation.main(sfm, model, images, pairs, features, matches)
+
+    tracks, stamp_file = output / f"tracks_{descriptor}.safetensors", output / "tracks.json"
+    options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor}
+    made_from = stamps.stamp(options, [sfm / "points3D.bin", features])
+    if tracks.exists() and stamps.is_current(stamp_file, made_from):
+        return tracks
+    observed = {
+        image.name: (number, point3D_ids(image))
+        for number, image in enumerate(reconstruction.images.values())
+    }
+    describe = Descriptor(descriptor)
+    parts = []
+    with open_h5(features) as file:
+        for name, (number, ids) in tqdm(observed.items(), desc="Describing tracks", unit="image"):
+            kept = np.flatnonzero(ids >= 0)
+            if not len(kept):
+                continue
+            group = get_features(file, name)
+            columns = [group["keypoints"][()], group["scales"][()], group["oris"][()]]
+            keypoints = np.column_stack(columns).astype(np.float32)[kept]
+            generator = np.random.default_rng([seed, number])
+            image, size = extract_features.load_image(images / name, conf["preprocessing"])
+            ratio = np.array(image.shape[:1:-1]) / size
+            scaled = keypoints.copy()  # in pixels of the resized image
+            scaled[:, :2] = (keypoints[:, :2] + 0.5) * ratio - 0.5
+            scaled[:, 2] *= ratio.mean()
+            described = describe_variants(image[0, 0].numpy(), scaled, describe, generator)
+            parts.append((described, ids[kept], np.full(len(kept), number), keypoints[:, :2]))
+    if not parts:
+        raise InputError(f"The map {model} gives no tracks.")
+    _, track = np.unique(np.concatenate([part[1] for part in parts]), return_inverse=True)
+    order = np.argsort(track, kind="stable")
+    tensors = {
+        "descriptors": np.concatenate([part[0] for part in parts], axis=2)[:, :, order],
+        "track": track[order],
+        "image": np.concatenate([part[2] for part in parts])[order],
+        "xy": np.concatenate([part[3] for part in parts])[order],
+    }
+    with replacing(tracks) as temporary:
+        save_file(tensors, temporary)
+    stamps.write(stamp_file, made_from)
+    logger.info("%d observations of %d points: %s", len(track), track.max() + 1, tracks)
+    return tracks
+
+
+def load(path: Path) -> Tracks:
+    """Read the file that `main` wrote."""
+    return Tracks(**load_file(path))
+
+
+@torch.no_grad()
+def describe_variants(
+    image: np.ndarray,
+    keypoints: np.ndarray,
+    describe: Descriptor,
+    generator: np.random.Generator,
+) -> np.ndarray:
+    """Describe keypoints in a photo and in photometric variants of it.
+
+    Args:
+        image: (H, W) float32 in [0, 1].
+        keypoints: (N, 4) x, y, scale (pixels), orientation (degrees).
+        describe: base descriptor.
+        generator: draws the variants.
+
+    Returns:
+        (2, VARIANTS, N, 128) float16: as seen and transposed.
+    """
+    described = np.empty((2, VARIANTS, len(keypoints), 128), np.float16)
+    for variant in range(VARIANTS):
+        view = photometric_variant(image, generator) if variant else image
+        patches = extract_patches(torch.from_numpy(view)[None, None], keypoints)
+        described[0, variant] = describe(patches).numpy()
+        described[1, variant] = describe(patches.transpose(2, 3).contiguous()).numpy()
+    return described
+
+
+def photometric_variant(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Draw how a camera would see the same under another light: darker, blurred, noisy, 8 bit.
+
+    Args:
+        image: (H, W) float32 in [0, 1].
+        generator: draws gamma 0.5-2, gain 0.08-1.2, blur up to 1.5 px and noise up to 2 %.
+
+    Returns:
+        (H, W) float32 in [0, 1].
+    """
+    gamma = 2 ** generator.uniform(-1, 1)
+    gain = np.exp(generator.uniform(np.log(0.08), np.log(1.2)))
+    view = gain * image**gamma
+    blur = generator.uniform(-1.5, 1.5)
+    if blur > 0.3:
+        view = cv2.GaussianBlur(view, (0, 0), blur)
+    noise = generator.uniform(0, 0.02) * np.sqrt(gain)  # less light, less shot noise
+    view = view + noise * generator.standard_normal(view.shape, np.float32)
+    return (np.round(view.clip(0, 1) * 255) / 255).astype(np.float32)

@@ -1,0 +1,179 @@
+"""Triangulate a map from matches of images whose poses are known."""
+
+import argparse
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pycolmap
+from tqdm import tqdm
+
+from . import cli, colmap, logger, stamps
+from .cli import InputError
+from .io import get_colmap_keypoints, get_matches, open_h5
+from .parsers import parse_retrieval
+
+MAX_EPIPOLAR_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
+STAMP = "made_from.json"
+
+
+def main(
+    sfm_dir: Path,
+    reference_model: Path,
+    image_dir: Path,
+    pairs: Path,
+    features: Path,
+    matches: Path,
+    verbose: bool = False,
+    mapper_options: dict | None = None,
+    overwrite: bool = False,
+) -> pycolmap.Reconstruction:
+    """Triangulate the matches that agree with the epipolar geometry of the known poses.
+
+    Args:
+        sfm_dir: the folder of the new COLMAP model; one made from the same inputs is read back.
+        reference_model: COLMAP model with the cameras and poses of all images of the pairs.
+        image_dir: folder of the images; their colours go to the points.
+        pairs: text file of pairs.
+        features: feature file.
+        matches: match file.
+        verbose: show COLMAP's log.
+        mapper_options: of pycolmap's IncrementalPipelineOptions.
+        overwrite: triangulate anew.
+
+    Returns:
+        The map. Its keypoints are those of the feature file, in the same order.
+
+    Raises:
+        InputError: when an input is missing or no point can be triangulated.
+    """
+    options = {"random_seed": 0, "num_threads": 1, **(mapper_options or {})}
+    reference = colmap.read_model(reference_model)
+    for path in (pairs, features, matches):
+        if not path.is_file():
+            raise InputError(f"There is no file {path}.")
+    model_files = sorted(reference_model.glob("*.*"))
+    made_from = stamps.stamp(options, [*model_files, pairs, features, matches])
+    if not overwrite and stamps.is_current(sfm_dir / STAMP, made_from):
+        logger.info("The map %s is up to date.", sfm_dir)
+        return colmap.read_model(sfm_dir)
+
+    building = sfm_dir.with_name(f".{sfm_dir.name}.tmp")
+    shutil.rmtree(building, ignore_errors=True)
+    building.mkdir(parents=True)
+    database = building / "database.db"
+    with open_h5(features) as feature_file, open_h5(matches) as match_file:
+        _fill_database(database, reference, pairs, feature_file, match_file)
+    logger.info("Triangulating...")
+    reconstruction = colmap.triangulate_points(
+        reference, database, image_dir, building, options, verbose
+    )
+    if reconstruction.num_points3D() == 0:
+        raise InputError(
+            f"The map is empty: COLMAP triangulated no point from the matches {matches}. "
+            "Do the poses belong to these images, and do the pairs overlap?"
+        )
+    stamps.write(building / STAMP, made_from)
+    shutil.rmtree(sfm_dir, ignore_errors=True)
+    building.replace(sfm_dir)
+    logger.info("The map %s:\n%s", sfm_dir, reconstruction.summary())
+    return reconstruction
+
+
+def _fill_database(
+    path: Path,
+    reference: pycolmap.Reconstruction,
+    pairs: Path,
+    feature_file: h5py.File,
+    match_file: h5py.File,
+) -> None:
+    """Write cameras, poses, keypoints and the verified matches into a COLMAP database."""
+    images = {image.name: image for image in reference.images.values()}
+    keypoints, rays, thresholds = {}, {}, {}
+    for name, image in tqdm(images.items(), desc="Reading keypoints", unit="image"):
+        camera = reference.cameras[image.camera_id]
+        keypoints[name], uncertainty = get_colmap_keypoints(feature_file, name)
+        rays[name] = colmap.cam_from_img(camera, keypoints[name])
+        thresholds[name] = camera.cam_from_img_threshold(MAX_EPIPOLAR_ERROR * uncertainty)
+
+    verified, ratios = {}, []
+    for name0, names1 in parse_retrieval(pairs).items():
+        for name1 in names1:
+            if name0 not in images or name1 not in images:
+                absent = name1 if name0 in images else name0
+                raise InputError(f"{pairs}: image {absent} is not in the reference model.")
+            if name0 == name1 or (name0, name1) in verified or (name1, name0) in verified:
+                continue
+            matches, _ = get_matches(match_file, name0, name1)
+            for column, name in enumerate((name0, name1)):
+                if len(matches) and matches[:, column].max() >= len(keypoints[name]):
+                    raise InputError(
+                        f"The matches of {name0}, {name1} are not of the features "
+                        f"{feature_file.filename}: {name} has {len(keypoints[name])} keypoints."
+                    )
+            errors0, errors1 = epipolar_errors(
+                images[name1].cam_from_world() * images[name0].cam_from_world().inverse(),
+                rays[name0][matches[:, 0]],
+                rays[name1][matches[:, 1]],
+            )
+            valid = (errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])
+            verified[name0, name1] = matches, matches[valid]
+            if len(matches):
+                ratios.append(valid.mean())
+    if ratios:
+        logger.info(
+            "Matches on epipolar lines: mean %.1f %%, median %.1f %%, min %.1f %%, max %.1f %%.",
+            *(100 * np.array([np.mean(ratios), np.median(ratios), min(ratios), max(ratios)])),
+        )
+    colmap.write_database(path, reference, keypoints, verified)
+
+
+def epipolar_errors(
+    cam1_from_cam0: pycolmap.Rigid3d, points0: np.ndarray, points1: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Measure how far matches lie from the epipolar lines of a known relative pose.
+
+    Args:
+        cam1_from_cam0: the relative pose.
+        points0: (M, 2) points on the normalized image plane of camera 0.
+        points1: (M, 2) their matches on that of camera 1.
+
+    Returns:
+        Distances (M,) of points0 and of points1 to their lines, in units of focal lengths;
+        infinite where a line is not defined.
+    """
+    tx, ty, tz = cam1_from_cam0.translation
+    cross = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]])
+    essential = cross @ cam1_from_cam0.rotation.matrix()
+    points0, points1 = (np.pad(p, ((0, 0), (0, 1)), constant_values=1) for p in (points0, points1))
+    lines1, lines0 = points0 @ essential.T, points1 @ essential
+    distance = np.abs((points1 * lines1).sum(1))
+    errors = []
+    for lines in (lines0, lines1):
+        norm = np.linalg.norm(lines[:, :2], axis=1)
+        errors.append(np.divide(distance, norm, out=np.full_like(norm, np.inf), where=norm > 0))
+    return errors[0], errors[1]
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.triangulation --sfm_dir outputs/sfm "
+        "--reference_model 3D-models/aachen_v_1_1 --image_dir images --pairs pairs.txt "
+        "--features outputs/feats-dog-sift_sv64.h5 --matches outputs/matches.h5",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--sfm_dir", type=Path, required=True, help="folder of the new model")
+    parser.add_argument("--reference_model", type=Path, required=True, help="model with the poses")
+    parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
+    parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
+    parser.add_argument("--features", type=Path, required=True, help="feature file")
+    parser.add_argument("--matches", type=Path, required=True, help="match file")
+    parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
+    parser.add_argument("--overwrite", action="store_true", help="triangulate anew")
+    main(**vars(parser.parse_args()))
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,215 @@
+"""Localize the queries of Aachen Day-Night v1.1, or of any place in its layout.
+
+Extracts features, triangulates a map with the poses of the reference model, retrieves map images
+for each query and estimates its pose; a run that was stopped goes on where it was.
+"""
+
+import argparse
+from pathlib import Path
+
+from confs import features as features_confs
+from confs import matchers as matchers_confs
+from hloc_reduce import (
+    aggregate_features,
+    cli,
+    demo,
+    extract_features,
+    localize_sfm,
+    logger,
+    match_features,
+    pairs_from_covisibility,
+    pairs_from_retrieval,
+    results,
+    triangulation,
+)
+from hloc_reduce.cli import InputError
+from hloc_reduce.datasets import AACHEN_THRESHOLDS, Aachen
+from hloc_reduce.parsers import parse_poses
+from hloc_reduce.versions import versions
+
+# suffix of a retrieval file -> what makes pairs of it; any other is a text file of pairs
+PAIRS_FROM = {".h5": pairs_from_retrieval.main, ".hdf5": pairs_from_retrieval.main}
+
+
+def main(
+    dataset: Path,
+    outputs: Path,
+    feature: str = "sift_sv64",
+    matcher: str = "NN-ratio",
+    retrieval: str = "vlad",
+    num_covis: int = 20,
+    num_loc: int = 50,
+    ground_truth: Path | None = None,
+    overwrite: bool = False,
+) -> dict:
+    """Run all stages and return the summary, as in summary.json."""
+    feature_conf = features_confs.confs[cli.choose("feature", feature, features_confs.confs)]
+    matcher_conf = matchers_confs.confs[cli.choose("matcher", matcher, matchers_confs.confs)]
+    if retrieval != "vlad" and not Path(retrieval).is_file():
+        raise InputError(f"--retrieval {retrieval}: neither vlad nor a file that is there.")
+    for option, number in (("num_covis", num_covis), ("num_loc", num_loc)):
+        if number < 1:
+            raise InputError(f"--{option} {number}: at least 1.")
+    place = Aachen(dataset)
+    map_names, lists = place.map_names(), place.query_lists()
+    query_names = [name for queries in lists.values() for name, _ in queries]
+    if ground_truth is None and place.ground_truth.is_file():
+        ground_truth = place.ground_truth
+    truth = parse_poses(ground_truth) if ground_truth else {}
+
+    folder = results.RunFolder(
+        outputs,
+        {
+            "dataset": str(dataset.resolve()),
+            "feature": extract_features.provenance(feature_conf, as_half=True),
+            "matcher": matcher_conf["model"],
+            "retrieval": retrieval,
+            "num_covis": num_covis,
+            "num_loc": num_loc,
+        },
+        overwrite,
+    )
+    sfm = outputs / f"sfm_{feature}+{matcher}"
+    sfm_pairs = outputs / f"pairs-db-covis{num_covis}.txt"
+    loc_pairs = outputs / f"pairs-query-{Path(retrieval).stem}{num_loc}.txt"
+    poses = outputs / f"Aachen-v1.1_hloc_{feature}+{matcher}_{Path(retrieval).stem}{num_loc}.txt"
+
+    with folder.stage("extract_features"):
+        names = [*map_names, *query_names]
+        features = extract_features.main(
+            feature_conf, place.images, outputs, image_list=names, overwrite=overwrite
+        )
+    with folder.stage("pairs_from_covisibility"):
+        pairs_from_covisibility.main(place.reference_model, sfm_pairs, num_covis)
+    with folder.stage("match_map"):
+        sfm_matches = match_features.main(
+            matcher_conf, sfm_pairs, features.stem, outputs, overwrite=overwrite
+        )
+    with folder.stage("triangulation"):
+        reconstruction = triangulation.main(
+            sfm,
+            place.reference_model,
+            place.images,
+            sfm_pairs,
+            features,
+            sfm_matches,
+            overwrite=overwrite,
+        )
+    with folder.stage("retrieval"):
+        if retrieval == "vlad":
+            conf = aggregate_features.confs["vlad"]
+            retrieved = aggregate_features.main(conf, features, map_names, overwrite=overwrite)
+        else:
+            retrieved = Path(retrieval)
+        select = PAIRS_FROM.get(retrieved.suffix, pairs_from_retrieval.select)
+        select(retrieved, loc_pairs, num_loc, query_list=query_names, db_list=map_names)
+    with folder.stage("match_queries"):
+        loc_matches = match_features.main(
+            matcher_conf, loc_pairs, features.stem, outputs, overwrite=overwrite
+        )
+    with folder.stage("localization"):
+        records = localize_sfm.main(
+            sfm, place.queries, loc_pairs, features, loc_matches, poses, overwrite=overwrite
+        )
+
+    rows = results.query_table(lists, records, truth)
+    results.write_csv(rows, outputs / "queries.csv")
+    summary = {
+        "feature": feature,
+        "matcher": matcher,
+        "retrieval": retrieval,
+        "dataset": str(dataset),
+        "num_covis": num_covis,
+        "num_loc": num_loc,
+        "map_images": len(map_names),
+        "map_points3D": reconstruction.num_points3D(),
+        "queries": len(rows),
+        "queries_localized": sum(row["status"] == "localized" for row in rows),
+        "lists": {
+            name: results.summarize_list(
+                [row for row in rows if row["list"] == name],
+                AACHEN_THRESHOLDS.get(name, AACHEN_THRESHOLDS["day_time_queries_with_intrinsics"]),
+            )
+            for name in lists
+        },
+        "bytes_per_keypoint": results.bytes_per_keypoint(features, names),
+        "seconds": folder.seconds(),
+        "versions": versions(),
+        "poses": poses.name,
+    }
+    results.write_summary(summary, outputs / "summary.json")
+    return summary
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m pipelines.aachen",
+        description=__doc__,
+        epilog="example: python -m pipelines.aachen --feature sift_sv64 --demo",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument(
+        "--dataset", type=Path, help="folder of the data set (default: datasets/aachen_v1.1)"
+    )
+    parser.add_argument(
+        "--demo",
+        action="store_true",
+        help="render a small town in the data set's layout and localize there "
+        "(default --dataset: datasets/demo_town)",
+    )
+    parser.add_argument(
+        "--outputs",
+        type=Path,
+        help="folder for all results, of one configuration (default: outputs/<dataset>/<feature>)",
+    )
+    parser.add_argument("--feature", default="sift_sv64", help="local feature")
+    parser.add_argument("--matcher", default="NN-ratio", help="matcher")
+    parser.add_argument(
+        "--retrieval",
+        default="vlad",
+        metavar="vlad|FILE",
+        help="vlad, or hloc's text file of pairs or h5 file of global descriptors",
+    )
+    parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
+    parser.add_argument("--num_loc", type=int, default=50, help="map images of each query")
+    parser.add_argument(
+        "--ground_truth",
+        type=Path,
+        help="true poses of the queries (default: <dataset>/queries/ground_truth_poses.txt)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
+    parser.add_argument("--list_features", action="store_true", help="list the features and exit")
+    args = parser.parse_args()
+    if args.list_features:
+        print("\n".join(features_confs.confs))
+        return
+    cli.choose("feature", args.feature, features_confs.confs)
+    default = "datasets/demo_town" if args.demo else "datasets/aachen_v1.1"
+    dataset = args.dataset or Path(default)
+    outputs = args.outputs or Path("outputs") / dataset.name / args.feature
+    if args.demo:
+        demo.main(dataset)
+    summary = main(
+        dataset,
+        outputs,
+        args.feature,
+        args.matcher,
+        args.retrieval,
+        args.num_covis,
+        args.num_loc,
+        args.ground_truth,
+        args.overwrite,
+    )
+    logger.info(
+        "Localized %d of %d queries in %.0f s; %d bytes a descriptor. Results are in %s.",
+        summary["queries_localized"],
+        summary["queries"],
+        sum(summary["seconds"].values()),
+        summary["bytes_per_keypoint"]["descriptor"],
+        outputs,
+    )
+    print(results.recall_table(args.feature, summary["lists"]))
+
+
+if __name__ == "__main__":
+    cli.run(_main)
