@@ -44,10 +44,11 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
                 height=int(height),
                 params=np.array(params, float),
             )
-            if not (
-                camera.verify_params() and np.isfinite(camera.params).all() and camera.width > 0
-            ):
+            if not camera.verify_params():
                 raise ValueError(f"wrong number of parameters for {model}")
+            sizes = camera.width, camera.height, camera.focal_length_x, camera.focal_length_y
+            if not (np.isfinite(camera.params).all() and min(sizes) > 0):
+                raise ValueError("sizes and focal lengths are positive and finite")
         except (ValueError, TypeError, AttributeError, RuntimeError) as error:
             reason = str(error).strip().splitlines()[0]
             raise InputError(
@@ -92,9 +93,11 @@ def parse_retrieval(path: Path) -> dict[str, list[str]]:
 
 
 def write_pairs(pairs: list[tuple[str, str]], path: Path) -> None:
-    """Write pairs, one `name0 name1` a line."""
-    with replacing(path) as temporary:
-        temporary.write_text("".join(f"{name0} {name1}\n" for name0, name1 in pairs))
+    """Write pairs, one `name0 name1` a line; a file that has them already is not touched."""
+    text = "".join(f"{name0} {name1}\n" for name0, name1 in pairs)
+    if not path.exists() or path.read_bytes() != text.encode():
+        with replacing(path) as temporary:
+            temporary.write_text(text)
 
 
 def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:

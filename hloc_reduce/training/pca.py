@@ -22,7 +22,9 @@ def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, **_) -> MLP:
     Returns:
         One linear layer: the projection of the centred descriptors.
     """
-    descriptors = np.concatenate([tracks.descriptors[0, 0] for tracks in maps]).astype(np.float32)
+    descriptors = np.concatenate([tracks.descriptors[:, 0, 0] for tracks in maps]).astype(
+        np.float32
+    )
     pca = PCA(dim, random_state=seed).fit(descriptors)
     mlp = MLP([descriptors.shape[1], dim])
     mlp.linears[0].weight.data = torch.from_numpy(pca.components_).float()

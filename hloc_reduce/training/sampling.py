@@ -21,7 +21,7 @@ class PairSampler:
         self.augment, self.seed = augment, seed
         self.maps, self.starts, self.lengths = [], [], []
         for tracks in maps:
-            kept, starts, lengths = _matchable(tracks)
+            kept, starts, lengths = matchable(tracks)
             self.maps.append((tracks.descriptors, kept))
             self.starts.append(starts)
             self.lengths.append(lengths)
@@ -52,13 +52,13 @@ class PairSampler:
         views = []
         for which in (first, second):
             # half of the views are the photo itself
-            variants = generator.integers(1, descriptors.shape[1], size=len(track))
+            variants = generator.integers(1, descriptors.shape[2], size=len(track))
             variants *= generator.integers(2, size=len(track)) * self.augment
-            views.append(descriptors[transposed, variants, kept[starts[track] + which]])
+            views.append(descriptors[kept[starts[track] + which], transposed, variants])
         return views[0], views[1]
 
 
-def _matchable(tracks: Tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def matchable(tracks: Tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the observations that have a match: one for each point and image, two for each point.
 
     Returns:

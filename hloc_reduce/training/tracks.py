@@ -26,8 +26,8 @@ from ..extractors.dog import extract_patches
 from ..io import get_features, open_h5, replacing
 
 NUM_COVIS = 20
-# The photo as it is and five photometric variants, each as seen and transposed.
-VARIANTS = 6
+# The photo as it is and three photometric variants, each as seen and transposed.
+VARIANTS = 4
 
 
 @dataclass
@@ -35,10 +35,10 @@ class Tracks:
     """Descriptors of the observations of 3D points.
 
     Args:
-        descriptors: (2, V, M, 128) float16 of unit norm: as seen and transposed, V photometric
-            variants (the first is the photo itself), M observations.
+        descriptors: (M, 2, V, 128) float16 of unit norm: M observations, as seen and transposed,
+            in V photometric variants, the first of which is the photo itself.
         track: (M,) int64, which of the map's points an observation sees, sorted, from 0 on.
-        image: (M,) int64, in which image.
+        image: (M,) int64, in which image, numbered by name.
         xy: (M, 2) float32, where in it, in pixels.
     """
 
@@ -75,7 +75,8 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     )
     names = sorted({name for pair in pairs.read_text().splitlines() for name in pair.split()})
     features = extract_features.main(conf, images, output, image_list=names)
-    matcher = match_features.confs["NN-ratio"]
+    # no ratio test: the poses tell right from wrong, and what is ambiguous is worth learning
+    matcher = match_features.confs["NN-mutual"]
     matches = match_features.main(matcher, pairs, features.stem, output)
     sfm = output / f"sfm_{descriptor}"
     reconstruction = triangulation.main(sfm, model, images, pairs, features, matches)
@@ -85,14 +86,12 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     made_from = stamps.stamp(options, [sfm / "points3D.bin", features])
     if tracks.exists() and stamps.is_current(stamp_file, made_from):
         return tracks
-    observed = {
-        image.name: (number, point3D_ids(image))
-        for number, image in enumerate(reconstruction.images.values())
-    }
+    images_by_name = {image.name: image for image in reconstruction.images.values()}
     describe = Descriptor(descriptor)
     parts = []
     with open_h5(features) as file:
-        for name, (number, ids) in tqdm(observed.items(), desc="Describing tracks", unit="image"):
+        for number, name in enumerate(tqdm(names, desc="Describing tracks", unit="image")):
+            ids = point3D_ids(images_by_name[name])
             kept = np.flatnonzero(ids >= 0)
             if not len(kept):
                 continue
@@ -112,7 +111,7 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     _, track = np.unique(np.concatenate([part[1] for part in parts]), return_inverse=True)
     order = np.argsort(track, kind="stable")
     tensors = {
-        "descriptors": np.concatenate([part[0] for part in parts], axis=2)[:, :, order],
+        "descriptors": np.concatenate([part[0] for part in parts])[order],
         "track": track[order],
         "image": np.concatenate([part[2] for part in parts])[order],
         "xy": np.concatenate([part[3] for part in parts])[order],
@@ -145,14 +144,14 @@ def describe_variants(
         generator: draws the variants.
 
     Returns:
-        (2, VARIANTS, N, 128) float16: as seen and transposed.
+        (N, 2, VARIANTS, 128) float16: as seen and transposed.
     """
-    described = np.empty((2, VARIANTS, len(keypoints), 128), np.float16)
+    described = np.empty((len(keypoints), 2, VARIANTS, 128), np.float16)
     for variant in range(VARIANTS):
         view = photometric_variant(image, generator) if variant else image
         patches = extract_patches(torch.from_numpy(view)[None, None], keypoints)
-        described[0, variant] = describe(patches).numpy()
-        described[1, variant] = describe(patches.transpose(2, 3).contiguous()).numpy()
+        described[:, 0, variant] = describe(patches).numpy()
+        described[:, 1, variant] = describe(patches.transpose(2, 3).contiguous()).numpy()
     return described
 
 

@@ -1,0 +1,55 @@
+import pytest
+import torch
+
+from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
+
+
+def unit(number, dim, seed):
+    descriptors = torch.randn(number, dim, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.normalize(descriptors, dim=1)
+
+
+def match(descriptors0, descriptors1, ratio_threshold=None):
+    matcher = NearestNeighbor({"ratio_threshold": ratio_threshold})
+    result = matcher({"descriptors0": descriptors0.T[None], "descriptors1": descriptors1.T[None]})
+    return result["matches0"][0], result["matching_scores0"][0]
+
+
+def by_definition(descriptors0, descriptors1, ratio_threshold):
+    """Mutual nearest neighbours, both through the ratio test, from sorted distances."""
+    distances = (2 - 2 * descriptors0 @ descriptors1.T).clamp(min=0).sqrt()
+
+    def nearest(distances):
+        values, indices = distances.sort(dim=1)
+        passed = torch.ones(len(values), dtype=torch.bool)
+        if ratio_threshold:
+            passed = values[:, 0] <= ratio_threshold * values[:, 1]
+        return [int(i) if ok else -1 for i, ok in zip(indices[:, 0], passed, strict=True)]
+
+    forward, backward = nearest(distances), nearest(distances.T)
+    return [j if j >= 0 and backward[j] == i else -1 for i, j in enumerate(forward)]
+
+
+@pytest.mark.parametrize("ratio_threshold", [None, 0.8, 0.95])
+@pytest.mark.parametrize("sizes", [(200, 300), (300, 2), (2, 2)])
+def test_matches_by_definition(sizes, ratio_threshold):
+    base = unit(max(sizes), 16, 0)
+    descriptors0 = base[: sizes[0]]
+    descriptors1 = torch.nn.functional.normalize(base + 0.5 * unit(len(base), 16, 1), dim=1)
+    descriptors1 = descriptors1.flip(0)[: sizes[1]]
+    matches, scores = match(descriptors0, descriptors1, ratio_threshold)
+    assert matches.tolist() == by_definition(descriptors0, descriptors1, ratio_threshold)
+    assert (scores[matches < 0] == 0).all()
+    cosines = (descriptors0[matches >= 0] * descriptors1[matches[matches >= 0]]).sum(1)
+    torch.testing.assert_close(scores[matches >= 0], (cosines + 1) / 2)
+
+
+@pytest.mark.parametrize("sizes", [(0, 5), (5, 0), (0, 0)])
+def test_no_descriptors_no_matches(sizes):
+    matches, scores = match(unit(sizes[0], 8, 0), unit(sizes[1], 8, 1), 0.8)
+    assert matches.tolist() == [-1] * sizes[0] and scores.tolist() == [0] * sizes[0]
+
+
+def test_a_lone_descriptor_skips_the_ratio_test():
+    matches, _ = match(unit(5, 8, 0), unit(1, 8, 1), 0.8)
+    assert (matches >= 0).sum() == 1

@@ -1,0 +1,297 @@
+"""The stages on a scene whose answers are known: pairs, matches, map, poses."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+from hloc_reduce import (
+    colmap,
+    localize_sfm,
+    match_features,
+    pairs_from_covisibility,
+    pairs_from_retrieval,
+    stamps,
+    triangulation,
+)
+from hloc_reduce.cli import InputError
+from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.io import get_matches, list_h5_names
+from hloc_reduce.parsers import parse_poses, parse_retrieval, write_pairs
+
+MATCHER = match_features.confs["NN-ratio"]
+
+
+def all_pairs(scene, path, queries=(), skip=()):
+    names = [f"db/{i}.jpg" for i in range(6) if i not in skip]
+    pairs = [(a, b) for a in queries or names for b in names if a != b]
+    write_pairs(pairs, path)
+    return path
+
+
+@pytest.fixture
+def built(scene):
+    scene.pairs = all_pairs(scene, scene.root / "pairs-db.txt")
+    scene.matches = scene.root / "matches-db.h5"
+    match_features.main(MATCHER, scene.pairs, scene.features, matches=scene.matches)
+    scene.sfm = scene.root / "sfm"
+    scene.map = triangulation.main(
+        scene.sfm, scene.model, scene.images, scene.pairs, scene.features, scene.matches
+    )
+    scene.loc_pairs = all_pairs(scene, scene.root / "pairs-loc.txt", ["query/6.jpg", "query/7.jpg"])
+    scene.loc_matches = scene.root / "matches-loc.h5"
+    match_features.main(MATCHER, scene.loc_pairs, scene.features, matches=scene.loc_matches)
+    scene.localize = lambda **overrides: localize_sfm.main(
+        **{
+            "reference_sfm": scene.sfm,
+            "queries": scene.queries,
+            "retrieval": scene.loc_pairs,
+            "features": scene.features,
+            "matches": scene.loc_matches,
+            "results": scene.root / "poses.txt",
+            **overrides,
+        }
+    )
+    return scene
+
+
+def test_matches_are_those_of_the_scene(built):
+    assert len(list_h5_names(built.matches)) == 15  # each unordered pair once
+    with h5py.File(built.matches) as file:
+        assert file[list_h5_names(built.matches)[0]]["matches0"].dtype == np.int32
+        for name0, name1 in (("db/0.jpg", "db/1.jpg"), ("db/4.jpg", "db/2.jpg")):
+            matches, scores = get_matches(file, name0, name1)
+            assert len(matches) == 300 and scores.min() > 0.99
+            same = built.seen[name0][matches[:, 0]] == built.seen[name1][matches[:, 1]]
+            assert same.all()
+
+
+def test_matching_goes_on_with_what_is_missing(built):
+    with h5py.File(built.matches, "a") as file:
+        del file["db-0.jpg/db-1.jpg"]
+        file["db-0.jpg/db-2.jpg/matches0"][:] = 7  # would be repaired if matched again
+    match_features.main(MATCHER, built.pairs, built.features, matches=built.matches)
+    with h5py.File(built.matches) as file:
+        assert (file["db-0.jpg/db-1.jpg/matches0"][:] >= 0).all()
+        assert (file["db-0.jpg/db-2.jpg/matches0"][:] == 7).all()
+
+
+def test_map_is_where_the_points_are(built):
+    assert built.map.num_points3D() == 300
+    for point in built.map.points3D.values():
+        element = point.track.elements[0]
+        name = built.map.images[element.image_id].name
+        true = built.points[built.seen[name][element.point2D_idx]]
+        np.testing.assert_allclose(point.xyz, true, atol=1e-4)
+
+
+def test_half_a_pixel_would_be_seen(built):
+    """The map's keypoints are COLMAP's: the projections themselves, not half a pixel off."""
+    image = built.map.find_image_with_name("db/3.jpg")
+    errors = [
+        np.linalg.norm(p.xy - image.project_point(built.map.points3D[p.point3D_id].xyz))
+        for p in image.points2D
+        if p.has_point3D()
+    ]
+    assert len(errors) == 300 and max(errors) < 1e-2
+
+
+def test_map_is_built_once_and_again_when_its_inputs_change(built):
+    written = (built.sfm / "points3D.bin").stat().st_mtime_ns
+    arguments = (built.sfm, built.model, built.images, built.pairs, built.features, built.matches)
+    assert triangulation.main(*arguments).num_points3D() == 300
+    assert (built.sfm / "points3D.bin").stat().st_mtime_ns == written
+    all_pairs(built, built.pairs, skip=[5])
+    assert triangulation.main(*arguments).find_image_with_name("db/5.jpg").num_points3D == 0
+
+
+def test_an_empty_map_is_loud_and_keeps_the_old_one(built):
+    with h5py.File(built.matches, "a") as file:
+        for pair in list_h5_names(built.matches):
+            file[f"{pair}/matches0"][:] = -1
+    before = (built.sfm / "points3D.bin").read_bytes()
+    arguments = (built.sfm, built.model, built.images, built.pairs, built.features, built.matches)
+    with pytest.raises(InputError, match="The map is empty"):
+        triangulation.main(*arguments)
+    assert (built.sfm / "points3D.bin").read_bytes() == before
+
+
+def test_matches_off_their_epipolar_lines_are_left_out(built):
+    """Matches shifted by one keypoint are wrong; with true poses hardly any passes."""
+    with h5py.File(built.matches, "a") as file:
+        for pair in list_h5_names(built.matches):
+            matches = file[f"{pair}/matches0"]
+            matches[:] = np.roll(matches[:], 1)
+    try:
+        wrong = triangulation.main(
+            built.root / "wrong",
+            built.model,
+            built.images,
+            built.pairs,
+            built.features,
+            built.matches,
+        )
+        assert wrong.num_points3D() < 10
+    except InputError as error:
+        assert "empty" in str(error)
+
+
+def test_old_model_without_rigs(built):
+    for name in ("rigs.bin", "frames.bin"):
+        (built.model / name).unlink()
+    again = triangulation.main(
+        built.root / "sfm2", built.model, built.images, built.pairs, built.features, built.matches
+    )
+    assert again.num_points3D() == 300
+
+
+def test_queries_are_localized_exactly(built):
+    records = built.localize()
+    for name, record in records.items():
+        assert record["localized"] and record["num_inliers"] == 300
+        assert record["num_matches"] == 6 * 300 and record["db"] == "db/0.jpg"
+        metres, degrees = pose_error(localize_sfm.pose(record), built.poses[name])
+        assert metres < 1e-4 and degrees < 1e-2
+    lines = (built.root / "poses.txt").read_text().splitlines()
+    assert [line.split()[0] for line in lines] == ["6.jpg", "7.jpg"]
+    written = parse_poses(built.root / "poses.txt")["6.jpg"]
+    assert max(pose_error(written, built.poses["query/6.jpg"])) < 1e-2
+
+
+def test_localization_is_resumed_and_repeated_exactly(built):
+    first = built.localize()
+    poses = (built.root / "poses.txt").read_bytes()
+    log = built.root / "poses.txt_logs.jsonl"
+    lines = log.read_text().splitlines(keepends=True)
+    log.write_text("".join(lines[:2]) + lines[2][: len(lines[2]) // 2])  # killed while writing
+    assert built.localize() == first
+    assert (built.root / "poses.txt").read_bytes() == poses
+    assert log.read_text().splitlines(keepends=True) == lines
+    assert built.localize(overwrite=True) == first
+    assert built.localize(reference_sfm=built.map) == first
+
+
+def test_other_options_are_not_answered_from_the_log(built):
+    exact = built.localize()
+    strict = built.localize(ransac_thresh=1e-5)
+    assert strict["query/6.jpg"]["num_inliers"] < exact["query/6.jpg"]["num_inliers"]
+
+
+def test_hopeless_queries_fall_back_and_say_so(built):
+    """No features, no retrieved image, wrong matches: each gets a line, none is localized."""
+    with h5py.File(built.features, "a") as file:
+        for i, number in ((8, 0), (9, 40), (10, 40)):
+            group = file.create_group(f"query/{i}.jpg")
+            generator = np.random.default_rng(i)
+            group["keypoints"] = generator.uniform(0, 400, (number, 2)).astype(np.float32)
+    generator = np.random.default_rng(0)
+    with h5py.File(built.loc_matches, "a") as file:
+        file["query-8.jpg/db-3.jpg/matches0"] = np.zeros(0, np.int32)
+        file["query-8.jpg/db-3.jpg/matching_scores0"] = np.zeros(0, np.float16)
+        file["query-10.jpg/db-3.jpg/matches0"] = generator.permutation(300)[:40].astype(np.int32)
+        file["query-10.jpg/db-3.jpg/matching_scores0"] = np.ones(40, np.float16)
+    with built.loc_pairs.open("a") as file:
+        file.write("query/8.jpg db/3.jpg\nquery/10.jpg db/3.jpg\n")
+    with built.queries.open("a") as file:
+        for i in (8, 9, 10):
+            file.write(f"query/{i}.jpg SIMPLE_RADIAL 640 480 500 320 240 0.02\n")
+    records = built.localize(ransac_thresh=3)
+    for i, db in ((8, "db/3.jpg"), (9, None), (10, "db/3.jpg")):
+        record = records[f"query/{i}.jpg"]
+        assert not record["localized"] and record["db"] == db, record
+        pose = built.poses[db or "db/0.jpg"]
+        assert max(pose_error(localize_sfm.pose(record), pose)) < 1e-6
+    assert records["query/8.jpg"]["num_inliers"] == 0
+    assert records["query/10.jpg"]["num_matches"] == 40
+    assert len((built.root / "poses.txt").read_text().splitlines()) == 5
+
+
+def test_three_inliers_are_no_localization(built):
+    with h5py.File(built.loc_matches, "a") as file:
+        for i in range(6):
+            matches = file[f"query-6.jpg/db-{i}.jpg/matches0"]
+            values = matches[:]
+            kept = np.isin(built.seen["query/6.jpg"], [0, 1, 2])
+            matches[:] = np.where(kept, values, -1)
+    record = built.localize()["query/6.jpg"]
+    assert record["num_matches"] == 18 and not record["localized"]
+
+
+def test_missing_inputs_are_named(built):
+    with pytest.raises(InputError, match="not in the match file"):
+        write_pairs([("query/6.jpg", "db/0.jpg")], built.root / "other.txt")
+        built.localize(retrieval=built.root / "other.txt", matches=built.matches)
+    with pytest.raises(InputError, match="absent.h5"):
+        built.localize(features=built.root / "absent.h5")
+    with pytest.raises(InputError, match="no COLMAP model folder"):
+        built.localize(reference_sfm=built.root / "absent")
+    write_pairs([("db/0.jpg", "db/99.jpg")], built.pairs)
+    with pytest.raises(InputError, match="db/99.jpg is not in the reference model"):
+        triangulation.main(
+            built.sfm, built.model, built.images, built.pairs, built.features, built.matches
+        )
+    with pytest.raises(InputError, match="db/99.jpg is not in the feature file"):
+        match_features.main(MATCHER, built.pairs, built.features, matches=built.matches)
+    shutil.rmtree(built.model)
+    built.model.mkdir()
+    (built.model / "cameras.bin").write_bytes(b"\x01")
+    with pytest.raises(InputError, match="not a COLMAP model"):
+        colmap.read_model(built.model)
+
+
+def test_covisibility_by_hand():
+    counts = pairs_from_covisibility.covisibility(
+        [np.array([7, -1, 9, 9]), np.array([9, -1]), np.array([7, 9, 4]), np.array([-1])]
+    ).toarray()
+    # image 0 sees point 9 twice
+    assert counts.tolist() == [[0, 2, 3, 0], [2, 0, 1, 0], [3, 1, 0, 0], [0, 0, 0, 0]]
+
+
+def test_covisible_pairs_of_the_map(built, tmp_path):
+    with pytest.raises(InputError, match="no covisible images"):
+        pairs_from_covisibility.main(built.model, tmp_path / "p.txt", 2)
+    pairs = parse_retrieval(pairs_from_covisibility.main(built.sfm, tmp_path / "p.txt", 2))
+    assert {name: len(others) for name, others in pairs.items()} == {
+        f"db/{i}.jpg": 2 for i in range(6)
+    }
+
+
+def test_retrieval_ranks_by_similarity(tmp_path):
+    path = tmp_path / "global.h5"
+    vectors = {
+        "q/0": [1, 0, 0],
+        "q/blank": [0, 0, 0],
+        "db/same": [1, 0, 0],
+        "db/near": [0.8, 0.6, 0],
+        "db/opposite": [-1, 0, 0],
+        "db/blank": [0, 0, 0],
+    }
+    with h5py.File(path, "w") as file:
+        for name, vector in vectors.items():
+            file[f"{name}/global_descriptor"] = np.array(vector, np.float16)
+    output = tmp_path / "pairs.txt"
+    arguments = {"query_prefix": "q/", "db_prefix": "db/"}
+    pairs_from_retrieval.main(path, output, 10, **arguments)
+    retrieval = parse_retrieval(output)
+    assert retrieval["q/0"] == ["db/same", "db/near", "db/opposite", "db/blank"]
+    assert len(retrieval["q/blank"]) == 4
+    pairs_from_retrieval.main(path, output, 2)
+    retrieval = parse_retrieval(output)
+    assert all(name not in others and len(others) == 2 for name, others in retrieval.items())
+    with pytest.raises(InputError, match="db/none is not in"):
+        pairs_from_retrieval.main(path, output, 2, query_prefix="q/", db_list=["db/none"])
+    with pytest.raises(InputError, match="No image is selected"):
+        pairs_from_retrieval.main(path, output, 2, query_prefix="x/")
+
+
+def test_stamps_notice_changes(tmp_path):
+    source, file = tmp_path / "source", tmp_path / "stamp.json"
+    source.write_text("a")
+    made_from = stamps.stamp({"x": (1, 2)}, [source])
+    assert not stamps.is_current(file, made_from)
+    stamps.write(file, made_from)
+    assert stamps.is_current(file, made_from)
+    assert not stamps.is_current(file, stamps.stamp({"x": (1, 3)}, [source]))
+    source.write_text("ab")
+    assert not stamps.is_current(file, stamps.stamp({"x": (1, 2)}, [source]))

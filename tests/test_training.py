@@ -1,0 +1,179 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from hloc_reduce import projections
+from hloc_reduce.cli import InputError
+from hloc_reduce.evaluation.matching import average_precision
+from hloc_reduce.training import __main__ as training
+from hloc_reduce.training import pca, sv, tracks
+from hloc_reduce.training.sampling import PairSampler
+from hloc_reduce.training.tracks import Tracks
+
+RECIPE = {**sv.RECIPES["best"], "hidden": [64], "steps": 300, "batch_size": 100, "lr": 3e-3}
+
+
+def noisy_tracks(number=400, views=4, seed=0):
+    """Points told apart by 8 of 128 numbers, the others being louder noise."""
+    generator = np.random.default_rng(seed)
+    signal = np.zeros((number, 128))
+    signal[:, :8] = generator.standard_normal((number, 8))
+    track = np.repeat(np.arange(number), views)
+    noise = generator.standard_normal((len(track), 2, tracks.VARIANTS, 128))
+    noise[..., :8] = 0
+    descriptors = signal[track, None, None] + 0.3 * noise
+    descriptors /= np.linalg.norm(descriptors, axis=-1, keepdims=True)
+    xy = np.zeros((len(track), 2), np.float32)
+    image = np.tile(np.arange(views), number)
+    return Tracks(descriptors.astype(np.float16), track, image, xy)
+
+
+def held_out_precision(mlp):
+    held_out = noisy_tracks(seed=7)
+    views = torch.from_numpy(held_out.descriptors[:, 0, 0]).float()
+    embedded = mlp(views) if mlp else views
+    return average_precision(embedded[0::4], embedded[1::4])
+
+
+def test_sampler_draws_matches():
+    data = noisy_tracks()
+    data.descriptors[:] = 0
+    data.descriptors[:, 0, :, 0] = data.track[:, None]  # exact in float16
+    data.descriptors[:, 1, :, 0] = data.track[:, None] + 500
+    data.descriptors[..., 1] = data.image[:, None, None]
+    sampler = PairSampler([data], augment=True, balanced=True, seed=0)
+    anchors, positives = sampler.batch(3, 64)
+    assert (anchors[:, 0] == positives[:, 0]).all() and (anchors[:, 1] != positives[:, 1]).all()
+    assert (anchors[:, 0] >= 500).any() and (anchors[:, 0] < 500).any()
+    assert len(anchors[:, 0].unique()) == len(anchors) > 40
+    assert (sampler.batch(3, 64)[0] == anchors).all()
+    assert not torch.equal(sampler.batch(4, 64)[0][:40], anchors[:40])
+
+
+def test_sampler_without_augmentation_draws_photos_only():
+    data = noisy_tracks()
+    data.descriptors[:] = 1
+    data.descriptors[:, 0, 0] = 0
+    anchors, positives = PairSampler([data], False, False, 0).batch(0, 64)
+    assert not anchors.any() and not positives.any()
+
+
+def test_sampler_leaves_out_what_has_no_match():
+    """A second observation in the same image is no match, nor is a point seen once."""
+    data = noisy_tracks(number=3, views=2)
+    data.image[:] = [0, 0, 0, 1, 0, 1]
+    data.descriptors[..., 0] = data.track[:, None, None]
+    anchors, _ = PairSampler([data], True, True, 0).batch(0, 500)
+    assert sorted(anchors[:, 0].tolist()) == [1, 2]
+
+
+def test_sampler_balances_maps():
+    large, small = noisy_tracks(900), noisy_tracks(100)
+    large.descriptors[..., 0], small.descriptors[..., 0] = 0, 1
+    counts = {
+        balanced: PairSampler([large, small], False, balanced, 0).batch(0, 64)[0][:, 0].mean()
+        for balanced in (False, True)
+    }
+    assert counts[False] < 0.2 < counts[True] < 0.35
+
+
+def test_triplet_loss_by_hand():
+    anchors = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    positives = torch.tensor([[0.0, 1.0], [0.0, -1.0]])
+    # d(a0, p0) = sqrt 2, d(a1, p1) = 2; d(a0, p1) = sqrt 2; a1 = p0 counts as the same patch
+    expected = (1 + 2**0.5 - 2**0.5 + 1 + 2 - 2**0.5) / 2
+    assert sv.triplet_loss(anchors, positives, 1.0).item() == pytest.approx(expected, abs=1e-3)
+
+
+def test_supervised_learns_what_tells_points_apart(tmp_path):
+    mlp = sv.train([noisy_tracks()], 8, RECIPE, 0, tmp_path / "c")
+    assert held_out_precision(mlp) > held_out_precision(None) + 0.1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_training_goes_on_after_a_kill_as_if_nothing_had_been(tmp_path, monkeypatch):
+    monkeypatch.setattr(sv, "CHECKPOINT_STEPS", 20)
+    recipe = {**RECIPE, "steps": 60}
+    whole = sv.train([noisy_tracks()], 8, recipe, 0, tmp_path / "whole")
+    batch = PairSampler.batch
+
+    def killed(self, number, size):
+        if number == 47:
+            raise KeyboardInterrupt
+        return batch(self, number, size)
+
+    monkeypatch.setattr(PairSampler, "batch", killed)
+    with pytest.raises(KeyboardInterrupt):
+        sv.train([noisy_tracks()], 8, recipe, 0, tmp_path / "killed")
+    monkeypatch.setattr(PairSampler, "batch", batch)
+    assert torch.load(tmp_path / "killed", weights_only=True)["step"] == 40
+    resumed = sv.train([noisy_tracks()], 8, recipe, 0, tmp_path / "killed")
+    for key, value in whole.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[key]), key
+
+
+def test_pca_keeps_the_variance():
+    generator = np.random.default_rng(0)
+    data = noisy_tracks()
+    low = generator.standard_normal((len(data.track), 4)) @ generator.standard_normal((4, 128))
+    data.descriptors[:, 0, 0] = low + 3
+    mlp = pca.train([data], 4, {}, 0)
+    centred = low.astype(np.float16) - low.mean(0)
+    projected = mlp.linears[0](torch.from_numpy(data.descriptors[:, 0, 0]).float())
+    distances = torch.pdist(projected).detach()
+    torch.testing.assert_close(
+        distances, torch.pdist(torch.from_numpy(centred).float()), rtol=0.05, atol=0.05
+    )
+
+
+def test_photometric_variants_are_images():
+    image = np.linspace(0, 1, 40 * 50, dtype=np.float32).reshape(40, 50)
+    generator = np.random.default_rng(0)
+    views = [tracks.photometric_variant(image, generator) for _ in range(30)]
+    assert all(view.dtype == np.float32 and view.shape == (40, 50) for view in views)
+    assert min(view.max() for view in views) < 0.2 and max(view.mean() for view in views) > 0.4
+    assert all(view.min() >= 0 and view.max() <= 1 for view in views)
+
+
+def test_average_precision_by_hand():
+    """Ranked: hit, miss, hit; the fourth misses: (1 + 2/3) / 4."""
+    angles = torch.tensor([0.0, 1.0, 2.0, 3.0])
+    shifted = torch.tensor([0.01, 1.95, 2.2, 1.1])
+    unit = [torch.stack([a.cos(), a.sin()], 1) for a in (angles, shifted)]
+    # nearest: 0 -> 0 (.01), 1 -> 3 (.1), 2 -> 1 (.05), 3 -> 2 (.8)
+    assert average_precision(*unit) == pytest.approx(1 / 4)
+    assert average_precision(unit[0], unit[0]) == pytest.approx(1)
+    angles = torch.tensor([0.0, 1.0, 2.0, 4.0])
+    shifted = torch.tensor([0.01, 1.3, 2.2, 1.1])
+    unit = [torch.stack([a.cos(), a.sin()], 1) for a in (angles, shifted)]
+    # nearest: 0 -> 0 (.01), 1 -> 3 (.1), 2 -> 2 (.2), 3 -> 2 (1.8)
+    assert average_precision(*unit) == pytest.approx((1 + 2 / 3) / 4)
+
+
+def test_a_map_is_trained_on(scene, tmp_path, monkeypatch):
+    """From images with poses to a projection: the stages fit together."""
+    monkeypatch.setattr(training, "SCHEMES", {"pca": pca})
+    monkeypatch.setattr(tracks, "main", lambda *_: tmp_path / "tracks.safetensors")
+    monkeypatch.setattr(tracks, "load", lambda _: noisy_tracks())
+    (path,) = training.main(
+        {"place": (scene.images, scene.model)}, "sift", "pca", [16], tmp_path / "out", tmp_path
+    )
+    projection = projections.load(path)
+    assert projection.sizes == (128, 16)
+    assert projection.metadata["training_data"] == {"place": {"points": 400, "observations": 1600}}
+    assert json.dumps(projection.metadata["versions"])
+
+
+def test_maps_are_parsed(tmp_path):
+    images, model = tmp_path / "place/images", tmp_path / "place/sparse"
+    images.mkdir(parents=True)
+    with pytest.raises(InputError, match="no folder"):
+        training.parse_maps([f"{images}:{model}"])
+    model.mkdir()
+    assert training.parse_maps([f"{images}:{model}"]) == {"place": (images, model)}
+    with pytest.raises(InputError, match="images:model"):
+        training.parse_maps([str(images)])
+    with pytest.raises(InputError, match="another map"):
+        training.parse_maps([f"{images}:{model}"] * 2)
