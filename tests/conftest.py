@@ -85,3 +85,93 @@ def scene(tmp_path) -> SimpleNamespace:
         seen=seen,
         points=points,
     )
+
+
+SIZE = (480, 360)
+FOCAL = 500.0
+
+
+@pytest.fixture
+def plane(tmp_path):
+    """Photos of the plane z = 0 and a COLMAP model of their poses with covisibility."""
+    generator = np.random.default_rng(0)
+    texture = np.zeros((800, 800))
+    for sigma in (2, 4, 8):
+        noise = cv2.GaussianBlur(generator.standard_normal(texture.shape), (0, 0), sigma)
+        texture += noise / noise.std()
+    texture = (128 + 30 * texture).clip(0, 255).astype(np.uint8)
+
+    reference = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE",
+        width=SIZE[0],
+        height=SIZE[1],
+        params=[FOCAL, SIZE[0] / 2, SIZE[1] / 2],
+        camera_id=1,
+    )
+    reference.add_camera_with_trivial_rig(camera)
+    points = np.column_stack([generator.uniform(-0.5, 0.5, (30, 2)), np.zeros(30)])
+    (tmp_path / "images").mkdir()
+    poses = []
+    for i in range(5):
+        rotation = cv2.Rodrigues(np.array([0.1 * i - 0.2, 0.15 * i - 0.3, 0.2 * i]))[0]
+        translation = np.array([0.05 * i, -0.05, 2.2 + 0.1 * i])
+        poses.append(pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
+        # texture index (u, v) -> plane (u - 399.5, v - 399.5) / 400 -> image index
+        to_plane = np.array([[1 / 400, 0, -399.5 / 400], [0, 1 / 400, -399.5 / 400], [0, 0, 1]])
+        matrix = np.column_stack([rotation[:, :2], translation])
+        calibration = camera.calibration_matrix() - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        homography = calibration @ matrix @ to_plane
+        photo = cv2.warpPerspective(texture, homography, SIZE, flags=cv2.INTER_AREA)
+        cv2.imwrite(str(tmp_path / f"images/{i}.png"), photo)
+        pixels = camera.img_from_cam(points @ rotation.T + translation)
+        image = pycolmap.Image(
+            name=f"{i}.png", keypoints=pixels.reshape(-1, 2), camera_id=1, image_id=i + 1
+        )
+        reference.add_image_with_trivial_frame(image, poses[i])
+    for j, point in enumerate(points):
+        track = pycolmap.Track([pycolmap.TrackElement(i, j) for i in range(1, 6)])
+        reference.add_point3D(point, track)
+    (tmp_path / "model").mkdir()
+    reference.write(tmp_path / "model")
+    return tmp_path
+
+
+@pytest.fixture
+def aachen_layout(plane) -> Path:
+    """The photos of the plane in the layout of Aachen: four of the map, and three queries.
+
+    The queries are one by day, the same by night (darker), and one of a uniform grey.
+    """
+    root = plane / "dataset"
+    images, model = root / "images_upright", root / "3D-models/aachen_v_1_1"
+    for folder in ("db", "query/day", "query/night"):
+        (images / folder).mkdir(parents=True)
+    reference = pycolmap.Reconstruction(plane / "model")
+    truth = []
+    for image in reference.images.values():
+        photo = cv2.imread(str(plane / "images" / image.name))
+        if image.name == "4.png":
+            cv2.imwrite(str(images / "query/day/a.png"), photo)
+            cv2.imwrite(str(images / "query/night/a.png"), photo // 4)
+            cv2.imwrite(str(images / "query/day/grey.png"), np.full_like(photo, 128))
+            pose = image.cam_from_world()
+            values = [*pose.rotation.quat[[3, 0, 1, 2]], *pose.translation]
+            numbers = " ".join(map(repr, map(float, values)))
+            truth = [f"query/{name}.png {numbers}\n" for name in ("day/a", "night/a", "day/grey")]
+        else:
+            image.name = f"db/{image.name}"
+            cv2.imwrite(str(images / image.name), photo)
+    query = reference.find_image_with_name("4.png")
+    reference.deregister_frame(query.frame_id)
+    model.mkdir(parents=True)
+    reference.write(model)
+    for name in ("rigs.bin", "frames.bin"):
+        (model / name).unlink()
+    (root / "queries").mkdir()
+    intrinsics = f"SIMPLE_PINHOLE {SIZE[0]} {SIZE[1]} {FOCAL} {SIZE[0] / 2} {SIZE[1] / 2}\n"
+    for time, names in (("day", ["day/a", "day/grey"]), ("night", ["night/a"])):
+        path = root / f"queries/{time}_time_queries_with_intrinsics.txt"
+        path.write_text("".join(f"query/{name}.png {intrinsics}" for name in names))
+    (root / "queries/ground_truth_poses.txt").write_text("".join(truth))
+    return root

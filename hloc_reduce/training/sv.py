@@ -25,7 +25,7 @@ RECIPES = {
     },
     "best": {
         "hidden": [512, 512],
-        "steps": 8000,
+        "steps": 6000,
         "batch_size": 1024,
         "lr": 1e-3,
         "margin": 1.0,

@@ -1,0 +1,200 @@
+"""The main job, from photos to poses, and what it says to wrong input."""
+
+import csv
+import json
+import shutil
+import sys
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from hloc_reduce import cli
+from pipelines import aachen
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["aachen", *map(str, arguments)])
+    cli.run(aachen._main)
+
+
+def refused(monkeypatch, caplog, *arguments):
+    """Run with wrong input: exit code 2, one or two lines, no traceback; return the message."""
+    caplog.clear()
+    with pytest.raises(SystemExit) as exit:
+        run(monkeypatch, *arguments)
+    assert exit.value.code == 2
+    (message,) = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
+    assert message.count("\n") < 2
+    return message
+
+
+@pytest.fixture(autouse=True)
+def propagated(monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
+
+
+def outcome(outputs):
+    with (outputs / "queries.csv").open() as file:
+        rows = {row["query"]: row for row in csv.DictReader(file)}
+    return json.loads((outputs / "summary.json").read_text()), rows
+
+
+def test_plane(aachen_layout, tmp_path, monkeypatch, capsys):
+    outputs = tmp_path / "outputs"
+    run(monkeypatch, "--dataset", aachen_layout, "--outputs", outputs, "--feature", "sift_sv32")
+    summary, rows = outcome(outputs)
+    assert summary["queries"] == 3 and summary["queries_localized"] == 2
+    day = summary["lists"]["day_time_queries_with_intrinsics"]
+    night = summary["lists"]["night_time_queries_with_intrinsics"]
+    assert day["recall_percent"] == [50, 50, 50] and day["localized"] == 1
+    assert day["thresholds_m_deg"] == [[0.25, 2], [0.5, 5], [5, 10]]
+    assert night["recall_percent"] == [100, 100, 100]
+    assert night["thresholds_m_deg"] == [[0.5, 2], [1, 5], [5, 10]]
+    assert summary["bytes_per_keypoint"]["descriptor"] == 64
+    assert summary["map_points3D"] > 100 and summary["versions"]["pycolmap"]
+    assert len(summary["seconds"]) == 7
+    good, grey = rows["query/day/a.png"], rows["query/day/grey.png"]
+    assert good["status"] == "localized" and float(good["position_error_m"]) < 0.02
+    assert 0 < int(good["num_inliers"]) <= int(good["num_matches"])
+    assert grey["status"] == "fallback" and grey["num_matches"] == "0"
+    assert grey["retrieved"].startswith("db/")
+    poses = outputs / summary["poses"]
+    assert [line.split()[0] for line in poses.read_text().splitlines()] == ["a.png", "grey.png"] + [
+        "a.png"
+    ]
+    table = capsys.readouterr().out
+    assert "0.25 / 0.5 / 5" in table and "100.0 / 100.0 / 100.0" in table
+
+    # a second run computes nothing anew and says the same
+    before = {path: path.read_bytes() for path in outputs.rglob("*.h5")}
+    times = {path: path.stat().st_mtime_ns for path in before}
+    submitted = poses.read_bytes()
+    run(monkeypatch, "--dataset", aachen_layout, "--outputs", outputs, "--feature", "sift_sv32")
+    assert {path: path.stat().st_mtime_ns for path in before} == times
+    assert poses.read_bytes() == submitted
+    assert outcome(outputs)[0]["lists"] == summary["lists"]
+
+    # and so does a run from nothing
+    again = tmp_path / "again"
+    run(monkeypatch, "--dataset", aachen_layout, "--outputs", again, "--feature", "sift_sv32")
+    assert (again / summary["poses"]).read_bytes() == submitted
+
+
+def test_a_run_goes_on_where_it_was_stopped(aachen_layout, tmp_path, monkeypatch, caplog):
+    outputs = tmp_path / "outputs"
+    arguments = ("--dataset", aachen_layout, "--outputs", outputs, "--feature", "sift")
+    query = aachen_layout / "images_upright/query/night/a.png"
+    content = query.read_bytes()
+    query.write_bytes(b"no image")
+    message = refused(monkeypatch, caplog, *arguments)
+    assert "Cannot read image" in message and "query/night/a.png" in message
+    assert list((outputs / "feats-dog-sift.h5.pieces").iterdir())
+    query.write_bytes(content)
+    caplog.clear()
+    run(monkeypatch, *arguments)
+    summary, _ = outcome(outputs)
+    assert summary["queries_localized"] == 2
+    again = tmp_path / "again"
+    run(monkeypatch, *arguments[:2], "--outputs", again, *arguments[4:])
+    assert (again / summary["poses"]).read_bytes() == (outputs / summary["poses"]).read_bytes()
+
+
+def test_retrieval_from_files(aachen_layout, tmp_path, monkeypatch, caplog):
+    pairs = tmp_path / "pairs-query-netvlad50.txt"
+    pairs.write_text(
+        "query/day/a.png db/3.png\nquery/day/a.png db/gone.png\nquery/night/a.png db/2.png\n"
+        "query/other.png db/2.png\n"
+    )
+    outputs = tmp_path / "outputs"
+    arguments = ["--dataset", aachen_layout, "--feature", "sift", "--outputs", outputs]
+    run(monkeypatch, *arguments, "--retrieval", pairs)
+    _, rows = outcome(outputs)
+    assert rows["query/day/a.png"]["retrieved"] == "db/3.png"
+    assert rows["query/night/a.png"]["retrieved"] == "db/2.png"
+    grey = rows["query/day/grey.png"]  # for which the file has nothing
+    assert grey["status"] == "fallback" and grey["retrieved"] == ""
+
+    global_descriptors = tmp_path / "netvlad.h5"
+    generator = np.random.default_rng(0)
+    with h5py.File(global_descriptors, "w") as file:
+        for name in ["db/0.png", "db/1.png", "db/2.png", "db/3.png", *rows]:
+            vector = generator.standard_normal(8)
+            file[f"{name}/global_descriptor"] = vector / np.linalg.norm(vector)
+    outputs = arguments[-1] = tmp_path / "outputs2"
+    run(monkeypatch, *arguments, "--retrieval", global_descriptors, "--num_loc", 2)
+    lines = (outputs / "pairs-query-netvlad2.txt").read_text().splitlines()
+    assert len(lines) == 6
+    assert "neither vlad nor a file" in refused(
+        monkeypatch, caplog, *arguments, "--retrieval", tmp_path / "absent.h5"
+    )
+
+
+def test_wrong_input(aachen_layout, tmp_path, monkeypatch, caplog):
+    outputs = tmp_path / "outputs"
+    arguments = ("--dataset", aachen_layout, "--outputs", outputs)
+    message = refused(monkeypatch, caplog, *arguments, "--feature", "sift_sv46")
+    assert "sift_sv46" in message and message.index("sift_sv64") < message.index("sift_pca16")
+    message = refused(monkeypatch, caplog, *arguments, "--matcher", "NN")
+    assert "NN-ratio" in message
+    message = refused(monkeypatch, caplog, "--dataset", tmp_path / "nowhere")
+    for part in ("images_upright", "3D-models/aachen_v_1_1", "queries", "visuallocalization.net"):
+        assert part in message
+    assert "--num_loc 0" in refused(monkeypatch, caplog, *arguments, "--num_loc", 0)
+    message = refused(monkeypatch, caplog, *arguments, "--ground_truth", tmp_path / "truth.txt")
+    assert "truth.txt" in message
+    assert not outputs.exists()
+
+    (aachen_layout / "images_upright/db/2.png").rename(tmp_path / "2.png")
+    message = refused(monkeypatch, caplog, *arguments)
+    assert "1 of 7 images" in message and "db/2.png" in message
+    shutil.move(tmp_path / "2.png", aachen_layout / "images_upright/db/2.png")
+
+    queries = aachen_layout / "queries/night_time_queries_with_intrinsics.txt"
+    text = queries.read_text()
+    queries.write_text(text + "query/night/b.png PINHOLE 1\n")
+    message = refused(monkeypatch, caplog, *arguments)
+    assert f"{queries}:2" in message
+    queries.write_text(text)
+    model = aachen_layout / "3D-models/aachen_v_1_1/images.bin"
+    content = model.read_bytes()
+    model.write_bytes(content[: len(content) // 2])
+    assert "not a COLMAP model" in refused(monkeypatch, caplog, *arguments)
+    model.write_bytes(content)
+
+
+def test_outputs_of_another_configuration_are_refused(aachen_layout, tmp_path, monkeypatch, caplog):
+    outputs = tmp_path / "outputs"
+    arguments = ("--dataset", aachen_layout, "--outputs", outputs, "--feature", "sift")
+    run(monkeypatch, *arguments)
+    before = (outputs / "summary.json").read_bytes()
+    message = refused(monkeypatch, caplog, *arguments, "--matcher", "NN-mutual")
+    assert "matcher" in message and "--overwrite" in message
+    assert (outputs / "summary.json").read_bytes() == before
+    run(monkeypatch, *arguments, "--matcher", "NN-mutual", "--overwrite")
+    assert outcome(outputs)[0]["matcher"] == "NN-mutual"
+
+
+def test_grey_photos_only_give_an_empty_map(aachen_layout, tmp_path, monkeypatch, caplog):
+    for path in (aachen_layout / "images_upright").rglob("*.png"):
+        cv2.imwrite(str(path), np.full((360, 480), 128, np.uint8))
+    arguments = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--feature", "sift")
+    assert "The map is empty" in refused(monkeypatch, caplog, *arguments)
+
+
+def test_features_are_listed(monkeypatch, capsys):
+    run(monkeypatch, "--list_features")
+    names = capsys.readouterr().out.split()
+    assert names[0] == "sift" and "sift_sv16" in names and "sift_pca64" in names
+
+
+def test_herz_jesus(herz_jesus, tmp_path, monkeypatch):
+    """The whole job on a real place with laser-measured poses."""
+    run(monkeypatch, "--dataset", herz_jesus, "--outputs", tmp_path, "--feature", "sift_sv64")
+    summary, rows = outcome(tmp_path)
+    assert len(rows) == 16 and summary["queries_localized"] == 16
+    for row in rows.values():
+        assert float(row["position_error_m"]) < 0.25 and float(row["rotation_error_deg"]) < 2
+    day = summary["lists"]["day_time_queries_with_intrinsics"]
+    assert day["median_position_error_m"] < 0.01 and day["mean_inliers"] > 1000
