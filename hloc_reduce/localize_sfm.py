@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from . import cli, colmap, logger, stamps
 from .cli import InputError
-from .io import get_colmap_keypoints, get_matches, open_h5
+from .io import get_colmap_keypoints, get_matches, open_h5, replacing
 from .parsers import parse_query_lists, parse_retrieval, write_poses
 
 # Three points fit a pose always; chance alone agrees with five now and then.
@@ -176,9 +176,9 @@ class _Log:
         if lines and lines[0] == header:
             # what follows the last line end was cut off by a kill
             self.records = dict(json.loads(line) for line in lines[1:-1])
-        path.parent.mkdir(parents=True, exist_ok=True)
         kept = [json.dumps(item) for item in self.records.items()]
-        path.write_text("\n".join([header, *kept]) + "\n")
+        with replacing(path) as temporary:
+            temporary.write_text("\n".join([header, *kept]) + "\n")
 
     def __enter__(self) -> None:
         self.file = self.path.open("a")

@@ -5,30 +5,37 @@ import torch
 from ..base_model import BaseModel
 
 
+BLOCK = 1024  # rows of the similarity matrix in memory at once
+
+
 def nearest(
-    similarity: torch.Tensor, ratio_threshold: float | None
+    descriptors0: torch.Tensor, descriptors1: torch.Tensor, ratio_threshold: float | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Find the best column of every row that passes the ratio test.
+    """Find the nearest descriptor1 of every descriptor0 that passes the ratio test.
 
     Args:
-        similarity: (N, M) cosines, M > 0; changed in between, but left as it was.
-        ratio_threshold: accept if the distance to the best is at most this times the distance to
-            the second best; None accepts all.
+        descriptors0: (N, D) of unit norm.
+        descriptors1: (M, D) of unit norm, M > 0, and M > 1 for a ratio test.
+        ratio_threshold: accept if the distance to the nearest is at most this times the distance
+            to the second nearest; None accepts all.
 
     Returns:
-        The column (N,) int64, -1 where none passes, and its similarity (N,).
+        Its index (N,) int64, -1 where it does not pass, and its cosine (N,).
     """
-    best, column = similarity.max(dim=1)
-    if ratio_threshold is None or similarity.shape[1] < 2:
-        return column, best
-    # hiding the best and searching again is several times faster than topk
-    rows = torch.arange(len(similarity), device=similarity.device)
-    similarity[rows, column] = -torch.inf
-    second = similarity.amax(dim=1)
-    similarity[rows, column] = best
-    # squared distances of unit vectors are 2 - 2 * cosine
-    accepted = 2 * (1 - best) <= ratio_threshold**2 * 2 * (1 - second)
-    return torch.where(accepted, column, -1), best
+    indices, cosines = [], []
+    for rows in descriptors0.split(BLOCK):
+        similarity = rows @ descriptors1.T
+        best, index = similarity.max(dim=1)
+        if ratio_threshold is not None:
+            # hiding the best and searching again is faster than topk
+            similarity.scatter_(1, index[:, None], -torch.inf)
+            second = similarity.amax(dim=1)
+            # squared distances of unit vectors are 2 - 2 * cosine
+            accepted = 2 * (1 - best) <= ratio_threshold**2 * 2 * (1 - second)
+            index = torch.where(accepted, index, -1)
+        indices.append(index)
+        cosines.append(best)
+    return torch.cat(indices), torch.cat(cosines)
 
 
 class NearestNeighbor(BaseModel):
@@ -44,8 +51,9 @@ class NearestNeighbor(BaseModel):
         Returns:
             matches0 (1, N) int64, the index in 1 or -1, and matching_scores0 (1, N) in [0, 1].
         """
-        descriptors0, descriptors1 = data["descriptors0"][0], data["descriptors1"][0]
-        size0, size1 = descriptors0.shape[1], descriptors1.shape[1]
+        descriptors0 = data["descriptors0"][0].T.contiguous()
+        descriptors1 = data["descriptors1"][0].T.contiguous()
+        size0, size1 = len(descriptors0), len(descriptors1)
         if min(size0, size1) == 0:
             return {
                 "matches0": torch.full((1, size0), -1),
@@ -53,12 +61,15 @@ class NearestNeighbor(BaseModel):
             }
         # as in hloc, a lone descriptor on either side, which has no second best, skips the test
         ratio_threshold = self.conf["ratio_threshold"] if min(size0, size1) > 1 else None
-        similarity = descriptors0.T @ descriptors1
-        matches0, best = nearest(similarity, ratio_threshold)
-        matches1, _ = nearest(similarity.T.contiguous(), ratio_threshold)
-        mutual = matches1[matches0] == torch.arange(size0, device=matches0.device)
-        matched = mutual & (matches0 >= 0)
+        forward, cosine = nearest(descriptors0, descriptors1, ratio_threshold)
+        # the way back only for those that somebody wants
+        wanted = forward[forward >= 0].unique()
+        backward = torch.full((size1,), -1, device=forward.device)
+        if len(wanted):
+            backward[wanted], _ = nearest(descriptors1[wanted], descriptors0, ratio_threshold)
+        mutual = backward[forward] == torch.arange(size0, device=forward.device)
+        matched = mutual & (forward >= 0)
         return {
-            "matches0": torch.where(matched, matches0, -1)[None],
-            "matching_scores0": torch.where(matched, (best + 1) / 2, 0)[None],
+            "matches0": torch.where(matched, forward, -1)[None],
+            "matching_scores0": torch.where(matched, (cosine + 1) / 2, 0)[None],
         }

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import torch
 from safetensors.numpy import load_file, save_file
@@ -23,7 +24,8 @@ from ..cli import InputError
 from ..colmap import point3D_ids
 from ..descriptors import Descriptor
 from ..extractors.dog import extract_patches
-from ..io import get_features, open_h5, replacing
+from ..io import get_colmap_keypoints, get_features, open_h5, replacing
+from .completion import complete
 
 NUM_COVIS = 20
 # The photo as it is and three photometric variants, each as seen and transposed.
@@ -82,7 +84,7 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     reconstruction = triangulation.main(sfm, model, images, pairs, features, matches)
 
     tracks, stamp_file = output / f"tracks_{descriptor}.safetensors", output / "tracks.json"
-    options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor}
+    options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "completed": True}
     made_from = stamps.stamp(options, [sfm / "points3D.bin", features])
     if tracks.exists() and stamps.is_current(stamp_file, made_from):
         return tracks
@@ -90,22 +92,26 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     describe = Descriptor(descriptor)
     parts = []
     with open_h5(features) as file:
-        for number, name in enumerate(tqdm(names, desc="Describing tracks", unit="image")):
-            ids = point3D_ids(images_by_name[name])
-            kept = np.flatnonzero(ids >= 0)
-            if not len(kept):
-                continue
-            group = get_features(file, name)
-            columns = [group["keypoints"][()], group["scales"][()], group["oris"][()]]
-            keypoints = np.column_stack(columns).astype(np.float32)[kept]
-            generator = np.random.default_rng([seed, number])
-            image, size = extract_features.load_image(images / name, conf["preprocessing"])
-            ratio = np.array(image.shape[:1:-1]) / size
-            scaled = keypoints.copy()  # in pixels of the resized image
-            scaled[:, :2] = (keypoints[:, :2] + 0.5) * ratio - 0.5
-            scaled[:, 2] *= ratio.mean()
-            described = describe_variants(image[0, 0].numpy(), scaled, describe, generator)
-            parts.append((described, ids[kept], np.full(len(kept), number), keypoints[:, :2]))
+        keypoints = {name: _keypoints(file, name) for name in names}
+        places = {name: get_colmap_keypoints(file, name)[0] for name in names}
+    observed = complete(
+        reconstruction,
+        {name: np.column_stack([places[name], keypoints[name][:, 2:]]) for name in names},
+        {name: point3D_ids(images_by_name[name]) for name in names},
+    )
+    for number, name in enumerate(tqdm(names, desc="Describing tracks", unit="image")):
+        kept = np.flatnonzero(observed[name] >= 0)
+        if not len(kept):
+            continue
+        generator = np.random.default_rng([seed, number])
+        image, size = extract_features.load_image(images / name, conf["preprocessing"])
+        ratio = np.array(image.shape[:1:-1]) / size
+        scaled = keypoints[name][kept]  # in pixels of the resized image
+        scaled[:, :2] = (scaled[:, :2] + 0.5) * ratio - 0.5
+        scaled[:, 2] *= ratio.mean()
+        described = describe_variants(image[0, 0].numpy(), scaled, describe, generator)
+        ids, xy = observed[name][kept], keypoints[name][kept, :2]
+        parts.append((described, ids, np.full(len(kept), number), xy))
     if not parts:
         raise InputError(f"The map {model} gives no tracks.")
     _, track = np.unique(np.concatenate([part[1] for part in parts]), return_inverse=True)
@@ -126,6 +132,13 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
 def load(path: Path) -> Tracks:
     """Read the file that `main` wrote."""
     return Tracks(**load_file(path))
+
+
+def _keypoints(file: h5py.File, name: str) -> np.ndarray:
+    """Read keypoints (N, 4): x, y, scale (pixels), orientation (degrees)."""
+    group = get_features(file, name)
+    columns = [group["keypoints"][()], group["scales"][()], group["oris"][()]]
+    return np.column_stack(columns).astype(np.float32)
 
 
 @torch.no_grad()

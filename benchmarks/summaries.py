@@ -1,0 +1,59 @@
+"""Print a Markdown table of the summary.json of finished runs of pipelines.aachen."""
+
+import argparse
+import json
+from pathlib import Path
+
+from hloc_reduce import cli
+from hloc_reduce.cli import InputError
+
+HEADER = (
+    "| feature | bytes | list | localized | recall [%] | median error | mean inliers | points | s |"
+)
+
+
+def rows(summary: dict) -> list[str]:
+    """Format the lists of a summary, a row each."""
+    lines = []
+    for name, result in summary["lists"].items():
+        recall = " / ".join(f"{value:.1f}" for value in result.get("recall_percent", []))
+        error = (
+            f"{100 * result['median_position_error_m']:.2f} cm, "
+            f"{result['median_rotation_error_deg']:.3f}°"
+            if recall
+            else ""
+        )
+        cells = (
+            summary["feature"],
+            summary["bytes_per_keypoint"]["descriptor"],
+            name.split("_")[0],
+            f"{result['localized']} of {result['queries']}",
+            recall,
+            error,
+            f"{result['mean_inliers']:.0f}",
+            f"{summary['map_points3D']:,}",
+            f"{sum(summary['seconds'].values()):.0f}",
+        )
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return lines
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python benchmarks/summaries.py outputs/demo_town/*",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("outputs", type=Path, nargs="+", help="output folders of runs")
+    args = parser.parse_args()
+    lines = [HEADER, "| --- | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
+    for folder in args.outputs:
+        path = folder / "summary.json"
+        if not path.is_file():
+            raise InputError(f"{folder} has no summary.json: has the run finished?")
+        lines += rows(json.loads(path.read_text()))
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    cli.run(_main)

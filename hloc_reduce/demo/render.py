@@ -1,0 +1,246 @@
+"""The renderer: planar textured surfaces, a depth buffer, sunlight with shadows, lamps.
+
+World in metres, z up. Pixel coordinates are COLMAP's: the centre of the first pixel is
+(0.5, 0.5). For a surface ``M = K [R u | R v | R o + t]`` takes plane coordinates in metres to
+homogeneous pixels, and ``M^-1 (x, y, 1) = (u, v, 1) / z``: the texture coordinates and the inverse
+depth are linear in the pixel, hence exact at every pixel centre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from .surface import View, remap
+
+NEAR = 0.05  # metres
+SUPERSAMPLING = 2
+LAMP_REACH = 8.0  # metres at which the light of a lamp of strength 1 is neglected
+LINEAR = ((np.arange(256) / 255) ** 2.2).astype(np.float32)  # sRGB level to linear light
+
+
+@dataclass(frozen=True)
+class Light:
+    """Colours in linear light, (3,): of the sun number ``sun``, of the sky, and of the lamps."""
+
+    sun: int
+    sun_color: np.ndarray
+    sky_color: np.ndarray
+    lamp_color: np.ndarray
+    sky_shift: float = 0.0  # which clouds are up, in [0, 1)
+
+
+class Scene:
+    """All surfaces of the town, with its suns and lamps.
+
+    Args:
+        surfaces: the surfaces.
+        lamps: positions and strengths of the lamps, float (n, 4).
+        suns: unit vectors towards the possible suns, float (n, 3).
+        sky: uint8 RGB (H, W, 3), from the zenith down to the horizon, all around.
+        extent: radius in metres, around the origin, of what can throw shadows.
+    """
+
+    def __init__(self, surfaces, lamps, suns, sky, extent):
+        self.surfaces = surfaces
+        self.lamps, self.sky = np.asarray(lamps), sky
+        self.planes = np.stack([np.column_stack([*s.axes, s.origin]) for s in surfaces])
+        self.normals = -np.cross(self.planes[:, :, 0], self.planes[:, :, 1])
+        padded = [s.outline[np.minimum(np.arange(8), len(s.outline) - 1)] for s in surfaces]
+        padded = np.dstack([padded, np.ones((len(surfaces), 8))])
+        self.corners = padded @ self.planes.transpose(0, 2, 1)  # (n, 8, 3)
+        self.centers = self.corners.mean(axis=1)
+        self.radii = np.linalg.norm(self.corners - self.centers[:, None], axis=2).max(axis=1)
+        self.suns = np.asarray(suns)
+        self.sun_views = [_sun_view(sun, extent) for sun in self.suns]
+        # Of the surfaces slightly raised, lest they throw shadows on themselves.
+        raised = self.planes.copy()
+        raised[:, :, 2] += 0.06 * self.normals
+        self.sun_homographies = [view.calibration @ _moved(view, raised) for view in self.sun_views]
+        self.sun_buffers = [rasterize(self, view)[1] for view in self.sun_views]
+
+    def homographies(self, view: View) -> np.ndarray:
+        """Per surface from plane coordinates to homogeneous pixels, (n, 3, 3)."""
+        return view.calibration @ _moved(view, self.planes)
+
+
+def _moved(view: View, planes: np.ndarray) -> np.ndarray:
+    """Planes (n, 3, 3) from the world to the camera."""
+    moved = view.rotation @ planes
+    moved[:, :, 2] += view.translation
+    return moved
+
+
+def _sun_view(sun: np.ndarray, extent: float) -> View:
+    """A sun so far away that its rays are nearly parallel: shadows need no other camera model."""
+    distance, size = 40 * extent, 2048
+    right = np.cross(sun, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(-sun, right), -sun])
+    focal = size / 2 / extent * distance
+    calibration = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    return View(calibration, rotation, -rotation @ (sun * distance), (size, size))
+
+
+def _spans(matrix: np.ndarray, outline: np.ndarray, shape: tuple[int, int]):
+    """Pixels whose centres lie in the projected convex outline: first row, column ranges."""
+    points = np.column_stack([outline, np.ones(len(outline))]) @ matrix.T
+    if points[:, 2].min() < NEAR:  # clip, keeping the order of the corners
+        kept = []
+        for p, q in zip(points, [*points[1:], points[0]], strict=True):
+            if p[2] >= NEAR:
+                kept.append(p)
+            if (p[2] >= NEAR) != (q[2] >= NEAR):
+                kept.append(p + (NEAR - p[2]) / (q[2] - p[2]) * (q - p))
+        if not kept:
+            return None
+        points = np.array(kept)
+    x, y = (points[:, :2].T / points[:, 2])[..., None]
+    first = int(max(np.ceil(y.min() - 0.5), 0))
+    last = int(min(np.floor(y.max() - 0.5), shape[0] - 1))
+    if last < first:
+        return None
+    rows = np.arange(first, last + 1) + 0.5
+    following = np.arange(1, len(x) + 1) % len(x)
+    dx, dy = x[following] - x, y[following] - y
+    crossing = x + (rows - y) * (dx / np.where(dy == 0, np.inf, dy))
+    crossed = (rows >= y) != (rows >= y[following])
+    left = np.where(crossed, crossing, np.inf).min(axis=0)
+    right = np.where(crossed, crossing, -np.inf).max(axis=0)
+    left = np.clip(np.ceil(left - 0.5), 0, shape[1]).astype(np.int32)
+    right = np.clip(np.ceil(right - 0.5), 0, shape[1]).astype(np.int32)
+    return (first, left, right) if (left < right).any() else None
+
+
+def rasterize(scene: Scene, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """What is seen at every pixel centre.
+
+    Returns:
+        The index of the surface, int16 (h, w), -1 for the sky; the inverse depth, float32 (h, w),
+        0 for the sky.
+    """
+    surface = np.full(view.shape, -1, np.int16)
+    nearness = np.zeros(view.shape, np.float32)
+    homographies = scene.homographies(view)
+    candidates = _candidates(scene, view)
+    inverses = np.linalg.inv(homographies[candidates])
+    for k, inverse in zip(candidates, inverses, strict=True):
+        spans = _spans(homographies[k], scene.surfaces[k].outline, view.shape)
+        if spans is None:
+            continue
+        first, left, right = spans
+        x0, x1 = left.min(), right.max()
+        columns = np.arange(x0, x1)
+        mask = (columns >= left[:, None]) & (columns < right[:, None])
+        for u0, v0, u1, v1 in scene.surfaces[k].holes:
+            corners = np.array([(u0, v0), (u1, v0), (u1, v1), (u0, v1)])
+            hole = _spans(homographies[k], corners, view.shape)
+            if hole is not None:
+                a, b = hole[1].min(), hole[2].max()
+                inside = columns[max(a - x0, 0) : b - x0]
+                inside = (inside >= hole[1][:, None]) & (inside < hole[2][:, None])
+                rows = slice(hole[0] - first, hole[0] - first + len(inside))
+                mask[rows, max(a - x0, 0) : b - x0] &= ~inside
+        a, b, c = inverse[2]
+        rows = np.arange(first, first + len(left))
+        depth = (b * (rows + 0.5) + c).astype(np.float32)[:, None]
+        depth = depth + (a * (columns + 0.5)).astype(np.float32)
+        box = slice(first, first + len(left)), slice(x0, x1)
+        mask &= depth > nearness[box]
+        np.copyto(nearness[box], depth, where=mask)
+        np.copyto(surface[box], np.int16(k), where=mask)
+    return surface, nearness
+
+
+def _candidates(scene: Scene, view: View) -> np.ndarray:
+    """Indices of the surfaces that face the camera and are not wholly outside its image."""
+    facing = ((view.center - scene.planes[:, :, 2]) * scene.normals).sum(axis=1) > 1e-6
+    points = (scene.corners @ view.rotation.T + view.translation) @ view.calibration.T
+    x, y, z = np.moveaxis(points, 2, 0)
+    outside = (z < NEAR).all(1) | (x < 0).all(1) | (y < 0).all(1)
+    outside |= (x > view.shape[1] * z).all(1) | (y > view.shape[0] * z).all(1)
+    return np.flatnonzero(facing & ~outside)
+
+
+def render(scene: Scene, view: View, light: Light) -> np.ndarray:
+    """Linear light at every pixel, float32 RGB (h, w, 3), without supersampling."""
+    surface, _ = rasterize(scene, view)
+    order = np.argsort(surface, axis=None, kind="stable").astype(np.int32)
+    ends = np.cumsum(np.bincount(surface.ravel() + 1, minlength=len(scene.surfaces) + 1))
+    image = np.empty((surface.size, 3), np.float32)
+    if ends[0]:
+        image[order[: ends[0]]] = _sky(scene, view, light, order[: ends[0]])
+    seen = np.flatnonzero(np.diff(ends))
+    inverses = np.linalg.inv(scene.homographies(view)[seen])
+    scales = abs(np.linalg.det(inverses))
+    for k, inverse, scale in zip(seen, inverses, scales, strict=True):
+        pixels = order[ends[k] : ends[k + 1]]
+        y = pixels // view.shape[1]
+        x, y = pixels - y * view.shape[1] + 0.5, y + 0.5
+        z = 1 / (inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2])
+        u = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) * z
+        v = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) * z
+        color = scene.surfaces[k].texture.sample(u, v, scale * z**3)
+        image[pixels] = LINEAR.take(color) * _irradiance(scene, k, u, v, light)
+    return image.reshape(*view.shape, 3)
+
+
+def _sky(scene: Scene, view: View, light: Light, pixels: np.ndarray) -> np.ndarray:
+    """Linear light of the sky, float32 (N, 3)."""
+    y, x = np.divmod(pixels, view.shape[1])
+    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))])
+    rays = view.rotation.T @ np.linalg.inv(view.calibration) @ rays
+    height, width = scene.sky.shape[:2]
+    azimuth = np.arctan2(rays[1], rays[0]) / (2 * np.pi) + light.sky_shift
+    elevation = np.arctan2(rays[2], np.hypot(rays[0], rays[1])) / (np.pi / 2)
+    row = (1 - np.clip(elevation, 0, 1)) * (height - 1)
+    return LINEAR[remap(scene.sky, azimuth * width, row)] * (1.6 * light.sky_color)
+
+
+def _irradiance(scene: Scene, k: int, u: np.ndarray, v: np.ndarray, light: Light) -> np.ndarray:
+    """Light that falls on points of surface ``k``, or leaves it by itself, float32 (N, 3)."""
+    normal, (right, down, origin) = scene.normals[k], scene.planes[k].T
+    total = np.broadcast_to((0.72 + 0.28 * normal[2]) * light.sky_color, (len(u), 3))
+    total = total.astype(np.float32)
+    slope = normal @ scene.suns[light.sun]
+    if slope > 0 and light.sun_color.any():
+        lit = _sunlit(scene, k, u, v, light.sun)
+        total += lit[:, None] * (slope * light.sun_color).astype(np.float32)
+    if light.lamp_color.any():
+        received = np.full(len(u), scene.surfaces[k].glow, np.float32)
+        u, v = u.astype(np.float32), v.astype(np.float32)
+        distances = np.linalg.norm(scene.lamps[:, :3] - scene.centers[k], axis=1)
+        near = distances < scene.radii[k] + LAMP_REACH * np.sqrt(scene.lamps[:, 3])
+        for *position, strength in scene.lamps[near]:
+            offset = position - origin
+            height, across, along = map(float, (offset @ normal, offset @ right, offset @ down))
+            if height > 0:
+                squared = (u - across) ** 2 + (v - along) ** 2 + (height**2 + 0.05)
+                received += strength * height / (squared * np.sqrt(squared))
+        total += received[:, None] * light.lamp_color.astype(np.float32)
+    return total
+
+
+def _sunlit(scene: Scene, k: int, u: np.ndarray, v: np.ndarray, sun: int) -> np.ndarray:
+    """Part of the sun that points of surface ``k`` see, float32 (N,), from its depth buffer."""
+    view, buffer = scene.sun_views[sun], scene.sun_buffers[sun]
+    (a, b, c), (d, e, f), (g, h, i) = scene.sun_homographies[sun][k]
+    z = g * u + h * v + i
+    x, y = (a * u + b * v + c) / z, (d * u + e * v + f) / z
+    nearness = (1 / z).astype(np.float32)
+    column = np.minimum(np.maximum(x, 1), view.shape[1] - 2).astype(np.float32)
+    row = np.minimum(np.maximum(y, 1), view.shape[0] - 2).astype(np.float32)
+    lit = np.zeros(len(u), np.float32)
+    for dx, dy in ((-0.7, -0.3), (0.3, -0.7), (0.7, 0.3), (-0.3, 0.7)):  # softens the edge
+        texel = (row + np.float32(dy)).astype(np.int32) * view.shape[1]
+        texel += (column + np.float32(dx)).astype(np.int32)
+        lit += buffer.take(texel) <= nearness
+    return lit / 4
+
+
+def downsample(image: np.ndarray) -> np.ndarray:
+    """Mean of every block of supersampled pixels; centres map to centres."""
+    size = image.shape[1] // SUPERSAMPLING, image.shape[0] // SUPERSAMPLING
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
