@@ -198,3 +198,21 @@ def test_herz_jesus(herz_jesus, tmp_path, monkeypatch):
         assert float(row["position_error_m"]) < 0.25 and float(row["rotation_error_deg"]) < 2
     day = summary["lists"]["day_time_queries_with_intrinsics"]
     assert day["median_position_error_m"] < 0.01 and day["mean_inliers"] > 1000
+
+
+def test_demo(tmp_path, monkeypatch):
+    """The built-in town: rendered, localized, easy by day and hard by night."""
+    monkeypatch.chdir(tmp_path)
+    run(monkeypatch, "--demo", "--feature", "sift_sv64")
+    summary, rows = outcome(tmp_path / "outputs/demo_town/sift_sv64")
+    assert len(rows) == 20
+    day = summary["lists"]["day_time_queries_with_intrinsics"]
+    night = summary["lists"]["night_time_queries_with_intrinsics"]
+    assert day["recall_percent"][0] >= 90
+    assert 0 < night["recall_percent"][0] < 100
+    wrong = [
+        row
+        for row in rows.values()
+        if row["status"] == "localized" and float(row["position_error_m"]) > 5
+    ]
+    assert len(wrong) <= 1  # what is called localized is

@@ -3,10 +3,13 @@
 import cv2
 import h5py
 import numpy as np
+import pycolmap
 import pytest
 
 from hloc_reduce.cli import InputError
+from hloc_reduce.colmap import point3D_ids
 from hloc_reduce.training import tracks
+from hloc_reduce.training.completion import complete
 
 
 def test_tracks_of_a_plane(plane):
@@ -50,3 +53,32 @@ def test_a_map_without_tracks_is_refused(plane):
         cv2.imwrite(str(path), np.full((360, 480), 100, np.uint8))
     with pytest.raises(InputError, match="The map is empty"):
         tracks.main(plane / "images", plane / "model", plane / "out")
+
+
+def test_hidden_observations_are_found_again_by_geometry(plane):
+    tracks.main(plane / "images", plane / "model", plane / "out")
+    reconstruction = pycolmap.Reconstruction(plane / "out/sfm_sift")
+    images = {image.name: image for image in reconstruction.images.values()}
+    keypoints, observed = {}, {}
+    with h5py.File(plane / "out/feats-dog-sift.h5") as file:
+        for name in images:
+            keypoints[name] = tracks._keypoints(file, name).astype(float)
+            keypoints[name][:, :2] += 0.5
+            observed[name] = point3D_ids(images[name])
+    generator = np.random.default_rng(0)
+    hidden = {name: ids.copy() for name, ids in observed.items()}
+    for ids in hidden.values():
+        ids[generator.random(len(ids)) < 0.2] = -1
+    completed = complete(reconstruction, keypoints, hidden)
+    truth, found = (
+        np.concatenate(
+            [points[name][(hidden[name] < 0) & (observed[name] >= 0)] for name in images]
+        )
+        for points in (observed, completed)
+    )
+    assert len(truth) > 300
+    assert (found == truth).mean() > 0.8
+    assert ((found != truth) & (found >= 0)).mean() < 0.05
+    for name in images:  # what was known stays
+        kept = hidden[name] >= 0
+        assert (completed[name][kept] == hidden[name][kept]).all()

@@ -43,7 +43,7 @@ def test_sampler_draws_matches():
     data.descriptors[:, 0, :, 0] = data.track[:, None]  # exact in float16
     data.descriptors[:, 1, :, 0] = data.track[:, None] + 500
     data.descriptors[..., 1] = data.image[:, None, None]
-    sampler = PairSampler([data], augment=True, balanced=True, seed=0)
+    sampler = PairSampler([data], augment=0.5, balanced=True, seed=0)
     anchors, positives = sampler.batch(3, 64)
     assert (anchors[:, 0] == positives[:, 0]).all() and (anchors[:, 1] != positives[:, 1]).all()
     assert (anchors[:, 0] >= 500).any() and (anchors[:, 0] < 500).any()
@@ -56,7 +56,7 @@ def test_sampler_without_augmentation_draws_photos_only():
     data = noisy_tracks()
     data.descriptors[:] = 1
     data.descriptors[:, 0, 0] = 0
-    anchors, positives = PairSampler([data], False, False, 0).batch(0, 64)
+    anchors, positives = PairSampler([data], 0.0, False, 0).batch(0, 64)
     assert not anchors.any() and not positives.any()
 
 
@@ -65,7 +65,7 @@ def test_sampler_leaves_out_what_has_no_match():
     data = noisy_tracks(number=3, views=2)
     data.image[:] = [0, 0, 0, 1, 0, 1]
     data.descriptors[..., 0] = data.track[:, None, None]
-    anchors, _ = PairSampler([data], True, True, 0).batch(0, 500)
+    anchors, _ = PairSampler([data], 0.5, True, 0).batch(0, 500)
     assert sorted(anchors[:, 0].tolist()) == [1, 2]
 
 
@@ -73,7 +73,7 @@ def test_sampler_balances_maps():
     large, small = noisy_tracks(900), noisy_tracks(100)
     large.descriptors[..., 0], small.descriptors[..., 0] = 0, 1
     counts = {
-        balanced: PairSampler([large, small], False, balanced, 0).batch(0, 64)[0][:, 0].mean()
+        balanced: PairSampler([large, small], 0.0, balanced, 0).batch(0, 64)[0][:, 0].mean()
         for balanced in (False, True)
     }
     assert counts[False] < 0.2 < counts[True] < 0.35

@@ -4,7 +4,6 @@ import torch
 
 from ..base_model import BaseModel
 
-
 BLOCK = 1024  # rows of the similarity matrix in memory at once
 
 

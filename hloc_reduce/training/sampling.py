@@ -11,13 +11,14 @@ class PairSampler:
 
     Args:
         maps: tracks of one or more maps.
-        augment: draw photometric variants and transposed patches too.
+        augment: the share of views that are photometric variants, in [0, 1]; if it is not 0, half
+            of the pairs are transposed too.
         balanced: draw a map with a probability proportional to the square root of its number of
             tracks, not to the number, so that no large place outweighs the others.
         seed: a batch depends on it and on its number only.
     """
 
-    def __init__(self, maps: list[Tracks], augment: bool, balanced: bool, seed: int):
+    def __init__(self, maps: list[Tracks], augment: float, balanced: bool, seed: int):
         self.augment, self.seed = augment, seed
         self.maps, self.starts, self.lengths = [], [], []
         for tracks in maps:
@@ -48,12 +49,11 @@ class PairSampler:
         track = np.unique(generator.integers(len(starts), size=count))
         first = generator.integers(lengths[track])
         second = (first + generator.integers(1, lengths[track])) % lengths[track]
-        transposed = generator.integers(2, size=len(track)) * self.augment
+        transposed = generator.integers(2, size=len(track)) * (self.augment > 0)
         views = []
         for which in (first, second):
-            # half of the views are the photo itself
             variants = generator.integers(1, descriptors.shape[2], size=len(track))
-            variants *= generator.integers(2, size=len(track)) * self.augment
+            variants *= generator.random(len(track)) < self.augment  # 0 is the photo itself
             views.append(descriptors[kept[starts[track] + which], transposed, variants])
         return views[0], views[1]
 

@@ -20,7 +20,7 @@ RECIPES = {
         "batch_size": 1024,
         "lr": 1e-3,
         "margin": 1.0,
-        "augment": False,
+        "augment": 0.0,
         "balanced": False,
     },
     "best": {
@@ -29,7 +29,7 @@ RECIPES = {
         "batch_size": 1024,
         "lr": 1e-3,
         "margin": 1.0,
-        "augment": True,
+        "augment": 0.35,
         "balanced": True,
     },
 }
