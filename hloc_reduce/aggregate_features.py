@@ -6,7 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from tqdm import tqdm
 
 from confs import retrieval as retrieval_confs
@@ -56,7 +56,7 @@ def main(
                     raise InputError(f"The vocabulary {vocabulary} of {output} is gone: overwrite.")
                 model.fit(_sample(file, vocabulary_images, conf["model"]["max_samples"]))
                 with replacing(vocabulary) as temporary:
-                    save_file({"vocabulary": model.vocabulary}, temporary)
+                    temporary.write_bytes(save({"vocabulary": model.vocabulary}))
             model.vocabulary = load_file(vocabulary)["vocabulary"]
             for name in tqdm(todo, desc="Aggregating", unit="image"):
                 local = torch.from_numpy(get_features(file, name)["descriptors"][()])

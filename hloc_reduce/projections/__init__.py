@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as serialize
 from torch import nn
 
 from ..cli import InputError, choose
@@ -109,7 +109,7 @@ def save(mlp: MLP, metadata: dict, path: Path) -> None:
     metadata = {**metadata, "layers": list(mlp.sizes)}
     header = {key: json.dumps(value) for key, value in metadata.items()}
     with replacing(path) as temporary:
-        save_file({key: value.contiguous() for key, value in tensors.items()}, temporary, header)
+        temporary.write_bytes(serialize(tensors, header))
 
 
 def load(projection: str | Path) -> Projection:
