@@ -1,7 +1,7 @@
-# `make demo` and `make test` do everything on a machine with Python >= 3.10 and make.
+# `make demo` and `make test` do everything on a machine with Python >= 3.11 and make.
 PYTHON ?= python3
 VENV ?= .venv
-# installed versions are those that CI tested; PIP_FLAGS= takes the newest
+# installed versions are those that CI tested
 PIP_FLAGS ?= --constraint constraints.txt
 BIN := $(VENV)/bin
 

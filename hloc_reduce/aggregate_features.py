@@ -11,10 +11,10 @@ from tqdm import tqdm
 
 from confs import retrieval as retrieval_confs
 
-from . import cli, colmap, extractors, logger
+from . import cli, colmap, extractors, io, logger
 from .base_model import dynamic_load
 from .cli import InputError
-from .io import GroupWriter, get_features, list_h5_names, open_h5, replacing
+from .io import GroupWriter, get_dataset, list_h5_names, open_h5, replacing
 
 confs = retrieval_confs.confs
 
@@ -45,7 +45,7 @@ def main(
     output = Path(export_dir or features.parent) / f"{conf['output']}_{features.stem}.h5"
     model = dynamic_load(extractors, conf["model"]["name"])(conf["model"]).eval()
     with open_h5(features) as file:
-        made_by = {"model": conf["model"], "features": file.attrs.get("conf", features.name)}
+        made_by = {"model": conf["model"], "features": io.provenance(file)}
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [name for name in list_h5_names(features) if name not in writer]
             if not todo:
@@ -59,7 +59,7 @@ def main(
                     temporary.write_bytes(save({"vocabulary": model.vocabulary}))
             model.vocabulary = load_file(vocabulary)["vocabulary"]
             for name in tqdm(todo, desc="Aggregating", unit="image"):
-                local = torch.from_numpy(get_features(file, name)["descriptors"][()])
+                local = torch.from_numpy(get_dataset(file, name, "descriptors")[()])
                 descriptor = model({"descriptors": local[None]})["global_descriptor"][0]
                 writer.add(name, {"global_descriptor": descriptor.half().numpy()})
     logger.info("Global descriptors are in %s.", output)
@@ -71,7 +71,7 @@ def _sample(file: h5py.File, names: list[str], max_samples: int) -> np.ndarray:
     share = -(-max_samples // max(len(names), 1))
     samples = []
     for name in names:
-        descriptors = get_features(file, name)["descriptors"][()].T
+        descriptors = get_dataset(file, name, "descriptors")[()].T
         samples.append(descriptors[:: -(-len(descriptors) // share) or 1])
     if not sum(map(len, samples)):
         raise InputError(f"No image for the vocabulary has features in {file.filename}.")

@@ -13,14 +13,14 @@ class InputError(ValueError):
 
 
 def run(main: Callable[[], None]) -> None:
-    """Run a command line: an `InputError` becomes one logged line and exit code 2."""
+    """Run a command line: an error that a user can mend is one logged line and exit code 2."""
     try:
         main()
-    except InputError as error:
+    except (InputError, OSError) as error:
         logger.error(error)
         sys.exit(2)
     except KeyboardInterrupt:
-        logger.error("Interrupted. Run the same command again to go on from here.")
+        logger.error("Interrupted. Run it again, without --overwrite, to go on from here.")
         sys.exit(130)
 
 

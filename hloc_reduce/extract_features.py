@@ -15,7 +15,7 @@ from . import cli, extractors, logger, projections
 from .base_model import dynamic_load
 from .cli import InputError
 from .io import GroupWriter, read_image
-from .parsers import parse_image_list
+from .parsers import image_names
 
 confs = features_confs.confs
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
@@ -26,7 +26,7 @@ def main(
     image_dir: Path,
     export_dir: Path | None = None,
     as_half: bool = True,
-    image_list: Path | Iterable[str] | None = None,
+    image_list: Path | str | Iterable[str] | None = None,
     feature_path: Path | None = None,
     overwrite: bool = False,
 ) -> Path:
@@ -49,11 +49,11 @@ def main(
     """
     if feature_path is None:
         feature_path = Path(export_dir) / f"{conf['output']}.h5"
-    image_names = list_images(image_dir, image_list)
+    names = list_images(image_dir, image_list)
     with GroupWriter(feature_path, provenance(conf, as_half), overwrite) as writer:
-        todo = [name for name in image_names if name not in writer]
+        todo = [name for name in names if name not in writer]
         if not todo:
-            logger.info("All %d images are in %s.", len(image_names), feature_path)
+            logger.info("All %d images are in %s.", len(names), feature_path)
             return feature_path
         device = "cuda" if torch.cuda.is_available() else "cpu"
         model = load_extractor(conf["model"]).to(device)
@@ -66,7 +66,7 @@ def main(
             if len(features["keypoints"]) == 0:
                 logger.warning("Image %s has no keypoints.", name)
             writer.add(name, features, {"keypoints": {"uncertainty": uncertainty}})
-    logger.info("Features of %d images are in %s.", len(image_names), feature_path)
+    logger.info("Features of %d images are in %s.", len(names), feature_path)
     return feature_path
 
 
@@ -83,25 +83,25 @@ def provenance(conf: dict, as_half: bool) -> dict:
     return made_by
 
 
-def list_images(image_dir: Path, image_list: Path | Iterable[str] | None = None) -> list[str]:
+def list_images(image_dir: Path, image_list: Path | str | Iterable[str] | None = None) -> list[str]:
     """Return the names of the images of a folder, or of a list, checked to be there."""
     if image_list is None:
-        image_names = sorted(
+        names = sorted(
             path.relative_to(image_dir).as_posix()
             for path in Path(image_dir).rglob("*")
             if path.suffix.lower() in IMAGE_SUFFIXES
         )
-        if not image_names:
+        if not names:
             raise InputError(f"There is no image in {image_dir}.")
-        return image_names
-    image_names = parse_image_list(image_list) if isinstance(image_list, Path) else list(image_list)
-    missing = [name for name in image_names if not (image_dir / name).is_file()]
+        return names
+    names = image_names(image_list)
+    missing = [name for name in names if not (image_dir / name).is_file()]
     if missing:
         raise InputError(
-            f"{len(missing)} of {len(image_names)} images are not in {image_dir}: "
+            f"{len(missing)} of {len(names)} images are not in {image_dir}: "
             f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
         )
-    return image_names
+    return names
 
 
 def load_image(path: Path, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import time
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -71,7 +72,8 @@ class GroupWriter:
 
     Groups gather in memory and go into pieces beside the file, each moved into place when it is
     whole. Leaving the context merges the pieces into the file. What a piece holds is never
-    computed again, and the file itself is whole at any instant.
+    computed again, and the file itself is whole at any instant. A file keeps the `id` that it got
+    when it was begun, so that what is derived from it can tell it from one made anew.
 
     Args:
         path: the h5 file, new or to be extended.
@@ -98,9 +100,11 @@ class GroupWriter:
             path.unlink(missing_ok=True)
             shutil.rmtree(self.pieces, ignore_errors=True)
         self.names: set[str] = set()
+        self.id = uuid.uuid4().hex
         for part in [path] * path.exists() + self._finished():
             with open_h5(part) as file:
                 self._check(file, part)
+                self.id = file.attrs.get("id", self.id)
             self.names.update(list_h5_names(part))
         self.buffer: dict[str, tuple[dict, dict]] = {}
         self.buffer_bytes = 0
@@ -151,7 +155,7 @@ class GroupWriter:
 
     def _write(self, path: Path) -> None:
         with h5py.File(path, "w", libver="latest") as file:
-            file.attrs["conf"] = self.conf
+            file.attrs.update({"conf": self.conf, "id": self.id})
             for name, (arrays, attrs) in self.buffer.items():
                 group = file.create_group(name)
                 for key, array in arrays.items():
@@ -167,7 +171,7 @@ class GroupWriter:
             if self.path.exists():
                 shutil.copyfile(self.path, temporary)
             with h5py.File(temporary, "a", libver="latest") as merged:
-                merged.attrs["conf"] = self.conf
+                merged.attrs.update({"conf": self.conf, "id": self.id})
                 for piece in pieces:
                     names = list_h5_names(piece)
                     with open_h5(piece) as file:
@@ -177,16 +181,24 @@ class GroupWriter:
         shutil.rmtree(self.pieces, ignore_errors=True)
 
 
-def get_features(file: h5py.File, name: str) -> h5py.Group:
-    """Return the group of an image in an open feature file, or raise an InputError."""
+def get_dataset(file: h5py.File, name: str, key: str) -> h5py.Dataset:
+    """Return a data set of an image or a pair in an open h5 file, or raise an InputError."""
     if name not in file:
-        raise InputError(f"Image {name} is not in the feature file {file.filename}.")
-    return file[name]
+        raise InputError(f"{name} is not in the file {file.filename}.")
+    if key not in file[name]:
+        raise InputError(f"{file.filename} is not a file of {key}: {name} has none.")
+    return file[name][key]
+
+
+def provenance(file: h5py.File) -> str:
+    """Return what tells an open h5 file from others: what made it and when, or its name."""
+    conf = file.attrs.get("conf", Path(file.filename).name)
+    return f"{conf} {file.attrs.get('id', '')}"
 
 
 def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
     """Read keypoints (N, 2) float64, pixel centres at integers, and their uncertainty in pixels."""
-    dataset = get_features(file, name)["keypoints"]
+    dataset = get_dataset(file, name, "keypoints")
     return dataset[:, :2].astype(np.float64), float(dataset.attrs.get("uncertainty", 1.0))
 
 
@@ -227,8 +239,18 @@ def get_matches(file: h5py.File, name0: str, name1: str) -> tuple[np.ndarray, np
     pair, reverse = find_pair(file, name0, name1)
     if pair is None:
         raise InputError(f"The pair {name0}, {name1} is not in the match file {file.filename}.")
-    matches0 = file[pair]["matches0"][()]
+    matches0 = get_dataset(file, pair, "matches0")[()]
     matched = np.flatnonzero(matches0 != -1)
     matches = np.stack([matched, matches0[matched].astype(np.int64)], -1)
-    scores = file[pair]["matching_scores0"][()][matched]
+    scores = get_dataset(file, pair, "matching_scores0")[()][matched]
     return (matches[:, ::-1] if reverse else matches), scores
+
+
+def check_matches(matches: np.ndarray, names: tuple[str, str], sizes: tuple[int, int]) -> None:
+    """Raise an InputError if matches (M, 2) refer to keypoints that images do not have."""
+    for column, (name, size) in enumerate(zip(names, sizes, strict=True)):
+        if len(matches) and matches[:, column].max() >= size:
+            raise InputError(
+                f"The matches of {names[0]}, {names[1]} were made of other features: "
+                f"{name} has {size} keypoints only."
+            )

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from . import cli, colmap, logger, stamps
 from .cli import InputError
-from .io import get_colmap_keypoints, get_matches, open_h5, replacing
+from .io import check_matches, get_colmap_keypoints, get_matches, open_h5, replacing
 from .parsers import parse_query_lists, parse_retrieval, write_poses
 
 # Three points fit a pose always, and among hundreds of wrong matches a few more agree by chance.
@@ -47,8 +47,9 @@ def main(
 
     Returns:
         For each query a dict: `localized`; `qvec` (w, x, y, z) and `tvec`, camera from world;
-        `num_matches`, `num_inliers`; `db`, its best retrieved map image. A query that PnP could
-        not solve is not localized, and its pose is that of `db`.
+        `num_matches` with points of the map, `num_correspondences`, the different ones among
+        them, and `num_inliers` of these; `db`, its best retrieved map image. A query that PnP
+        could not solve is not localized, and its pose is that of `db`.
 
         The same is kept in `<results>_logs.jsonl`, from which a later run goes on.
 
@@ -116,9 +117,9 @@ class QueryLocalizer:
         return self._rows[name]
 
     def correspondences(
-        self, name: str, db_names: list[str], match_file: h5py.File
+        self, name: str, num_keypoints: int, db_names: list[str], match_file: h5py.File
     ) -> tuple[np.ndarray, int]:
-        """Collect the 2D-3D matches of a query through retrieved images.
+        """Collect the 2D-3D matches of a query with so many keypoints through retrieved images.
 
         Returns:
             Different pairs (M, 2) of keypoint index and row of `points`, sorted, and the number
@@ -127,7 +128,9 @@ class QueryLocalizer:
         found = [np.zeros((0, 2), np.int64)]
         for db_name in db_names:
             matches, _ = get_matches(match_file, name, db_name)
-            rows = self.point_rows(db_name)[matches[:, 1]]
+            rows = self.point_rows(db_name)
+            check_matches(matches, (name, db_name), (num_keypoints, len(rows)))
+            rows = rows[matches[:, 1]]
             found.append(np.stack([matches[:, 0], rows], 1)[rows >= 0])
         found = np.concatenate(found)
         return np.unique(found, axis=0), len(found)
@@ -147,8 +150,8 @@ class QueryLocalizer:
             logger.warning("%d images retrieved for %s are not in the map.", absent, name)
         if not db_names:
             logger.warning("No map image was retrieved for %s.", name)
-        pairs, num_matches = self.correspondences(name, db_names, match_file)
         keypoints, _ = get_colmap_keypoints(feature_file, name)
+        pairs, num_matches = self.correspondences(name, len(keypoints), db_names, match_file)
         found = colmap.estimate_pose(
             keypoints[pairs[:, 0]], self.points[pairs[:, 1]], camera, self.config, SEED
         )
@@ -161,6 +164,7 @@ class QueryLocalizer:
             "qvec": [float(value) for value in (w, x, y, z)],
             "tvec": [float(value) for value in cam_from_world.translation],
             "num_matches": num_matches,
+            "num_correspondences": len(pairs),
             "num_inliers": int(found["num_inliers"]) if found else 0,
             "db": db_names[0] if db_names else None,
         }

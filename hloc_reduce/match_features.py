@@ -11,10 +11,10 @@ from tqdm import tqdm
 
 from confs import matchers as matchers_confs
 
-from . import cli, logger, matchers
+from . import cli, io, logger, matchers
 from .base_model import dynamic_load
 from .cli import InputError
-from .io import GroupWriter, get_features, names_to_pair, open_h5
+from .io import GroupWriter, get_dataset, names_to_pair, open_h5
 from .parsers import parse_retrieval
 
 confs = matchers_confs.confs
@@ -74,7 +74,7 @@ def provenance(conf: dict, *feature_files: h5py.File) -> dict:
     """Return what determines the matches: the configurations of matcher and features."""
     made_by = {"model": conf["model"]}
     for i, file in enumerate(feature_files):
-        made_by[f"features{i}"] = file.attrs.get("conf", Path(file.filename).name)
+        made_by[f"features{i}"] = io.provenance(file)
     return made_by
 
 
@@ -106,7 +106,7 @@ def _match(
 
     @lru_cache(CACHED_IMAGES)
     def descriptors(file: h5py.File, name: str) -> torch.Tensor:
-        array = get_features(file, name)["descriptors"][()]
+        array = get_dataset(file, name, "descriptors")[()]
         return torch.from_numpy(array).to(device).float()[None]
 
     for name0, name1 in tqdm(pairs, desc="Matching", unit="pair", smoothing=0.1):

@@ -24,7 +24,11 @@ def main(model: Path, output: Path, num_matched: int) -> Path:
     Raises:
         InputError: when there is no model or it has no covisible images.
     """
+    if num_matched < 1:
+        raise cli.InputError(f"num_matched is {num_matched}: at least 1.")
     reconstruction = colmap.read_model(model)
+    if not reconstruction.images:
+        raise cli.InputError(f"The model {model} has no images.")
     images = [reconstruction.images[i] for i in sorted(reconstruction.images)]
     counts = covisibility([colmap.point3D_ids(image) for image in images])
     pairs = []

@@ -8,8 +8,8 @@ import numpy as np
 
 from . import cli, colmap, logger
 from .cli import InputError
-from .io import get_features, list_h5_names, open_h5
-from .parsers import parse_image_list, parse_retrieval, write_pairs
+from .io import get_dataset, list_h5_names, open_h5
+from .parsers import image_names, parse_retrieval, write_pairs
 
 QUERY_BLOCK = 1024  # rows of the similarity matrix in memory at once
 
@@ -44,6 +44,8 @@ def main(
     Raises:
         InputError: for an image without a global descriptor, or no image at all.
     """
+    if num_matched < 1:
+        raise InputError(f"num_matched is {num_matched}: at least 1.")
     db_descriptors = db_descriptors or descriptors
     if db_model is not None:
         db_list = [image.name for image in colmap.read_model(db_model).images.values()]
@@ -112,7 +114,7 @@ def _select(
         prefix = prefix if isinstance(prefix, str) else tuple(prefix)
         selected = [name for name in list_h5_names(path) if name.startswith(prefix)]
     elif names is not None:
-        selected = parse_image_list(names) if isinstance(names, Path) else list(names)
+        selected = image_names(names)
     else:
         selected = list_h5_names(path)
     if not selected:
@@ -122,7 +124,9 @@ def _select(
 
 def _read(path: Path, names: list[str]) -> np.ndarray:
     with open_h5(path) as file:
-        rows = [get_features(file, name)["global_descriptor"][()] for name in names]
+        rows = [get_dataset(file, name, "global_descriptor")[()] for name in names]
+    if len({row.shape for row in rows}) > 1:
+        raise InputError(f"The global descriptors in {path} differ in size.")
     return np.stack(rows).astype(np.float32)
 
 

@@ -1,13 +1,13 @@
 """The text files of hloc: image lists, query lists with intrinsics, pairs, poses."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from .cli import InputError
+from .cli import InputError, choose
 from .io import replacing
 
 
@@ -28,6 +28,18 @@ def parse_image_list(path: Path) -> list[str]:
     return [words[0] for _, words in _lines(path)]
 
 
+def image_names(images: Path | str | Iterable[str]) -> list[str]:
+    """Return the names of a list file, given by its path, or of any other iterable.
+
+    Raises:
+        InputError: when there is none.
+    """
+    names = parse_image_list(Path(images)) if isinstance(images, (Path, str)) else list(images)
+    if not names:
+        raise InputError(f"There is no image in the list {images}.")
+    return names
+
+
 def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
     """Read queries with intrinsics, one `name MODEL width height params...` a line.
 
@@ -38,6 +50,7 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
     for place, words in _lines(path):
         try:
             name, model, width, height, *params = words
+            choose("camera model", model, pycolmap.CameraModelId.__members__)
             camera = pycolmap.Camera(
                 model=model,
                 width=int(width),

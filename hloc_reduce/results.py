@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -20,12 +21,15 @@ COLUMNS = (
     "list",
     "status",
     "num_matches",
+    "num_correspondences",
     "num_inliers",
     "inlier_ratio",
     "position_error_m",
     "rotation_error_deg",
     "retrieved",
 )
+# what a run leaves in its folder, but for lists of pairs, which are always written anew
+PRODUCTS = ("*feats-*", ".*.tmp", "sfm_*", "Aachen-*", "queries.csv", "s*.json")
 FAILED = (float("inf"), float("inf"))
 
 
@@ -35,7 +39,8 @@ class RunFolder:
     Args:
         path: the folder; made if need be.
         conf: what determines the results.
-        overwrite: begin anew, with this configuration.
+        overwrite: begin anew, with this configuration; what a run left in the folder is deleted
+            first, so that a run that is stopped can go on without `overwrite`.
 
     Raises:
         InputError: when the folder holds results of another configuration.
@@ -57,8 +62,10 @@ class RunFolder:
                     f"{path} holds results of another configuration ({key}: {before.get(key)} "
                     f"before, {conf.get(key)} now). Choose other --outputs, or --overwrite."
                 )
-        if overwrite:
-            self._seconds_file.unlink(missing_ok=True)
+        elif conf_file.exists():
+            conf_file.unlink()
+            for product in (file for pattern in PRODUCTS for file in path.glob(pattern)):
+                shutil.rmtree(product) if product.is_dir() else product.unlink()
         with replacing(conf_file) as temporary:
             temporary.write_text(json.dumps(conf, indent=1))
 
@@ -99,16 +106,17 @@ def query_table(
     for list_name, queries in lists.items():
         for name, _ in queries:
             record = records[name]
-            matches, inliers = record["num_matches"], record["num_inliers"]
+            correspondences, inliers = record["num_correspondences"], record["num_inliers"]
             known = name in truth
             errors = pose_error(pose(record), truth[name]) if known else (None, None)
             values = (
                 name,
                 list_name,
                 "localized" if record["localized"] else "fallback",
-                matches,
+                record["num_matches"],
+                correspondences,
                 inliers,
-                round(inliers / matches, 4) if matches else 0.0,
+                round(inliers / correspondences, 4) if correspondences else 0.0,
                 *errors,
                 record["db"],
             )

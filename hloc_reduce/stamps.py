@@ -11,7 +11,8 @@ def stamp(options: dict, inputs: list[Path]) -> dict:
     files = {}
     for path in inputs:
         status = path.stat()
-        files[path.name] = [status.st_size, status.st_mtime_ns]
+        key = path.name if path.name not in files else str(path)
+        files[key] = [status.st_size, status.st_mtime_ns]
     return {"options": options, "inputs": files}
 
 

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from . import cli, colmap, logger, stamps
 from .cli import InputError
-from .io import get_colmap_keypoints, get_matches, open_h5
+from .io import check_matches, get_colmap_keypoints, get_matches, open_h5
 from .parsers import parse_retrieval
 
 MAX_EPIPOLAR_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
@@ -59,6 +59,9 @@ def main(
         logger.info("The map %s is up to date.", sfm_dir)
         return colmap.read_model(sfm_dir)
 
+    sfm_dir = sfm_dir.resolve()
+    if sfm_dir.exists() and not (sfm_dir / STAMP).exists() and any(sfm_dir.iterdir()):
+        raise InputError(f"{sfm_dir} is not a map of this program, so it is not replaced.")
     building = sfm_dir.with_name(f".{sfm_dir.name}.tmp")
     shutil.rmtree(building, ignore_errors=True)
     building.mkdir(parents=True)
@@ -75,8 +78,12 @@ def main(
             "Do the poses belong to these images, and do the pairs overlap?"
         )
     stamps.write(building / STAMP, made_from)
-    shutil.rmtree(sfm_dir, ignore_errors=True)
+    replaced = sfm_dir.with_name(f".{sfm_dir.name}.old")
+    shutil.rmtree(replaced, ignore_errors=True)
+    if sfm_dir.exists():
+        sfm_dir.replace(replaced)
     building.replace(sfm_dir)
+    shutil.rmtree(replaced, ignore_errors=True)
     logger.info("The map %s:\n%s", sfm_dir, reconstruction.summary())
     return reconstruction
 
@@ -106,12 +113,7 @@ def _fill_database(
             if name0 == name1 or (name0, name1) in verified or (name1, name0) in verified:
                 continue
             matches, _ = get_matches(match_file, name0, name1)
-            for column, name in enumerate((name0, name1)):
-                if len(matches) and matches[:, column].max() >= len(keypoints[name]):
-                    raise InputError(
-                        f"The matches of {name0}, {name1} are not of the features "
-                        f"{feature_file.filename}: {name} has {len(keypoints[name])} keypoints."
-                    )
+            check_matches(matches, (name0, name1), (len(keypoints[name0]), len(keypoints[name1])))
             errors0, errors1 = epipolar_errors(
                 images[name1].cam_from_world() * images[name0].cam_from_world().inverse(),
                 rays[name0][matches[:, 0]],

@@ -23,8 +23,7 @@ from hloc_reduce import (
     triangulation,
 )
 from hloc_reduce.cli import InputError
-from hloc_reduce.datasets import AACHEN_THRESHOLDS, Aachen
-from hloc_reduce.parsers import parse_poses
+from hloc_reduce.datasets import Aachen, thresholds
 from hloc_reduce.versions import versions
 
 # suffix of a retrieval file -> what makes pairs of it; any other is a text file of pairs
@@ -43,19 +42,12 @@ def main(
     overwrite: bool = False,
 ) -> dict:
     """Run all stages and return the summary, as in summary.json."""
-    feature_conf = features_confs.confs[cli.choose("feature", feature, features_confs.confs)]
-    matcher_conf = matchers_confs.confs[cli.choose("matcher", matcher, matchers_confs.confs)]
-    if retrieval != "vlad" and not Path(retrieval).is_file():
-        raise InputError(f"--retrieval {retrieval}: neither vlad nor a file that is there.")
-    for option, number in (("num_covis", num_covis), ("num_loc", num_loc)):
-        if number < 1:
-            raise InputError(f"--{option} {number}: at least 1.")
+    feature_conf, matcher_conf = features_confs.confs[feature], matchers_confs.confs[matcher]
     place = Aachen(dataset)
     map_names, lists = place.map_names(), place.query_lists()
     query_names = [name for queries in lists.values() for name, _ in queries]
-    if ground_truth is None and place.ground_truth.is_file():
-        ground_truth = place.ground_truth
-    truth = parse_poses(ground_truth) if ground_truth else {}
+    place.check_images([*map_names, *query_names])
+    truth = place.true_poses(query_names, ground_truth)
 
     folder = results.RunFolder(
         outputs,
@@ -76,41 +68,27 @@ def main(
 
     with folder.stage("extract_features"):
         names = [*map_names, *query_names]
-        features = extract_features.main(
-            feature_conf, place.images, outputs, image_list=names, overwrite=overwrite
-        )
+        features = extract_features.main(feature_conf, place.images, outputs, image_list=names)
     with folder.stage("pairs_from_covisibility"):
         pairs_from_covisibility.main(place.reference_model, sfm_pairs, num_covis)
     with folder.stage("match_map"):
-        sfm_matches = match_features.main(
-            matcher_conf, sfm_pairs, features.stem, outputs, overwrite=overwrite
-        )
+        sfm_matches = match_features.main(matcher_conf, sfm_pairs, features.stem, outputs)
     with folder.stage("triangulation"):
         reconstruction = triangulation.main(
-            sfm,
-            place.reference_model,
-            place.images,
-            sfm_pairs,
-            features,
-            sfm_matches,
-            overwrite=overwrite,
+            sfm, place.reference_model, place.images, sfm_pairs, features, sfm_matches
         )
     with folder.stage("retrieval"):
         if retrieval == "vlad":
             conf = aggregate_features.confs["vlad"]
-            retrieved = aggregate_features.main(conf, features, map_names, overwrite=overwrite)
+            retrieved = aggregate_features.main(conf, features, map_names)
         else:
             retrieved = Path(retrieval)
         select = PAIRS_FROM.get(retrieved.suffix, pairs_from_retrieval.select)
         select(retrieved, loc_pairs, num_loc, query_list=query_names, db_list=map_names)
     with folder.stage("match_queries"):
-        loc_matches = match_features.main(
-            matcher_conf, loc_pairs, features.stem, outputs, overwrite=overwrite
-        )
+        loc_matches = match_features.main(matcher_conf, loc_pairs, features.stem, outputs)
     with folder.stage("localization"):
-        records = localize_sfm.main(
-            sfm, place.queries, loc_pairs, features, loc_matches, poses, overwrite=overwrite
-        )
+        records = localize_sfm.main(sfm, place.queries, loc_pairs, features, loc_matches, poses)
 
     rows = results.query_table(lists, records, truth)
     results.write_csv(rows, outputs / "queries.csv")
@@ -128,7 +106,7 @@ def main(
         "lists": {
             name: results.summarize_list(
                 [row for row in rows if row["list"] == name],
-                AACHEN_THRESHOLDS.get(name, AACHEN_THRESHOLDS["day_time_queries_with_intrinsics"]),
+                thresholds(name),
             )
             for name in lists
         },
@@ -184,6 +162,12 @@ def _main() -> None:
         print("\n".join(features_confs.confs))
         return
     cli.choose("feature", args.feature, features_confs.confs)
+    cli.choose("matcher", args.matcher, matchers_confs.confs)
+    if args.retrieval != "vlad" and not Path(args.retrieval).is_file():
+        raise InputError(f"--retrieval {args.retrieval}: neither vlad nor a file that is there.")
+    for option in ("num_covis", "num_loc"):
+        if getattr(args, option) < 1:
+            raise InputError(f"--{option} {getattr(args, option)}: at least 1.")
     default = "datasets/demo_town" if args.demo else "datasets/aachen_v1.1"
     dataset = args.dataset or Path(default)
     outputs = args.outputs or Path("outputs") / dataset.name / args.feature
@@ -208,7 +192,13 @@ def _main() -> None:
         summary["bytes_per_keypoint"]["descriptor"],
         outputs,
     )
-    print(results.recall_table(args.feature, summary["lists"]))
+    if any("recall_percent" in result for result in summary["lists"].values()):
+        print(results.recall_table(args.feature, summary["lists"]))
+    else:
+        print(
+            "The true poses are not known here. For recall, submit "
+            f"{outputs / summary['poses']} to https://www.visuallocalization.net."
+        )
 
 
 if __name__ == "__main__":

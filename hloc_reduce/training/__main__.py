@@ -5,11 +5,13 @@ from the tracks.
 """
 
 import argparse
+import hashlib
+import json
 from pathlib import Path
 
 from .. import cli, logger, projections
 from ..cli import InputError
-from ..descriptors import DESCRIPTORS
+from ..descriptors import DESCRIPTORS, DIM
 from ..versions import versions
 from . import pca, sv, tracks
 
@@ -49,6 +51,7 @@ def main(
         name: tracks.main(images, model, cache / name, descriptor, seed)
         for name, (images, model) in maps.items()
     }
+    checksums = {name: checksum(file) for name, file in files.items()}
     data = [tracks.load(file) for file in files.values()]
     trainer = SCHEMES[scheme]
     for dim, path in zip(dims, paths, strict=True):
@@ -57,18 +60,41 @@ def main(
             "scheme": scheme,
             "dim": dim,
             "training_data": {
-                name: {"points": part.num_tracks, "observations": len(part.track)}
+                name: {
+                    "points": part.num_tracks,
+                    "observations": len(part.track),
+                    "sha256": checksums[name],
+                }
                 for name, part in zip(files, data, strict=True)
             },
             "recipe": {"name": recipe, **trainer.RECIPES[recipe]},
             "seed": seed,
             "versions": versions(),
         }
-        checkpoint = path.with_suffix(f".{recipe}-{seed}.ckpt")
-        mlp = trainer.train(data, dim, trainer.RECIPES[recipe], seed, checkpoint=checkpoint)
+        if path.exists():
+            before = projections.load(path).metadata
+            if {key: before.get(key) for key in metadata} == metadata:
+                logger.info("%s is there already.", path)
+                continue
+        checkpoint = path.with_suffix(".ckpt")
+        mlp = trainer.train(
+            data,
+            dim,
+            trainer.RECIPES[recipe],
+            seed,
+            checkpoint=checkpoint,
+            made_from=json.dumps(metadata, sort_keys=True),
+        )
         projections.save(mlp, metadata, path)
+        checkpoint.unlink(missing_ok=True)
         logger.info("Saved %s.", path)
     return paths
+
+
+def checksum(path: Path) -> str:
+    """Return the sha256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
@@ -123,8 +149,8 @@ def _main() -> None:
     trainer = SCHEMES[cli.choose("scheme", args.scheme, SCHEMES)]
     cli.choose("recipe", args.recipe, trainer.RECIPES)
     for dim in args.dim:
-        if not 0 < dim <= 128:
-            raise InputError(f"--dim {dim}: choose 1 to 128.")
+        if not 0 < dim <= DIM:
+            raise InputError(f"--dim {dim}: choose 1 to {DIM}.")
     main(
         parse_maps(args.map),
         args.descriptor,

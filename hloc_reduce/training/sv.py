@@ -57,7 +57,9 @@ def triplet_loss(anchors: torch.Tensor, positives: torch.Tensor, margin: float) 
     return (margin + positive - negative).clamp(min=0).mean()
 
 
-def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path) -> MLP:
+def train(
+    maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path, made_from: str = ""
+) -> MLP:
     """Train a projection on the tracks of maps, the same for the same seed.
 
     Args:
@@ -65,7 +67,8 @@ def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Pat
         dim: number of output dimensions.
         recipe: an entry of `RECIPES`.
         seed: of the initial weights and the batches.
-        checkpoint: file from which a killed training goes on.
+        checkpoint: file from which a killed training goes on; the caller deletes it.
+        made_from: says what the training is made from; a checkpoint of another is not used.
 
     Returns:
         The trained network.
@@ -81,10 +84,11 @@ def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Pat
     step = 0
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True)
-        step = state.pop("step")
-        for key, part in parts.items():
-            part.load_state_dict(state[key])
-        logger.info("Going on from step %d of %s.", step, checkpoint)
+        if state["made_from"] == made_from:
+            step = state["step"]
+            for key, part in parts.items():
+                part.load_state_dict(state[key])
+            logger.info("Going on from step %d of %s.", step, checkpoint)
     mean_loss = None
     progress = trange(step, steps, initial=step, total=steps, desc=f"Training {dim}-D", unit="step")
     for step in progress:
@@ -100,6 +104,5 @@ def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Pat
         if (step + 1) % CHECKPOINT_STEPS == 0:
             with replacing(checkpoint) as temporary:
                 state = {key: part.state_dict() for key, part in parts.items()}
-                torch.save({"step": step + 1, **state}, temporary)
-    checkpoint.unlink(missing_ok=True)
+                torch.save({"step": step + 1, "made_from": made_from, **state}, temporary)
     return mlp.eval()

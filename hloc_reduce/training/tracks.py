@@ -13,6 +13,7 @@ from tqdm import tqdm
 from confs import features as features_confs
 
 from .. import (
+    colmap,
     extract_features,
     logger,
     match_features,
@@ -22,7 +23,7 @@ from .. import (
 )
 from ..cli import InputError
 from ..colmap import point3D_ids
-from ..descriptors import Descriptor
+from ..descriptors import DIM, Descriptor
 from ..extractors.dog import extract_patches
 from ..io import get_colmap_keypoints, get_features, open_h5, replacing
 from .completion import complete
@@ -71,11 +72,15 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     Raises:
         InputError: when the map cannot be read or gives no tracks.
     """
+    source = {"images": str(images.resolve()), "model": str(model.resolve())}
+    if (output / "source.json").exists() and not stamps.is_current(output / "source.json", source):
+        raise InputError(f"{output} holds the tracks of another map. Choose another folder.")
+    stamps.write(output / "source.json", source)
     conf = features_confs.feature(descriptor, features_confs.base(descriptor))
     pairs = pairs_from_covisibility.main(
         model, output / f"pairs-db-covis{NUM_COVIS}.txt", NUM_COVIS
     )
-    names = sorted({name for pair in pairs.read_text().splitlines() for name in pair.split()})
+    names = sorted(image.name for image in colmap.read_model(model).images.values())
     features = extract_features.main(conf, images, output, image_list=names)
     # no ratio test: the poses tell right from wrong, and what is ambiguous is worth learning
     matcher = match_features.confs["NN-mutual"]
@@ -83,7 +88,8 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     sfm = output / f"sfm_{descriptor}"
     reconstruction = triangulation.main(sfm, model, images, pairs, features, matches)
 
-    tracks, stamp_file = output / f"tracks_{descriptor}.safetensors", output / "tracks.json"
+    tracks = output / f"tracks_{descriptor}.safetensors"
+    stamp_file = tracks.with_suffix(".json")
     options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "completed": True}
     made_from = stamps.stamp(options, [sfm / "points3D.bin", features])
     if tracks.exists() and stamps.is_current(stamp_file, made_from):
@@ -159,7 +165,7 @@ def describe_variants(
     Returns:
         (N, 2, VARIANTS, 128) float16: as seen and transposed.
     """
-    described = np.empty((len(keypoints), 2, VARIANTS, 128), np.float16)
+    described = np.empty((len(keypoints), 2, VARIANTS, DIM), np.float16)
     for variant in range(VARIANTS):
         view = photometric_variant(image, generator) if variant else image
         patches = extract_patches(torch.from_numpy(view)[None, None], keypoints)
