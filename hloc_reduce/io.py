@@ -193,7 +193,7 @@ def get_dataset(file: h5py.File, name: str, key: str) -> h5py.Dataset:
 def provenance(file: h5py.File) -> str:
     """Return what tells an open h5 file from others: what made it and when, or its name."""
     conf = file.attrs.get("conf", Path(file.filename).name)
-    return f"{conf} {file.attrs.get('id', '')}"
+    return f"{conf} {file.attrs.get('id', '')}".strip()
 
 
 def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:

@@ -141,6 +141,14 @@ def test_wrong_input(aachen_layout, tmp_path, monkeypatch, caplog):
     message = refused(monkeypatch, caplog, "--dataset", tmp_path / "nowhere")
     for part in ("images_upright", "3D-models/aachen_v_1_1", "queries", "visuallocalization.net"):
         assert part in message
+    truth = tmp_path / "truth.txt"
+    truth.write_text("a.png 1 0 0 0 0 0 0\n")
+    message = refused(monkeypatch, caplog, *arguments, "--ground_truth", truth)
+    assert "the pose of no query" in message
+    truth.unlink()
+    file = tmp_path / "file"
+    file.touch()
+    assert str(file) in refused(monkeypatch, caplog, *arguments[:2], "--outputs", file)
     assert "--num_loc 0" in refused(monkeypatch, caplog, *arguments, "--num_loc", 0)
     message = refused(monkeypatch, caplog, *arguments, "--ground_truth", tmp_path / "truth.txt")
     assert "truth.txt" in message
@@ -181,6 +189,16 @@ def test_grey_photos_only_give_an_empty_map(aachen_layout, tmp_path, monkeypatch
         cv2.imwrite(str(path), np.full((360, 480), 128, np.uint8))
     arguments = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--feature", "sift")
     assert "The map is empty" in refused(monkeypatch, caplog, *arguments)
+
+
+def test_without_ground_truth(aachen_layout, tmp_path, monkeypatch, capsys):
+    (aachen_layout / "queries/ground_truth_poses.txt").unlink()
+    arguments = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--feature", "sift")
+    run(monkeypatch, *arguments)
+    summary, rows = outcome(tmp_path / "o")
+    assert "recall_percent" not in summary["lists"]["day_time_queries_with_intrinsics"]
+    assert rows["query/day/a.png"]["position_error_m"] == ""
+    assert "submit" in capsys.readouterr().out
 
 
 def test_features_are_listed(monkeypatch, capsys):

@@ -17,7 +17,7 @@ from hloc_reduce import (
 )
 from hloc_reduce.cli import InputError
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.io import get_matches, list_h5_names
+from hloc_reduce.io import GroupWriter, get_matches, list_h5_names
 from hloc_reduce.parsers import parse_poses, parse_retrieval, write_pairs
 
 MATCHER = match_features.confs["NN-ratio"]
@@ -231,13 +231,64 @@ def test_missing_inputs_are_named(built):
         triangulation.main(
             built.sfm, built.model, built.images, built.pairs, built.features, built.matches
         )
-    with pytest.raises(InputError, match="db/99.jpg is not in the feature file"):
+    with pytest.raises(InputError, match="db/99.jpg is not in the file"):
         match_features.main(MATCHER, built.pairs, built.features, matches=built.matches)
     shutil.rmtree(built.model)
     built.model.mkdir()
     (built.model / "cameras.bin").write_bytes(b"\x01")
     with pytest.raises(InputError, match="not a COLMAP model"):
         colmap.read_model(built.model)
+
+
+def test_what_is_no_map_is_not_replaced(built, tmp_path):
+    folder = tmp_path / "precious"
+    folder.mkdir()
+    (folder / "thesis.txt").write_text("years of work")
+    arguments = (built.model, built.images, built.pairs, built.features, built.matches)
+    for target in (folder, built.model):
+        with pytest.raises(InputError, match="not a map of this program"):
+            triangulation.main(target, *arguments)
+    assert (folder / "thesis.txt").exists()
+
+
+def test_matches_of_other_features_are_refused(built):
+    with h5py.File(built.features, "a") as file:
+        for name in ("query/6.jpg", "db/0.jpg"):
+            keypoints = file[name]["keypoints"][:200]
+            del file[name]["keypoints"]
+            file[name]["keypoints"] = keypoints
+    with pytest.raises(InputError, match="made of other features: query/6.jpg has 200"):
+        built.localize()
+    with pytest.raises(InputError, match="made of other features: db/0.jpg has 200"):
+        triangulation.main(
+            built.sfm, built.model, built.images, built.pairs, built.features, built.matches
+        )
+
+
+def test_features_made_anew_invalidate_their_matches(tmp_path):
+    """The same configuration, but other photos: an h5 file's id tells."""
+    features, pairs = tmp_path / "f.h5", tmp_path / "pairs.txt"
+    write_pairs([("a", "b")], pairs)
+    descriptors = {"descriptors": np.eye(4, 3, dtype=np.float16)}
+    for overwrite in (False, True):
+        with GroupWriter(features, {"x": 1}, overwrite) as writer:
+            writer.add("a", descriptors)
+            writer.add("b", descriptors)
+        if overwrite:
+            with pytest.raises(InputError, match="another configuration"):
+                match_features.main(MATCHER, pairs, features, matches=tmp_path / "m.h5")
+        else:
+            match_features.main(MATCHER, pairs, features, matches=tmp_path / "m.h5")
+            with GroupWriter(features, {"x": 1}) as writer:  # more images change nothing
+                writer.add("c", descriptors)
+            match_features.main(MATCHER, pairs, features, matches=tmp_path / "m.h5")
+
+
+def test_files_of_another_kind_are_refused(built):
+    with pytest.raises(InputError, match="not a file of global_descriptor"):
+        pairs_from_retrieval.main(built.features, built.root / "p.txt", 3)
+    with pytest.raises(InputError, match="not in the file|not a file of"):
+        match_features.main(MATCHER, built.pairs, built.matches, matches=built.root / "m.h5")
 
 
 def test_covisibility_by_hand():

@@ -102,7 +102,7 @@ def save(mlp: MLP, metadata: dict, path: Path) -> None:
     `metadata` holds strings, numbers, lists and dicts of these.
     """
     tensors = {
-        key: value.half() if key.startswith("linears.") else value.float()
+        key: (value.half() if key.startswith("linears.") else value.float()).contiguous()
         for key, value in mlp.state_dict().items()
         if not key.endswith("num_batches_tracked")
     }

@@ -25,7 +25,7 @@ from ..cli import InputError
 from ..colmap import point3D_ids
 from ..descriptors import DIM, Descriptor
 from ..extractors.dog import extract_patches
-from ..io import get_colmap_keypoints, get_features, open_h5, replacing
+from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
 from .completion import complete
 
 NUM_COVIS = 20
@@ -142,8 +142,7 @@ def load(path: Path) -> Tracks:
 
 def _keypoints(file: h5py.File, name: str) -> np.ndarray:
     """Read keypoints (N, 4): x, y, scale (pixels), orientation (degrees)."""
-    group = get_features(file, name)
-    columns = [group["keypoints"][()], group["scales"][()], group["oris"][()]]
+    columns = [get_dataset(file, name, key)[()] for key in ("keypoints", "scales", "oris")]
     return np.column_stack(columns).astype(np.float32)
 
 
