@@ -3,7 +3,8 @@
 From each point of a map two observations in different images are drawn. All first descriptors are
 ranked by the distance to their nearest second descriptor; correct is the same point. "dark" is the
 same with photometric variants (darkness, blur, noise) of the second photos. Prints a Markdown
-table of percentages, a row for each feature that ships and for each `--projection`.
+table of percentages, means over several draws, with a row for each feature that ships and for each
+`--projection`.
 """
 
 import argparse
@@ -49,27 +50,27 @@ def _main() -> None:
     parser.add_argument(
         "--cache", type=Path, default=Path("outputs/training/maps"), help="folder for the tracks"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the pairs")
+    parser.add_argument("--draws", type=int, default=5, help="draws of pairs of observations")
     args = parser.parse_args()
 
     pairs = {}
     for name, (images, model) in parse_maps(args.map).items():
         data = tracks.load(tracks.main(images, model, args.cache / name, args.descriptor))
-        pairs[name] = draw_pairs(data, args.seed)
+        pairs[name] = [draw_pairs(data, seed) for seed in range(args.draws)]
     shipped = [name for name in projections.names() if name.startswith(f"{args.descriptor}_")]
     shipped.sort(key=lambda name: (name.rstrip("0123456789"), -projections.load(name).dim))
     rows = {args.descriptor: torch.nn.Identity()}
     rows |= {name: projections.load(name) for name in shipped}
     rows |= {path.stem: projections.load(path) for path in args.projection}
 
-    points = [f"{name} ({len(sets['photo'][0])})" for name, sets in pairs.items()]
+    points = [f"{name} ({len(sets[0]['photo'][0])})" for name, sets in pairs.items()]
     print(f"| feature | {' | '.join(points)} | mean | mean dark |")
     print("| --- |" + " ---: |" * (len(pairs) + 2))
     for row, project in rows.items():
         values = {
             kind: [
-                100 * average_precision(*(project(side) for side in sets[kind]))
-                for sets in pairs.values()
+                np.mean([100 * average_precision(*map(project, sets[kind])) for sets in draws])
+                for draws in pairs.values()
             ]
             for kind in ("photo", "dark")
         }
