@@ -1,0 +1,31 @@
+"""The wheel has everything that the commands need outside the repository."""
+
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+from confs.features import confs
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_wheel_is_complete(tmp_path):
+    source = tmp_path / "source"
+    for folder in ("confs", "hloc_reduce", "pipelines"):
+        shutil.copytree(ROOT / folder, source / folder)
+    for file in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / file, source)
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path]
+    subprocess.run([*command, source], check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    modules = {
+        path.relative_to(ROOT).as_posix()
+        for folder in ("confs", "hloc_reduce", "pipelines")
+        for path in (ROOT / folder).rglob("*.py")
+    }
+    assert modules <= names
+    projections = {conf["model"].get("projection") for conf in confs.values()} - {None}
+    assert {f"hloc_reduce/projections/weights/{name}.safetensors" for name in projections} <= names
