@@ -34,7 +34,12 @@ def choose(kind: str, name: str, names: Iterable[str]) -> str:
 
 
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
-    """Shows defaults, except of options that have none, and keeps the example's line."""
+    """Shows defaults, except of options that have none, and keeps an example on its line."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if text.startswith("example: "):
+            return text
+        return super()._fill_text(text, width, indent)
 
     def _get_help_string(self, action: argparse.Action) -> str:
         if action.default in (None, False):

@@ -85,6 +85,8 @@ def provenance(conf: dict, as_half: bool) -> dict:
 
 def list_images(image_dir: Path, image_list: Path | str | Iterable[str] | None = None) -> list[str]:
     """Return the names of the images of a folder, or of a list, checked to be there."""
+    if not Path(image_dir).is_dir():
+        raise InputError(f"There is no folder {image_dir}.")
     if image_list is None:
         names = sorted(
             path.relative_to(image_dir).as_posix()
@@ -154,7 +156,9 @@ def _main() -> None:
     parser.add_argument("--image_dir", type=Path, required=True, help="folder of images")
     parser.add_argument("--export_dir", type=Path, help="folder for the feature file")
     parser.add_argument("--feature_path", type=Path, help="the feature file itself")
-    parser.add_argument("--conf", default="sift_sv64", help="feature to extract")
+    parser.add_argument(
+        "--conf", default="sift_sv64", help="feature, see pipelines.aachen --list_features"
+    )
     parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
     parser.add_argument("--overwrite", action="store_true", help="extract anew what is there")
     args = parser.parse_args()

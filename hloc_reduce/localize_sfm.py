@@ -56,6 +56,8 @@ def main(
     Raises:
         InputError: when an input is missing or broken, or the map is empty.
     """
+    if ransac_thresh <= 0:
+        raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
     query_list = [query for queries in parse_query_lists(queries).values() for query in queries]
     retrieved = parse_retrieval(retrieval)
     in_memory = isinstance(reference_sfm, pycolmap.Reconstruction)

@@ -47,6 +47,8 @@ def main(
     Raises:
         InputError: for an image without features, or no path for the matches.
     """
+    if not parse_retrieval(pairs):
+        raise InputError(f"{pairs} has no pair.")
     if isinstance(features, Path) or Path(features).exists():
         feature_path = Path(features)
         if matches is None:
@@ -128,7 +130,9 @@ def _main() -> None:
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
-    parser.add_argument("--features", default="feats-dog-sift_sv64", help="name of the features")
+    parser.add_argument(
+        "--features", default="feats-dog-sift_sv64", help="name of the features, without .h5"
+    )
     parser.add_argument("--export_dir", type=Path, required=True, help="folder of the features")
     parser.add_argument("--matches", type=Path, help="the match file itself")
     parser.add_argument("--conf", default="NN-ratio", help="matcher")

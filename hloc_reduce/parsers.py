@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 from .cli import InputError, choose
 from .io import replacing
 
+CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield ("file:number", words) of every line that is neither empty nor a comment."""
@@ -50,7 +52,7 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
     for place, words in _lines(path):
         try:
             name, model, width, height, *params = words
-            choose("camera model", model, pycolmap.CameraModelId.__members__)
+            choose("camera model", model, CAMERA_MODELS)
             camera = pycolmap.Camera(
                 model=model,
                 width=int(width),

@@ -57,10 +57,9 @@ class RunFolder:
                 raise InputError(f"{conf_file} is broken: use --overwrite.") from None
             keys = [key for key in {**before, **conf} if before.get(key) != conf.get(key)]
             if keys:
-                key = keys[0]
                 raise InputError(
-                    f"{path} holds results of another configuration ({key}: {before.get(key)} "
-                    f"before, {conf.get(key)} now). Choose other --outputs, or --overwrite."
+                    f"{path} holds results of another {' and '.join(keys)}. "
+                    "Choose other --outputs, one folder for each configuration, or --overwrite."
                 )
         elif conf_file.exists():
             conf_file.unlink()

@@ -24,6 +24,8 @@ from hloc_reduce import (
 )
 from hloc_reduce.cli import InputError
 from hloc_reduce.datasets import Aachen, thresholds
+from hloc_reduce.io import list_h5_names
+from hloc_reduce.parsers import parse_retrieval
 from hloc_reduce.versions import versions
 
 # suffix of a retrieval file -> what makes pairs of it; any other is a text file of pairs
@@ -48,6 +50,10 @@ def main(
     query_names = [name for queries in lists.values() for name, _ in queries]
     place.check_images([*map_names, *query_names])
     truth = place.true_poses(query_names, ground_truth)
+    if retrieval != "vlad" and Path(retrieval).suffix in PAIRS_FROM:
+        list_h5_names(Path(retrieval))  # a broken file is refused before any work is done
+    elif retrieval != "vlad":
+        parse_retrieval(Path(retrieval))
 
     folder = results.RunFolder(
         outputs,
@@ -140,8 +146,10 @@ def _main() -> None:
         type=Path,
         help="folder for all results, of one configuration (default: outputs/<dataset>/<feature>)",
     )
-    parser.add_argument("--feature", default="sift_sv64", help="local feature")
-    parser.add_argument("--matcher", default="NN-ratio", help="matcher")
+    parser.add_argument("--feature", default="sift_sv64", help="local feature, see --list_features")
+    parser.add_argument(
+        "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
+    )
     parser.add_argument(
         "--retrieval",
         default="vlad",

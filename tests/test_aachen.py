@@ -126,6 +126,11 @@ def test_retrieval_from_files(aachen_layout, tmp_path, monkeypatch, caplog):
     run(monkeypatch, *arguments, "--retrieval", global_descriptors, "--num_loc", 2)
     lines = (outputs / "pairs-query-netvlad2.txt").read_text().splitlines()
     assert len(lines) == 6
+    prose = tmp_path / "prose.txt"
+    prose.write_text("this is no list of pairs")
+    arguments[-1] = tmp_path / "outputs3"
+    message = refused(monkeypatch, caplog, *arguments, "--retrieval", prose)
+    assert "prose.txt:1" in message and not arguments[-1].exists()
     assert "neither vlad nor a file" in refused(
         monkeypatch, caplog, *arguments, "--retrieval", tmp_path / "absent.h5"
     )

@@ -222,6 +222,8 @@ def test_missing_inputs_are_named(built):
     with pytest.raises(InputError, match="not in the match file"):
         write_pairs([("query/6.jpg", "db/0.jpg")], built.root / "other.txt")
         built.localize(retrieval=built.root / "other.txt", matches=built.matches)
+    with pytest.raises(InputError, match="above 0"):
+        built.localize(ransac_thresh=-3)
     with pytest.raises(InputError, match="absent.h5"):
         built.localize(features=built.root / "absent.h5")
     with pytest.raises(InputError, match="no COLMAP model folder"):
