@@ -93,6 +93,28 @@ def test_supervised_learns_what_tells_points_apart(tmp_path):
     assert held_out_precision(mlp) > held_out_precision(None) + 0.1
 
 
+def test_paper_recipe_is_the_papers(tmp_path, monkeypatch):
+    """Sec. III-D: two hidden layers, 10 epochs of batches of 1,024, Adam from 0.001 to 0."""
+    numbers, rates = [], []
+    batch, step = PairSampler.batch, torch.optim.Adam.step
+
+    def counted(self, number, size):
+        assert size == 1024 and self.augment == 0
+        numbers.append(number)
+        return batch(self, number, size)
+
+    def observed(self, *arguments):
+        rates.append(self.param_groups[0]["lr"])
+        return step(self, *arguments)
+
+    monkeypatch.setattr(PairSampler, "batch", counted)
+    monkeypatch.setattr(torch.optim.Adam, "step", observed)
+    mlp = sv.train([noisy_tracks()], 16, sv.RECIPES["paper"], 0, tmp_path / "c")
+    assert mlp.sizes == (128, 512, 512, 16)
+    assert numbers == list(range(20))  # 1,600 observations are two batches an epoch
+    np.testing.assert_allclose(rates, 1e-3 * (1 - np.arange(20) / 20))
+
+
 def test_training_goes_on_after_a_kill_as_if_nothing_had_been(tmp_path, monkeypatch):
     monkeypatch.setattr(sv, "CHECKPOINT_STEPS", 20)
     recipe = {**RECIPE, "steps": 60}
