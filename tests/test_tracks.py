@@ -33,10 +33,17 @@ def test_tracks_of_a_plane(plane):
     follows = np.flatnonzero(np.diff(data.track) == 0)
     similarity = (photos[follows] * photos[follows + 1]).sum(1)
     assert np.median(similarity) > 0.9
-    transposed = data.descriptors[:, 1, 0].astype(np.float32)
-    similarity = (transposed[follows] * transposed[follows + 1]).sum(1)
+    mirrored = data.descriptors[:, 1, 0].astype(np.float32)
+    similarity = (mirrored[follows] * mirrored[follows + 1]).sum(1)
     assert np.median(similarity) > 0.9
-    assert np.median((transposed * photos).sum(1)) < 0.9
+    assert np.median((mirrored * photos).sum(1)) < 0.9
+    # the gradients along the keypoint's orientation stay so, those across it change sign
+    bins = mirrored.reshape(-1, 8, 4, 4).sum((2, 3))[:, [0, 7, 6, 5, 4, 3, 2, 1]]
+    np.testing.assert_allclose(bins, photos.reshape(-1, 8, 4, 4).sum((2, 3)), atol=0.02)
+    # what descriptors matched is what the triangulated model has
+    model = pycolmap.Reconstruction(plane / "out/sfm_sift")
+    assert data.matched.sum() == model.compute_num_observations()
+    assert data.only(data.matched).num_tracks == model.num_points3D()
 
 
 def test_tracks_are_computed_once_and_the_same(plane):

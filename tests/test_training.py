@@ -28,7 +28,7 @@ def noisy_tracks(number=400, views=4, seed=0):
     descriptors /= np.linalg.norm(descriptors, axis=-1, keepdims=True)
     xy = np.zeros((len(track), 2), np.float32)
     image = np.tile(np.arange(views), number)
-    return Tracks(descriptors.astype(np.float16), track, image, xy)
+    return Tracks(descriptors.astype(np.float16), track, image, xy, np.ones(len(track), bool))
 
 
 def held_out_precision(mlp):
@@ -44,7 +44,7 @@ def test_sampler_draws_matches():
     data.descriptors[:, 0, :, 0] = data.track[:, None]  # exact in float16
     data.descriptors[:, 1, :, 0] = data.track[:, None] + 500
     data.descriptors[..., 1] = data.image[:, None, None]
-    sampler = PairSampler([data], augment=0.5, balanced=True, seed=0)
+    sampler = PairSampler([data], 0.5, True, None, 0)
     anchors, positives = sampler.batch(3, 64)
     assert (anchors[:, 0] == positives[:, 0]).all() and (anchors[:, 1] != positives[:, 1]).all()
     assert (anchors[:, 0] >= 500).any() and (anchors[:, 0] < 500).any()
@@ -57,7 +57,7 @@ def test_sampler_without_augmentation_draws_photos_only():
     data = noisy_tracks()
     data.descriptors[:] = 1
     data.descriptors[:, 0, 0] = 0
-    anchors, positives = PairSampler([data], 0.0, False, 0).batch(0, 64)
+    anchors, positives = PairSampler([data], 0.0, False, None, 0).batch(0, 64)
     assert not anchors.any() and not positives.any()
 
 
@@ -66,7 +66,7 @@ def test_sampler_leaves_out_what_has_no_match():
     data = noisy_tracks(number=3, views=2)
     data.image[:] = [0, 0, 0, 1, 0, 1]
     data.descriptors[..., 0] = data.track[:, None, None]
-    anchors, _ = PairSampler([data], 0.5, True, 0).batch(0, 500)
+    anchors, _ = PairSampler([data], 0.5, True, None, 0).batch(0, 500)
     assert sorted(anchors[:, 0].tolist()) == [1, 2]
 
 
@@ -74,10 +74,19 @@ def test_sampler_balances_maps():
     large, small = noisy_tracks(900), noisy_tracks(100)
     large.descriptors[..., 0], small.descriptors[..., 0] = 0, 1
     counts = {
-        balanced: PairSampler([large, small], 0.0, balanced, 0).batch(0, 64)[0][:, 0].mean()
+        balanced: PairSampler([large, small], 0.0, balanced, None, 0).batch(0, 64)[0][:, 0].mean()
         for balanced in (False, True)
     }
     assert counts[False] < 0.2 < counts[True] < 0.35
+
+
+def test_sampler_draws_a_batch_from_few_maps():
+    maps = [noisy_tracks(200) for _ in range(5)]
+    for number, data in enumerate(maps):
+        data.descriptors[..., 0] = number
+    sampler = PairSampler(maps, 0.0, True, 2, 0)
+    drawn = [set(sampler.batch(number, 64)[0][:, 0].tolist()) for number in range(20)]
+    assert max(map(len, drawn)) == 2 and set.union(*drawn) == {0, 1, 2, 3, 4}
 
 
 def test_triplet_loss_by_hand():

@@ -20,17 +20,21 @@ RECIPES = {
         "batch_size": 1024,
         "lr": 1e-3,
         "margin": 1.0,
+        "weight_decay": 0.0,
         "augment": 0.0,
         "balanced": False,
+        "maps_per_batch": None,
     },
     "best": {
         "hidden": [512, 512],
         "steps": 6000,
         "batch_size": 1024,
-        "lr": 1e-3,
+        "lr": 1e-2,
         "margin": 1.0,
-        "augment": 0.35,
+        "weight_decay": 1e-5,
+        "augment": 0.25,
         "balanced": True,
+        "maps_per_batch": 2,
     },
 }
 CHECKPOINT_STEPS = 500
@@ -74,11 +78,14 @@ def train(
         The trained network.
     """
     torch.manual_seed(seed)
-    sampler = PairSampler(maps, recipe["augment"], recipe["balanced"], seed)
+    drawing = {key: recipe[key] for key in ("augment", "balanced", "maps_per_batch")}
+    sampler = PairSampler(maps, **drawing, seed=seed)
     size = recipe["batch_size"]
     steps = recipe.get("steps") or recipe["epochs"] * -(-sampler.num_observations // size)
     mlp = MLP([maps[0].descriptors.shape[-1], *recipe["hidden"], dim]).train()
-    optimizer = torch.optim.Adam(mlp.parameters(), lr=recipe["lr"])
+    optimizer = torch.optim.Adam(
+        mlp.parameters(), lr=recipe["lr"], weight_decay=recipe["weight_decay"]
+    )
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, steps)
     parts = {"mlp": mlp, "optimizer": optimizer, "schedule": schedule}
     step = 0

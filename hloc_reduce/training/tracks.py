@@ -29,7 +29,7 @@ from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
 from .completion import complete
 
 NUM_COVIS = 20
-# The photo as it is and three photometric variants, each as seen and transposed.
+# The photo as it is and three photometric variants, each as seen and mirrored.
 VARIANTS = 4
 
 
@@ -38,22 +38,28 @@ class Tracks:
     """Descriptors of the observations of 3D points.
 
     Args:
-        descriptors: (M, 2, V, 128) float16 of unit norm: M observations, as seen and transposed,
-            in V photometric variants, the first of which is the photo itself.
+        descriptors: (M, 2, V, 128) float16 of unit norm: M observations, as seen and mirrored, in
+            V photometric variants, the first of which is the photo itself.
         track: (M,) int64, which of the map's points an observation sees, sorted, from 0 on.
         image: (M,) int64, in which image, numbered by name.
         xy: (M, 2) float32, where in it, in pixels.
+        matched: (M,) bool, whether descriptors matched it; the others were found by geometry.
     """
 
     descriptors: np.ndarray
     track: np.ndarray
     image: np.ndarray
     xy: np.ndarray
+    matched: np.ndarray
 
     @property
     def num_tracks(self) -> int:
         """The number of points."""
         return int(self.track[-1]) + 1
+
+    def only(self, kept: np.ndarray) -> "Tracks":
+        """Leave out observations; `kept` indexes or masks them. Points keep their numbers."""
+        return Tracks(**{key: value[kept] for key, value in vars(self).items()})
 
 
 def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed: int = 0) -> Path:
@@ -90,7 +96,7 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
 
     tracks = output / f"tracks_{descriptor}.safetensors"
     stamp_file = tracks.with_suffix(".json")
-    options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "completed": True}
+    options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "format": 2}
     made_from = stamps.stamp(options, [sfm / "points3D.bin", features])
     if tracks.exists() and stamps.is_current(stamp_file, made_from):
         return tracks
@@ -100,10 +106,11 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     with open_h5(features) as file:
         keypoints = {name: _keypoints(file, name) for name in names}
         places = {name: get_colmap_keypoints(file, name)[0] for name in names}
+    matched = {name: point3D_ids(images_by_name[name]) for name in names}
     observed = complete(
         reconstruction,
         {name: np.column_stack([places[name], keypoints[name][:, 2:]]) for name in names},
-        {name: point3D_ids(images_by_name[name]) for name in names},
+        matched,
     )
     for number, name in enumerate(tqdm(names, desc="Describing tracks", unit="image")):
         kept = np.flatnonzero(observed[name] >= 0)
@@ -117,7 +124,7 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
         scaled[:, 2] *= ratio.mean()
         described = describe_variants(image[0, 0].numpy(), scaled, describe, generator)
         ids, xy = observed[name][kept], keypoints[name][kept, :2]
-        parts.append((described, ids, np.full(len(kept), number), xy))
+        parts.append((described, ids, np.full(len(kept), number), xy, matched[name][kept] >= 0))
     if not parts:
         raise InputError(f"The map {model} gives no tracks.")
     _, track = np.unique(np.concatenate([part[1] for part in parts]), return_inverse=True)
@@ -127,6 +134,7 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
         "track": track[order],
         "image": np.concatenate([part[2] for part in parts])[order],
         "xy": np.concatenate([part[3] for part in parts])[order],
+        "matched": np.concatenate([part[4] for part in parts])[order],
     }
     with replacing(tracks) as temporary:
         save_file(tensors, temporary)
@@ -162,14 +170,15 @@ def describe_variants(
         generator: draws the variants.
 
     Returns:
-        (N, 2, VARIANTS, 128) float16: as seen and transposed.
+        (N, 2, VARIANTS, 128) float16: as seen and mirrored.
     """
     described = np.empty((len(keypoints), 2, VARIANTS, DIM), np.float16)
     for variant in range(VARIANTS):
         view = photometric_variant(image, generator) if variant else image
         patches = extract_patches(torch.from_numpy(view)[None, None], keypoints)
         described[:, 0, variant] = describe(patches).numpy()
-        described[:, 1, variant] = describe(patches.transpose(2, 3).contiguous()).numpy()
+        # across the axis of its orientation: a mirrored world, whose keypoints are oriented alike
+        described[:, 1, variant] = describe(patches.flip(2)).numpy()
     return described
 
 
