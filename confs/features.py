@@ -1,8 +1,17 @@
-"""Local features: `<descriptor>`, 128-D, and `<descriptor>_<scheme><dim>`, its projections."""
+"""Local features: base descriptors, 128-D, their projections, and those of a user's own file.
 
+`<descriptor>_<scheme><dim>` are the paper's; `<descriptor>_nested` is 64-D, and
+`<descriptor>_nested@<dim>` its first numbers.
+"""
+
+from pathlib import Path
+
+import yaml
+
+from hloc_reduce.cli import InputError, choose
 from hloc_reduce.descriptors import DESCRIPTORS
 
-SCHEMES = ("pca", "sv")
+SCHEMES = ("pca", "us", "ss", "sv")
 DIMS = (64, 32, 24, 16)
 
 PREPROCESSING = {"grayscale": True, "resize_max": 1600}
@@ -18,10 +27,63 @@ def feature(name: str, model: dict) -> dict:
     return {"output": f"feats-dog-{name}", "model": model, "preprocessing": PREPROCESSING}
 
 
+def names(descriptor: str) -> list[str]:
+    """List the projections of a base descriptor."""
+    nested = f"{descriptor}_nested"
+    return [f"{descriptor}_{scheme}{dim}" for scheme in SCHEMES for dim in DIMS] + [
+        nested,
+        *(f"{nested}@{dim}" for dim in DIMS[1:]),
+    ]
+
+
 confs = {name: feature(name, base(name)) for name in DESCRIPTORS} | {
     name: feature(name, {"name": "reduced", "base": base(descriptor), "projection": name})
     for descriptor in DESCRIPTORS
-    for scheme in SCHEMES
-    for dim in DIMS
-    for name in [f"{descriptor}_{scheme}{dim}"]
+    for name in names(descriptor)
 }
+
+
+def get(name: str, projection: Path | None = None) -> tuple[str, dict]:
+    """Return the name and the configuration of a feature.
+
+    Args:
+        name: a key of `confs`, or the path of a YAML file with a `model` and perhaps
+            `preprocessing`; that feature is called as the file.
+        projection: file of another projection of the same base; the feature is called after it.
+
+    Raises:
+        InputError: for an unknown name or a file that is none.
+    """
+    if Path(name).suffix in (".yaml", ".yml"):
+        name, conf = Path(name).stem, read(Path(name))
+    else:
+        conf = confs[choose("feature", name, confs)]
+    if projection is None:
+        return name, conf
+    model = {
+        "name": "reduced",
+        "base": conf["model"].get("base", conf["model"]),
+        "projection": str(projection),
+    }
+    output = feature(projection.stem, model)["output"]
+    return projection.stem, {**conf, "output": output, "model": model}
+
+
+def read(path: Path) -> dict:
+    """Read the configuration of a feature from a YAML file.
+
+    Raises:
+        InputError: when it is none.
+    """
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{path} cannot be read ({' '.join(str(error).split())}).") from None
+    model = content.get("model") if isinstance(content, dict) else None
+    if not isinstance(model, dict) or "name" not in model:
+        raise InputError(f"{path} has no model with a name, such as: model: {{name: dog}}.")
+    unknown = content.keys() - {"model", "preprocessing"}
+    if unknown:
+        raise InputError(f"{path}: unknown keys {', '.join(map(str, sorted(unknown, key=str)))}.")
+    preprocessing = {**PREPROCESSING, **(content.get("preprocessing") or {})}
+    return {"output": f"feats-{path.stem}", "model": model, "preprocessing": preprocessing}

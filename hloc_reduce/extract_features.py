@@ -14,6 +14,7 @@ from confs import features as features_confs
 from . import cli, extractors, logger, projections
 from .base_model import dynamic_load
 from .cli import InputError
+from .descriptors import DESCRIPTORS, check_weights
 from .io import GroupWriter, read_image
 from .parsers import image_names
 
@@ -76,7 +77,14 @@ def load_extractor(conf: dict) -> torch.nn.Module:
 
 
 def provenance(conf: dict, as_half: bool) -> dict:
-    """Return what determines the features: the configuration and the projection's checksum."""
+    """Return what determines the features: the configuration and the projection's checksum.
+
+    Raises:
+        InputError: when the projection or the weights of its base descriptor are not to be had.
+    """
+    base = conf["model"].get("base", conf["model"])
+    if base.get("descriptor") in DESCRIPTORS:
+        check_weights(base["descriptor"])
     made_by = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
     if "projection" in conf["model"]:
         made_by["projection_sha256"] = projections.checksum(conf["model"]["projection"])
@@ -157,14 +165,16 @@ def _main() -> None:
     parser.add_argument("--export_dir", type=Path, help="folder for the feature file")
     parser.add_argument("--feature_path", type=Path, help="the feature file itself")
     parser.add_argument(
-        "--conf", default="sift_sv64", help="feature, see pipelines.aachen --list_features"
+        "--conf",
+        default="sift_sv64",
+        help="feature, see pipelines.aachen --list_features, or a YAML file of one",
     )
     parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
     parser.add_argument("--overwrite", action="store_true", help="extract anew what is there")
     args = parser.parse_args()
     if args.export_dir is None and args.feature_path is None:
         raise InputError("Give --export_dir or --feature_path.")
-    conf = confs[cli.choose("feature", args.conf, confs)]
+    _, conf = features_confs.get(args.conf)
     main(
         conf,
         args.image_dir,

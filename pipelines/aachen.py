@@ -42,9 +42,11 @@ def main(
     num_loc: int = 50,
     ground_truth: Path | None = None,
     overwrite: bool = False,
+    projection: Path | None = None,
 ) -> dict:
     """Run all stages and return the summary, as in summary.json."""
-    feature_conf, matcher_conf = features_confs.confs[feature], matchers_confs.confs[matcher]
+    feature, feature_conf = features_confs.get(feature, projection)
+    matcher_conf = matchers_confs.confs[matcher]
     place = Aachen(dataset)
     map_names, lists = place.map_names(), place.query_lists()
     query_names = [name for queries in lists.values() for name, _ in queries]
@@ -146,7 +148,16 @@ def _main() -> None:
         type=Path,
         help="folder for all results, of one configuration (default: outputs/<dataset>/<feature>)",
     )
-    parser.add_argument("--feature", default="sift_sv64", help="local feature, see --list_features")
+    parser.add_argument(
+        "--feature",
+        default="sift_sv64",
+        help="local feature, see --list_features, or a YAML file with its configuration",
+    )
+    parser.add_argument(
+        "--projection",
+        type=Path,
+        help="file of a projection to use with the base descriptor of --feature",
+    )
     parser.add_argument(
         "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
     )
@@ -169,7 +180,7 @@ def _main() -> None:
     if args.list_features:
         print("\n".join(features_confs.confs))
         return
-    cli.choose("feature", args.feature, features_confs.confs)
+    feature, _ = features_confs.get(args.feature, args.projection)
     cli.choose("matcher", args.matcher, matchers_confs.confs)
     if args.retrieval != "vlad" and not Path(args.retrieval).is_file():
         raise InputError(f"--retrieval {args.retrieval}: neither vlad nor a file that is there.")
@@ -178,7 +189,7 @@ def _main() -> None:
             raise InputError(f"--{option} {getattr(args, option)}: at least 1.")
     default = "datasets/demo_town" if args.demo else "datasets/aachen_v1.1"
     dataset = args.dataset or Path(default)
-    outputs = args.outputs or Path("outputs") / dataset.name / args.feature
+    outputs = args.outputs or Path("outputs") / dataset.name / feature
     if args.demo:
         demo.main(dataset)
     summary = main(
@@ -191,6 +202,7 @@ def _main() -> None:
         args.num_loc,
         args.ground_truth,
         args.overwrite,
+        args.projection,
     )
     logger.info(
         "Localized %d of %d queries in %.0f s; %d bytes a descriptor. Results are in %s.",
@@ -201,7 +213,7 @@ def _main() -> None:
         outputs,
     )
     if any("recall_percent" in result for result in summary["lists"].values()):
-        print(results.recall_table(args.feature, summary["lists"]))
+        print(results.recall_table(feature, summary["lists"]))
     else:
         print(
             "The true poses are not known here. For recall, submit "

@@ -21,6 +21,13 @@ def herz_jesus() -> Path:
 
 
 @pytest.fixture
+def base_weights(monkeypatch) -> None:
+    """Weights of learned base descriptors: those of the shared folder, where it is there."""
+    if (SHARED / "torch_home").is_dir():
+        monkeypatch.setenv("TORCH_HOME", str(SHARED / "torch_home"))
+
+
+@pytest.fixture
 def textured() -> np.ndarray:
     """A grey image (240, 320) uint8 of smooth blobs of all sizes: many DoG keypoints."""
     generator = np.random.default_rng(0)

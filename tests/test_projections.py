@@ -1,16 +1,24 @@
+import hashlib
+import io
 import json
+import re
+from pathlib import Path
+from urllib.error import URLError
 
 import numpy as np
 import pytest
 import torch
+from conftest import SHARED
 from safetensors.torch import save_file
+from torch import nn
 
 import hloc_reduce
+from confs import features
 from confs.features import confs
 from hloc_reduce import projections
 from hloc_reduce.cli import InputError
 from hloc_reduce.extract_features import load_extractor
-from hloc_reduce.projections import MLP, Projection
+from hloc_reduce.projections import MLP, Projection, released
 
 
 def trained(sizes):
@@ -64,16 +72,19 @@ def test_what_is_no_projection_is_refused(tmp_path):
         projections.load(path)
     with pytest.raises(InputError, match="no projection file"):
         projections.load(tmp_path / "absent.safetensors")
-    with pytest.raises(InputError, match="There are: sift_sv64"):
-        projections.load("sift_sv65")
+    with pytest.raises(InputError, match="There is no projection sift-x"):
+        projections.load("sift-x")
 
 
-@pytest.mark.parametrize("feature", confs)
-def test_every_feature_describes_patches(feature):
+SHIPPED = [name for name in confs if confs[name]["model"].get("projection") in projections.names()]
+
+
+@pytest.mark.parametrize("feature", ["sift", *SHIPPED])
+def test_every_feature_describes_patches(feature, base_weights):
     torch.manual_seed(0)
     patches = torch.rand(200, 1, 32, 32)
     descriptors = hloc_reduce.describe_patches(patches, feature)
-    dim = int(feature.split("_")[1].lstrip("pcasv")) if "_" in feature else 128
+    dim = int(re.search(r"\d*$", feature)[0] or 64) if "_" in feature else 128
     assert descriptors.shape == (200, dim) and descriptors.dtype == torch.float32
     np.testing.assert_allclose(descriptors.norm(dim=1), 1, atol=1e-5)
     # patches are described one by one: batches and their order do not matter
@@ -84,14 +95,153 @@ def test_every_feature_describes_patches(feature):
 @pytest.mark.parametrize("name", projections.names())
 def test_what_ships_says_where_it_comes_from(name):
     metadata = projections.load(name).metadata
-    assert f"{metadata['descriptor']}_{metadata['scheme']}{metadata['dim']}" == name
+    dim = "" if metadata["scheme"] == "nested" else metadata["dim"]
+    assert f"{metadata['descriptor']}_{metadata['scheme']}{dim}" == name
     assert metadata["training_data"] and metadata["versions"] and "seed" in metadata
     assert metadata["recipe"]["name"] in ("best", "paper")
 
 
-def test_all_features_ship():
-    needed = {conf["model"].get("projection") for conf in confs.values()} - {None}
-    assert needed == set(projections.names())
+def test_the_papers_68_features_have_names():
+    paper = [name for name in confs if "nested" not in name]
+    assert len(paper) == 68
+    for name in ("hardnet_us24", "tfeat_ss16", "mkd_pca32", "mkd", "mkd_nested@32"):
+        assert confs[name]["output"] == f"feats-dog-{name}"
+
+
+def test_what_does_not_ship_says_how_to_train_it():
+    with pytest.raises(InputError, match="--descriptor hardnet --scheme us --dim 24 --map"):
+        projections.load("hardnet_us24")
+    with pytest.raises(InputError, match="--descriptor hardnet --scheme nested --map"):
+        projections.load("hardnet_nested@24")
+
+
+def test_the_first_numbers_of_a_nested_projection(tmp_path):
+    mlp = trained((128, 32, 24))
+    projections.save(mlp, {"scheme": "nested"}, tmp_path / "p.safetensors")
+    whole = projections.load(tmp_path / "p.safetensors")
+    first = projections.load(f"{tmp_path / 'p.safetensors'}@8")
+    descriptors = torch.rand(10, 128)
+    expected = torch.nn.functional.normalize(whole(descriptors)[:, :8], dim=1)
+    torch.testing.assert_close(first(descriptors), expected)
+    assert first.dim == 8 and first.sizes == (128, 32, 8)
+    for prefix in ("25", "0", "x"):
+        with pytest.raises(InputError, match="first"):
+            projections.load(f"{tmp_path / 'p.safetensors'}@{prefix}")
+    projections.save(mlp, {"scheme": "sv"}, tmp_path / "p.safetensors")
+    with pytest.raises(InputError, match="not nested"):
+        projections.load(f"{tmp_path / 'p.safetensors'}@8")
+
+
+def released_state(sizes):
+    """A network as the authors' code saves it."""
+    layers = []
+    for before, after in zip(sizes[:-2], sizes[1:-1], strict=True):
+        layers += [nn.Linear(before, after), nn.ReLU(), nn.BatchNorm1d(after)]
+    network = nn.Sequential(*layers, nn.Linear(*sizes[-2:]))
+    for _ in range(20):
+        network(torch.rand(50, sizes[0]))
+    return nn.Sequential(network.eval())
+
+
+def test_released_networks_are_read(tmp_path):
+    network = released_state((128, 96, 24))
+    torch.save(network.state_dict(), tmp_path / "HardNet_sv_dim24.pth")
+    project = projections.load(tmp_path / "HardNet_sv_dim24.pth")
+    assert project.sizes == (128, 96, 24)
+    descriptors = torch.rand(10, 128)
+    with torch.no_grad():
+        expected = nn.functional.normalize(network(descriptors), dim=1)
+    torch.testing.assert_close(project(descriptors), expected, atol=1e-5, rtol=1e-4)
+
+
+def test_a_pickle_that_is_no_network_is_refused(tmp_path):
+    class Harm:
+        def __reduce__(self):
+            return Path.touch, (tmp_path / "harmed",)
+
+    path = tmp_path / "p.pth"
+    for content in (Harm(), {"a": 1}, {}, [torch.zeros(2)]):
+        torch.save(content, path)
+        with pytest.raises(InputError, match="not a projection"):
+            projections.load(path)
+    path.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="not a projection"):
+        projections.load(path)
+    assert not (tmp_path / "harmed").exists()
+
+
+def test_released_networks_are_downloaded_once_and_checked(tmp_path, monkeypatch):
+    buffer = io.BytesIO()
+    torch.save(released_state((128, 96, 24)).state_dict(), buffer)
+    content, asked = buffer.getvalue(), []
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(
+        released, "urlopen", lambda url, timeout: asked.append(url) or io.BytesIO(content)
+    )
+    with pytest.raises(InputError, match="not the HardNet_sv_dim24.pth that was released"):
+        projections.load("hardnet_sv24")
+    assert not list(tmp_path.rglob("*.pth"))
+    known = ("HardNet_sv_dim24.pth", hashlib.sha256(content).hexdigest())
+    monkeypatch.setitem(released.FILES, "hardnet_sv24", known)
+    for _ in range(2):
+        assert projections.load("hardnet_sv24").sizes == (128, 96, 24)
+    assert asked == [f"{released.URL}/HardNet_sv_dim24.pth"] * 2
+
+    def unreachable(url, timeout):
+        raise URLError("no network")
+
+    monkeypatch.setattr(released, "urlopen", unreachable)
+    with pytest.raises(InputError, match="hardnet_sv64 is not there.*no network.*checkpoints"):
+        projections.load("hardnet_sv64")
+
+
+@pytest.mark.parametrize("name", released.FILES)
+def test_the_real_released_networks(name):
+    file, sha256 = released.FILES[name]
+    path = SHARED / "released_projections" / file
+    if not path.is_file():
+        pytest.skip(f"{path} is not on this machine")
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == sha256
+    project = projections.load(path)
+    assert project.sizes == (128, 96, int(name.removeprefix("hardnet_sv")))
+    generator = torch.Generator().manual_seed(0)
+    descriptors = nn.functional.normalize(torch.randn(100, 128, generator=generator), dim=1)
+    np.testing.assert_allclose(project(descriptors).norm(dim=1), 1, atol=1e-5)
+
+
+def test_features_of_a_file(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "model: {name: reduced, base: {name: dog, descriptor: sift}, projection: sift_sv16}\n"
+        "preprocessing: {resize_max: 800}\n"
+    )
+    name, conf = features.get(str(path))
+    assert name == "mine" and conf["output"] == "feats-mine"
+    assert conf["model"]["projection"] == "sift_sv16"
+    assert conf["preprocessing"] == {"grayscale": True, "resize_max": 800}
+    for content, message in {
+        "model: [": "cannot be read",
+        "- 1": "no model",
+        "model: dog": "no model",
+        "model: {name: dog}\ncolour: 1": "unknown keys colour",
+        "!!python/object/apply:os.system ['true']": "cannot be read",
+    }.items():
+        path.write_text(content)
+        with pytest.raises(InputError, match=message):
+            features.get(str(path))
+    with pytest.raises(InputError, match="cannot be read"):
+        features.get(str(tmp_path / "absent.yaml"))
+
+
+def test_another_projection_of_a_feature():
+    name, conf = features.get("hardnet_sv64", Path("copies/mine.pth"))
+    assert name == "mine" and conf["output"] == "feats-dog-mine"
+    assert conf["model"] == {
+        "name": "reduced",
+        "base": features.base("hardnet"),
+        "projection": "copies/mine.pth",
+    }
+    assert features.get("sift", Path("mine.pth"))[1]["model"]["base"] == features.base("sift")
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import sys
 import zipfile
 from pathlib import Path
 
-from confs.features import confs
+from hloc_reduce import projections
 
 ROOT = Path(__file__).parents[1]
 
@@ -27,5 +27,7 @@ def test_wheel_is_complete(tmp_path):
         for path in (ROOT / folder).rglob("*.py")
     }
     assert modules <= names
-    projections = {conf["model"].get("projection") for conf in confs.values()} - {None}
-    assert {f"hloc_reduce/projections/weights/{name}.safetensors" for name in projections} <= names
+    weights = {
+        f"hloc_reduce/projections/weights/{name}.safetensors" for name in projections.names()
+    }
+    assert weights and weights <= names

@@ -1,17 +1,53 @@
 """Base descriptors: 32x32 patches to 128 numbers."""
 
-import kornia
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.request import urlopen
+
 import torch
+from kornia import feature
 from torch import nn
 
-from ..cli import choose
+from ..cli import InputError, choose
 
 PATCH_SIZE = 32
 DIM = 128
+TIMEOUT = 5  # seconds to wait for a server
 
-# name -> the kornia module that maps (N, 1, 32, 32) in [0, 1] to (N, 128)
+
+@dataclass(frozen=True)
+class Base:
+    """A base descriptor.
+
+    Args:
+        make: returns the kornia module that maps (N, 1, 32, 32) in [0, 1] to (N, 128).
+        url: the weights that kornia downloads to torch's cache; "" for a descriptor without.
+        hidden: the sizes of the hidden layers of its projections: two for hand-crafted descriptors,
+            one for learned ones (Sec. III-D).
+    """
+
+    make: Callable[[], nn.Module]
+    url: str = ""
+    hidden: tuple[int, ...] = (512, 512)
+
+
 DESCRIPTORS = {
-    "sift": lambda: kornia.feature.SIFTDescriptor(PATCH_SIZE, 8, 4, rootsift=False),
+    "sift": Base(lambda: feature.SIFTDescriptor(PATCH_SIZE, 8, 4, rootsift=False)),
+    "mkd": Base(
+        feature.MKDDescriptor,
+        "https://github.com/manyids2/mkd_pytorch/raw/master/mkd_pytorch/mkd-concat-64.pth",
+    ),
+    "tfeat": Base(
+        lambda: feature.TFeat(pretrained=True),
+        "https://huggingface.co/kornia/tfeat/resolve/main/tfeat-liberty.params",
+        hidden=(512,),
+    ),
+    "hardnet": Base(
+        lambda: feature.HardNet(pretrained=True),
+        "https://huggingface.co/kornia/hardnet/resolve/main/checkpoint_liberty_with_aug.pth",
+        hidden=(96,),
+    ),
 }
 
 
@@ -22,14 +58,16 @@ class Descriptor(nn.Module):
         name: a key of `DESCRIPTORS`.
 
     Raises:
-        InputError: for an unknown name.
+        InputError: for an unknown name, or when its weights are neither cached nor to be had.
     """
 
     batch_size = 128  # kornia's SIFT is five times slower in batches of 1,024 on a CPU
 
     def __init__(self, name: str):
         super().__init__()
-        self.describe = DESCRIPTORS[choose("descriptor", name, DESCRIPTORS)]()
+        base = DESCRIPTORS[choose("descriptor", name, DESCRIPTORS)]
+        check_weights(name)
+        self.describe = base.make().eval()
 
     @torch.no_grad()
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
@@ -38,3 +76,23 @@ class Descriptor(nn.Module):
             return patches.new_zeros((0, DIM))
         batches = [self.describe(batch) for batch in patches.split(self.batch_size)]
         return nn.functional.normalize(torch.cat(batches), dim=1)
+
+
+def check_weights(name: str) -> None:
+    """Make sure that kornia, which retries for minutes, finds or can download weights.
+
+    Raises:
+        InputError: when they are not in torch's cache and their address does not answer.
+    """
+    url = DESCRIPTORS[name].url
+    path = Path(torch.hub.get_dir()) / "checkpoints" / url.rpartition("/")[2]
+    if not url or path.is_file():
+        return
+    try:
+        urlopen(url, timeout=TIMEOUT).close()
+    except OSError as error:
+        reason = getattr(error, "reason", error)
+        raise InputError(
+            f"The weights of {name} are not there, and cannot be downloaded ({reason}): "
+            f"put {url} to {path}, or set TORCH_HOME to the folder whose hub/checkpoints has it."
+        ) from None

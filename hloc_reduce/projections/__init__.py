@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import pickle
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,10 +12,21 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
 from torch import nn
 
-from ..cli import InputError, choose
+from ..cli import InputError
 from ..io import replacing
+from . import released
 
 WEIGHTS = Path(__file__).parent / "weights"
+# how to make one that does not ship
+COMMAND = (
+    "python -m hloc_reduce.training --descriptor {descriptor} --scheme {scheme}{dim} "
+    "--map IMAGES:MODEL --output weights"
+)
+PREFIX = "@"  # sift_nested@24: the first 24 numbers of sift_nested
+BROKEN = (
+    *(SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError, IndexError),
+    *(AttributeError, pickle.UnpicklingError),
+)
 
 
 class MLP(nn.Module):
@@ -59,6 +72,19 @@ class Projection(nn.Module):
                 shift = norm.bias.detach() - norm.running_mean * scale
         self.requires_grad_(False).eval()
 
+    def cut(self, dim: int) -> "Projection":
+        """Keep the first numbers only, as nested projections are made for.
+
+        Raises:
+            InputError: when there are not so many.
+        """
+        if not 0 < dim <= self.dim:
+            raise InputError(f"A projection to {self.dim} numbers has no first {dim}.")
+        last = self.linears[-1]
+        last.weight.data, last.bias.data = last.weight.data[:dim], last.bias.data[:dim]
+        self.sizes = (*self.sizes[:-1], dim)
+        return self
+
     @property
     def dim(self) -> int:
         """The number of output dimensions."""
@@ -80,20 +106,39 @@ def names() -> list[str]:
 def find(projection: str | Path) -> Path:
     """Return the file of a projection, given by the name of one that ships or by its path.
 
+    Those of hardnet that the paper's authors released are downloaded once.
+
     Raises:
-        InputError: when there is neither.
+        InputError: when it is not there, does not ship or cannot be had.
     """
     path = Path(projection)
     if path.suffix:
         if not path.is_file():
             raise InputError(f"There is no projection file {path}.")
         return path
-    return WEIGHTS / f"{choose('projection', str(projection), names())}.safetensors"
+    name = str(projection)
+    path = WEIGHTS / f"{name}.safetensors"
+    if path.is_file():
+        return path
+    if name in released.FILES:
+        return released.fetch(name)
+    parts = re.fullmatch(r"([a-z]+)_([a-z]+)(\d*)", name)
+    if not parts:
+        raise InputError(f"There is no projection {name}. Those that ship: {', '.join(names())}.")
+    descriptor, scheme, dim = parts.groups()
+    command = COMMAND.format(
+        descriptor=descriptor, scheme=scheme, dim=f" --dim {dim}" if dim else ""
+    )
+    raise InputError(
+        f"The projection {name} does not ship. Train it by '{command}' and add "
+        f"'--projection weights/{name}.safetensors'."
+    )
 
 
 def checksum(projection: str | Path) -> str:
     """Return the sha256 of a projection's file, to tell which one made a feature file."""
-    return hashlib.sha256(find(projection).read_bytes()).hexdigest()
+    path = find(str(projection).partition(PREFIX)[0])
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def save(mlp: MLP, metadata: dict, path: Path) -> None:
@@ -121,17 +166,45 @@ def load(projection: str | Path) -> Projection:
     Raises:
         InputError: when it is not there or is not a projection.
     """
+    projection, _, prefix = str(projection).partition(PREFIX)
     path = find(projection)
     try:
-        with safe_open(path, "pt") as file:
-            metadata = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
-            state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
-        mlp = MLP(metadata["layers"])
-        missing, unexpected = mlp.load_state_dict(state, strict=False)
-        missing = [key for key in missing if not key.endswith("num_batches_tracked")]
-        if missing or unexpected:
-            raise ValueError(f"tensors {missing + unexpected} missing or unknown")
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        mlp, metadata = READERS.get(path.suffix, read_safetensors)(path)
+    except BROKEN as error:
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"{path} is not a projection ({reason}).") from None
-    return Projection(mlp, metadata)
+    loaded = Projection(mlp, metadata)
+    if not prefix:
+        return loaded
+    if metadata.get("scheme") != "nested" or not prefix.isdigit():
+        raise InputError(f"{path.stem} is not nested: it has no first {prefix} numbers of use.")
+    return loaded.cut(int(prefix))
+
+
+def read_safetensors(path: Path) -> tuple[MLP, dict]:
+    """Read a network and its metadata; a broken file raises any of what `load` handles."""
+    with safe_open(path, "pt") as file:
+        metadata = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
+        state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
+    mlp = MLP(metadata["layers"])
+    missing, unexpected = mlp.load_state_dict(state, strict=False)
+    missing = [key for key in missing if not key.endswith("num_batches_tracked")]
+    if missing or unexpected:
+        raise ValueError(f"tensors {missing + unexpected} missing or unknown")
+    return mlp, metadata
+
+
+def read_released(path: Path) -> tuple[MLP, dict]:
+    """Read a network in the form in which the paper's authors released theirs."""
+    state = torch.load(path, weights_only=True, map_location="cpu")
+    state = {key.replace("module.", ""): value for key, value in state.items()}
+    linears = [key.removesuffix("weight") for key, value in state.items() if value.ndim == 2]
+    norms = [key.removesuffix("running_var") for key in state if key.endswith("running_var")]
+    mlp = MLP([state[f"{linears[0]}weight"].shape[1], *(len(state[f"{k}bias"]) for k in linears)])
+    for layers, prefixes in ((mlp.linears, linears), (mlp.norms, norms)):
+        for layer, prefix in zip(layers, prefixes, strict=True):
+            layer.load_state_dict({key: state[prefix + key] for key in layer.state_dict()})
+    return mlp, {"training_data": f"{path.name} of {released.SOURCE}"}
+
+
+READERS = {".pth": read_released}

@@ -1,0 +1,84 @@
+from pathlib import Path
+from urllib.error import URLError
+
+import kornia
+import pytest
+import torch
+
+from confs import features
+from hloc_reduce import descriptors
+from hloc_reduce.cli import InputError
+from hloc_reduce.descriptors import DESCRIPTORS, Descriptor
+from hloc_reduce.extract_features import provenance
+
+
+def available(name):
+    """Make a descriptor, or skip where its weights are not on this machine."""
+    url = DESCRIPTORS[name].url
+    path = Path(torch.hub.get_dir()) / "checkpoints" / url.rpartition("/")[2]
+    if url and not path.is_file():
+        pytest.skip(f"the weights {path} are not on this machine")
+    return Descriptor(name)
+
+
+@pytest.mark.parametrize("name", DESCRIPTORS)
+def test_descriptors_are_of_unit_norm_and_do_not_depend_on_the_batch(name, base_weights):
+    describe = available(name)
+    patches = torch.rand(150, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    described = describe(patches)
+    assert described.shape == (150, 128) and described.dtype == torch.float32
+    torch.testing.assert_close(described.norm(dim=1), torch.ones(150))
+    torch.testing.assert_close(describe(patches[140:141]), described[140:141])
+    assert describe(patches[:0]).shape == (0, 128)
+
+
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [("mkd", kornia.feature.MKDDescriptor), ("tfeat", lambda: kornia.feature.TFeat(True))],
+)
+def test_descriptors_are_kornias(name, module, base_weights):
+    describe = available(name)
+    patches = torch.rand(5, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        expected = torch.nn.functional.normalize(module().eval()(patches), dim=1)
+    torch.testing.assert_close(describe(patches), expected)
+
+
+def test_hardnet_without_its_weights(monkeypatch):
+    """The network is kornia's; its weights are not needed to try the rest."""
+    base = descriptors.Base(lambda: kornia.feature.HardNet(pretrained=False))
+    monkeypatch.setitem(DESCRIPTORS, "hardnet", base)
+    torch.manual_seed(0)
+    described = Descriptor("hardnet")(torch.rand(10, 1, 32, 32))
+    assert described.shape == (10, 128)
+    torch.testing.assert_close(described.norm(dim=1), torch.ones(10))
+
+
+def test_missing_weights_are_named_at_once(tmp_path, monkeypatch):
+    asked = []
+
+    def unreachable(url, timeout):
+        asked.append((url, timeout))
+        raise URLError("no network")
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(descriptors, "urlopen", unreachable)
+    with pytest.raises(InputError, match="no network"):  # before anything is computed or written
+        provenance(features.confs["tfeat"], True)
+    asked.clear()
+    with pytest.raises(InputError) as error:
+        Descriptor("tfeat")
+    message = str(error.value)
+    assert "no network" in message and "kornia/tfeat/resolve/main/tfeat-liberty.params" in message
+    assert str(tmp_path / "hub/checkpoints/tfeat-liberty.params") in message
+    assert len(asked) == 1 and asked[0][1] < 10
+
+
+@pytest.mark.parametrize("name", ["mkd", "tfeat", "hardnet"])
+def test_kornia_looks_for_the_same_files(name):
+    """The addresses are kornia's own, so that what is found is what kornia loads."""
+    module = {"mkd": kornia.feature.mkd, "tfeat": kornia.feature.tfeat}.get(
+        name, kornia.feature.hardnet
+    )
+    listed = [[urls] if isinstance(urls, str) else urls for urls in module.urls.values()]
+    assert DESCRIPTORS[name].url in sum(listed, [])
