@@ -9,11 +9,13 @@ from hloc_reduce import projections
 from hloc_reduce.cli import InputError
 from hloc_reduce.evaluation.matching import average_precision
 from hloc_reduce.training import __main__ as training
-from hloc_reduce.training import pca, sv, tracks
-from hloc_reduce.training.sampling import PairSampler
+from hloc_reduce.training import loop, nested, pca, ss, sv, tracks, us
+from hloc_reduce.training.losses import distance_loss, triplet_loss
+from hloc_reduce.training.sampling import DescriptorSampler, PairSampler
 from hloc_reduce.training.tracks import Tracks
 
-RECIPE = {**sv.RECIPES["best"], "hidden": [64], "steps": 300, "batch_size": 100, "lr": 3e-3}
+SMALL = {"hidden": [64], "distance_weight": 0.0, "steps": 300, "batch_size": 100, "lr": 3e-3}
+RECIPE = {**sv.RECIPES["best"], **SMALL}
 
 
 def noisy_tracks(number=400, views=4, seed=0):
@@ -94,7 +96,7 @@ def test_triplet_loss_by_hand():
     positives = torch.tensor([[0.0, 1.0], [0.0, -1.0]])
     # d(a0, p0) = sqrt 2, d(a1, p1) = 2; d(a0, p1) = sqrt 2; a1 = p0 counts as the same patch
     expected = (1 + 2**0.5 - 2**0.5 + 1 + 2 - 2**0.5) / 2
-    assert sv.triplet_loss(anchors, positives, 1.0).item() == pytest.approx(expected, abs=1e-3)
+    assert triplet_loss(anchors, positives, 1.0).item() == pytest.approx(expected, abs=1e-3)
 
 
 def test_supervised_learns_what_tells_points_apart(tmp_path):
@@ -118,14 +120,15 @@ def test_paper_recipe_is_the_papers(tmp_path, monkeypatch):
 
     monkeypatch.setattr(PairSampler, "batch", counted)
     monkeypatch.setattr(torch.optim.Adam, "step", observed)
-    mlp = sv.train([noisy_tracks()], 16, sv.RECIPES["paper"], 0, tmp_path / "c")
+    recipe = training.complete_recipe("sv", "paper", "sift")
+    mlp = sv.train([noisy_tracks()], 16, recipe, 0, tmp_path / "c")
     assert mlp.sizes == (128, 512, 512, 16)
     assert numbers == list(range(20))  # 1,600 observations are two batches an epoch
     np.testing.assert_allclose(rates, 1e-3 * (1 - np.arange(20) / 20))
 
 
 def test_training_goes_on_after_a_kill_as_if_nothing_had_been(tmp_path, monkeypatch):
-    monkeypatch.setattr(sv, "CHECKPOINT_STEPS", 20)
+    monkeypatch.setattr(loop, "CHECKPOINT_STEPS", 20)
     recipe = {**RECIPE, "steps": 60}
     whole = sv.train([noisy_tracks()], 8, recipe, 0, tmp_path / "whole")
     batch = PairSampler.batch
@@ -147,6 +150,102 @@ def test_training_goes_on_after_a_kill_as_if_nothing_had_been(tmp_path, monkeypa
     resumed = sv.train([noisy_tracks()], 8, recipe, 0, tmp_path / "killed")
     for key, value in whole.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[key]), key
+
+
+def test_distance_loss_by_hand():
+    descriptors = torch.eye(3)
+    embedded = torch.tensor([[1.0, 0.0], [1.0, 0.0], [-1.0, 0.0]])
+    # sqrt 2 becomes 0, 2 and 2, each of them twice
+    expected = (2 * (2 + 2 * (2 - 2**0.5) ** 2)) ** 0.5 / 6
+    assert distance_loss(descriptors, embedded).item() == pytest.approx(expected, abs=1e-3)
+    assert distance_loss(descriptors, descriptors).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_distance_loss_keeps_distances(tmp_path):
+    data = noisy_tracks()
+    data.descriptors[..., 8:] *= 0.1
+    data.descriptors /= np.linalg.norm(data.descriptors.astype(np.float32), axis=-1)[..., None]
+    plain = torch.from_numpy(data.descriptors[:, 0, 0]).float()
+    values = {}
+    for weight in (0.0, 1e5):
+        recipe = {**RECIPE, "distance_weight": weight}
+        mlp = sv.train([data], 8, recipe, 0, tmp_path / str(weight))
+        with torch.no_grad():
+            values[weight] = distance_loss(plain, mlp(plain)).item()
+    assert values[1e5] < 0.7 * values[0.0]
+
+
+def test_nested_prefixes_are_good_descriptors(tmp_path):
+    recipe = {**nested.RECIPES["best"], **SMALL, "prefixes": [16, 8]}
+    mlp = nested.train([noisy_tracks()], 16, recipe, 0, tmp_path / "c")
+    cut = lambda rows: torch.nn.functional.normalize(mlp(rows)[:, :8], dim=1)  # noqa: E731
+    assert held_out_precision(mlp) > held_out_precision(None) + 0.1
+    assert held_out_precision(cut) > held_out_precision(None) + 0.1
+
+
+def test_auto_encoder_recovers_what_has_few_dimensions(tmp_path):
+    """Descriptors on a plane of 8 of 128 dimensions fit through 8 numbers, not through 2."""
+    data = noisy_tracks()
+    data.descriptors[..., 8:] = 0
+    data.descriptors /= np.linalg.norm(data.descriptors.astype(np.float32), axis=-1)[..., None]
+    recipe = {**us.RECIPES["best"], **SMALL}
+    plain = torch.from_numpy(data.descriptors[:, 0, 0]).float()
+    mlp = us.train([data], 8, recipe, 0, tmp_path / "c")
+    with torch.no_grad():
+        kept = mlp(plain)
+    similarity, embedded = (rows @ rows.T for rows in (plain, kept))
+    assert np.corrcoef(similarity.flatten(), embedded.flatten())[0, 1] > 0.9
+
+
+def test_self_supervised_tells_clusters_apart(tmp_path):
+    pytest.importorskip("faiss")
+    recipe = {**ss.RECIPES["best"], **SMALL, "per_cluster": 8, "cluster_steps": 100}
+    data = noisy_tracks()
+    data.descriptors[..., 8:] *= 0.3
+    mlp = ss.train([data], 8, recipe, 0, tmp_path / "c")
+    views = torch.from_numpy(data.descriptors[:, 0, 0]).float()
+    with torch.no_grad():
+        embedded = mlp(views)
+    assert average_precision(embedded[0::4], embedded[1::4]) > 0.5
+    again = ss.train([data], 8, recipe, 0, tmp_path / "again")
+    assert torch.equal(mlp.linears[0].weight, again.linears[0].weight)
+
+
+def test_self_supervised_goes_on_with_the_same_clusters(tmp_path, monkeypatch):
+    pytest.importorskip("faiss")
+    monkeypatch.setattr(loop, "CHECKPOINT_STEPS", 20)
+    recipe = {**ss.RECIPES["best"], **SMALL, "steps": 60, "cluster_steps": 25, "per_cluster": 8}
+    whole = ss.train([noisy_tracks()], 8, recipe, 0, tmp_path / "whole")
+    views = DescriptorSampler.views
+
+    def killed(self, *arguments):
+        killed.calls += 1
+        if killed.calls == 47:
+            raise KeyboardInterrupt
+        return views(self, *arguments)
+
+    killed.calls = 0
+    monkeypatch.setattr(DescriptorSampler, "views", killed)
+    with pytest.raises(KeyboardInterrupt):
+        ss.train([noisy_tracks()], 8, recipe, 0, tmp_path / "killed")
+    monkeypatch.setattr(DescriptorSampler, "views", views)
+    assert torch.load(tmp_path / "killed", weights_only=True)["step"] == 40
+    resumed = ss.train([noisy_tracks()], 8, recipe, 0, tmp_path / "killed")
+    for key, value in whole.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[key]), key
+
+
+def test_an_epoch_goes_once_through_all_descriptors():
+    data = [noisy_tracks(30), noisy_tracks(20, seed=1)]
+    sampler = DescriptorSampler(data, 0.0, mirror=False, balanced=False, seed=0)
+    first = np.concatenate([sampler.indices(number, 64) for number in range(4)])
+    assert sorted(first) == list(range(200))
+    second = np.concatenate([sampler.indices(number, 64) for number in range(4, 8)])
+    assert sorted(second) == list(range(200)) and (first != second).any()
+    seen, plain = sampler.batch(0, 64)
+    assert torch.equal(seen, plain)
+    both = np.concatenate([part.descriptors[:, 0, 0] for part in data])
+    np.testing.assert_array_equal(plain.numpy(), both[sampler.indices(0, 64)])
 
 
 def test_pca_keeps_the_variance():
@@ -194,7 +293,7 @@ def test_a_map_is_trained_on(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(tracks, "main", lambda *_: tmp_path / "tracks.safetensors")
     monkeypatch.setattr(tracks, "load", lambda _: noisy_tracks())
     (path,) = training.main(
-        {"place": (scene.images, scene.model)}, "sift", "pca", [16], tmp_path / "out", tmp_path
+        {"place": (scene.images, scene.model)}, [], "sift", "pca", [16], tmp_path / "out", tmp_path
     )
     projection = projections.load(path)
     assert projection.sizes == (128, 16)
@@ -203,7 +302,14 @@ def test_a_map_is_trained_on(scene, tmp_path, monkeypatch):
     }
     assert json.dumps(projection.metadata["versions"])
     written = path.stat().st_mtime_ns
-    arguments = ({"place": (scene.images, scene.model)}, "sift", "pca", [16, 8], tmp_path / "out")
+    arguments = (
+        {"place": (scene.images, scene.model)},
+        [],
+        "sift",
+        "pca",
+        [16, 8],
+        tmp_path / "out",
+    )
     assert len(training.main(*arguments, tmp_path)) == 2
     assert path.stat().st_mtime_ns == written
 

@@ -1,4 +1,4 @@
-"""Train a projection on COLMAP maps.
+"""Train projections on COLMAP maps or on PhotoTour patches.
 
 Extracts, matches and triangulates the images of each map with the poses of its model, and learns
 from the tracks.
@@ -9,17 +9,22 @@ import hashlib
 import json
 from pathlib import Path
 
+import torch
+
 from .. import cli, logger, projections
 from ..cli import InputError
 from ..descriptors import DESCRIPTORS, DIM
+from ..evaluation.phototour import fpr95
 from ..versions import versions
-from . import pca, sv, tracks
+from . import nested, pca, phototour, ss, sv, tracks, us
 
-SCHEMES = {"pca": pca, "sv": sv}
+SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
+RECIPES = ("best", "paper")
 
 
 def main(
     maps: dict[str, tuple[Path, Path]],
+    sequences: list[Path],
     descriptor: str,
     scheme: str,
     dims: list[int],
@@ -32,9 +37,10 @@ def main(
 
     Args:
         maps: from the name of each map to the folders of its images and its COLMAP model.
+        sequences: folders of PhotoTour.
         descriptor: base descriptor.
         scheme: a key of `SCHEMES`.
-        dims: numbers of output dimensions.
+        dims: numbers of output dimensions; not of "nested", which has its own.
         output: folder for `<descriptor>_<scheme><dim>.safetensors`.
         cache: folder for what is computed of the maps, used again by later trainings.
         recipe: "best", or "paper" for its losses, layers and hyper-parameters.
@@ -46,15 +52,24 @@ def main(
     Raises:
         InputError: when a map cannot be used.
     """
-    paths = [output / f"{descriptor}_{scheme}{dim}.safetensors" for dim in dims]
+    trainer = SCHEMES[scheme]
+    if trainer is nested:
+        paths = {nested.PREFIXES[0]: output / f"{descriptor}_nested.safetensors"}
+    else:
+        paths = {dim: output / f"{descriptor}_{scheme}{dim}.safetensors" for dim in dims}
+    settings = complete_recipe(scheme, recipe, descriptor)
     files = {
+        folder.resolve().name: phototour.main(
+            folder, cache / folder.resolve().name, descriptor, seed
+        )
+        for folder in sequences
+    } | {
         name: tracks.main(images, model, cache / name, descriptor, seed)
         for name, (images, model) in maps.items()
     }
     checksums = {name: checksum(file) for name, file in files.items()}
     data = [tracks.load(file) for file in files.values()]
-    trainer = SCHEMES[scheme]
-    for dim, path in zip(dims, paths, strict=True):
+    for dim, path in paths.items():
         metadata = {
             "descriptor": descriptor,
             "scheme": scheme,
@@ -67,7 +82,7 @@ def main(
                 }
                 for name, part in zip(files, data, strict=True)
             },
-            "recipe": {"name": recipe, **trainer.RECIPES[recipe]},
+            "recipe": {"name": recipe, **settings},
             "seed": seed,
             "versions": versions(),
         }
@@ -80,7 +95,7 @@ def main(
         mlp = trainer.train(
             data,
             dim,
-            trainer.RECIPES[recipe],
+            settings,
             seed,
             checkpoint=checkpoint,
             made_from=json.dumps(metadata, sort_keys=True),
@@ -88,7 +103,19 @@ def main(
         projections.save(mlp, metadata, path)
         checkpoint.unlink(missing_ok=True)
         logger.info("Saved %s.", path)
-    return paths
+    return list(paths.values())
+
+
+def complete_recipe(scheme: str, recipe: str, descriptor: str) -> dict:
+    """Return the hyper-parameters of a scheme's recipe for a descriptor."""
+    trainer = SCHEMES[scheme]
+    if trainer is pca:
+        return {}
+    return {
+        "hidden": list(DESCRIPTORS[descriptor].hidden),
+        "distance_weight": trainer.DISTANCE_WEIGHTS.get(descriptor, 0.0),
+        **trainer.RECIPES[recipe],
+    }
 
 
 def checksum(path: Path) -> str:
@@ -126,17 +153,44 @@ def _main() -> None:
         "--map town/images:town/sparse --output weights",
         formatter_class=cli.HelpFormatter,
     )
-    parser.add_argument("--descriptor", default="sift", help="base descriptor")
-    parser.add_argument("--scheme", default="sv", help=f"one of {', '.join(SCHEMES)}")
-    parser.add_argument("--dim", type=int, nargs="+", default=[64], help="output dimensions")
+    parser.add_argument(
+        "--descriptor",
+        nargs="+",
+        default=["sift"],
+        help=f"base descriptors, of {', '.join(DESCRIPTORS)}",
+    )
+    parser.add_argument(
+        "--scheme", nargs="+", default=["sv"], help=f"schemes, of {', '.join(SCHEMES)}"
+    )
+    parser.add_argument(
+        "--dim",
+        type=int,
+        nargs="+",
+        default=[64],
+        help="output dimensions, of all schemes but nested",
+    )
     parser.add_argument(
         "--map",
         action="append",
-        required=True,
+        default=[],
         metavar="IMAGES:MODEL",
         help="folder of images and folder of their COLMAP model; may be repeated",
     )
-    parser.add_argument("--recipe", default="best", help="best or paper")
+    parser.add_argument(
+        "--phototour",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="folder of a PhotoTour sequence to train on; may be repeated",
+    )
+    parser.add_argument(
+        "--validate",
+        type=Path,
+        metavar="DIR",
+        help="folder of another PhotoTour sequence, to print the FPR95 of its pairs",
+    )
+    parser.add_argument("--recipe", default="best", help=f"one of {', '.join(RECIPES)}")
     parser.add_argument(
         "--output", type=Path, default=Path("outputs/training"), help="folder for the projections"
     )
@@ -145,22 +199,54 @@ def _main() -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random")
     args = parser.parse_args()
-    cli.choose("descriptor", args.descriptor, DESCRIPTORS)
-    trainer = SCHEMES[cli.choose("scheme", args.scheme, SCHEMES)]
-    cli.choose("recipe", args.recipe, trainer.RECIPES)
+    for descriptor in args.descriptor:
+        cli.choose("descriptor", descriptor, DESCRIPTORS)
+    for scheme in args.scheme:
+        cli.choose("scheme", scheme, SCHEMES)
+    cli.choose("recipe", args.recipe, RECIPES)
+    if not args.map and not args.phototour:
+        raise InputError("There is nothing to train on. Give --map or --phototour.")
+    if args.validate:
+        phototour.read_pairs(args.validate)
     for dim in args.dim:
         if not 0 < dim <= DIM:
             raise InputError(f"--dim {dim}: choose 1 to {DIM}.")
-    main(
-        parse_maps(args.map),
-        args.descriptor,
-        args.scheme,
-        args.dim,
-        args.output,
-        args.cache,
-        args.recipe,
-        args.seed,
-    )
+    maps = parse_maps(args.map)
+    for descriptor in args.descriptor:
+        paths = [
+            path
+            for scheme in args.scheme
+            for path in main(
+                maps,
+                args.phototour,
+                descriptor,
+                scheme,
+                args.dim,
+                args.output,
+                args.cache,
+                args.recipe,
+                args.seed,
+            )
+        ]
+        if args.validate:
+            folder = args.cache / args.validate.resolve().name
+            validate(args.validate, folder, descriptor, paths)
+
+
+def validate(folder: Path, cache: Path, descriptor: str, paths: list[Path]) -> None:
+    """Print the FPR95 of a base descriptor and projections of it on a PhotoTour sequence."""
+    pairs, matches = phototour.read_pairs(folder)
+    data = tracks.load(phototour.main(folder, cache, descriptor))
+    if pairs.max() >= len(data.image):
+        raise InputError(f"{folder}: the pairs name more patches than info.txt.")
+    descriptors = torch.empty(len(data.image), DIM)
+    descriptors[torch.from_numpy(data.image)] = torch.from_numpy(data.descriptors[:, 0, 0]).float()
+    projects = {descriptor: torch.nn.Identity()}
+    projects |= {path.stem: projections.load(path) for path in paths}
+    for name, project in projects.items():
+        first, second = project(descriptors)[pairs.T]
+        value = fpr95((first - second).norm(dim=1).numpy(), matches)
+        print(f"FPR95 of {name} on {folder.resolve().name}: {100 * value:.2f} %")
 
 
 if __name__ == "__main__":

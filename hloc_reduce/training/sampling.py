@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from ..descriptors import DIM
 from .tracks import Tracks
 
 
@@ -69,6 +70,59 @@ class PairSampler:
             variants *= generator.random(len(track)) < self.augment  # 0 is the photo itself
             views.append(descriptors[kept[starts[track] + which], mirrored, variants])
         return views[0], views[1]
+
+
+class DescriptorSampler:
+    """Draws single observations.
+
+    Args:
+        maps: tracks of one or more maps.
+        augment: the share of views that are photometric variants, in [0, 1].
+        mirror: mirror half of the views.
+        balanced: draw a map with a probability proportional to the square root of its number of
+            observations, and of it any; otherwise an epoch goes once through all observations.
+        seed: a batch depends on it and on its number only.
+    """
+
+    def __init__(self, maps: list[Tracks], augment: float, mirror: bool, balanced: bool, seed: int):
+        self.maps, self.augment, self.mirror = maps, augment, mirror
+        self.balanced, self.seed = balanced, seed
+        sizes = np.array([len(tracks.track) for tracks in maps])
+        self.starts = np.concatenate([[0], sizes.cumsum()])
+        self.shares = np.sqrt(sizes) / np.sqrt(sizes).sum()
+        self.num_observations = int(sizes.sum())
+
+    def batch(self, number: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw batch `number`: views, augmented or not, and the photos of the same, (N, 128)."""
+        generator = np.random.default_rng([self.seed, number])
+        return self.views(self.indices(number, size), generator)
+
+    def indices(self, number: int, size: int) -> np.ndarray:
+        """Draw the observations (N,) of batch `number`, counted through all maps."""
+        if self.balanced:
+            generator = np.random.default_rng([self.seed, number, 1])
+            place = generator.choice(len(self.maps), size, p=self.shares)
+            return generator.integers(self.starts[place], self.starts[place + 1])
+        per_epoch = -(-self.num_observations // size)
+        epoch, number = divmod(number, per_epoch)
+        order = np.random.default_rng([self.seed, epoch]).permutation(self.num_observations)
+        return order[number * size : (number + 1) * size]
+
+    def views(
+        self, indices: np.ndarray, generator: np.random.Generator
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return views of observations, augmented or not, and the photos of the same."""
+        variant = generator.random(len(indices)) < self.augment
+        mirrored = generator.integers(2, size=len(indices)) * self.mirror
+        seen, plain = (np.empty((len(indices), DIM), np.float32) for _ in range(2))
+        for start, end, tracks in zip(self.starts, self.starts[1:], self.maps, strict=False):
+            rows = np.flatnonzero((indices >= start) & (indices < end))
+            chosen = generator.integers(1, max(2, tracks.descriptors.shape[2]), size=len(rows))
+            chosen = chosen * variant[rows]
+            inside = indices[rows] - start
+            seen[rows] = tracks.descriptors[inside, mirrored[rows], chosen]
+            plain[rows] = tracks.descriptors[inside, mirrored[rows], 0]
+        return torch.from_numpy(seen), torch.from_numpy(plain)
 
 
 def matchable(tracks: Tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

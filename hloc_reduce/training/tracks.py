@@ -29,6 +29,7 @@ from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
 from .completion import complete
 
 NUM_COVIS = 20
+MATCHED = "sift"  # which descriptor finds the tracks, whatever they are described with
 # The photo as it is and three photometric variants, each as seen and mirrored.
 VARIANTS = 4
 
@@ -82,7 +83,7 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     if (output / "source.json").exists() and not stamps.is_current(output / "source.json", source):
         raise InputError(f"{output} holds the tracks of another map. Choose another folder.")
     stamps.write(output / "source.json", source)
-    conf = features_confs.feature(descriptor, features_confs.base(descriptor))
+    conf = features_confs.feature(MATCHED, features_confs.base(MATCHED))
     pairs = pairs_from_covisibility.main(
         model, output / f"pairs-db-covis{NUM_COVIS}.txt", NUM_COVIS
     )
@@ -91,7 +92,7 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     # no ratio test: the poses tell right from wrong, and what is ambiguous is worth learning
     matcher = match_features.confs["NN-mutual"]
     matches = match_features.main(matcher, pairs, features.stem, output)
-    sfm = output / f"sfm_{descriptor}"
+    sfm = output / f"sfm_{MATCHED}"
     reconstruction = triangulation.main(sfm, model, images, pairs, features, matches)
 
     tracks = output / f"tracks_{descriptor}.safetensors"

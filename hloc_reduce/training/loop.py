@@ -1,0 +1,72 @@
+"""The loop that all learned schemes share."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import torch
+from torch import nn
+from tqdm import trange
+
+from .. import logger
+from ..io import replacing
+
+CHECKPOINT_STEPS = 500
+
+
+def device() -> torch.device:
+    """Return the device that trainings run on: a GPU when there is one."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def fit(
+    network: nn.Module,
+    loss: Callable[[int], torch.Tensor],
+    steps: int,
+    recipe: dict,
+    checkpoint: Path,
+    made_from: str = "",
+    before: Callable[[int], Iterable[nn.Parameter]] | None = None,
+) -> None:
+    """Minimize a loss with Adam.
+
+    Args:
+        network: everything that is learned, on its device.
+        loss: returns the scalar loss of a step, given its number; depends on nothing else but the
+            network, so that a killed training that goes on is the same as an undisturbed one.
+        steps: their number.
+        recipe: `lr`, `weight_decay` (L2) and `final_lr`, the share of `lr` that the learning rate
+            falls to, linearly.
+        checkpoint: file from which a killed training goes on; the caller deletes it.
+        made_from: says what the training is made from; a checkpoint of another is not used.
+        before: called before each step with its number, may change the network and returns the
+            parameters that were set anew, of which the optimizer knows nothing then.
+    """
+    optimizer = torch.optim.Adam(
+        network.parameters(), lr=recipe["lr"], weight_decay=recipe["weight_decay"]
+    )
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, recipe["final_lr"], steps)
+    parts = {"network": network, "optimizer": optimizer, "schedule": schedule}
+    start = 0
+    if checkpoint.exists():
+        state = torch.load(checkpoint, weights_only=True, map_location="cpu")
+        if state["made_from"] == made_from:
+            start = state["step"]
+            for key, part in parts.items():
+                part.load_state_dict(state[key])
+            logger.info("Going on from step %d of %s.", start, checkpoint)
+    mean_loss = None
+    progress = trange(start, steps, initial=start, total=steps, desc="Training", unit="step")
+    for step in progress:
+        for parameter in before(step) if before else ():
+            optimizer.state.pop(parameter, None)
+        value = loss(step)
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+        schedule.step()
+        mean_loss = value.item() if mean_loss is None else 0.99 * mean_loss + 0.01 * value.item()
+        progress.set_postfix(loss=f"{mean_loss:.4f}", refresh=False)
+        if (step + 1) % CHECKPOINT_STEPS == 0:
+            with replacing(checkpoint) as temporary:
+                state = {key: part.state_dict() for key, part in parts.items()}
+                torch.save({"step": step + 1, "made_from": made_from, **state}, temporary)

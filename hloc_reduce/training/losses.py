@@ -1,0 +1,44 @@
+"""Losses that schemes share."""
+
+import torch
+
+DUPLICATE_DISTANCE = 0.008  # HardNet takes what is nearer than this for the same patch
+
+
+def triplet_loss(anchors: torch.Tensor, positives: torch.Tensor, margin: float) -> torch.Tensor:
+    """Compute the triplet margin loss of Eq. 5 with HardNet's hardest-in-batch negatives.
+
+    Args:
+        anchors: (N, D) of unit norm.
+        positives: (N, D) of unit norm, row i matching anchor i only.
+        margin: m.
+
+    Returns:
+        The mean over i of max(0, m + d(a_i, p_i) - d(a_i, n_i)), a scalar, where d(a_i, n_i) is
+        the least distance of anchor i or positive i to a row of the other side that is not i.
+    """
+    distances = (2 - 2 * anchors @ positives.T).clamp(min=1e-8).sqrt()
+    positive = distances.diagonal()
+    same = torch.eye(len(anchors), dtype=torch.bool, device=anchors.device)
+    others = distances.masked_fill(same | (distances < DUPLICATE_DISTANCE), torch.inf)
+    negative = torch.minimum(others.amin(dim=0), others.amin(dim=1))
+    return (margin + positive - negative).clamp(min=0).mean()
+
+
+def distance_loss(descriptors: torch.Tensor, embedded: torch.Tensor) -> torch.Tensor:
+    """Compute how much a projection changes the distances between descriptors (Eq. 2).
+
+    Args:
+        descriptors: (N, 128) of unit norm.
+        embedded: (N, D) of unit norm, their projections.
+
+    Returns:
+        sqrt(sum over i, j != i of (d(x_i, x_j) - d(y_i, y_j))^2) / (N (N - 1)), a scalar.
+    """
+    before, after = (
+        (2 - 2 * rows @ rows.T).clamp(min=1e-8).sqrt() for rows in (descriptors, embedded)
+    )
+    changes = (before - after).square()
+    number = len(descriptors)
+    total = changes.sum() - changes.diagonal().sum()
+    return total.clamp(min=1e-12).sqrt() / (number * (number - 1))

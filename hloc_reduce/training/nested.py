@@ -1,0 +1,9 @@
+"""Supervised reduction to 64 numbers whose first 32, 24 or 16 are good descriptors themselves."""
+
+from . import sv
+
+PREFIXES = (64, 32, 24, 16)
+# not in the paper: the losses of the prefixes are learned together
+RECIPES = {name: {**recipe, "prefixes": PREFIXES} for name, recipe in sv.RECIPES.items()}
+DISTANCE_WEIGHTS = sv.DISTANCE_WEIGHTS
+train = sv.train

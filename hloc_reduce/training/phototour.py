@@ -1,0 +1,142 @@
+"""UBC PhotoTour patches as training data (Winder and Brown, 2007), in the layout of its zip files.
+
+Each sequence is a folder of sheets `patches0000.bmp`, ... of 16x16 patches of 64x64 pixels;
+`info.txt`, whose lines begin with the 3D point that a patch shows; and lists of pairs
+`m50_100000_100000_0.txt`.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from safetensors.numpy import save_file
+from tqdm import tqdm
+
+from .. import logger, stamps
+from ..cli import InputError
+from ..descriptors import DIM, PATCH_SIZE, Descriptor
+from ..io import replacing
+from .tracks import VARIANTS, photometric_variant
+
+SHEET, SIDE = 16, 64
+PAIRS = "m50_100000_100000_0.txt"
+
+
+def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) -> Path:
+    """Describe the patches of a sequence, labelled by point.
+
+    Args:
+        folder: the sequence.
+        output: folder for the file; one that is there already, made from the same, is used.
+        descriptor: the base descriptor.
+        seed: of the photometric variants.
+
+    Returns:
+        The file of `tracks.load`; every patch counts as an image of its own.
+
+    Raises:
+        InputError: when the folder is not a sequence.
+    """
+    path = output / f"tracks_{descriptor}.safetensors"
+    points = read_points(folder)
+    made_from = stamps.stamp(
+        {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "format": 2},
+        [folder / "info.txt", *sheets(folder)],
+    )
+    stamp_file = path.with_suffix(".json")
+    if path.exists() and stamps.is_current(stamp_file, made_from):
+        return path
+    output.mkdir(parents=True, exist_ok=True)
+    describe = Descriptor(descriptor)
+    described = np.empty((len(points), 2, VARIANTS, DIM), np.float16)
+    for number, sheet in enumerate(tqdm(sheets(folder), desc="Describing patches", unit="sheet")):
+        first = number * SHEET**2
+        patches = read_sheet(sheet)[: len(points) - first]
+        generator = np.random.default_rng([seed, number])
+        rows = slice(first, first + len(patches))
+        for variant in range(VARIANTS):
+            views = patches
+            if variant:
+                views = np.stack([photometric_variant(patch, generator) for patch in patches])
+            views = torch.from_numpy(views)[:, None]
+            described[rows, 0, variant] = describe(views).numpy()
+            described[rows, 1, variant] = describe(views.flip(2)).numpy()
+    _, track = np.unique(points, return_inverse=True)
+    order = np.argsort(track, kind="stable")
+    tensors = {
+        "descriptors": described[order],
+        "track": track[order],
+        "image": order,
+        "xy": np.zeros((len(points), 2), np.float32),
+        "matched": np.ones(len(points), bool),
+    }
+    with replacing(path) as temporary:
+        save_file(tensors, temporary)
+    stamps.write(stamp_file, made_from)
+    logger.info("%d patches of %d points: %s", len(track), track.max() + 1, path)
+    return path
+
+
+def read_points(folder: Path) -> np.ndarray:
+    """Read which point each patch shows, (N,) int64.
+
+    Raises:
+        InputError: when the folder is not a sequence.
+    """
+    info = folder / "info.txt"
+    if not info.is_file():
+        raise InputError(
+            f"{folder} is not a PhotoTour sequence: it has no info.txt "
+            "(http://matthewalunbrown.com/patchdata/patchdata.html)."
+        )
+    points = []
+    for number, line in enumerate(info.read_text().splitlines(), 1):
+        try:
+            points.append(int(line.split()[0]))
+        except (ValueError, IndexError):
+            raise InputError(f"{info}, line {number}: no number of a point.") from None
+    missing = -(-len(points) // SHEET**2) - len(sheets(folder))
+    if not points or missing > 0:
+        raise InputError(f"{folder}: {info} names {len(points)} patches, {missing} sheets miss.")
+    return np.array(points)
+
+
+def sheets(folder: Path) -> list[Path]:
+    """Return the sheets of patches in order."""
+    return sorted(folder.glob("patches[0-9][0-9][0-9][0-9].bmp"))
+
+
+def read_sheet(path: Path) -> np.ndarray:
+    """Read the patches (256, 32, 32) float32 in [0, 1] of a sheet, row by row.
+
+    Raises:
+        InputError: when it is not one.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None or image.shape != (SHEET * SIDE,) * 2:
+        raise InputError(f"{path} is not a sheet of 16x16 patches of 64x64 pixels.")
+    patches = image.reshape(SHEET, SIDE, SHEET, SIDE).swapaxes(1, 2).reshape(-1, SIDE, SIDE)
+    size = (PATCH_SIZE, PATCH_SIZE)
+    small = [cv2.resize(patch, size, interpolation=cv2.INTER_AREA) for patch in patches]
+    return np.stack(small).astype(np.float32) / 255
+
+
+def read_pairs(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read the pairs of patches (P, 2) int64 that are listed to verify with, and which match.
+
+    Raises:
+        InputError: when the list is missing or broken.
+    """
+    path = folder / PAIRS
+    if not path.is_file():
+        raise InputError(f"There is no list of pairs {path}.")
+    pairs = []
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        try:
+            values = [int(value) for value in line.split()]
+            pairs.append((values[0], values[3], values[1] == values[4]))
+        except (ValueError, IndexError):
+            raise InputError(f"{path}, line {number}: not a pair of patches and points.") from None
+    pairs = np.array(pairs, np.int64).reshape(-1, 3)
+    return pairs[:, :2], pairs[:, 2] == 1

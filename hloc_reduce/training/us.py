@@ -1,0 +1,66 @@
+"""Unsupervised reduction: an auto-encoder (Sec. III-A)."""
+
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from ..projections import MLP
+from .loop import device, fit
+from .losses import distance_loss
+from .sampling import DescriptorSampler
+from .tracks import Tracks
+
+# "paper" is Sec. III-D; an epoch goes once through all descriptors.
+RECIPES = {
+    "paper": {
+        "epochs": 5,
+        "batch_size": 1024,
+        "lr": 1e-3,
+        "final_lr": 1.0,
+        "weight_decay": 0.0,
+        "augment": 0.0,
+        "mirror": False,
+        "balanced": False,
+    },
+    "best": {
+        "steps": 6000,
+        "batch_size": 1024,
+        "lr": 1e-2,
+        "final_lr": 0.0,
+        "weight_decay": 0.0,
+        "augment": 0.25,
+        "mirror": True,
+        "balanced": True,
+    },
+}
+DISTANCE_WEIGHTS = {"hardnet": 0.1}  # alpha
+
+
+def train(
+    maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path, made_from: str = ""
+) -> MLP:
+    """Train an encoder whose mirrored decoder recovers the descriptors; arguments as in `sv`.
+
+    The loss is Eq. 3: the mean of ||x - x'||, and for some the distance loss. What an augmented
+    view is to become again is the photo as it is.
+    """
+    torch.manual_seed(seed)
+    drawing = {key: recipe[key] for key in ("augment", "mirror", "balanced")}
+    sampler = DescriptorSampler(maps, **drawing, seed=seed)
+    size, place = recipe["batch_size"], device()
+    steps = recipe.get("steps") or recipe["epochs"] * -(-sampler.num_observations // size)
+    sizes = [maps[0].descriptors.shape[-1], *recipe["hidden"], dim]
+    encoder, decoder = MLP(sizes), MLP(sizes[::-1])
+    network = nn.ModuleList([encoder, decoder]).train().to(place)
+
+    def loss(step: int) -> torch.Tensor:
+        seen, plain = (views.to(place) for views in sampler.batch(step, size))
+        embedded = encoder(seen)
+        value = (plain - decoder(embedded)).norm(dim=1).mean()
+        if recipe["distance_weight"]:
+            value = value + recipe["distance_weight"] * distance_loss(seen, embedded)
+        return value
+
+    fit(network, loss, steps, recipe, checkpoint, made_from)
+    return encoder.eval().cpu()

@@ -1,0 +1,95 @@
+"""PhotoTour sequences, synthesized in the layout of the real ones."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from hloc_reduce.cli import InputError
+from hloc_reduce.descriptors import Descriptor
+from hloc_reduce.evaluation.phototour import fpr95
+from hloc_reduce.training import __main__ as training
+from hloc_reduce.training import phototour, tracks
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    """300 patches on two sheets: 100 points, three noisy patches of each, in random order."""
+    generator = np.random.default_rng(0)
+    folder = tmp_path / "town"
+    folder.mkdir()
+    points = generator.permutation(np.repeat(np.arange(100), 3))
+    textures = [
+        cv2.resize(generator.uniform(0, 255, (8, 8)), (64, 64), interpolation=cv2.INTER_CUBIC)
+        for _ in range(100)
+    ]
+    noisy = [textures[point] + 8 * generator.standard_normal((64, 64)) for point in points]
+    patches = np.zeros((512, 64, 64), np.uint8)
+    patches[:300] = np.clip(noisy, 0, 255)
+    for number, sheet in enumerate(patches.reshape(2, 16, 16, 64, 64)):
+        image = sheet.swapaxes(1, 2).reshape(1024, 1024)
+        cv2.imwrite(str(folder / f"patches{number:04}.bmp"), image)
+    (folder / "info.txt").write_text("".join(f"{10 * point} 0\n" for point in points))
+    lines = []
+    for i in range(300):
+        same = np.flatnonzero(points == points[i])
+        for j in (same[same != i][0], (i + 1) % 300):
+            lines.append(f"{i} {10 * points[i]} 0 {j} {10 * points[j]} 0 0")
+    (folder / phototour.PAIRS).write_text("\n".join(lines))
+    return folder, patches, points
+
+
+def test_patches_are_read_row_by_row(sequence):
+    folder, patches, _ = sequence
+    read = phototour.read_sheet(folder / "patches0001.bmp")
+    expected = cv2.resize(patches[256 + 17], (32, 32), interpolation=cv2.INTER_AREA) / 255
+    np.testing.assert_allclose(read[17], expected, atol=1e-6)
+
+
+def test_patches_of_a_point_are_a_track(sequence, tmp_path):
+    folder, patches, points = sequence
+    data = tracks.load(phototour.main(folder, tmp_path / "cache"))
+    assert data.num_tracks == 100 and len(data.track) == 300
+    assert (points[data.image] == data.track).all()  # an image of its own each, by its number
+    first = torch.from_numpy(phototour.read_sheet(folder / "patches0000.bmp")[:1, None])
+    row = data.descriptors[np.flatnonzero(data.image == 0)[0], 0, 0]
+    assert Descriptor("sift")(first)[0].numpy() @ row.astype(np.float32) > 0.999
+
+
+def test_training_and_validation(sequence, tmp_path, monkeypatch, capsys):
+    folder, _, _ = sequence
+    small = {**training.sv.RECIPES["best"], "steps": 20, "batch_size": 64}
+    monkeypatch.setitem(training.sv.RECIPES, "best", small)
+    paths = training.main({}, [folder], "sift", "sv", [16], tmp_path / "w", tmp_path / "cache")
+    training.validate(folder, tmp_path / "cache", "sift", paths)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(" on ")[0] for line in lines] == ["FPR95 of sift", "FPR95 of sift_sv16"]
+    assert lines[0].endswith("on town: 0.00 %")  # noise of 3 % is nothing to sift
+
+
+def test_broken_sequences_are_refused(sequence, tmp_path):
+    folder, _, _ = sequence
+    with pytest.raises(InputError, match="not a PhotoTour sequence"):
+        phototour.main(tmp_path, tmp_path / "cache")
+    (folder / "patches0001.bmp").unlink()
+    with pytest.raises(InputError, match="300 patches, 1 sheets miss"):
+        phototour.main(folder, tmp_path / "cache")
+    (folder / "info.txt").write_text("1 0\nx 0\n")
+    with pytest.raises(InputError, match="info.txt, line 2"):
+        phototour.main(folder, tmp_path / "cache")
+    (folder / phototour.PAIRS).write_text("1 2 3\n")
+    with pytest.raises(InputError, match="line 1: not a pair"):
+        phototour.read_pairs(folder)
+    cv2.imwrite(str(folder / "patches0000.bmp"), np.zeros((64, 64), np.uint8))
+    (folder / "info.txt").write_text("1 0\n")
+    with pytest.raises(InputError, match="not a sheet"):
+        phototour.main(folder, tmp_path / "cache")
+
+
+def test_fpr95_by_hand():
+    distances = np.concatenate([np.arange(100) / 100, [0.5, 0.935, 0.94, 2.0]])
+    matches = np.arange(104) < 100
+    # 95 of 100 are within 0.94
+    assert fpr95(distances, matches) == 0.75
+    with pytest.raises(ValueError, match="Both"):
+        fpr95(distances, np.ones(104, bool))
