@@ -2,8 +2,8 @@
 
 From each point of a map two observations in different images are drawn. All first descriptors are
 ranked by the distance to their nearest second descriptor; correct is the same point. The columns of
-the maps and their mean are for tracks as triangulated from the base descriptor's mutual nearest
-neighbours. "completed" adds the observations that it missed and geometry found, and "dark" takes
+the maps and their mean are for tracks as triangulated from the mutual nearest neighbours of
+`sift`. "completed" adds the observations that it missed and geometry found, and "dark" takes
 photometric variants (darkness, blur, noise) of the second photos, too. Prints a Markdown table of
 percentages, means over several draws, with a row for each feature that ships and for each
 `--projection`.

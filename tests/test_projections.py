@@ -132,6 +132,14 @@ def test_the_first_numbers_of_a_nested_projection(tmp_path):
         projections.load(f"{tmp_path / 'p.safetensors'}@8")
 
 
+def test_a_path_may_have_an_at_sign(tmp_path):
+    path = tmp_path / "me@home" / "a@b.safetensors"
+    path.parent.mkdir()
+    projections.save(trained((128, 16)), {"scheme": "nested"}, path)
+    assert projections.load(path).dim == 16 and projections.load(f"{path}@8").dim == 8
+    assert projections.checksum(path) == projections.checksum(f"{path}@8")
+
+
 def released_state(sizes):
     """A network as the authors' code saves it."""
     layers = []

@@ -22,7 +22,8 @@ COMMAND = (
     "python -m hloc_reduce.training --descriptor {descriptor} --scheme {scheme}{dim} "
     "--map IMAGES:MODEL --output weights"
 )
-PREFIX = "@"  # sift_nested@24: the first 24 numbers of sift_nested
+# sift_nested@24: the first 24 numbers of sift_nested; an @ in the path of a file is its own
+PREFIX = re.compile(r"(.+)@([^@/\\.]+)")
 BROKEN = (
     *(SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError, IndexError),
     *(AttributeError, pickle.UnpicklingError),
@@ -135,9 +136,15 @@ def find(projection: str | Path) -> Path:
     )
 
 
+def split_prefix(projection: str | Path) -> tuple[str, str]:
+    """Split `name@24` into the name and the prefix, "" where there is none."""
+    match = PREFIX.fullmatch(str(projection))
+    return match.groups() if match else (str(projection), "")
+
+
 def checksum(projection: str | Path) -> str:
     """Return the sha256 of a projection's file, to tell which one made a feature file."""
-    path = find(str(projection).partition(PREFIX)[0])
+    path = find(split_prefix(projection)[0])
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -166,7 +173,7 @@ def load(projection: str | Path) -> Projection:
     Raises:
         InputError: when it is not there or is not a projection.
     """
-    projection, _, prefix = str(projection).partition(PREFIX)
+    projection, prefix = split_prefix(projection)
     path = find(projection)
     try:
         mlp, metadata = READERS.get(path.suffix, read_safetensors)(path)
