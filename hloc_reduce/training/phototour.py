@@ -10,14 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from safetensors.numpy import save_file
 from tqdm import tqdm
 
-from .. import logger, stamps
+from .. import stamps
 from ..cli import InputError
 from ..descriptors import DIM, PATCH_SIZE, Descriptor
-from ..io import replacing
-from .tracks import VARIANTS, photometric_variant
+from .tracks import VARIANTS, photometric_variant, save, stamp
 
 SHEET, SIDE = 16, 64
 PAIRS = "m50_100000_100000_0.txt"
@@ -40,12 +38,8 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
     """
     path = output / f"tracks_{descriptor}.safetensors"
     points = read_points(folder)
-    made_from = stamps.stamp(
-        {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "format": 2},
-        [folder / "info.txt", *sheets(folder)],
-    )
-    stamp_file = path.with_suffix(".json")
-    if path.exists() and stamps.is_current(stamp_file, made_from):
+    made_from = stamp(descriptor, seed, [folder / "info.txt", *sheets(folder)])
+    if path.exists() and stamps.is_current(path.with_suffix(".json"), made_from):
         return path
     output.mkdir(parents=True, exist_ok=True)
     describe = Descriptor(descriptor)
@@ -62,20 +56,16 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
             views = torch.from_numpy(views)[:, None]
             described[rows, 0, variant] = describe(views).numpy()
             described[rows, 1, variant] = describe(views.flip(2)).numpy()
-    _, track = np.unique(points, return_inverse=True)
-    order = np.argsort(track, kind="stable")
-    tensors = {
-        "descriptors": described[order],
-        "track": track[order],
-        "image": order,
-        "xy": np.zeros((len(points), 2), np.float32),
-        "matched": np.ones(len(points), bool),
-    }
-    with replacing(path) as temporary:
-        save_file(tensors, temporary)
-    stamps.write(stamp_file, made_from)
-    logger.info("%d patches of %d points: %s", len(track), track.max() + 1, path)
-    return path
+    no_places = np.zeros((len(points), 2), np.float32)
+    return save(
+        path,
+        made_from,
+        described,
+        points,
+        image=np.arange(len(points)),
+        xy=no_places,
+        matched=np.ones(len(points), bool),
+    )
 
 
 def read_points(folder: Path) -> np.ndarray:

@@ -117,7 +117,7 @@ class DescriptorSampler:
         seen, plain = (np.empty((len(indices), DIM), np.float32) for _ in range(2))
         for start, end, tracks in zip(self.starts, self.starts[1:], self.maps, strict=False):
             rows = np.flatnonzero((indices >= start) & (indices < end))
-            chosen = generator.integers(1, max(2, tracks.descriptors.shape[2]), size=len(rows))
+            chosen = generator.integers(1, tracks.descriptors.shape[2], size=len(rows))
             chosen = chosen * variant[rows]
             inside = indices[rows] - start
             seen[rows] = tracks.descriptors[inside, mirrored[rows], chosen]

@@ -22,6 +22,7 @@ RECIPES = {
         "epochs": 200,
         "cluster_epochs": 10,
         "batch_size": 256,
+        "classes": None,
         "lr": 1e-3,
         "final_lr": 1.0,
         "weight_decay": 0.0,
@@ -29,10 +30,11 @@ RECIPES = {
     },
     "best": {
         "per_cluster": 4.5,
-        "descriptors": 60_000,
+        "descriptors": 100_000,
         "steps": 6000,
         "cluster_steps": 1500,
-        "batch_size": 1024,
+        "batch_size": 512,
+        "classes": 2048,
         "lr": 3e-3,
         "final_lr": 0.0,
         "weight_decay": 1e-5,
@@ -60,9 +62,15 @@ class ArcClassifier(nn.Module):
         nn.init.constant_(self.log_scale, np.log(SCALE))
         return [self.weight, self.log_scale]
 
-    def forward(self, embedded: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """Return the cross-entropy of (N, D) of unit norm with labels (N,)."""
-        cosine = embedded @ nn.functional.normalize(self.weight, dim=1).T
+    def forward(
+        self, embedded: torch.Tensor, labels: torch.Tensor, classes: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the cross-entropy of (N, D) of unit norm with labels (N,).
+
+        Only the classes (C,), sorted, the labels among them, are told apart.
+        """
+        labels = torch.searchsorted(classes, labels)
+        cosine = embedded @ nn.functional.normalize(self.weight[classes], dim=1).T
         target = cosine.gather(1, labels[:, None])
         angle = target.clamp(-1 + 1e-6, 1 - 1e-6).acos() + MARGIN
         logits = cosine.scatter(1, labels[:, None], torch.minimum(angle.cos(), target))
@@ -86,7 +94,7 @@ def cluster(descriptors: np.ndarray, num_clusters: int, seed: int) -> np.ndarray
         seed=seed,
         min_points_per_centroid=1,
         max_points_per_centroid=len(descriptors),
-        gpu=faiss.get_num_gpus() > 0 if hasattr(faiss, "get_num_gpus") else False,
+        gpu=faiss.get_num_gpus() > 0,
     )
     kmeans.train(descriptors)
     return kmeans.index.search(descriptors, 1)[1][:, 0]
@@ -130,8 +138,14 @@ def train(
         epoch, batch = divmod(step, per_epoch)
         order = np.random.default_rng([seed, epoch]).permutation(number)
         drawn = order[batch * size : (batch + 1) * size]
-        seen, _ = sampler.views(chosen[drawn], np.random.default_rng([seed, step, 1]))
-        return network.classifier(mlp(seen.to(place)), network.labels[torch.from_numpy(drawn)])
+        generator = np.random.default_rng([seed, step, 1])
+        seen, _ = sampler.views(chosen[drawn], generator)
+        labels = network.labels[torch.from_numpy(drawn)]
+        classes = torch.arange(num_clusters, device=place)
+        if recipe["classes"] and recipe["classes"] < num_clusters:
+            others = generator.integers(num_clusters, size=recipe["classes"])
+            classes = torch.cat([torch.from_numpy(others).to(place), labels]).unique()
+        return network.classifier(mlp(seen.to(place)), labels, classes)
 
     fit(network, loss, steps, recipe, checkpoint, made_from, cluster_anew)
     return mlp.eval().cpu()

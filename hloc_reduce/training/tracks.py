@@ -96,10 +96,8 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     reconstruction = triangulation.main(sfm, model, images, pairs, features, matches)
 
     tracks = output / f"tracks_{descriptor}.safetensors"
-    stamp_file = tracks.with_suffix(".json")
-    options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "format": 2}
-    made_from = stamps.stamp(options, [sfm / "points3D.bin", features])
-    if tracks.exists() and stamps.is_current(stamp_file, made_from):
+    made_from = stamp(descriptor, seed, [sfm / "points3D.bin", features])
+    if tracks.exists() and stamps.is_current(tracks.with_suffix(".json"), made_from):
         return tracks
     images_by_name = {image.name: image for image in reconstruction.images.values()}
     describe = Descriptor(descriptor)
@@ -128,24 +126,50 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
         parts.append((described, ids, np.full(len(kept), number), xy, matched[name][kept] >= 0))
     if not parts:
         raise InputError(f"The map {model} gives no tracks.")
-    _, track = np.unique(np.concatenate([part[1] for part in parts]), return_inverse=True)
+    return save(tracks, made_from, *map(np.concatenate, zip(*parts, strict=True)))
+
+
+def stamp(descriptor: str, seed: int, inputs: list[Path]) -> dict:
+    """Describe what a file of `load` is made from."""
+    options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "format": 2}
+    return stamps.stamp(options, inputs)
+
+
+def save(
+    path: Path,
+    made_from: dict,
+    descriptors: np.ndarray,
+    points: np.ndarray,
+    image: np.ndarray,
+    xy: np.ndarray,
+    matched: np.ndarray,
+) -> Path:
+    """Write the file of `load` and its stamp.
+
+    Args:
+        path: of the file.
+        made_from: its stamp.
+        descriptors: as in `Tracks`, in any order.
+        points: (M,) which points the observations see, by any numbers.
+        image: as in `Tracks`.
+        xy: as in `Tracks`.
+        matched: as in `Tracks`.
+
+    Returns:
+        The path.
+    """
+    _, track = np.unique(points, return_inverse=True)
     order = np.argsort(track, kind="stable")
-    tensors = {
-        "descriptors": np.concatenate([part[0] for part in parts])[order],
-        "track": track[order],
-        "image": np.concatenate([part[2] for part in parts])[order],
-        "xy": np.concatenate([part[3] for part in parts])[order],
-        "matched": np.concatenate([part[4] for part in parts])[order],
-    }
-    with replacing(tracks) as temporary:
-        save_file(tensors, temporary)
-    stamps.write(stamp_file, made_from)
-    logger.info("%d observations of %d points: %s", len(track), track.max() + 1, tracks)
-    return tracks
+    tracks = Tracks(descriptors, track, image, xy, matched).only(order)
+    with replacing(path) as temporary:
+        save_file(vars(tracks), temporary)
+    stamps.write(path.with_suffix(".json"), made_from)
+    logger.info("%d observations of %d points: %s", len(track), tracks.num_tracks, path)
+    return path
 
 
 def load(path: Path) -> Tracks:
-    """Read the file that `main` wrote."""
+    """Read the file that `save` wrote."""
     return Tracks(**load_file(path))
 
 
