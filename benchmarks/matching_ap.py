@@ -4,20 +4,24 @@ From each point of a map two observations in different images are drawn. All fir
 ranked by the distance to their nearest second descriptor; correct is the same point. The columns of
 the maps and their mean are for tracks as triangulated from the mutual nearest neighbours of
 `sift`. "completed" adds the observations that it missed and geometry found, and "dark" takes
-photometric variants (darkness, blur, noise) of the second photos, too. Prints a Markdown table of
-percentages, means over several draws, with a row for each feature that ships and for each
-`--projection`.
+photometric variants (darkness, blur, noise) of the second photos, too. Prints Markdown tables of
+percentages, means over several draws: for each base descriptor one with a row for itself, each
+projection of it that ships and each `--projection` whose name begins with its name; then one of the
+means of matched tracks and of dark photos by number of dimensions.
 """
 
 import argparse
+import re
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from hloc_reduce import cli, projections
+from hloc_reduce.descriptors import DIM
 from hloc_reduce.evaluation.matching import average_precision
-from hloc_reduce.training import tracks
+from hloc_reduce.training import nested, tracks
 from hloc_reduce.training.__main__ import parse_maps
 from hloc_reduce.training.sampling import matchable
 
@@ -34,6 +38,41 @@ def draw_pairs(data: tracks.Tracks, seed: int) -> tuple[torch.Tensor, torch.Tens
     return tuple(torch.from_numpy(data.descriptors[i, 0, v]).float() for i, v in drawn)
 
 
+def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.Module]:
+    """Load what projects a descriptor, by name, nested ones at each of their sizes."""
+    names = [name for name in projections.names() if name.split("_")[0] == descriptor]
+    nested_name = f"{descriptor}_nested"
+    if nested_name in names:
+        names.remove(nested_name)
+        names += [f"{nested_name}@{dim}" for dim in nested.PREFIXES]
+    files = [file for file in files if file.stem.lower().startswith(descriptor)]
+    loaded = {name: projections.load(name) for name in names}
+    loaded |= {file.stem: projections.load(file) for file in files}
+    order = sorted(loaded, key=lambda name: (family(name), -loaded[name].dim))
+    return {descriptor: torch.nn.Identity()} | {name: loaded[name] for name in order}
+
+
+def family(name: str) -> str:
+    """Return what the projections to several numbers of dimensions have in common."""
+    return re.sub(r"(@|_dim)?\d*$", "", name)
+
+
+def draw_all(data: tracks.Tracks, draws: int) -> dict[str, list]:
+    """Draw the pairs of each kind of a map."""
+    matched = data.only(data.matched)
+    completed = [draw_pairs(data, seed) for seed in range(draws)]
+    return {
+        "matched": [draw_pairs(matched, seed)[:2] for seed in range(draws)],
+        "completed": [(first, second) for first, second, _ in completed],
+        "dark": [(first, dark) for first, _, dark in completed],
+    }
+
+
+def measure(project: torch.nn.Module, draws: list) -> float:
+    """Return the mean AP in percent."""
+    return np.mean([100 * average_precision(*map(project, views)) for views in draws])
+
+
 def _main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__,
@@ -41,7 +80,9 @@ def _main() -> None:
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument("--map", action="append", required=True, metavar="IMAGES:MODEL")
-    parser.add_argument("--descriptor", default="sift", help="base descriptor")
+    parser.add_argument(
+        "--descriptor", nargs="+", default=["sift", "mkd", "tfeat"], help="base descriptors"
+    )
     parser.add_argument(
         "--projection", type=Path, nargs="*", default=[], help="projection files to compare with"
     )
@@ -51,33 +92,34 @@ def _main() -> None:
     parser.add_argument("--draws", type=int, default=5, help="draws of pairs of observations")
     args = parser.parse_args()
 
-    pairs = {"matched": {}, "completed": {}, "dark": {}}
-    for name, (images, model) in parse_maps(args.map).items():
-        data = tracks.load(tracks.main(images, model, args.cache / name, args.descriptor))
-        matched = data.only(data.matched)
-        pairs["matched"][name] = [draw_pairs(matched, seed)[:2] for seed in range(args.draws)]
-        completed = [draw_pairs(data, seed) for seed in range(args.draws)]
-        pairs["completed"][name] = [(first, second) for first, second, _ in completed]
-        pairs["dark"][name] = [(first, dark) for first, _, dark in completed]
-    shipped = [name for name in projections.names() if name.startswith(f"{args.descriptor}_")]
-    shipped.sort(key=lambda name: (name.rstrip("0123456789"), -projections.load(name).dim))
-    rows = {args.descriptor: torch.nn.Identity()}
-    rows |= {name: projections.load(name) for name in shipped}
-    rows |= {path.stem: projections.load(path) for path in args.projection}
-
-    points = [f"{name} ({len(draws[0][0])})" for name, draws in pairs["matched"].items()]
-    print(f"| feature | {' | '.join(points)} | mean | completed | dark |")
-    print("| --- |" + " ---: |" * (len(points) + 3))
-    for row, project in rows.items():
-        values = {
-            kind: [
-                np.mean([100 * average_precision(*map(project, views)) for views in draws])
-                for draws in places.values()
-            ]
-            for kind, places in pairs.items()
+    maps = parse_maps(args.map)
+    means = defaultdict(dict)
+    for descriptor in args.descriptor:
+        pairs = {
+            name: draw_all(
+                tracks.load(tracks.main(images, model, args.cache / name, descriptor)), args.draws
+            )
+            for name, (images, model) in maps.items()
         }
-        cells = [*values["matched"], *map(np.mean, values.values())]
-        print(f"| {row} | {' | '.join(f'{value:.2f}' for value in cells)} |")
+        points = [f"{name} ({len(kinds['matched'][0][0])})" for name, kinds in pairs.items()]
+        print(f"| feature | {' | '.join(points)} | mean | completed | dark |")
+        print("| --- |" + " ---: |" * (len(points) + 3))
+        for row, project in load_projections(descriptor, args.projection).items():
+            values = {
+                kind: [measure(project, kinds[kind]) for kinds in pairs.values()]
+                for kind in ("matched", "completed", "dark")
+            }
+            mean = {kind: np.mean(places) for kind, places in values.items()}
+            cells = " | ".join(f"{value:.2f}" for value in (*values["matched"], *mean.values()))
+            print(f"| {row} | {cells} |", flush=True)
+            dim = getattr(project, "dim", DIM)
+            means[family(row)][dim] = f"{mean['matched']:.2f} ({mean['dark']:.2f})"
+        print()
+    dims = sorted({dim for by_dim in means.values() for dim in by_dim}, reverse=True)
+    print(f"| mean (dark) | {' | '.join(map(str, dims))} |")
+    print("| --- |" + " ---: |" * len(dims))
+    for name, by_dim in means.items():
+        print(f"| {name} | {' | '.join(by_dim.get(dim, '') for dim in dims)} |")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
 """PhotoTour sequences, synthesized in the layout of the real ones."""
 
 import cv2
+import kornia
 import numpy as np
 import pytest
 import torch
 
+from hloc_reduce import projections
 from hloc_reduce.cli import InputError
-from hloc_reduce.descriptors import Descriptor
+from hloc_reduce.descriptors import DESCRIPTORS, Base, Descriptor
 from hloc_reduce.evaluation.phototour import fpr95
 from hloc_reduce.training import __main__ as training
 from hloc_reduce.training import phototour, tracks
@@ -65,6 +67,26 @@ def test_training_and_validation(sequence, tmp_path, monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(" on ")[0] for line in lines] == ["FPR95 of sift", "FPR95 of sift_sv16"]
     assert lines[0].endswith("on town: 0.00 %")  # noise of 3 % is nothing to sift
+
+
+def test_hardnet_is_trained_with_the_distance_loss(sequence, tmp_path, monkeypatch):
+    """Every scheme, a few steps, on what a random network describes."""
+    folder, _, _ = sequence
+    torch.manual_seed(0)
+    network = kornia.feature.HardNet(pretrained=False)
+    base = Base(lambda: network, hidden=DESCRIPTORS["hardnet"].hidden)
+    monkeypatch.setitem(DESCRIPTORS, "hardnet", base)
+    weights = {"pca": None, "us": 0.1, "ss": 0.0, "sv": 3.0, "nested": 3.0}
+    assert weights.keys() == training.SCHEMES.keys()
+    for scheme, weight in weights.items():
+        module = training.SCHEMES[scheme]
+        short = {"steps": 4, "batch_size": 64}
+        monkeypatch.setitem(module.RECIPES, "best", {**module.RECIPES["best"], **short})
+        (path,) = training.main({}, [folder], "hardnet", scheme, [24], tmp_path / "w", tmp_path)
+        project = projections.load(path)
+        assert project.sizes[0] == 128 and project.dim == (64 if scheme == "nested" else 24)
+        assert project.sizes[1:-1] == (() if scheme == "pca" else (96,))
+        assert project.metadata["recipe"].get("distance_weight") == weight
 
 
 def test_broken_sequences_are_refused(sequence, tmp_path):

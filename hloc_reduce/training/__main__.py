@@ -72,6 +72,7 @@ def main(
     for dim, path in paths.items():
         metadata = {
             "descriptor": descriptor,
+            "input": "descriptors of unit L2 norm",
             "scheme": scheme,
             "dim": dim,
             "training_data": {

@@ -1,5 +1,6 @@
 """Self-supervised reduction: k-means clusters as labels (Sec. III-B)."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,37 +10,27 @@ from torch import nn
 from .. import logger
 from ..cli import InputError
 from ..projections import MLP
+from . import sv
 from .loop import device, fit
 from .sampling import DescriptorSampler
 from .tracks import Tracks
 
 # "paper" is Sec. III-D: 100,000 clusters for the 450,092 patches of Liberty, that is 4.5 patches
-# each, 200 epochs, clustered anew every 10.
+# each, 200 epochs, clustered anew every 10. "best" clusters once, each map for itself and within
+# cells of about so many descriptors, and then learns as the supervised scheme does.
 RECIPES = {
     "paper": {
+        "loss": "classification",
         "per_cluster": 4.5,
-        "descriptors": None,
         "epochs": 200,
         "cluster_epochs": 10,
         "batch_size": 256,
-        "classes": None,
         "lr": 1e-3,
         "final_lr": 1.0,
         "weight_decay": 0.0,
         "augment": 0.0,
     },
-    "best": {
-        "per_cluster": 4.5,
-        "descriptors": 100_000,
-        "steps": 6000,
-        "cluster_steps": 1500,
-        "batch_size": 512,
-        "classes": 2048,
-        "lr": 3e-3,
-        "final_lr": 0.0,
-        "weight_decay": 1e-5,
-        "augment": 0.35,
-    },
+    "best": {**sv.RECIPES["best"], "loss": "triplet", "per_cluster": 4.5, "per_cell": 64},
 }
 DISTANCE_WEIGHTS = {}
 ITERATIONS = 10  # of k-means
@@ -62,15 +53,9 @@ class ArcClassifier(nn.Module):
         nn.init.constant_(self.log_scale, np.log(SCALE))
         return [self.weight, self.log_scale]
 
-    def forward(
-        self, embedded: torch.Tensor, labels: torch.Tensor, classes: torch.Tensor
-    ) -> torch.Tensor:
-        """Return the cross-entropy of (N, D) of unit norm with labels (N,).
-
-        Only the classes (C,), sorted, the labels among them, are told apart.
-        """
-        labels = torch.searchsorted(classes, labels)
-        cosine = embedded @ nn.functional.normalize(self.weight[classes], dim=1).T
+    def forward(self, embedded: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        """Return the cross-entropy of (N, D) of unit norm with labels (N,)."""
+        cosine = embedded @ nn.functional.normalize(self.weight, dim=1).T
         target = cosine.gather(1, labels[:, None])
         angle = target.clamp(-1 + 1e-6, 1 - 1e-6).acos() + MARGIN
         logits = cosine.scatter(1, labels[:, None], torch.minimum(angle.cos(), target))
@@ -100,25 +85,77 @@ def cluster(descriptors: np.ndarray, num_clusters: int, seed: int) -> np.ndarray
     return kmeans.index.search(descriptors, 1)[1][:, 0]
 
 
+def cluster_in_cells(
+    descriptors: np.ndarray, per_cluster: float, per_cell: int, seed: int
+) -> np.ndarray:
+    """Cluster within cells found by k-means: nearly the same clusters in a fraction of the time.
+
+    Args:
+        descriptors: (N, D) float32.
+        per_cluster: the mean number of descriptors of a cluster.
+        per_cell: the mean number of descriptors of a cell.
+        seed: of the first centres.
+
+    Returns:
+        Labels (N,) int64, from 0 on.
+    """
+    cell = cluster(descriptors, max(1, len(descriptors) // per_cell), seed)
+    order = np.argsort(cell, kind="stable")
+    labels, number = np.empty(len(descriptors), np.int64), 0
+    for rows in np.split(order, np.flatnonzero(np.diff(cell[order])) + 1):
+        inside = max(1, round(len(rows) / per_cluster))
+        labels[rows] = number + cluster(descriptors[rows], inside, seed)
+        number += inside
+    return labels
+
+
 def train(
     maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path, made_from: str = ""
 ) -> MLP:
-    """Train a projection to tell clusters of descriptors apart; arguments as in `sv`.
+    """Train a projection to tell clusters of descriptors apart; arguments as in `sv`."""
+    trainer = {"classification": classify, "triplet": match}[recipe["loss"]]
+    return trainer(maps, dim, recipe, seed, checkpoint, made_from)
+
+
+def match(
+    maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path, made_from: str
+) -> MLP:
+    """Learn as the supervised scheme does, with clusters of base descriptors for points."""
+    return sv.train(
+        [by_cluster(tracks, recipe, seed) for tracks in maps],
+        dim,
+        recipe,
+        seed,
+        checkpoint,
+        made_from,
+    )
+
+
+def by_cluster(tracks: Tracks, recipe: dict, seed: int) -> Tracks:
+    """Take clusters of the observations of a map for its points, whatever they see."""
+    logger.info("Clustering %d descriptors.", len(tracks.track))
+    descriptors = tracks.descriptors[:, 0, 0].astype(np.float32)
+    labels = cluster_in_cells(descriptors, recipe["per_cluster"], recipe["per_cell"], seed)
+    order = np.argsort(labels, kind="stable")
+    views = np.arange(len(labels))  # each counts as an image of its own
+    return replace(tracks.only(order), track=labels[order], image=views)
+
+
+def classify(
+    maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path, made_from: str
+) -> MLP:
+    """Learn a classification layer behind the projection.
 
     The first clusters are those of the base descriptors, the later ones of the projected; each
     time the classification layer begins anew.
     """
     torch.manual_seed(seed)
     sampler = DescriptorSampler(maps, recipe["augment"], mirror=False, balanced=False, seed=seed)
-    generator = np.random.default_rng(seed)
-    number = min(sampler.num_observations, recipe["descriptors"] or sampler.num_observations)
-    chosen = np.sort(generator.choice(sampler.num_observations, number, replace=False))
-    _, descriptors = sampler.views(chosen, np.random.default_rng(seed))
+    number = sampler.num_observations
+    _, descriptors = sampler.views(np.arange(number), np.random.default_rng(seed))
     size, place = recipe["batch_size"], device()
     per_epoch = -(-number // size)
-    steps = recipe.get("steps") or recipe["epochs"] * per_epoch
-    every = recipe.get("cluster_steps") or recipe["cluster_epochs"] * per_epoch
-    num_clusters = max(2, int(number / recipe["per_cluster"]))
+    num_clusters = max(1, int(number / recipe["per_cluster"]))
     mlp = MLP([descriptors.shape[1], *recipe["hidden"], dim])
     network = nn.Module()
     network.mlp, network.classifier = mlp, ArcClassifier(num_clusters, dim)
@@ -126,7 +163,7 @@ def train(
     network.train().to(place)
 
     def cluster_anew(step: int) -> list[nn.Parameter]:
-        if step % every:
+        if step % (recipe["cluster_epochs"] * per_epoch):
             return []
         logger.info("Clustering %d descriptors.", number)
         rows = embed(mlp, descriptors, place) if step else descriptors
@@ -135,18 +172,12 @@ def train(
         return network.classifier.reset()
 
     def loss(step: int) -> torch.Tensor:
-        epoch, batch = divmod(step, per_epoch)
-        order = np.random.default_rng([seed, epoch]).permutation(number)
-        drawn = order[batch * size : (batch + 1) * size]
-        generator = np.random.default_rng([seed, step, 1])
-        seen, _ = sampler.views(chosen[drawn], generator)
-        labels = network.labels[torch.from_numpy(drawn)]
-        classes = torch.arange(num_clusters, device=place)
-        if recipe["classes"] and recipe["classes"] < num_clusters:
-            others = generator.integers(num_clusters, size=recipe["classes"])
-            classes = torch.cat([torch.from_numpy(others).to(place), labels]).unique()
-        return network.classifier(mlp(seen.to(place)), labels, classes)
+        drawn = sampler.indices(step, size)
+        seen, _ = sampler.views(drawn, np.random.default_rng([seed, step, 1]))
+        labels = network.labels[torch.from_numpy(drawn).to(place)]
+        return network.classifier(mlp(seen.to(place)), labels)
 
+    steps = recipe.get("steps") or recipe["epochs"] * per_epoch
     fit(network, loss, steps, recipe, checkpoint, made_from, cluster_anew)
     return mlp.eval().cpu()
 
