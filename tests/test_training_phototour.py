@@ -76,7 +76,7 @@ def test_hardnet_is_trained_with_the_distance_loss(sequence, tmp_path, monkeypat
     network = kornia.feature.HardNet(pretrained=False)
     base = Base(lambda: network, hidden=DESCRIPTORS["hardnet"].hidden)
     monkeypatch.setitem(DESCRIPTORS, "hardnet", base)
-    weights = {"pca": None, "us": 0.1, "ss": 0.0, "sv": 3.0, "nested": 3.0}
+    weights = {"pca": None, "us": 1000.0, "ss": 0.0, "sv": 3.0, "nested": 3.0}
     assert weights.keys() == training.SCHEMES.keys()
     for scheme, weight in weights.items():
         module = training.SCHEMES[scheme]
@@ -87,6 +87,7 @@ def test_hardnet_is_trained_with_the_distance_loss(sequence, tmp_path, monkeypat
         assert project.sizes[0] == 128 and project.dim == (64 if scheme == "nested" else 24)
         assert project.sizes[1:-1] == (() if scheme == "pca" else (96,))
         assert project.metadata["recipe"].get("distance_weight") == weight
+    assert training.complete_recipe("us", "paper", "hardnet")["distance_weight"] == 0.1
 
 
 def test_broken_sequences_are_refused(sequence, tmp_path):

@@ -30,7 +30,13 @@ RECIPES = {
         "weight_decay": 0.0,
         "augment": 0.0,
     },
-    "best": {**sv.RECIPES["best"], "loss": "triplet", "per_cluster": 4.5, "per_cell": 64},
+    "best": {
+        **sv.RECIPES["best"],
+        "loss": "triplet",
+        "per_cluster": 4.5,
+        "per_cell": 64,
+        "steps": 3000,
+    },
 }
 DISTANCE_WEIGHTS = {}
 ITERATIONS = 10  # of k-means

@@ -24,17 +24,18 @@ RECIPES = {
         "balanced": False,
     },
     "best": {
-        "steps": 6000,
+        "steps": 3000,
         "batch_size": 1024,
-        "lr": 1e-2,
+        "lr": 3e-3,
         "final_lr": 0.0,
         "weight_decay": 0.0,
         "augment": 0.25,
         "mirror": True,
         "balanced": True,
+        "distance_weight": 1000.0,
     },
 }
-DISTANCE_WEIGHTS = {"hardnet": 0.1}  # alpha
+DISTANCE_WEIGHTS = {"hardnet": 0.1}  # alpha; of recipes that have none themselves
 
 
 def train(
