@@ -1,6 +1,6 @@
 """Make a place with strongly darkened queries, in the layout of Aachen Day-Night, from a map.
 
-Every third photo of the map becomes a query, the others stay the map. Each query is exposed 4 to 6
+Every third photo of the map becomes a query, the others stay the map. Each query is exposed 2 to 4
 stops less: linear light, shot and read noise, 8 bits; noise and exposure come from a seed.
 Run pipelines.aachen on the result, and benchmarks/summaries.py on its outputs.
 """
@@ -17,7 +17,7 @@ from hloc_reduce.datasets import Aachen
 from hloc_reduce.training.__main__ import parse_maps
 
 EVERY = 3
-STOPS = (4.0, 6.0)
+STOPS = (2.0, 4.0)
 GAMMA = 2.2
 SHOT_NOISE, READ_NOISE = 0.01, 0.002  # of full exposure, in linear light
 
