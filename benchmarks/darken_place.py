@@ -1,8 +1,10 @@
 """Make a place with strongly darkened queries, in the layout of Aachen Day-Night, from a map.
 
-Every third photo of the map becomes a query, the others stay the map. Each query is exposed 2 to 4
-stops less: linear light, shot and read noise, 8 bits; noise and exposure come from a seed.
-Run pipelines.aachen on the result, and benchmarks/summaries.py on its outputs.
+Every third photo of the map becomes a query, the others stay the map. The 8-bit values of each
+query are multiplied by a gain, blurred, made noisy and rounded to 8 bits again; all is drawn from
+a seed. Run pipelines.aachen on the result, with the features of benchmarks/features: where photos
+have a tenth of the contrast, keypoints need a tenth of the threshold. Then benchmarks/summaries.py
+prints the table.
 """
 
 import argparse
@@ -17,20 +19,22 @@ from hloc_reduce.datasets import Aachen
 from hloc_reduce.training.__main__ import parse_maps
 
 EVERY = 3
-STOPS = (2.0, 4.0)
-GAMMA = 2.2
-SHOT_NOISE, READ_NOISE = 0.01, 0.002  # of full exposure, in linear light
+GAIN = (0.06, 0.12)
+BLUR = (0.3, 1.2)  # standard deviation in pixels
+NOISE = 0.003  # standard deviation, of full scale
 
 
-def darken(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Expose an 8-bit image less, as another 8-bit image."""
-    light = (image / 255) ** GAMMA * 0.5 ** generator.uniform(*STOPS)
-    noise = np.sqrt(SHOT_NOISE**2 * light + READ_NOISE**2)
-    light = light + noise * generator.standard_normal(light.shape)
-    return np.round(255 * light.clip(0, 1) ** (1 / GAMMA)).astype(np.uint8)
+def darken(
+    image: np.ndarray, gain: tuple[float, float], generator: np.random.Generator
+) -> np.ndarray:
+    """Darken, blur and add noise to an 8-bit image; the gain is drawn evenly in its logarithm."""
+    view = image / 255 * np.exp(generator.uniform(*np.log(gain)))
+    view = cv2.GaussianBlur(view, (0, 0), generator.uniform(*BLUR))
+    view += NOISE * generator.standard_normal(view.shape)
+    return np.round(255 * view.clip(0, 1)).astype(np.uint8)
 
 
-def main(images: Path, model: Path, output: Path) -> None:
+def main(images: Path, model: Path, output: Path, gain: tuple[float, float] = GAIN) -> None:
     """Write the place."""
     reconstruction = colmap.read_model(model)
     photos = sorted(reconstruction.images.values(), key=lambda image: image.name)
@@ -41,7 +45,8 @@ def main(images: Path, model: Path, output: Path) -> None:
         target = output / "images_upright" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         generator = np.random.default_rng(number)
-        cv2.imwrite(str(target), darken(cv2.imread(str(images / photo.name)), generator))
+        photo_pixels = cv2.imread(str(images / photo.name))
+        cv2.imwrite(str(target), darken(photo_pixels, gain, generator))
         camera, pose = photo.camera, photo.cam_from_world()
         size_and_params = (camera.width, camera.height, *camera.params.tolist())
         lines.append(f"{name} {camera.model.name} {' '.join(map(repr, size_and_params))}\n")
@@ -75,10 +80,18 @@ def _main() -> None:
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument("--map", required=True, metavar="IMAGES:MODEL")
+    parser.add_argument(
+        "--gain",
+        type=float,
+        nargs=2,
+        default=GAIN,
+        metavar=("LEAST", "MOST"),
+        help="of the queries",
+    )
     parser.add_argument("--output", type=Path, required=True, help="new folder of the place")
     args = parser.parse_args()
     [(images, model)] = parse_maps([args.map]).values()
-    main(images, model, args.output)
+    main(images, model, args.output, tuple(args.gain))
 
 
 if __name__ == "__main__":

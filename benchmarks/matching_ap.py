@@ -4,13 +4,16 @@ From each point of a map two observations in different images are drawn. All fir
 ranked by the distance to their nearest second descriptor; correct is the same point. The columns of
 the maps and their mean are for tracks as triangulated from the mutual nearest neighbours of
 `sift`. "completed" adds the observations that it missed and geometry found, and "dark" takes
-photometric variants (darkness, blur, noise) of the second photos, too. Prints Markdown tables of
+photometric variants (darkness, blur, noise) of the second photos, too. "photo pairs" is as hloc
+matches, one photo with another, completed: the observations in one of the points that both see,
+with all observations in the other; mean over the pairs of photos. Prints Markdown tables of
 percentages, means over several draws: for each base descriptor one with a row for itself, each
 projection of it that ships and each `--projection` whose name begins with its name; then one of the
-means of matched tracks and of dark photos by number of dimensions.
+means by number of dimensions.
 """
 
 import argparse
+import itertools
 import re
 from collections import defaultdict
 from pathlib import Path
@@ -25,6 +28,9 @@ from hloc_reduce.training import nested, tracks
 from hloc_reduce.training.__main__ import parse_maps
 from hloc_reduce.training.sampling import matchable
 
+KINDS = ("matched", "completed", "dark", "photo pairs")
+MIN_SHARED = 30  # points that a pair of photos must share
+
 
 def draw_pairs(data: tracks.Tracks, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Draw two observations of each point: base descriptors (N, 128) as seen, seen and dark."""
@@ -36,6 +42,24 @@ def draw_pairs(data: tracks.Tracks, seed: int) -> tuple[torch.Tensor, torch.Tens
     variant = generator.integers(1, data.descriptors.shape[2], size=len(second))
     drawn = [(first, 0), (second, 0), (second, variant)]
     return tuple(torch.from_numpy(data.descriptors[i, 0, v]).float() for i, v in drawn)
+
+
+def photo_pairs(data: tracks.Tracks) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """List base descriptors (N, 128), (M, 128) of pairs of photos, the first N of common points."""
+    photos = []
+    for image in np.unique(data.image):
+        seen = np.flatnonzero(data.image == image)
+        photos.append(seen[np.unique(data.track[seen], return_index=True)[1]])
+    pairs = []
+    for seen, others in itertools.permutations(photos, 2):
+        _, first, second = np.intersect1d(
+            data.track[seen], data.track[others], assume_unique=True, return_indices=True
+        )
+        if len(first) < MIN_SHARED:
+            continue
+        views = seen[first], np.concatenate([others[second], np.delete(others, second)])
+        pairs.append(tuple(torch.from_numpy(data.descriptors[i, 0, 0]).float() for i in views))
+    return pairs
 
 
 def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.Module]:
@@ -58,13 +82,14 @@ def family(name: str) -> str:
 
 
 def draw_all(data: tracks.Tracks, draws: int) -> dict[str, list]:
-    """Draw the pairs of each kind of a map."""
+    """Pair the descriptors of a map in each of KINDS."""
     matched = data.only(data.matched)
     completed = [draw_pairs(data, seed) for seed in range(draws)]
     return {
         "matched": [draw_pairs(matched, seed)[:2] for seed in range(draws)],
         "completed": [(first, second) for first, second, _ in completed],
         "dark": [(first, dark) for first, _, dark in completed],
+        "photo pairs": photo_pairs(data),
     }
 
 
@@ -102,21 +127,20 @@ def _main() -> None:
             for name, (images, model) in maps.items()
         }
         points = [f"{name} ({len(kinds['matched'][0][0])})" for name, kinds in pairs.items()]
-        print(f"| feature | {' | '.join(points)} | mean | completed | dark |")
-        print("| --- |" + " ---: |" * (len(points) + 3))
+        print(f"| feature | {' | '.join(points)} | mean | {' | '.join(KINDS[1:])} |")
+        print("| --- |" + " ---: |" * (len(points) + len(KINDS)))
         for row, project in load_projections(descriptor, args.projection).items():
             values = {
-                kind: [measure(project, kinds[kind]) for kinds in pairs.values()]
-                for kind in ("matched", "completed", "dark")
+                kind: [measure(project, kinds[kind]) for kinds in pairs.values()] for kind in KINDS
             }
             mean = {kind: np.mean(places) for kind, places in values.items()}
             cells = " | ".join(f"{value:.2f}" for value in (*values["matched"], *mean.values()))
             print(f"| {row} | {cells} |", flush=True)
             dim = getattr(project, "dim", DIM)
-            means[family(row)][dim] = f"{mean['matched']:.2f} ({mean['dark']:.2f})"
+            means[family(row)][dim] = " / ".join(f"{mean[kind]:.1f}" for kind in KINDS)
         print()
     dims = sorted({dim for by_dim in means.values() for dim in by_dim}, reverse=True)
-    print(f"| mean (dark) | {' | '.join(map(str, dims))} |")
+    print(f"| {' / '.join(KINDS)} | {' | '.join(map(str, dims))} |")
     print("| --- |" + " ---: |" * len(dims))
     for name, by_dim in means.items():
         print(f"| {name} | {' | '.join(by_dim.get(dim, '') for dim in dims)} |")

@@ -302,6 +302,9 @@ def test_average_precision_by_hand():
     unit = [torch.stack([a.cos(), a.sin()], 1) for a in (angles, shifted)]
     # nearest: 0 -> 0 (.01), 1 -> 3 (.1), 2 -> 2 (.2), 3 -> 2 (1.8)
     assert average_precision(*unit) == pytest.approx((1 + 2 / 3) / 4)
+    # a fifth descriptor in the way of the first: miss, miss, hit, miss
+    distracted = torch.cat([unit[1], unit[0][:1]])
+    assert average_precision(unit[0], distracted) == pytest.approx(1 / 3 / 4)
 
 
 def test_a_map_is_trained_on(scene, tmp_path, monkeypatch):

@@ -12,7 +12,8 @@ def average_precision(
 
     Args:
         descriptors0: (N, D) of unit norm.
-        descriptors1: (N, D) of unit norm, row i matching row i of descriptors0 only.
+        descriptors1: (M, D) of unit norm, M >= N, row i matching row i of descriptors0 only;
+            the rows after the first N match none.
         block: rows compared at once.
 
     Returns:
