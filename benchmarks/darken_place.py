@@ -15,7 +15,9 @@ import cv2
 import numpy as np
 
 from hloc_reduce import cli, colmap
+from hloc_reduce.cli import InputError
 from hloc_reduce.datasets import Aachen
+from hloc_reduce.io import read_image
 from hloc_reduce.training.__main__ import parse_maps
 
 EVERY = 3
@@ -45,8 +47,8 @@ def main(images: Path, model: Path, output: Path, gain: tuple[float, float] = GA
         target = output / "images_upright" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         generator = np.random.default_rng(number)
-        photo_pixels = cv2.imread(str(images / photo.name))
-        cv2.imwrite(str(target), darken(photo_pixels, gain, generator))
+        view = darken(read_image(images / photo.name), gain, generator)
+        cv2.imwrite(str(target), view[..., ::-1])
         camera, pose = photo.camera, photo.cam_from_world()
         size_and_params = (camera.width, camera.height, *camera.params.tolist())
         lines.append(f"{name} {camera.model.name} {' '.join(map(repr, size_and_params))}\n")
@@ -90,6 +92,8 @@ def _main() -> None:
     )
     parser.add_argument("--output", type=Path, required=True, help="new folder of the place")
     args = parser.parse_args()
+    if not 0 < args.gain[0] <= args.gain[1]:
+        raise InputError("--gain: give two numbers above 0, the smaller first.")
     [(images, model)] = parse_maps([args.map]).values()
     main(images, model, args.output, tuple(args.gain))
 

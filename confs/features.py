@@ -8,6 +8,7 @@ from pathlib import Path
 
 import yaml
 
+from hloc_reduce import projections
 from hloc_reduce.cli import InputError, choose
 from hloc_reduce.descriptors import DESCRIPTORS
 
@@ -65,8 +66,9 @@ def get(name: str, projection: Path | None = None) -> tuple[str, dict]:
         "base": conf["model"].get("base", conf["model"]),
         "projection": str(projection),
     }
-    output = feature(projection.stem, model)["output"]
-    return projection.stem, {**conf, "output": output, "model": model}
+    file, prefix = projections.split_prefix(projection)
+    name = Path(file).stem + (prefix and f"@{prefix}")
+    return name, {**conf, "output": feature(name, model)["output"], "model": model}
 
 
 def read(path: Path) -> dict:
@@ -80,10 +82,17 @@ def read(path: Path) -> dict:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path} cannot be read ({' '.join(str(error).split())}).") from None
     model = content.get("model") if isinstance(content, dict) else None
-    if not isinstance(model, dict) or "name" not in model:
-        raise InputError(f"{path} has no model with a name, such as: model: {{name: dog}}.")
-    unknown = content.keys() - {"model", "preprocessing"}
+    for part in (model, model.get("base", model) if isinstance(model, dict) else None):
+        if not isinstance(part, dict) or "name" not in part:
+            raise InputError(f"{path} has no model with a name, such as: model: {{name: dog}}.")
+    given = content.get("preprocessing") or {}
+    if not isinstance(given, dict):
+        raise InputError(f"{path}: preprocessing cannot be {given!r}.")
+    unknown = (content.keys() - {"model", "preprocessing"}) | (given.keys() - PREPROCESSING.keys())
     if unknown:
         raise InputError(f"{path}: unknown keys {', '.join(map(str, sorted(unknown, key=str)))}.")
-    preprocessing = {**PREPROCESSING, **(content.get("preprocessing") or {})}
+    preprocessing = {**PREPROCESSING, **given}
+    resize_max = preprocessing["resize_max"]
+    if resize_max is not None and not (isinstance(resize_max, int) and resize_max > 0):
+        raise InputError(f"{path}: resize_max is a number of pixels or null, not {resize_max!r}.")
     return {"output": f"feats-{path.stem}", "model": model, "preprocessing": preprocessing}

@@ -2,11 +2,13 @@
 
 import importlib
 import inspect
+import pkgutil
+from numbers import Number
 from types import ModuleType
 
 from torch import nn
 
-from .cli import InputError
+from .cli import InputError, choose
 
 
 class BaseModel(nn.Module):
@@ -16,7 +18,8 @@ class BaseModel(nn.Module):
         conf: overrides of `default_conf`, and optionally the key `name`.
 
     Raises:
-        InputError: for a configuration key that the model does not have.
+        InputError: for a configuration key that the model does not have, or a value of another
+            kind than its default.
     """
 
     default_conf: dict = {}
@@ -30,6 +33,11 @@ class BaseModel(nn.Module):
                 f"{type(self).__name__} has no option {', '.join(sorted(unknown))}. "
                 f"It has: {', '.join(self.default_conf)}."
             )
+        for kind in (Number, str, dict):
+            for key, value in conf.items():
+                default = self.default_conf.get(key)
+                if isinstance(default, kind) and not isinstance(value, kind):
+                    raise InputError(f"{type(self).__name__}: {key} cannot be {value!r}.")
         self.conf = {**self.default_conf, **conf}
         self._init(self.conf)
 
@@ -37,7 +45,7 @@ class BaseModel(nn.Module):
         """Check that the required inputs are there and compute the predictions."""
         missing = [key for key in self.required_inputs if key not in data]
         if missing:
-            raise KeyError(f"{type(self).__name__} needs {', '.join(missing)}.")
+            raise InputError(f"{type(self).__name__} needs {', '.join(missing)}.")
         return self._forward(data)
 
     def _init(self, conf: dict) -> None:
@@ -45,8 +53,14 @@ class BaseModel(nn.Module):
 
 
 def dynamic_load(root: ModuleType, name: str) -> type[BaseModel]:
-    """Return the one BaseModel that the module `name` of the package `root` defines."""
-    module = importlib.import_module(f"{root.__name__}.{name}")
+    """Return the one BaseModel that the module `name` of the package `root` defines.
+
+    Raises:
+        InputError: when there is no such module.
+    """
+    names = [module.name for module in pkgutil.iter_modules(root.__path__)]
+    kind = root.__name__.rpartition(".")[2].removesuffix("s")
+    module = importlib.import_module(f"{root.__name__}.{choose(kind, name, names)}")
     (model,) = (
         value
         for _, value in inspect.getmembers(module, inspect.isclass)

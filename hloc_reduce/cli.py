@@ -28,7 +28,7 @@ def choose(kind: str, name: str, names: Iterable[str]) -> str:
     """Return `name` if it is one of `names`, else raise an InputError, nearest names first."""
     names = list(names)
     if name not in names:
-        near = difflib.get_close_matches(name, names, n=len(names) or 1, cutoff=0)
+        near = difflib.get_close_matches(str(name), names, n=len(names) or 1, cutoff=0)
         raise InputError(f"Unknown {kind} '{name}'. There are: {', '.join(near) or 'none'}.")
     return name
 

@@ -20,8 +20,16 @@ def dog_detector(options: dict) -> Callable[[np.ndarray], np.ndarray]:
     Returns:
         A function from an image (H, W) float32 in [0, 1] to keypoints (N, 4) float32: x, y with
         pixel centres at integers, scale in pixels, orientation in degrees from x towards y.
+
+    Raises:
+        InputError: for an option that there is not.
     """
-    extraction = pycolmap.FeatureExtractionOptions(sift=pycolmap.SiftExtractionOptions(options))
+    try:
+        sift = pycolmap.SiftExtractionOptions(options)
+    except (AttributeError, TypeError, RuntimeError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"The DoG options {options} cannot be used ({reason}).") from None
+    extraction = pycolmap.FeatureExtractionOptions(sift=sift)
     extractor = pycolmap.FeatureExtractor.create(extraction, pycolmap.Device.cpu)
 
     def detect(image: np.ndarray) -> np.ndarray:

@@ -83,7 +83,7 @@ def provenance(conf: dict, as_half: bool) -> dict:
         InputError: when the projection or the weights of its base descriptor are not to be had.
     """
     base = conf["model"].get("base", conf["model"])
-    if base.get("descriptor") in DESCRIPTORS:
+    if base.get("descriptor") in list(DESCRIPTORS):
         check_weights(base["descriptor"])
     made_by = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
     if "projection" in conf["model"]:

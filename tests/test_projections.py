@@ -18,6 +18,7 @@ from confs.features import confs
 from hloc_reduce import projections
 from hloc_reduce.cli import InputError
 from hloc_reduce.extract_features import load_extractor
+from hloc_reduce.extractors.reduced import Reduced
 from hloc_reduce.projections import MLP, Projection, released
 
 
@@ -101,6 +102,33 @@ def test_what_ships_says_where_it_comes_from(name):
     assert metadata["recipe"]["name"] in ("best", "paper")
 
 
+def test_everything_ships_in_25_megabytes():
+    expected = {
+        name
+        for descriptor in ("sift", "mkd", "tfeat")
+        for name in features.names(descriptor)
+        if "@" not in name
+    }
+    assert set(projections.names()) == expected and len(expected) == 51
+    assert sum(path.stat().st_size for path in projections.WEIGHTS.iterdir()) < 25e6
+
+
+@pytest.mark.parametrize("name", projections.names())
+def test_what_ships_takes_unit_norm(name):
+    assert projections.load(name).metadata["input"] == "descriptors of unit L2 norm"
+
+
+@pytest.mark.parametrize("dim", [64, 32, 24, 16])
+def test_the_authors_sift_models(dim):
+    path = SHARED / f"released_projections/SIFT_sv_dim{dim}.pth"
+    if not path.is_file():
+        pytest.skip(f"{path} is not on this machine")
+    projection = projections.load(path)
+    assert projection.sizes == (128, 512, 512, dim)
+    descriptors = torch.nn.functional.normalize(torch.rand(10, 128), dim=1)
+    torch.testing.assert_close(projection(descriptors).norm(dim=1), torch.ones(10))
+
+
 def test_the_papers_68_features_have_names():
     paper = [name for name in confs if "nested" not in name]
     assert len(paper) == 68
@@ -113,6 +141,10 @@ def test_what_does_not_ship_says_how_to_train_it():
         projections.load("hardnet_us24")
     with pytest.raises(InputError, match="--descriptor hardnet --scheme nested --map"):
         projections.load("hardnet_nested@24")
+    with pytest.raises(InputError, match="weights/hardnet_nested.safetensors@24"):
+        projections.load("hardnet_nested@24")
+    with pytest.raises(InputError, match="There is no projection"):
+        projections.load("sitf_sv64")
 
 
 def test_the_first_numbers_of_a_nested_projection(tmp_path):
@@ -231,7 +263,11 @@ def test_features_of_a_file(tmp_path):
         "model: [": "cannot be read",
         "- 1": "no model",
         "model: dog": "no model",
+        "model: {name: reduced, base: dog}": "no model",
         "model: {name: dog}\ncolour: 1": "unknown keys colour",
+        "model: {name: dog}\npreprocessing: {resize: 9}": "unknown keys resize",
+        "model: {name: dog}\npreprocessing: 5": "cannot be 5",
+        "model: {name: dog}\npreprocessing: {resize_max: big}": "resize_max is",
         "!!python/object/apply:os.system ['true']": "cannot be read",
     }.items():
         path.write_text(content)
@@ -239,6 +275,30 @@ def test_features_of_a_file(tmp_path):
             features.get(str(path))
     with pytest.raises(InputError, match="cannot be read"):
         features.get(str(tmp_path / "absent.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        ({"name": "dgo"}, "Unknown extractor 'dgo'"),
+        ({"name": 5}, "Unknown extractor '5'"),
+        ({"name": "dog", "max_keypoints": "many"}, "max_keypoints cannot be 'many'"),
+        ({"name": "dog", "options": [1]}, "options cannot be"),
+        ({"name": "dog", "descriptor": ["sift"]}, "descriptor cannot be"),
+        ({"name": "dog", "descriptor": "sfit"}, "Unknown descriptor 'sfit'"),
+        ({"name": "dog", "options": {"threshold": 1}}, "The DoG options"),
+        ({"name": "dog", "options": {"peak_threshold": "low"}}, "The DoG options"),
+        ({"name": "vlad"}, "VLAD needs|Vlad needs"),
+    ],
+)
+def test_a_wrong_model_is_one_clear_error(model, message):
+    with pytest.raises(InputError, match=message):
+        load_extractor(model)({"image": torch.rand(1, 1, 64, 64)})
+
+
+def test_dog_wants_grey_images():
+    with pytest.raises(InputError, match="grey"):
+        load_extractor({"name": "dog"})({"image": torch.rand(1, 3, 64, 64)})
 
 
 def test_another_projection_of_a_feature():
@@ -272,3 +332,14 @@ def test_projection_of_other_descriptors_is_refused(tmp_path, textured):
     image = torch.from_numpy(textured / np.float32(255))[None, None]
     with pytest.raises(InputError, match="for 256-D .* have 128"):
         load_extractor(conf)({"image": image})
+
+
+def test_a_feature_is_called_after_file_and_prefix(tmp_path):
+    name, conf = features.get("sift", f"{tmp_path}/mine.safetensors@24")
+    assert name == "mine@24" and conf["output"] == "feats-dog-mine@24"
+    assert conf["model"]["projection"] == f"{tmp_path}/mine.safetensors@24"
+
+
+def test_a_projection_of_another_descriptor_is_refused(base_weights):
+    with pytest.raises(InputError, match="is for sift, not for mkd"):
+        Reduced({"base": {"name": "dog", "descriptor": "mkd"}, "projection": "sift_sv16"})

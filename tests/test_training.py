@@ -1,5 +1,6 @@
 import hashlib
 import json
+import re
 
 import numpy as np
 import pytest
@@ -223,7 +224,7 @@ def test_clusters_within_cells():
     group = np.repeat(np.arange(12), 40)
     centres = generator.standard_normal((12, 16))
     descriptors = centres[group] + 0.01 * generator.standard_normal((480, 16))
-    labels = ss.cluster_in_cells(descriptors.astype(np.float32), 10, 160, seed=0)
+    labels = ss.cluster_in_cells(descriptors.astype(np.float32), 10, 160, 10, seed=0)
     assert set(labels) <= set(range(60)) and len(set(labels)) > 36
     for label in set(labels):
         assert len(set(group[labels == label])) == 1
@@ -264,6 +265,29 @@ def test_an_epoch_goes_once_through_all_descriptors():
     assert torch.equal(seen, plain)
     both = np.concatenate([part.descriptors[:, 0, 0] for part in data])
     np.testing.assert_array_equal(plain.numpy(), both[sampler.indices(0, 64)])
+
+
+@pytest.mark.parametrize(("scheme", "batch_size"), [(us, 39), (ss, 39)])
+def test_a_last_batch_of_one_is_left_out(scheme, batch_size, tmp_path):
+    """40 observations: a batch normalization learns nothing from the fortieth alone."""
+    if scheme is ss:
+        pytest.importorskip("faiss")
+    recipe = {**scheme.RECIPES["paper"], **SMALL, "batch_size": batch_size, "epochs": 2}
+    recipe.pop("steps", None)
+    scheme.train([noisy_tracks(10)], 8, {"distance_weight": 0.0, **recipe}, 0, tmp_path / "c")
+
+
+def test_the_papers_hyper_parameters():
+    """Sec. III-D; those of the classification layer are of the authors' code."""
+    recipe = training.complete_recipe("us", "paper", "hardnet")
+    assert recipe["distance_weight"] == 0.1 and recipe["hidden"] == [96]
+    assert (recipe["epochs"], recipe["lr"], recipe["batch_size"]) == (5, 0.001, 1024)
+    recipe = training.complete_recipe("ss", "paper", "sift")
+    assert recipe["hidden"] == [512, 512] and not recipe["distance_weight"]
+    assert (recipe["epochs"], recipe["lr"], recipe["batch_size"]) == (200, 0.001, 256)
+    assert recipe["cluster_epochs"] == 10 and recipe["final_lr"] == 1
+    assert int(450_092 / recipe["per_cluster"]) == 100_000
+    assert (recipe["margin"], recipe["scale"]) == (0.1, 1)
 
 
 def test_pca_keeps_the_variance():
@@ -333,6 +357,49 @@ def test_a_map_is_trained_on(scene, tmp_path, monkeypatch):
     )
     assert len(training.main(*arguments, tmp_path)) == 2
     assert path.stat().st_mtime_ns == written
+
+
+def test_nested_is_trained_once(scene, tmp_path, monkeypatch):
+    recipe = {**nested.RECIPES["best"], "steps": 2, "batch_size": 16}
+    monkeypatch.setitem(nested.RECIPES, "best", recipe)
+    monkeypatch.setattr(tracks, "main", lambda *_: tmp_path / "tracks.safetensors")
+    monkeypatch.setattr(tracks, "load", lambda _: noisy_tracks())
+    (tmp_path / "tracks.safetensors").touch()
+    arguments = {"a": (scene.images, scene.model)}, [], "sift", "nested", [], tmp_path, tmp_path
+    (path,) = training.main(*arguments)
+    written = path.stat().st_mtime_ns
+    assert training.main(*arguments) == [path] and path.stat().st_mtime_ns == written
+
+
+def run(monkeypatch, *arguments):
+    """Run the command line."""
+    monkeypatch.setattr("sys.argv", ["training", *map(str, arguments)])
+    training._main()
+
+
+def test_a_sequence_is_called_otherwise_than_a_map(tmp_path, monkeypatch):
+    for folder in ("a/liberty", "b/liberty/images", "b/liberty/sparse"):
+        (tmp_path / folder).mkdir(parents=True)
+    place = f"{tmp_path}/b/liberty/images:{tmp_path}/b/liberty/sparse"
+    with pytest.raises(InputError, match="called liberty"):
+        run(monkeypatch, "--map", place, "--phototour", tmp_path / "a/liberty")
+    with pytest.raises(InputError, match="--seed -1"):
+        run(monkeypatch, "--map", place, "--seed", -1)
+
+
+def test_the_command_for_what_does_not_ship_is_one(tmp_path, monkeypatch):
+    """The line that the message prints trains, when there is a map; here the map is not there."""
+    monkeypatch.setattr(training, "check_weights", lambda name: None)
+    with pytest.raises(InputError) as error:
+        projections.load("hardnet_us24")
+    command = re.search("python -m hloc_reduce.training ([^']*)", str(error.value))[1]
+    with pytest.raises(InputError, match="there is no folder IMAGES"):
+        run(monkeypatch, *command.split())
+
+
+def test_too_few_observations_for_pca():
+    with pytest.raises(InputError, match="too few"):
+        pca.train([noisy_tracks(2)], 64, {}, 0)
 
 
 def test_maps_are_parsed(tmp_path):

@@ -63,7 +63,7 @@ def test_training_and_validation(sequence, tmp_path, monkeypatch, capsys):
     small = {**training.sv.RECIPES["best"], "steps": 20, "batch_size": 64}
     monkeypatch.setitem(training.sv.RECIPES, "best", small)
     paths = training.main({}, [folder], "sift", "sv", [16], tmp_path / "w", tmp_path / "cache")
-    training.validate(folder, tmp_path / "cache", "sift", paths)
+    training.validate(folder, tmp_path / "cache", "sift", paths, seed=0)
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(" on ")[0] for line in lines] == ["FPR95 of sift", "FPR95 of sift_sv16"]
     assert lines[0].endswith("on town: 0.00 %")  # noise of 3 % is nothing to sift
@@ -79,9 +79,10 @@ def test_hardnet_is_trained_with_the_distance_loss(sequence, tmp_path, monkeypat
     weights = {"pca": None, "us": 1000.0, "ss": 0.0, "sv": 3.0, "nested": 3.0}
     assert weights.keys() == training.SCHEMES.keys()
     for scheme, weight in weights.items():
-        module = training.SCHEMES[scheme]
-        short = {"steps": 4, "batch_size": 64}
-        monkeypatch.setitem(module.RECIPES, "best", {**module.RECIPES["best"], **short})
+        if weight is not None:
+            recipes = training.SCHEMES[scheme].RECIPES
+            short = {"steps": 4, "batch_size": 64}
+            monkeypatch.setitem(recipes, "best", {**recipes["best"], **short})
         (path,) = training.main({}, [folder], "hardnet", scheme, [24], tmp_path / "w", tmp_path)
         project = projections.load(path)
         assert project.sizes[0] == 128 and project.dim == (64 if scheme == "nested" else 24)
@@ -103,8 +104,14 @@ def test_broken_sequences_are_refused(sequence, tmp_path):
     (folder / phototour.PAIRS).write_text("1 2 3\n")
     with pytest.raises(InputError, match="line 1: not a pair"):
         phototour.read_pairs(folder)
+    (folder / phototour.PAIRS).write_text("0 5 0 1 5 0\n")
+    with pytest.raises(InputError, match="both matching pairs and others"):
+        phototour.read_pairs(folder)
     cv2.imwrite(str(folder / "patches0000.bmp"), np.zeros((64, 64), np.uint8))
-    (folder / "info.txt").write_text("1 0\n")
+    (folder / "info.txt").write_text("1 0\n2 0\n")
+    with pytest.raises(InputError, match="no two patches"):
+        phototour.main(folder, tmp_path / "cache")
+    (folder / "info.txt").write_text("1 0\n1 0\n")
     with pytest.raises(InputError, match="not a sheet"):
         phototour.main(folder, tmp_path / "cache")
 

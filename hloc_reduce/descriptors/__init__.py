@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from urllib.request import urlopen
 
 import torch
@@ -22,13 +23,14 @@ class Base:
 
     Args:
         make: returns the kornia module that maps (N, 1, 32, 32) in [0, 1] to (N, 128).
-        url: the weights that kornia downloads to torch's cache; "" for a descriptor without.
+        urls: of the weights that kornia downloads to torch's cache, the first that answers; none
+            for a descriptor without.
         hidden: the sizes of the hidden layers of its projections: two for hand-crafted descriptors,
             one for learned ones (Sec. III-D).
     """
 
     make: Callable[[], nn.Module]
-    url: str = ""
+    urls: tuple[str, ...] = ()
     hidden: tuple[int, ...] = (512, 512)
 
 
@@ -36,16 +38,23 @@ DESCRIPTORS = {
     "sift": Base(lambda: feature.SIFTDescriptor(PATCH_SIZE, 8, 4, rootsift=False)),
     "mkd": Base(
         feature.MKDDescriptor,
-        "https://github.com/manyids2/mkd_pytorch/raw/master/mkd_pytorch/mkd-concat-64.pth",
+        ("https://github.com/manyids2/mkd_pytorch/raw/master/mkd_pytorch/mkd-concat-64.pth",),
     ),
     "tfeat": Base(
         lambda: feature.TFeat(pretrained=True),
-        "https://huggingface.co/kornia/tfeat/resolve/main/tfeat-liberty.params",
+        (
+            "https://huggingface.co/kornia/tfeat/resolve/main/tfeat-liberty.params",
+            "https://github.com/vbalnt/tfeat/raw/master/pretrained-models/tfeat-liberty.params",
+        ),
         hidden=(512,),
     ),
     "hardnet": Base(
         lambda: feature.HardNet(pretrained=True),
-        "https://huggingface.co/kornia/hardnet/resolve/main/checkpoint_liberty_with_aug.pth",
+        (
+            "https://huggingface.co/kornia/hardnet/resolve/main/checkpoint_liberty_with_aug.pth",
+            "https://github.com/DagnyT/hardnet/raw/master/pretrained/train_liberty_with_aug/"
+            "checkpoint_liberty_with_aug.pth",
+        ),
         hidden=(96,),
     ),
 }
@@ -67,7 +76,11 @@ class Descriptor(nn.Module):
         super().__init__()
         base = DESCRIPTORS[choose("descriptor", name, DESCRIPTORS)]
         check_weights(name)
-        self.describe = base.make().eval()
+        try:
+            self.describe = base.make().eval()
+        except (RuntimeError, EOFError, UnpicklingError) as error:
+            reason = str(error).strip().splitlines()[0]
+            raise InputError(f"The weights {weights(name)} are broken ({reason}).") from None
 
     @torch.no_grad()
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
@@ -84,15 +97,23 @@ def check_weights(name: str) -> None:
     Raises:
         InputError: when they are not in torch's cache and their address does not answer.
     """
-    url = DESCRIPTORS[name].url
-    path = Path(torch.hub.get_dir()) / "checkpoints" / url.rpartition("/")[2]
-    if not url or path.is_file():
+    path, urls = weights(name), DESCRIPTORS[name].urls
+    if path is None or path.is_file():
         return
-    try:
-        urlopen(url, timeout=TIMEOUT).close()
-    except OSError as error:
-        reason = getattr(error, "reason", error)
-        raise InputError(
-            f"The weights of {name} are not there, and cannot be downloaded ({reason}): "
-            f"put {url} to {path}, or set TORCH_HOME to the folder whose hub/checkpoints has it."
-        ) from None
+    for url in urls:
+        try:
+            urlopen(url, timeout=TIMEOUT).close()
+            return
+        except OSError as error:
+            reason = getattr(error, "reason", error)
+    raise InputError(
+        f"The weights of {name} are not there, and cannot be downloaded ({reason}): "
+        f"put {urls[0]} to {path}, or set TORCH_HOME to the folder whose hub/checkpoints has it."
+    )
+
+
+def weights(name: str) -> Path | None:
+    """Return where torch's cache has the weights of a descriptor; None for one without."""
+    urls = DESCRIPTORS[name].urls
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
+    return folder / urls[0].rpartition("/")[2] if urls else None

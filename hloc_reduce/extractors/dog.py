@@ -6,6 +6,7 @@ from kornia.feature.laf import extract_patches_from_pyramid, laf_from_center_sca
 
 from .. import colmap
 from ..base_model import BaseModel
+from ..cli import InputError
 from ..descriptors import PATCH_SIZE, Descriptor
 
 
@@ -52,6 +53,8 @@ class DoG(BaseModel):
 
     def _forward(self, data: dict) -> dict:
         image = data["image"]
+        if image.shape[1] != 1:
+            raise InputError("DoG needs grey images: preprocessing: {grayscale: true}.")
         if self.detect is None:
             self.detect = colmap.dog_detector(self.conf["options"])
         keypoints = self.detect(image[0, 0].cpu().numpy())

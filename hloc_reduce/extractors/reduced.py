@@ -18,6 +18,12 @@ class Reduced(BaseModel):
     def _init(self, conf: dict) -> None:
         self.base = dynamic_load(extractors, conf["base"]["name"])(conf["base"])
         self.project = projections.load(conf["projection"])
+        trained_on = self.project.metadata.get("descriptor")
+        described = self.base.conf.get("descriptor", trained_on)
+        if trained_on not in (None, described):
+            raise InputError(
+                f"The projection {conf['projection']} is for {trained_on}, not for {described}."
+            )
 
     @property
     def detection_noise(self) -> float:

@@ -13,6 +13,7 @@ from safetensors.torch import save as serialize
 from torch import nn
 
 from ..cli import InputError
+from ..descriptors import DESCRIPTORS
 from ..io import replacing
 from . import released
 
@@ -26,7 +27,7 @@ COMMAND = (
 PREFIX = re.compile(r"(.+)@([^@/\\.]+)")
 BROKEN = (
     *(SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError, IndexError),
-    *(AttributeError, pickle.UnpicklingError),
+    *(AttributeError, EOFError, pickle.UnpicklingError),
 )
 
 
@@ -107,24 +108,26 @@ def names() -> list[str]:
 def find(projection: str | Path) -> Path:
     """Return the file of a projection, given by the name of one that ships or by its path.
 
+    `@` and a prefix may follow.
+
     Those of hardnet that the paper's authors released are downloaded once.
 
     Raises:
         InputError: when it is not there, does not ship or cannot be had.
     """
-    path = Path(projection)
+    name, prefix = split_prefix(projection)
+    path = Path(name)
     if path.suffix:
         if not path.is_file():
             raise InputError(f"There is no projection file {path}.")
         return path
-    name = str(projection)
     path = WEIGHTS / f"{name}.safetensors"
     if path.is_file():
         return path
     if name in released.FILES:
         return released.fetch(name)
     parts = re.fullmatch(r"([a-z]+)_([a-z]+)(\d*)", name)
-    if not parts:
+    if not parts or parts[1] not in DESCRIPTORS:
         raise InputError(f"There is no projection {name}. Those that ship: {', '.join(names())}.")
     descriptor, scheme, dim = parts.groups()
     command = COMMAND.format(
@@ -132,7 +135,7 @@ def find(projection: str | Path) -> Path:
     )
     raise InputError(
         f"The projection {name} does not ship. Train it by '{command}' and add "
-        f"'--projection weights/{name}.safetensors'."
+        f"'--projection weights/{name}.safetensors{prefix and '@' + prefix}'."
     )
 
 
@@ -144,8 +147,7 @@ def split_prefix(projection: str | Path) -> tuple[str, str]:
 
 def checksum(projection: str | Path) -> str:
     """Return the sha256 of a projection's file, to tell which one made a feature file."""
-    path = find(split_prefix(projection)[0])
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(find(projection).read_bytes()).hexdigest()
 
 
 def save(mlp: MLP, metadata: dict, path: Path) -> None:
@@ -173,14 +175,13 @@ def load(projection: str | Path) -> Projection:
     Raises:
         InputError: when it is not there or is not a projection.
     """
-    projection, prefix = split_prefix(projection)
-    path = find(projection)
+    path, prefix = find(projection), split_prefix(projection)[1]
     try:
         mlp, metadata = READERS.get(path.suffix, read_safetensors)(path)
+        loaded = Projection(mlp, metadata)
     except BROKEN as error:
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"{path} is not a projection ({reason}).") from None
-    loaded = Projection(mlp, metadata)
     if not prefix:
         return loaded
     if metadata.get("scheme") != "nested" or not prefix.isdigit():
@@ -211,7 +212,7 @@ def read_released(path: Path) -> tuple[MLP, dict]:
     for layers, prefixes in ((mlp.linears, linears), (mlp.norms, norms)):
         for layer, prefix in zip(layers, prefixes, strict=True):
             layer.load_state_dict({key: state[prefix + key] for key in layer.state_dict()})
-    return mlp, {"training_data": f"{path.name} of {released.SOURCE}"}
+    return mlp, {"training_data": f"{path.name}, in the form of {released.SOURCE}"}
 
 
 READERS = {".pth": read_released}

@@ -1,6 +1,7 @@
 """The projections that the paper's authors released, downloaded from them when they are needed."""
 
 import hashlib
+from http.client import HTTPException
 from pathlib import Path
 from urllib.request import urlopen
 
@@ -50,7 +51,7 @@ def fetch(name: str) -> Path:
         try:
             with urlopen(f"{URL}/{file}", timeout=TIMEOUT) as response:
                 content = response.read()
-        except OSError as error:
+        except (OSError, HTTPException) as error:
             raise InputError(
                 f"{name} is not there, and {URL}/{file} cannot be downloaded "
                 f"({getattr(error, 'reason', error)}): put it to {path}, or name a copy with "

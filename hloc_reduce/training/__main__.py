@@ -13,13 +13,13 @@ import torch
 
 from .. import cli, logger, projections
 from ..cli import InputError
-from ..descriptors import DESCRIPTORS, DIM
+from ..descriptors import DESCRIPTORS, DIM, check_weights
 from ..evaluation.phototour import fpr95
 from ..versions import versions
 from . import nested, pca, phototour, ss, sv, tracks, us
 
 SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
-RECIPES = ("best", "paper")
+RECIPE_NAMES = ("best", "paper")
 
 
 def main(
@@ -42,7 +42,7 @@ def main(
         scheme: a key of `SCHEMES`.
         dims: numbers of output dimensions; not of "nested", which has its own.
         output: folder for `<descriptor>_<scheme><dim>.safetensors`.
-        cache: folder for what is computed of the maps, used again by later trainings.
+        cache: folder for what is computed of maps and sequences, used again by later trainings.
         recipe: "best", or "paper" for its losses, layers and hyper-parameters.
         seed: of everything random.
 
@@ -50,7 +50,7 @@ def main(
         The files.
 
     Raises:
-        InputError: when a map cannot be used.
+        InputError: when a map or a sequence cannot be used.
     """
     trainer = SCHEMES[scheme]
     if trainer is nested:
@@ -191,7 +191,7 @@ def _main() -> None:
         metavar="DIR",
         help="folder of another PhotoTour sequence, to print the FPR95 of its pairs",
     )
-    parser.add_argument("--recipe", default="best", help=f"one of {', '.join(RECIPES)}")
+    parser.add_argument("--recipe", default="best", help=f"one of {', '.join(RECIPE_NAMES)}")
     parser.add_argument(
         "--output", type=Path, default=Path("outputs/training"), help="folder for the projections"
     )
@@ -201,18 +201,27 @@ def _main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random")
     args = parser.parse_args()
     for descriptor in args.descriptor:
-        cli.choose("descriptor", descriptor, DESCRIPTORS)
+        check_weights(cli.choose("descriptor", descriptor, DESCRIPTORS))
     for scheme in args.scheme:
         cli.choose("scheme", scheme, SCHEMES)
-    cli.choose("recipe", args.recipe, RECIPES)
+    if "ss" in args.scheme:
+        ss.check()
+    cli.choose("recipe", args.recipe, RECIPE_NAMES)
     if not args.map and not args.phototour:
         raise InputError("There is nothing to train on. Give --map or --phototour.")
+    if args.seed < 0:
+        raise InputError(f"--seed {args.seed}: choose 0 or more.")
     if args.validate:
         phototour.read_pairs(args.validate)
+        phototour.read_points(args.validate)
     for dim in args.dim:
         if not 0 < dim <= DIM:
             raise InputError(f"--dim {dim}: choose 1 to {DIM}.")
     maps = parse_maps(args.map)
+    names = [*maps, *(folder.resolve().name for folder in args.phototour)]
+    for name in set(names):
+        if names.count(name) > 1:
+            raise InputError(f"Two of the maps and sequences are called {name}. Rename a folder.")
     for descriptor in args.descriptor:
         paths = [
             path
@@ -231,13 +240,13 @@ def _main() -> None:
         ]
         if args.validate:
             folder = args.cache / args.validate.resolve().name
-            validate(args.validate, folder, descriptor, paths)
+            validate(args.validate, folder, descriptor, paths, args.seed)
 
 
-def validate(folder: Path, cache: Path, descriptor: str, paths: list[Path]) -> None:
+def validate(folder: Path, cache: Path, descriptor: str, paths: list[Path], seed: int) -> None:
     """Print the FPR95 of a base descriptor and projections of it on a PhotoTour sequence."""
     pairs, matches = phototour.read_pairs(folder)
-    data = tracks.load(phototour.main(folder, cache, descriptor))
+    data = tracks.load(phototour.main(folder, cache, descriptor, seed))
     if pairs.max() >= len(data.image):
         raise InputError(f"{folder}: the pairs name more patches than info.txt.")
     descriptors = torch.empty(len(data.image), DIM)

@@ -4,6 +4,6 @@ from . import sv
 
 PREFIXES = (64, 32, 24, 16)
 # not in the paper: the losses of the prefixes are learned together
-RECIPES = {name: {**recipe, "prefixes": PREFIXES} for name, recipe in sv.RECIPES.items()}
+RECIPES = {name: {**recipe, "prefixes": list(PREFIXES)} for name, recipe in sv.RECIPES.items()}
 DISTANCE_WEIGHTS = sv.DISTANCE_WEIGHTS
 train = sv.train

@@ -4,10 +4,9 @@ import numpy as np
 import torch
 from sklearn.decomposition import PCA
 
+from ..cli import InputError
 from ..projections import MLP
 from .tracks import Tracks
-
-RECIPES = {"best": {}, "paper": {}}
 
 
 def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, **_) -> MLP:
@@ -19,12 +18,17 @@ def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, **_) -> MLP:
         recipe: has no entries.
         seed: of scikit-learn's solver.
 
+    Raises:
+        InputError: when there are fewer observations than dimensions.
+
     Returns:
         One linear layer: the projection of the centred descriptors.
     """
     descriptors = np.concatenate([tracks.descriptors[:, 0, 0] for tracks in maps]).astype(
         np.float32
     )
+    if len(descriptors) < dim:
+        raise InputError(f"{len(descriptors)} observations are too few for {dim} dimensions.")
     pca = PCA(dim, random_state=seed).fit(descriptors)
     mlp = MLP([descriptors.shape[1], dim])
     mlp.linears[0].weight.data = torch.from_numpy(pca.components_).float()

@@ -2,7 +2,7 @@
 
 Each sequence is a folder of sheets `patches0000.bmp`, ... of 16x16 patches of 64x64 pixels;
 `info.txt`, whose lines begin with the 3D point that a patch shows; and lists of pairs
-`m50_100000_100000_0.txt`.
+`m50_100000_100000_0.txt`, or of other numbers of matching and other pairs.
 """
 
 from pathlib import Path
@@ -15,10 +15,11 @@ from tqdm import tqdm
 from .. import stamps
 from ..cli import InputError
 from ..descriptors import DIM, PATCH_SIZE, Descriptor
-from .tracks import VARIANTS, photometric_variant, save, stamp
+from .loop import device
+from .tracks import VARIANTS, describe_mirrored, photometric_variant, save, stamp
 
 SHEET, SIDE = 16, 64
-PAIRS = "m50_100000_100000_0.txt"
+PAIRS = "m50_100000_100000_0.txt"  # read before any other of its kind
 
 
 def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) -> Path:
@@ -42,7 +43,7 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
     if path.exists() and stamps.is_current(path.with_suffix(".json"), made_from):
         return path
     output.mkdir(parents=True, exist_ok=True)
-    describe = Descriptor(descriptor)
+    describe = Descriptor(descriptor).to(device())
     described = np.empty((len(points), 2, VARIANTS, DIM), np.float16)
     for number, sheet in enumerate(tqdm(sheets(folder), desc="Describing patches", unit="sheet")):
         first = number * SHEET**2
@@ -54,8 +55,7 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
             if variant:
                 views = np.stack([photometric_variant(patch, generator) for patch in patches])
             views = torch.from_numpy(views)[:, None]
-            described[rows, 0, variant] = describe(views).numpy()
-            described[rows, 1, variant] = describe(views.flip(2)).numpy()
+            described[rows, :, variant] = describe_mirrored(views, describe)
     no_places = np.zeros((len(points), 2), np.float32)
     return save(
         path,
@@ -81,13 +81,15 @@ def read_points(folder: Path) -> np.ndarray:
             "(http://matthewalunbrown.com/patchdata/patchdata.html)."
         )
     points = []
-    for number, line in enumerate(info.read_text().splitlines(), 1):
+    for number, line in enumerate(info.read_text(errors="replace").splitlines(), 1):
         try:
             points.append(int(line.split()[0]))
         except (ValueError, IndexError):
             raise InputError(f"{info}, line {number}: no number of a point.") from None
+    if len(set(points)) == len(points):
+        raise InputError(f"{info}: no two patches show the same point.")
     missing = -(-len(points) // SHEET**2) - len(sheets(folder))
-    if not points or missing > 0:
+    if missing > 0:
         raise InputError(f"{folder}: {info} names {len(points)} patches, {missing} sheets miss.")
     return np.array(points)
 
@@ -119,14 +121,19 @@ def read_pairs(folder: Path) -> tuple[np.ndarray, np.ndarray]:
         InputError: when the list is missing or broken.
     """
     path = folder / PAIRS
-    if not path.is_file():
+    others = sorted(folder.glob("m50_*_*_0.txt"))
+    if not path.is_file() and not others:
         raise InputError(f"There is no list of pairs {path}.")
+    path = path if path.is_file() else others[-1]
     pairs = []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
         try:
             values = [int(value) for value in line.split()]
             pairs.append((values[0], values[3], values[1] == values[4]))
         except (ValueError, IndexError):
             raise InputError(f"{path}, line {number}: not a pair of patches and points.") from None
     pairs = np.array(pairs, np.int64).reshape(-1, 3)
-    return pairs[:, :2], pairs[:, 2] == 1
+    matches = pairs[:, 2] == 1
+    if matches.all() or not matches.any():
+        raise InputError(f"{path} needs both matching pairs and others.")
+    return pairs[:, :2], matches

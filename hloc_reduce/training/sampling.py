@@ -16,8 +16,8 @@ class PairSampler:
             of the pairs are mirrored too.
         balanced: draw a map with a probability proportional to the square root of its number of
             tracks, not to the number, so that no large place outweighs the others.
-        maps_per_batch: draw each batch from so many maps, whose points look more alike than those
-            of many; None draws from all.
+        maps_per_batch: draw each batch from so many maps at most, whose points look more alike
+            than those of many; None draws from all.
         seed: a batch depends on it and on its number only.
     """
 
@@ -39,7 +39,7 @@ class PairSampler:
         sizes = np.array([len(starts) for starts in self.starts], float)
         weights = np.sqrt(sizes) if balanced else sizes
         self.shares = weights / weights.sum()
-        self.num_observations = sum(len(kept) for _, kept in self.maps)
+        self.num_observations = int(sum(lengths.sum() for lengths in self.lengths))
 
     def batch(self, number: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw batch `number`: anchors and positives, each (at most size, 128) float32.
@@ -103,10 +103,18 @@ class DescriptorSampler:
             generator = np.random.default_rng([self.seed, number, 1])
             place = generator.choice(len(self.maps), size, p=self.shares)
             return generator.integers(self.starts[place], self.starts[place + 1])
-        per_epoch = -(-self.num_observations // size)
-        epoch, number = divmod(number, per_epoch)
+        epoch, number = divmod(number, self.per_epoch(size))
         order = np.random.default_rng([self.seed, epoch]).permutation(self.num_observations)
         return order[number * size : (number + 1) * size]
+
+    def per_epoch(self, size: int) -> int:
+        """Return the number of batches of an epoch.
+
+        A last one of a single observation, which a batch normalization cannot learn from, is left
+        out.
+        """
+        full, rest = divmod(self.num_observations, size)
+        return full + (rest > 1)
 
     def views(
         self, indices: np.ndarray, generator: np.random.Generator
@@ -126,10 +134,11 @@ class DescriptorSampler:
 
 
 def matchable(tracks: Tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the observations that have a match: one for each point and image, two for each point.
+    """Find the points that are seen in several images, and one observation for each image.
 
     Returns:
-        Their indices, in the order of the tracks; and for each track the first and the number.
+        Indices of observations, sorted by track; and for each track of two or more of them, the
+        first, as a position in these indices, and their number.
     """
     _, kept = np.unique(np.stack([tracks.track, tracks.image], 1), axis=0, return_index=True)
     _, starts, lengths = np.unique(tracks.track[kept], return_index=True, return_counts=True)

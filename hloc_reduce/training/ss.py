@@ -1,5 +1,6 @@
 """Self-supervised reduction: k-means clusters as labels (Sec. III-B)."""
 
+import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,13 +16,17 @@ from .loop import device, fit
 from .sampling import DescriptorSampler
 from .tracks import Tracks
 
-# "paper" is Sec. III-D: 100,000 clusters for the 450,092 patches of Liberty, that is 4.5 patches
-# each, 200 epochs, clustered anew every 10. "best" clusters once, each map for itself and within
-# cells of about so many descriptors, and then learns as the supervised scheme does.
+# "paper" is Sec. III-D: 100,000 clusters for the 450,092 patches of Liberty, 200 epochs, clustered
+# anew every 10; the classification layer is the one that it cites, with the margin in radians, the
+# first scale and the iterations of k-means of the authors' code. "best" clusters once, each map for
+# itself and within cells of about so many descriptors, and then learns as the supervised scheme.
 RECIPES = {
     "paper": {
         "loss": "classification",
-        "per_cluster": 4.5,
+        "per_cluster": 450_092 / 100_000,
+        "iterations": 20,
+        "margin": 0.1,
+        "scale": 1.0,
         "epochs": 200,
         "cluster_epochs": 10,
         "batch_size": 256,
@@ -35,53 +40,63 @@ RECIPES = {
         "loss": "triplet",
         "per_cluster": 4.5,
         "per_cell": 64,
+        "iterations": 10,
         "steps": 3000,
     },
 }
 DISTANCE_WEIGHTS = {}
-ITERATIONS = 10  # of k-means
-MARGIN = 0.1  # radians, as the authors' code has it
-SCALE = 10.0
 
 
 class ArcClassifier(nn.Module):
-    """Cosine similarities to a learned direction for each class, with ArcFace's angular margin."""
+    """Cosine similarities to a learned direction for each class, with ArcFace's angular margin.
 
-    def __init__(self, num_classes: int, dim: int):
+    Args:
+        num_classes: the number of classes.
+        dim: of the descriptors.
+        margin: radians.
+        scale: of the logits, at first; it is learned.
+    """
+
+    def __init__(self, num_classes: int, dim: int, margin: float, scale: float):
         super().__init__()
+        self.margin, self.first_scale = margin, scale
         self.weight = nn.Parameter(torch.empty(num_classes, dim))
-        self.log_scale = nn.Parameter(torch.empty(()))
+        self.scale = nn.Parameter(torch.empty(()))
         self.reset()
 
     def reset(self) -> list[nn.Parameter]:
         """Forget everything and return what has been set anew."""
         nn.init.xavier_uniform_(self.weight)
-        nn.init.constant_(self.log_scale, np.log(SCALE))
-        return [self.weight, self.log_scale]
+        nn.init.constant_(self.scale, self.first_scale)
+        return [self.weight, self.scale]
 
     def forward(self, embedded: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         """Return the cross-entropy of (N, D) of unit norm with labels (N,)."""
         cosine = embedded @ nn.functional.normalize(self.weight, dim=1).T
         target = cosine.gather(1, labels[:, None])
-        angle = target.clamp(-1 + 1e-6, 1 - 1e-6).acos() + MARGIN
+        angle = target.clamp(-1 + 1e-6, 1 - 1e-6).acos() + self.margin
         logits = cosine.scatter(1, labels[:, None], torch.minimum(angle.cos(), target))
-        return nn.functional.cross_entropy(logits * self.log_scale.exp(), labels)
+        return nn.functional.cross_entropy(logits * self.scale, labels)
 
 
-def cluster(descriptors: np.ndarray, num_clusters: int, seed: int) -> np.ndarray:
-    """Cluster descriptors (N, D) float32 by k-means and return the labels (N,) int64.
+def check() -> None:
+    """Make sure that all is there that the scheme needs.
 
     Raises:
         InputError: when faiss is not installed.
     """
-    try:
-        import faiss
-    except ImportError:
-        raise InputError("The scheme ss needs faiss: pip install faiss-cpu.") from None
+    if not importlib.util.find_spec("faiss"):
+        raise InputError("The scheme ss needs faiss: pip install faiss-cpu.")
+
+
+def cluster(descriptors: np.ndarray, num_clusters: int, iterations: int, seed: int) -> np.ndarray:
+    """Cluster descriptors (N, D) float32 by k-means and return the labels (N,) int64."""
+    import faiss
+
     kmeans = faiss.Kmeans(
         descriptors.shape[1],
         num_clusters,
-        niter=ITERATIONS,
+        niter=iterations,
         seed=seed,
         min_points_per_centroid=1,
         max_points_per_centroid=len(descriptors),
@@ -92,7 +107,7 @@ def cluster(descriptors: np.ndarray, num_clusters: int, seed: int) -> np.ndarray
 
 
 def cluster_in_cells(
-    descriptors: np.ndarray, per_cluster: float, per_cell: int, seed: int
+    descriptors: np.ndarray, per_cluster: float, per_cell: int, iterations: int, seed: int
 ) -> np.ndarray:
     """Cluster within cells found by k-means: nearly the same clusters in a fraction of the time.
 
@@ -100,17 +115,18 @@ def cluster_in_cells(
         descriptors: (N, D) float32.
         per_cluster: the mean number of descriptors of a cluster.
         per_cell: the mean number of descriptors of a cell.
+        iterations: of k-means.
         seed: of the first centres.
 
     Returns:
         Labels (N,) int64, from 0 on.
     """
-    cell = cluster(descriptors, max(1, len(descriptors) // per_cell), seed)
+    cell = cluster(descriptors, max(1, len(descriptors) // per_cell), iterations, seed)
     order = np.argsort(cell, kind="stable")
     labels, number = np.empty(len(descriptors), np.int64), 0
     for rows in np.split(order, np.flatnonzero(np.diff(cell[order])) + 1):
         inside = max(1, round(len(rows) / per_cluster))
-        labels[rows] = number + cluster(descriptors[rows], inside, seed)
+        labels[rows] = number + cluster(descriptors[rows], inside, iterations, seed)
         number += inside
     return labels
 
@@ -141,7 +157,8 @@ def by_cluster(tracks: Tracks, recipe: dict, seed: int) -> Tracks:
     """Take clusters of the observations of a map for its points, whatever they see."""
     logger.info("Clustering %d descriptors.", len(tracks.track))
     descriptors = tracks.descriptors[:, 0, 0].astype(np.float32)
-    labels = cluster_in_cells(descriptors, recipe["per_cluster"], recipe["per_cell"], seed)
+    how = (recipe[key] for key in ("per_cluster", "per_cell", "iterations"))
+    labels = cluster_in_cells(descriptors, *how, seed)
     order = np.argsort(labels, kind="stable")
     views = np.arange(len(labels))  # each counts as an image of its own
     return replace(tracks.only(order), track=labels[order], image=views)
@@ -160,11 +177,14 @@ def classify(
     number = sampler.num_observations
     _, descriptors = sampler.views(np.arange(number), np.random.default_rng(seed))
     size, place = recipe["batch_size"], device()
-    per_epoch = -(-number // size)
+    per_epoch = sampler.per_epoch(size)
     num_clusters = max(1, int(number / recipe["per_cluster"]))
     mlp = MLP([descriptors.shape[1], *recipe["hidden"], dim])
     network = nn.Module()
-    network.mlp, network.classifier = mlp, ArcClassifier(num_clusters, dim)
+    network.mlp, network.classifier = (
+        mlp,
+        ArcClassifier(num_clusters, dim, recipe["margin"], recipe["scale"]),
+    )
     network.register_buffer("labels", torch.zeros(number, dtype=torch.int64))
     network.train().to(place)
 
@@ -173,7 +193,8 @@ def classify(
             return []
         logger.info("Clustering %d descriptors.", number)
         rows = embed(mlp, descriptors, place) if step else descriptors
-        network.labels.copy_(torch.from_numpy(cluster(rows.numpy(), num_clusters, seed + step)))
+        labels = cluster(rows.numpy(), num_clusters, recipe["iterations"], seed + step)
+        network.labels.copy_(torch.from_numpy(labels))
         torch.manual_seed(seed + step)
         return network.classifier.reset()
 

@@ -27,6 +27,7 @@ from ..descriptors import DIM, Descriptor
 from ..extractors.dog import extract_patches
 from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
 from .completion import complete
+from .loop import device
 
 NUM_COVIS = 20
 MATCHED = "sift"  # which descriptor finds the tracks, whatever they are described with
@@ -42,7 +43,7 @@ class Tracks:
         descriptors: (M, 2, V, 128) float16 of unit norm: M observations, as seen and mirrored, in
             V photometric variants, the first of which is the photo itself.
         track: (M,) int64, which of the map's points an observation sees, sorted, from 0 on.
-        image: (M,) int64, in which image, numbered by name.
+        image: (M,) int64, in which image, numbered by name; a patch of PhotoTour is one of its own.
         xy: (M, 2) float32, where in it, in pixels.
         matched: (M,) bool, whether descriptors matched it; the others were found by geometry.
     """
@@ -55,7 +56,7 @@ class Tracks:
 
     @property
     def num_tracks(self) -> int:
-        """The number of points."""
+        """The number of points, counted up to the last that is observed."""
         return int(self.track[-1]) + 1
 
     def only(self, kept: np.ndarray) -> "Tracks":
@@ -100,7 +101,7 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     if tracks.exists() and stamps.is_current(tracks.with_suffix(".json"), made_from):
         return tracks
     images_by_name = {image.name: image for image in reconstruction.images.values()}
-    describe = Descriptor(descriptor)
+    describe = Descriptor(descriptor).to(device())
     parts = []
     with open_h5(features) as file:
         keypoints = {name: _keypoints(file, name) for name in names}
@@ -201,10 +202,17 @@ def describe_variants(
     for variant in range(VARIANTS):
         view = photometric_variant(image, generator) if variant else image
         patches = extract_patches(torch.from_numpy(view)[None, None], keypoints)
-        described[:, 0, variant] = describe(patches).numpy()
-        # across the axis of its orientation: a mirrored world, whose keypoints are oriented alike
-        described[:, 1, variant] = describe(patches.flip(2)).numpy()
+        described[:, :, variant] = describe_mirrored(patches, describe)
     return described
+
+
+def describe_mirrored(patches: torch.Tensor, describe: Descriptor) -> np.ndarray:
+    """Describe patches (N, 1, 32, 32) as seen and mirrored, (N, 2, 128) float32.
+
+    Mirrored is across the axis of the orientation: a mirrored world, oriented alike.
+    """
+    views = (patches.to(device()), patches.flip(2).to(device()))
+    return np.stack([describe(view).cpu().numpy() for view in views], axis=1)
 
 
 def photometric_variant(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:

@@ -50,7 +50,7 @@ def train(
     drawing = {key: recipe[key] for key in ("augment", "mirror", "balanced")}
     sampler = DescriptorSampler(maps, **drawing, seed=seed)
     size, place = recipe["batch_size"], device()
-    steps = recipe.get("steps") or recipe["epochs"] * -(-sampler.num_observations // size)
+    steps = recipe.get("steps") or recipe["epochs"] * sampler.per_epoch(size)
     sizes = [maps[0].descriptors.shape[-1], *recipe["hidden"], dim]
     encoder, decoder = MLP(sizes), MLP(sizes[::-1])
     network = nn.ModuleList([encoder, decoder]).train().to(place)
