@@ -22,7 +22,8 @@ import numpy as np
 import torch
 
 from hloc_reduce import cli, projections
-from hloc_reduce.descriptors import DIM
+from hloc_reduce.cli import InputError
+from hloc_reduce.descriptors import DESCRIPTORS, DIM
 from hloc_reduce.evaluation.matching import average_precision
 from hloc_reduce.training import nested, tracks
 from hloc_reduce.training.__main__ import parse_maps
@@ -69,16 +70,16 @@ def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.M
     if nested_name in names:
         names.remove(nested_name)
         names += [f"{nested_name}@{dim}" for dim in nested.PREFIXES]
-    files = [file for file in files if file.stem.lower().startswith(descriptor)]
+    files = [file for file in files if file.name.lower().startswith(descriptor)]
     loaded = {name: projections.load(name) for name in names}
-    loaded |= {file.stem: projections.load(file) for file in files}
+    loaded |= {file.name: projections.load(file) for file in files}
     order = sorted(loaded, key=lambda name: (family(name), -loaded[name].dim))
     return {descriptor: torch.nn.Identity()} | {name: loaded[name] for name in order}
 
 
 def family(name: str) -> str:
     """Return what the projections to several numbers of dimensions have in common."""
-    return re.sub(r"(@|_dim)?\d*$", "", name)
+    return re.sub(r"(@|_dim)?\d*(\.\w+)?$", "", name)
 
 
 def draw_all(data: tracks.Tracks, draws: int) -> dict[str, list]:
@@ -117,6 +118,13 @@ def _main() -> None:
     parser.add_argument("--draws", type=int, default=5, help="draws of pairs of observations")
     args = parser.parse_args()
 
+    for descriptor in args.descriptor:
+        cli.choose("descriptor", descriptor, DESCRIPTORS)
+    for file in args.projection:
+        if not file.name.lower().startswith(tuple(args.descriptor)):
+            raise InputError(f"{file}: its name does not begin with a descriptor's.")
+    if args.draws < 1:
+        raise InputError("--draws: at least 1.")
     maps = parse_maps(args.map)
     means = defaultdict(dict)
     for descriptor in args.descriptor:

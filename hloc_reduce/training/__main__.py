@@ -254,7 +254,8 @@ def validate(folder: Path, cache: Path, descriptor: str, paths: list[Path], seed
     projects = {descriptor: torch.nn.Identity()}
     projects |= {path.stem: projections.load(path) for path in paths}
     for name, project in projects.items():
-        first, second = project(descriptors)[pairs.T]
+        projected = torch.cat([project(rows) for rows in descriptors.split(65536)])
+        first, second = projected[pairs.T]
         value = fpr95((first - second).norm(dim=1).numpy(), matches)
         print(f"FPR95 of {name} on {folder.resolve().name}: {100 * value:.2f} %")
 
