@@ -79,7 +79,7 @@ def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.M
 
 def family(name: str) -> str:
     """Return what the projections to several numbers of dimensions have in common."""
-    return re.sub(r"(@|_dim)?\d*(\.\w+)?$", "", name)
+    return re.sub(r"(@|_dim)?\d*(?=(\.\w+)?$)", "", name)
 
 
 def draw_all(data: tracks.Tracks, draws: int) -> dict[str, list]:
