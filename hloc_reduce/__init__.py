@@ -4,6 +4,9 @@ import logging
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
     import torch
 
 __version__ = "0.1.0"
@@ -38,12 +41,16 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
         >>> describe_patches(torch.rand(10, 1, 32, 32), "sift_sv64").shape
         torch.Size([10, 64])
     """
+    import torch
+
     from confs.features import confs
 
     from . import projections
     from .cli import choose
     from .descriptors import Descriptor
 
+    if not isinstance(patches, torch.Tensor):
+        raise ValueError(f"Patches are a torch.Tensor, not {type(patches).__name__}.")
     if patches.ndim != 4 or patches.shape[1:] != (1, 32, 32) or not patches.is_floating_point():
         raise ValueError(
             f"Patches are (N, 1, 32, 32) float in [0, 1], not {tuple(patches.shape)} "
@@ -55,3 +62,24 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
     if "projection" in model:
         descriptors = projections.load(model["projection"]).to(patches.device)(descriptors)
     return descriptors
+
+
+def register(features: "Iterable[Path]" = ()) -> list[str]:
+    """Add this project's extractors, features and matchers to the installed hloc.
+
+    After it hloc's `dynamic_load` finds the extractors `reduced` and `vlad`, and the confs of
+    `hloc.extract_features` and `hloc.match_features` have the entries of `confs`. What hloc has
+    already stays as it is, its `sift`, too; a second call changes nothing.
+
+    Args:
+        features: YAML files of more features, each called as its file.
+
+    Returns:
+        The names of the confs that were added.
+
+    Raises:
+        InputError: when hloc is missing, too old or cannot be imported, or a file is no feature's.
+    """
+    from . import hloc
+
+    return hloc.register(features)

@@ -6,7 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from tqdm import tqdm
 
 from confs import retrieval as retrieval_confs
@@ -14,6 +14,7 @@ from confs import retrieval as retrieval_confs
 from . import cli, colmap, extractors, io, logger
 from .base_model import dynamic_load
 from .cli import InputError
+from .extractors.vlad import read_vocabulary
 from .io import GroupWriter, get_dataset, list_h5_names, open_h5, replacing
 
 confs = retrieval_confs.confs
@@ -57,7 +58,7 @@ def main(
                 model.fit(_sample(file, vocabulary_images, conf["model"]["max_samples"]))
                 with replacing(vocabulary) as temporary:
                     temporary.write_bytes(save({"vocabulary": model.vocabulary}))
-            model.vocabulary = load_file(vocabulary)["vocabulary"]
+            model.vocabulary = read_vocabulary(vocabulary)
             for name in tqdm(todo, desc="Aggregating", unit="image"):
                 local = torch.from_numpy(get_dataset(file, name, "descriptors")[()])
                 descriptor = model({"descriptors": local[None]})["global_descriptor"][0]
@@ -87,7 +88,7 @@ def _main() -> None:
     )
     parser.add_argument("--features", type=Path, required=True, help="feature file")
     parser.add_argument("--model", type=Path, required=True, help="COLMAP model of the map images")
-    parser.add_argument("--conf", default="vlad", help="way of aggregation")
+    parser.add_argument("--conf", default="vlad", help=f"one of {', '.join(confs)}")
     parser.add_argument("--export_dir", type=Path, help="folder for the output")
     parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
     args = parser.parse_args()

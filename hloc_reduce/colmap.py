@@ -1,6 +1,7 @@
 """The parts of pycolmap whose interface or behaviour differs between versions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -30,16 +31,22 @@ def dog_detector(options: dict) -> Callable[[np.ndarray], np.ndarray]:
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"The DoG options {options} cannot be used ({reason}).") from None
     extraction = pycolmap.FeatureExtractionOptions(sift=sift)
-    extractor = pycolmap.FeatureExtractor.create(extraction, pycolmap.Device.cpu)
+    if hasattr(pycolmap, "FeatureExtractor"):  # from 4.0 on
+        extractor = pycolmap.FeatureExtractor.create(extraction, pycolmap.Device.cpu)
+    else:
+        extractor = pycolmap.Sift(extraction, pycolmap.Device.cpu)
 
     def detect(image: np.ndarray) -> np.ndarray:
-        found, _ = extractor.extract_from_float32_array(image)
-        keypoints = np.array(
-            [(k.x, k.y, k.compute_scale(), np.rad2deg(k.compute_orientation())) for k in found],
-            np.float32,
-        ).reshape(-1, 4)
-        keypoints[:, :2] -= 0.5  # this interface has COLMAP's origin, the corner
-        return keypoints
+        if isinstance(extractor, pycolmap.Sift):
+            keypoints = extractor.extract(image)[0].reshape(-1, 4)
+        else:
+            found, _ = extractor.extract_from_float32_array(image)
+            keypoints = np.array(
+                [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found], np.float32
+            ).reshape(-1, 4)
+        x_y, scale, orientation = np.split(keypoints, [2, 3], axis=1)
+        # the origin of both is COLMAP's, the corner
+        return np.concatenate([x_y - 0.5, scale, np.rad2deg(orientation)], axis=1)
 
     return detect
 
@@ -57,6 +64,30 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     except Exception as error:  # pycolmap raises RuntimeError, ValueError, IndexError, ...
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"{path} is not a COLMAP model ({reason}).") from None
+
+
+def add_image(
+    model: pycolmap.Reconstruction,
+    camera: pycolmap.Camera,
+    image: pycolmap.Image,
+    cam_from_world: pycolmap.Rigid3d,
+) -> None:
+    """Add an image with a pose, and its camera if it is new, as a rig and a frame of its own.
+
+    The same as pycolmap's `add_image_with_trivial_frame`, which 3.13 does not have.
+    """
+    if not model.exists_camera(camera.camera_id):
+        model.add_camera(camera)
+        rig = pycolmap.Rig(rig_id=camera.camera_id)
+        rig.add_ref_sensor(camera.sensor_id)
+        model.add_rig(rig)
+    frame = pycolmap.Frame(frame_id=image.image_id, rig_id=camera.camera_id)
+    frame.add_data_id(image.data_id)
+    frame.rig_from_world = cam_from_world
+    model.add_frame(frame)
+    image.frame_id = frame.frame_id
+    model.add_image(image)
+    model.register_frame(frame.frame_id)
 
 
 def point3D_ids(image: pycolmap.Image) -> np.ndarray:
@@ -79,7 +110,7 @@ def write_database(
     path: Path,
     reference: pycolmap.Reconstruction,
     keypoints: dict[str, np.ndarray],
-    matches: dict[tuple[str, str], tuple[np.ndarray, np.ndarray]],
+    matches: dict[tuple[str, str], tuple[np.ndarray, np.ndarray | None]],
 ) -> None:
     """Write a COLMAP database with the ids of a reference model.
 
@@ -87,7 +118,8 @@ def write_database(
         path: the new database.
         reference: model with cameras, rigs, frames and images.
         keypoints: from image name to (N, 2), COLMAP's pixels.
-        matches: from two image names to all and to the verified matches, both (M, 2).
+        matches: from two image names to all and to the verified matches, both (M, 2); None for
+            those that `verify_matches` will verify.
     """
     image_ids = {image.name: image.image_id for image in reference.images.values()}
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
@@ -104,12 +136,21 @@ def write_database(
         for (name0, name1), (all_matches, verified) in matches.items():
             ids = image_ids[name0], image_ids[name1]
             database.write_matches(*ids, all_matches.astype(np.uint32))
+            if verified is None:
+                continue
             # from 4.2.1 on COLMAP skips a geometry whose configuration is undefined
             geometry = pycolmap.TwoViewGeometry(
                 config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
                 inlier_matches=verified.astype(np.uint32),
             )
             database.write_two_view_geometry(*ids, geometry)
+
+
+def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
+    """Estimate the two-view geometries of the matches of a database, with hloc's options."""
+    options = {"ransac": {"max_num_trials": 20000, "min_inlier_ratio": 0.1, "random_seed": 0}}
+    with _log(verbose):
+        pycolmap.verify_matches(database, pairs, options=options)
 
 
 def triangulate_points(
@@ -120,11 +161,14 @@ def triangulate_points(
     options: dict,
     verbose: bool,
 ) -> pycolmap.Reconstruction:
-    """Triangulate the verified matches of a database into `output`; poses stay as they are."""
-    level = pycolmap.logging.minloglevel
-    if verbose:
-        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.INFO)
-    try:
+    """Triangulate the verified matches of a database into `output`; poses stay as they are.
+
+    Without any the model is empty; COLMAP 3.13 would raise a ValueError.
+    """
+    with pycolmap.Database.open(database) as opened:
+        if opened.num_inlier_matches() == 0:
+            return pycolmap.Reconstruction()
+    with _log(verbose):
         return pycolmap.triangulate_points(
             reference,
             database,
@@ -132,6 +176,16 @@ def triangulate_points(
             output,
             options=pycolmap.IncrementalPipelineOptions(options),
         )
+
+
+@contextmanager
+def _log(verbose: bool) -> Iterator[None]:
+    """Show COLMAP's log of a block, or not."""
+    level = pycolmap.logging.minloglevel
+    if verbose:
+        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.INFO)
+    try:
+        yield
     finally:
         pycolmap.logging.minloglevel = level
 

@@ -12,7 +12,6 @@ from tqdm import tqdm
 from confs import features as features_confs
 
 from . import cli, extractors, logger, projections
-from .base_model import dynamic_load
 from .cli import InputError
 from .descriptors import DESCRIPTORS, check_weights
 from .io import GroupWriter, read_image
@@ -57,7 +56,7 @@ def main(
             logger.info("All %d images are in %s.", len(names), feature_path)
             return feature_path
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        model = load_extractor(conf["model"]).to(device)
+        model = extractors.load(conf["model"]).eval().to(device)
         for name in tqdm(todo, desc="Extracting features", unit="image"):
             features = extract(model, image_dir / name, conf["preprocessing"], device)
             uncertainty = features.pop("uncertainty")
@@ -71,23 +70,20 @@ def main(
     return feature_path
 
 
-def load_extractor(conf: dict) -> torch.nn.Module:
-    """Make the extractor of a model configuration, ready to compute."""
-    return dynamic_load(extractors, conf["name"])(conf).eval()
-
-
 def provenance(conf: dict, as_half: bool) -> dict:
     """Return what determines the features: the configuration and the projection's checksum.
 
     Raises:
-        InputError: when the projection or the weights of its base descriptor are not to be had.
+        InputError: when the configuration is wrong, or the projection or the weights of its base
+            descriptor are not to be had.
     """
-    base = conf["model"].get("base", conf["model"])
-    if base.get("descriptor") in list(DESCRIPTORS):
-        check_weights(base["descriptor"])
     made_by = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
-    if "projection" in conf["model"]:
+    if conf["model"].get("projection") is not None:
         made_by["projection_sha256"] = projections.checksum(conf["model"]["projection"])
+    base = conf["model"].get("base", conf["model"])
+    if base["name"] == "dog" and base.get("descriptor") in list(DESCRIPTORS):
+        check_weights(base["descriptor"])
+    extractors.load(conf["model"])
     return made_by
 
 
@@ -139,8 +135,8 @@ def extract(
 
     Returns:
         keypoints (N, 2) float32 (x, y) in pixels of the original image, centres at integers;
-        descriptors (D, N); scores, scales (pixels), oris (degrees) (N,); image_size (2,) width,
-        height; and the uncertainty of the keypoints in pixels.
+        descriptors (D, N); scores, scales (pixels), oris (degrees) (N,), as far as the model has
+        them; image_size (2,) width, height; and the uncertainty of the keypoints in pixels.
     """
     image, size = load_image(path, preprocessing)
     features = {
@@ -148,7 +144,8 @@ def extract(
     }
     ratio = (size / np.array(image.shape[:1:-1])).astype(np.float32)
     features["keypoints"] = (features["keypoints"] + 0.5) * ratio - 0.5
-    features["scales"] = features["scales"] * ratio.mean()
+    if "scales" in features:
+        features["scales"] = features["scales"] * ratio.mean()
     features["image_size"] = size
     features["uncertainty"] = model.detection_noise * ratio.mean()
     return features
@@ -170,6 +167,12 @@ def _main() -> None:
         help="feature, see pipelines.aachen --list_features, or a YAML file of one",
     )
     parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
+    parser.add_argument(
+        "--as_half",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="store all but the keypoints as float16",
+    )
     parser.add_argument("--overwrite", action="store_true", help="extract anew what is there")
     args = parser.parse_args()
     if args.export_dir is None and args.feature_path is None:
@@ -179,6 +182,7 @@ def _main() -> None:
         conf,
         args.image_dir,
         args.export_dir,
+        args.as_half,
         image_list=args.image_list,
         feature_path=args.feature_path,
         overwrite=args.overwrite,

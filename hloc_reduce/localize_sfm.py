@@ -7,6 +7,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from tqdm import tqdm
 
 from . import cli, colmap, logger, stamps
@@ -27,11 +29,14 @@ def main(
     matches: Path,
     results: Path,
     ransac_thresh: float = 12,
+    covisibility_clustering: bool = False,
     prepend_camera_name: bool = False,
     config: dict | None = None,
     overwrite: bool = False,
 ) -> dict[str, dict]:
     """Localize all queries of the lists that match a glob.
+
+    Takes what hloc's `localize_sfm.main` takes.
 
     Args:
         reference_sfm: the map, made from the same features.
@@ -41,6 +46,8 @@ def main(
         matches: match file of the pairs.
         results: text file of poses, one line for every query.
         ransac_thresh: inliers reproject within so many pixels.
+        covisibility_clustering: solve each cluster of retrieved images that see common points by
+            itself and keep the pose with the most inliers.
         prepend_camera_name: write `folder/basename` instead of `basename`.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
         overwrite: localize anew what is there.
@@ -70,11 +77,14 @@ def main(
     inputs = [retrieval, features, matches, *sorted(queries.parent.glob(queries.name))]
     if not in_memory:
         inputs.append(reference_sfm / "points3D.bin")
-    made_from = stamps.stamp({"config": config}, [path for path in inputs if path.exists()])
+    options = {"config": config}
+    if covisibility_clustering:
+        options["covisibility_clustering"] = True
+    made_from = stamps.stamp(options, [path for path in inputs if path.exists()])
     log = _Log(Path(f"{results}_logs.jsonl"), made_from, overwrite or in_memory)
     todo = [query for query in query_list if query[0] not in log.records]
     if todo:
-        localizer = QueryLocalizer(reference, config)
+        localizer = QueryLocalizer(reference, config, covisibility_clustering)
         with open_h5(features) as feature_file, open_h5(matches) as match_file, log:
             for name, camera in tqdm(todo, desc="Localizing", unit="query"):
                 record = localizer.localize(
@@ -100,10 +110,17 @@ class QueryLocalizer:
     Args:
         reconstruction: the map.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
+        covisibility_clustering: as of `main`.
     """
 
-    def __init__(self, reconstruction: pycolmap.Reconstruction, config: dict | None = None):
+    def __init__(
+        self,
+        reconstruction: pycolmap.Reconstruction,
+        config: dict | None = None,
+        covisibility_clustering: bool = False,
+    ):
         self.config = config or {}
+        self.covisibility_clustering = covisibility_clustering
         self.images = {image.name: image for image in reconstruction.images.values()}
         ids = np.array(sorted(reconstruction.point3D_ids()), np.int64)
         self.point_ids = ids
@@ -137,6 +154,21 @@ class QueryLocalizer:
         found = np.concatenate(found)
         return np.unique(found, axis=0), len(found)
 
+    def clusters(self, db_names: list[str]) -> list[list[str]]:
+        """Split map images into clusters that see no common point, the largest first."""
+        rows = [self.point_rows(name) for name in db_names]
+        image = np.repeat(np.arange(len(rows)), [len(part) for part in rows])
+        point = np.concatenate([*rows, np.zeros(0, np.int64)])
+        seen = coo_array(
+            (np.ones((point >= 0).sum()), (image[point >= 0], point[point >= 0])),
+            shape=(len(rows), len(self.points)),
+        ).tocsr()
+        number, label = connected_components(seen @ seen.T, directed=False)
+        clusters = [[] for _ in range(number)]
+        for name, cluster in zip(db_names, label, strict=True):
+            clusters[cluster].append(name)
+        return sorted(clusters, key=len, reverse=True) or [[]]
+
     def localize(
         self,
         name: str,
@@ -153,11 +185,17 @@ class QueryLocalizer:
         if not db_names:
             logger.warning("No map image was retrieved for %s.", name)
         keypoints, _ = get_colmap_keypoints(feature_file, name)
-        pairs, num_matches = self.correspondences(name, len(keypoints), db_names, match_file)
-        found = colmap.estimate_pose(
-            keypoints[pairs[:, 0]], self.points[pairs[:, 1]], camera, self.config, SEED
-        )
-        localized = found is not None and found["num_inliers"] >= MIN_INLIERS
+        clusters = self.clusters(db_names) if self.covisibility_clustering else [db_names]
+        solved = []
+        for cluster in clusters:
+            pairs, num_matches = self.correspondences(name, len(keypoints), cluster, match_file)
+            found = colmap.estimate_pose(
+                keypoints[pairs[:, 0]], self.points[pairs[:, 1]], camera, self.config, SEED
+            )
+            num_inliers = int(found["num_inliers"]) if found else 0
+            solved.append((num_inliers, num_matches, len(pairs), found))
+        num_inliers, num_matches, num_correspondences, found = max(solved, key=lambda s: s[0])
+        localized = num_inliers >= MIN_INLIERS
         best = self.images[db_names[0]] if db_names else self.first
         cam_from_world = found["cam_from_world"] if localized else best.cam_from_world()
         x, y, z, w = cam_from_world.rotation.quat
@@ -166,8 +204,8 @@ class QueryLocalizer:
             "qvec": [float(value) for value in (w, x, y, z)],
             "tvec": [float(value) for value in cam_from_world.translation],
             "num_matches": num_matches,
-            "num_correspondences": len(pairs),
-            "num_inliers": int(found["num_inliers"]) if found else 0,
+            "num_correspondences": num_correspondences,
+            "num_inliers": num_inliers,
             "db": db_names[0] if db_names else None,
         }
 
@@ -216,6 +254,11 @@ def _main() -> None:
     parser.add_argument("--results", type=Path, required=True, help="text file of poses")
     parser.add_argument(
         "--ransac_thresh", type=float, default=12.0, help="inliers reproject within so many pixels"
+    )
+    parser.add_argument(
+        "--covisibility_clustering",
+        action="store_true",
+        help="solve each cluster of retrieved images that see common points by itself",
     )
     parser.add_argument(
         "--prepend_camera_name", action="store_true", help="write folder/basename of each query"

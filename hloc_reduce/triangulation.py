@@ -25,11 +25,16 @@ def main(
     pairs: Path,
     features: Path,
     matches: Path,
+    skip_geometric_verification: bool = False,
+    estimate_two_view_geometries: bool = False,
+    min_match_score: float | None = None,
     verbose: bool = False,
     mapper_options: dict | None = None,
     overwrite: bool = False,
 ) -> pycolmap.Reconstruction:
     """Triangulate the matches that agree with the epipolar geometry of the known poses.
+
+    Takes what hloc's `triangulation.main` takes.
 
     Args:
         sfm_dir: the folder of the new COLMAP model; one made from the same inputs is read back.
@@ -38,6 +43,10 @@ def main(
         pairs: text file of pairs.
         features: feature file.
         matches: match file.
+        skip_geometric_verification: triangulate all matches.
+        estimate_two_view_geometries: triangulate those that agree with a geometry that COLMAP
+            estimates from them, not with the known poses.
+        min_match_score: take matches of a higher score only.
         verbose: show COLMAP's log.
         mapper_options: of pycolmap's IncrementalPipelineOptions.
         overwrite: triangulate anew.
@@ -54,7 +63,13 @@ def main(
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
     model_files = sorted(reference_model.glob("*.*"))
-    made_from = stamps.stamp(options, [*model_files, pairs, features, matches])
+    verification = {
+        "skip_geometric_verification": skip_geometric_verification,
+        "estimate_two_view_geometries": estimate_two_view_geometries,
+        "min_match_score": min_match_score,
+    }
+    chosen = {key: value for key, value in verification.items() if value}
+    made_from = stamps.stamp({**options, **chosen}, [*model_files, pairs, features, matches])
     if not overwrite and stamps.is_current(sfm_dir / STAMP, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
         return colmap.read_model(sfm_dir)
@@ -67,7 +82,9 @@ def main(
     building.mkdir(parents=True)
     database = building / "database.db"
     with open_h5(features) as feature_file, open_h5(matches) as match_file:
-        _fill_database(database, reference, pairs, feature_file, match_file)
+        _fill_database(database, reference, pairs, feature_file, match_file, **verification)
+    if estimate_two_view_geometries and not skip_geometric_verification:
+        colmap.verify_matches(database, pairs, verbose)
     logger.info("Triangulating...")
     reconstruction = colmap.triangulate_points(
         reference, database, image_dir, building, options, verbose
@@ -94,6 +111,9 @@ def _fill_database(
     pairs: Path,
     feature_file: h5py.File,
     match_file: h5py.File,
+    skip_geometric_verification: bool,
+    estimate_two_view_geometries: bool,
+    min_match_score: float | None,
 ) -> None:
     """Write cameras, poses, keypoints and the verified matches into a COLMAP database."""
     images = {image.name: image for image in reference.images.values()}
@@ -112,8 +132,13 @@ def _fill_database(
                 raise InputError(f"{pairs}: image {absent} is not in the reference model.")
             if name0 == name1 or (name0, name1) in verified or (name1, name0) in verified:
                 continue
-            matches, _ = get_matches(match_file, name0, name1)
+            matches, scores = get_matches(match_file, name0, name1)
             check_matches(matches, (name0, name1), (len(keypoints[name0]), len(keypoints[name1])))
+            if min_match_score:
+                matches = matches[scores > min_match_score]
+            if skip_geometric_verification or estimate_two_view_geometries:
+                verified[name0, name1] = matches, matches if skip_geometric_verification else None
+                continue
             errors0, errors1 = epipolar_errors(
                 images[name1].cam_from_world() * images[name0].cam_from_world().inverse(),
                 rays[name0][matches[:, 0]],
@@ -167,11 +192,26 @@ def _main() -> None:
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument("--sfm_dir", type=Path, required=True, help="folder of the new model")
-    parser.add_argument("--reference_model", type=Path, required=True, help="model with the poses")
+    parser.add_argument(
+        "--reference_model",
+        "--reference_sfm_model",
+        type=Path,
+        required=True,
+        help="model with the poses",
+    )
     parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
     parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
     parser.add_argument("--features", type=Path, required=True, help="feature file")
     parser.add_argument("--matches", type=Path, required=True, help="match file")
+    parser.add_argument(
+        "--skip_geometric_verification", action="store_true", help="triangulate all matches"
+    )
+    parser.add_argument(
+        "--estimate_two_view_geometries",
+        action="store_true",
+        help="verify by geometries estimated from the matches, not by the known poses",
+    )
+    parser.add_argument("--min_match_score", type=float, help="take matches of a higher score only")
     parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
     parser.add_argument("--overwrite", action="store_true", help="triangulate anew")
     main(**vars(parser.parse_args()))

@@ -9,6 +9,8 @@ import numpy as np
 import pycolmap
 import pytest
 
+from hloc_reduce import colmap
+
 SHARED = Path(__file__).parents[2] / "shared"
 
 
@@ -53,7 +55,6 @@ def scene(tmp_path) -> SimpleNamespace:
         model="SIMPLE_RADIAL", width=640, height=480, params=[500, 320, 240, 0.02], camera_id=1
     )
     reference = pycolmap.Reconstruction()
-    reference.add_camera_with_trivial_rig(camera)
     poses, seen = {}, {}
     features = tmp_path / "features.h5"
     with h5py.File(features, "w") as file:
@@ -71,7 +72,7 @@ def scene(tmp_path) -> SimpleNamespace:
             seen[name] = order
             if i < 6:
                 image = pycolmap.Image(name=name, camera_id=1, image_id=i + 1)
-                reference.add_image_with_trivial_frame(image, poses[name])
+                colmap.add_image(reference, camera, image, poses[name])
             (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(tmp_path / "images" / name), np.full((480, 640), 99, np.uint8))
     model = tmp_path / "reference"
@@ -116,7 +117,6 @@ def plane(tmp_path):
         params=[FOCAL, SIZE[0] / 2, SIZE[1] / 2],
         camera_id=1,
     )
-    reference.add_camera_with_trivial_rig(camera)
     points = np.column_stack([generator.uniform(-0.5, 0.5, (30, 2)), np.zeros(30)])
     (tmp_path / "images").mkdir()
     poses = []
@@ -135,7 +135,7 @@ def plane(tmp_path):
         image = pycolmap.Image(
             name=f"{i}.png", keypoints=pixels.reshape(-1, 2), camera_id=1, image_id=i + 1
         )
-        reference.add_image_with_trivial_frame(image, poses[i])
+        colmap.add_image(reference, camera, image, poses[i])
     for j, point in enumerate(points):
         track = pycolmap.Track([pycolmap.TrackElement(i, j) for i in range(1, 6)])
         reference.add_point3D(point, track)

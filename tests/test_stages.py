@@ -4,6 +4,7 @@ import shutil
 
 import h5py
 import numpy as np
+import pycolmap
 import pytest
 
 from hloc_reduce import (
@@ -137,6 +138,36 @@ def test_matches_off_their_epipolar_lines_are_left_out(built):
         assert "empty" in str(error)
 
 
+def test_matches_of_low_score_are_left_out(built):
+    """Those of the first point, which is then in no track."""
+    with h5py.File(built.matches, "a") as file:
+        for pair in list_h5_names(built.matches):
+            seen = built.seen[f"db/{pair[3:4]}.jpg"]
+            file[f"{pair}/matching_scores0"][seen == 0] = 0.5
+    arguments = (built.model, built.images, built.pairs, built.features, built.matches)
+    for score, points in ((0.6, 299), (0.4, 300), (None, 300)):
+        sfm = built.root / f"sfm_{score}"
+        assert triangulation.main(sfm, *arguments, min_match_score=score).num_points3D() == points
+
+
+@pytest.mark.parametrize("how", ["skip_geometric_verification", "estimate_two_view_geometries"])
+def test_matches_are_verified_otherwise(built, how):
+    """A tenth of the matches is wrong: taken as they are, or found out without the known poses."""
+    with h5py.File(built.matches, "a") as file:
+        for pair in list_h5_names(built.matches):
+            matches = file[f"{pair}/matches0"][:]
+            matches[:30] = np.roll(matches[:30], 1)
+            file[f"{pair}/matches0"][:] = matches
+    arguments = (built.model, built.images, built.pairs, built.features, built.matches)
+    triangulation.main(built.root / "other", *arguments, **{how: True})
+    with pycolmap.Database.open(built.root / "other/database.db") as database:
+        verified = database.num_inlier_matches() / database.num_matches()
+    if how == "skip_geometric_verification":
+        assert verified == 1
+    else:
+        assert 0.85 < verified < 0.95
+
+
 def test_old_model_without_rigs(built):
     for name in ("rigs.bin", "frames.bin"):
         (built.model / name).unlink()
@@ -170,6 +201,24 @@ def test_localization_is_resumed_and_repeated_exactly(built):
     assert log.read_text().splitlines(keepends=True) == lines
     assert built.localize(overwrite=True) == first
     assert built.localize(reference_sfm=built.map) == first
+
+
+def test_clusters_of_covisible_images_are_solved_by_themselves(built):
+    """Half of the points are seen by one half of the map, the others by the other."""
+    for image in built.map.images.values():
+        late = int(image.name[3]) > 2
+        for index, point in enumerate(built.seen[image.name]):
+            if (point < 120) == late:
+                built.map.delete_observation(image.image_id, index)
+    localizer = localize_sfm.QueryLocalizer(built.map)
+    names = [f"db/{i}.jpg" for i in (5, 1, 3, 0, 2)]
+    assert localizer.clusters(names) == [["db/1.jpg", "db/0.jpg", "db/2.jpg"], names[0:3:2]]
+    assert localizer.clusters([]) == [[]]
+    whole = built.localize(reference_sfm=built.map)["query/6.jpg"]
+    part = built.localize(reference_sfm=built.map, covisibility_clustering=True)["query/6.jpg"]
+    assert (whole["num_inliers"], part["num_inliers"]) == (300, 180)
+    assert (whole["num_matches"], part["num_matches"]) == (900, 540)
+    assert part["db"] == "db/0.jpg" and part["localized"]
 
 
 def test_other_options_are_not_answered_from_the_log(built):

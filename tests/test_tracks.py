@@ -1,11 +1,15 @@
 """Training data from photos with poses: a textured plane seen by five cameras."""
 
+import shutil
+
 import cv2
 import h5py
 import numpy as np
 import pycolmap
 import pytest
+import torch
 
+from confs import features
 from hloc_reduce.cli import InputError
 from hloc_reduce.colmap import point3D_ids
 from hloc_reduce.training import tracks
@@ -69,7 +73,8 @@ def test_hidden_observations_are_found_again_by_geometry(plane):
     keypoints, observed = {}, {}
     with h5py.File(plane / "out/feats-dog-sift.h5") as file:
         for name in images:
-            keypoints[name] = tracks._keypoints(file, name).astype(float)
+            columns = [file[name][key][()] for key in ("keypoints", "scales", "oris")]
+            keypoints[name] = np.column_stack(columns).astype(float)
             keypoints[name][:, :2] += 0.5
             observed[name] = point3D_ids(images[name])
     generator = np.random.default_rng(0)
@@ -89,3 +94,49 @@ def test_hidden_observations_are_found_again_by_geometry(plane):
     for name in images:  # what was known stays
         kept = hidden[name] >= 0
         assert (completed[name][kept] == hidden[name][kept]).all()
+
+
+class Extractor(torch.nn.Module):
+    """Finds keypoints a pixel beside (1, 2) and far from (50, 60)."""
+
+    descriptor = "test"
+
+    def forward(self, data):
+        assert data["image"].shape[1] == 3
+        return {
+            "keypoints": torch.tensor([[[200.0, 3], [2, 2]]]),
+            "descriptors": torch.eye(256)[None, :, 7:9],
+        }
+
+
+def test_keypoints_are_found_anew_in_variants(monkeypatch):
+    monkeypatch.setattr(tracks.extractors, "load", lambda _: Extractor())
+    describe = tracks.FeatureDescriber({"name": "test"})
+    known = np.eye(256, dtype=np.float16)[:2]
+    keypoints = np.array([[1, 2], [50, 60]], np.float32)
+    described = describe(torch.rand(1, 3, 80, 90), keypoints, known, np.random.default_rng(0))
+    assert described.shape == (2, 2, tracks.VARIANTS, 256) and described.dtype == np.float16
+    assert (described[:, :, 0] == known[:, None]).all()
+    assert (described[0, :, 1:] == np.eye(256)[8]).all()
+    assert (described[1, :, 1:] == known[1]).all()
+
+
+def test_tracks_of_an_extractor(plane):
+    """Its own keypoints, without scales and orientations: nothing is completed."""
+    conf = features.feature("plain", {"name": "dog", "max_keypoints": 300})
+    path = tracks.main(plane / "images", plane / "model", plane / "out", "plain", conf=conf)
+    data = tracks.load(path)
+    assert path.name == "tracks_plain.safetensors" and data.descriptors.shape[-1] == 128
+    assert not data.matched.all()
+    # in a variant most are found again, under another light
+    photos, variants = data.descriptors[:, 0, 0], data.descriptors[:, 0, 1]
+    changed = (photos != variants).any(axis=1)
+    assert 0.3 < changed.mean() < 1
+    cosine = (photos.astype(np.float32) * variants.astype(np.float32)).sum(1)
+    assert np.median(cosine[changed]) > 0.8
+    with h5py.File(plane / "out/feats-dog-plain.h5", "a") as file:
+        for name in file:
+            del file[name]["oris"]
+    shutil.rmtree(plane / "out/sfm_plain")
+    tracks.main(plane / "images", plane / "model", plane / "out", "plain", conf=conf)
+    assert tracks.load(path).matched.all()

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from .. import colmap
 from .cameras import Photo
 from .render import Scene
 from .surface import View
@@ -89,8 +90,6 @@ def write_model(
     model = pycolmap.Reconstruction()
     tracks = [pycolmap.Track() for _ in points]
     for image_id, (photo, (inside, pixels)) in enumerate(zip(photos, seen, strict=True), start=1):
-        if not model.exists_camera(photo.camera.camera_id):
-            model.add_camera_with_trivial_rig(photo.camera)
         kept = well_seen[inside]
         for idx, point in enumerate(inside[kept]):
             tracks[point].add_element(image_id, idx)
@@ -100,7 +99,7 @@ def write_model(
             camera_id=photo.camera.camera_id,
             image_id=image_id,
         )
-        model.add_image_with_trivial_frame(image, photo.cam_from_world)
+        colmap.add_image(model, photo.camera, image, photo.cam_from_world)
     for point in np.flatnonzero(well_seen):
         model.add_point3D(points[point], tracks[point])
     model.update_point_3d_errors()

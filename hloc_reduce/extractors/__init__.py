@@ -1,1 +1,28 @@
 """Extractors: image to features."""
+
+import pkgutil
+import sys
+
+from torch import nn
+
+from ..base_model import dynamic_load
+
+
+def load(conf: dict) -> nn.Module:
+    """Make the extractor of a model configuration.
+
+    Its `name` is that of a module of this package, else of one of an installed hloc's
+    extractors. `hloc.dog` is hloc's where both have a `dog`.
+
+    Raises:
+        InputError: when there is no such extractor, or its configuration is wrong.
+    """
+    ours = [module.name for module in pkgutil.iter_modules(__path__)]
+    if conf["name"] not in ours:
+        from ..hloc import is_installed
+
+        if is_installed():
+            from ..hloc.extractor import HlocExtractor
+
+            return HlocExtractor({"conf": conf})
+    return dynamic_load(sys.modules[__name__], conf["name"])(conf)

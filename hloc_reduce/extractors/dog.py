@@ -49,7 +49,13 @@ class DoG(BaseModel):
 
     def _init(self, conf: dict) -> None:
         self.describe = Descriptor(conf["descriptor"])
+        colmap.dog_detector(conf["options"])  # refuses wrong options
         self.detect = None  # made for the first image, so that the model can be copied before
+
+    @property
+    def descriptor(self) -> str:
+        """The name that a projection of these descriptors is kept under."""
+        return self.conf["descriptor"]
 
     def _forward(self, data: dict) -> dict:
         image = data["image"]

@@ -1,28 +1,34 @@
 """Any extractor followed by a frozen projection of its descriptors."""
 
-from .. import extractors, projections
-from ..base_model import BaseModel, dynamic_load
+from .. import projections
+from ..base_model import BaseModel
 from ..cli import InputError
+from . import load
 
 
 class Reduced(BaseModel):
     """The features of `base` with descriptors projected to fewer dimensions.
 
-    `base` is the configuration of an extractor, `projection` the name of a projection that ships
-    or the path of one.
+    `base` is the configuration of an extractor, of this project or of an installed hloc;
+    `projection` the name of a projection that ships or the path of one, None for none.
     """
 
-    default_conf = {"base": {"name": "dog"}, "projection": "sift_sv64"}
+    default_conf = {"base": {"name": "dog"}, "projection": None}
     required_inputs = ("image",)
 
     def _init(self, conf: dict) -> None:
-        self.base = dynamic_load(extractors, conf["base"]["name"])(conf["base"])
+        self.base = load(conf["base"])
+        if not hasattr(self.base, "descriptor"):
+            raise InputError(f"{conf['base']['name']} gives no local features to project.")
+        self.project = None
+        if conf["projection"] is None:
+            return
         self.project = projections.load(conf["projection"])
-        trained_on = self.project.metadata.get("descriptor")
-        described = self.base.conf.get("descriptor", trained_on)
-        if trained_on not in (None, described):
+        trained_on = self.project.metadata.get("descriptor", self.base.descriptor)
+        if trained_on != self.base.descriptor:
             raise InputError(
-                f"The projection {conf['projection']} is for {trained_on}, not for {described}."
+                f"The projection {conf['projection']} is for {trained_on}, not for "
+                f"{self.base.descriptor}."
             )
 
     @property
@@ -32,6 +38,8 @@ class Reduced(BaseModel):
 
     def _forward(self, data: dict) -> dict:
         features = self.base(data)
+        if self.project is None:
+            return features
         descriptors = features["descriptors"][0].T
         if descriptors.shape[1] != self.project.sizes[0]:
             raise InputError(

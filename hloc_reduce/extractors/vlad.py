@@ -1,11 +1,30 @@
 """VLAD: a global descriptor made of local ones (Jégou et al., CVPR 2010)."""
 
+from pathlib import Path
+
 import numpy as np
 import torch
-from sklearn.cluster import MiniBatchKMeans
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch.nn.functional import normalize, one_hot
 
 from ..base_model import BaseModel
+from ..cli import InputError
+
+# 64 words of sift_sv64, learned by aggregate_features from south-building
+VOCABULARY = Path(__file__).parent / "vlad_sift_sv64.safetensors"
+
+
+def read_vocabulary(path: Path | str | None = None) -> torch.Tensor:
+    """Read a vocabulary (words, D) float32 that aggregate_features wrote; default: one that ships.
+
+    Raises:
+        InputError: when the file is not there or is none.
+    """
+    try:
+        return load_file(path or VOCABULARY)["vocabulary"].float()
+    except (OSError, SafetensorError, KeyError) as error:
+        raise InputError(f"{path} is not a vocabulary ({error}).") from None
 
 
 class VLAD(BaseModel):
@@ -23,6 +42,8 @@ class VLAD(BaseModel):
 
     def fit(self, descriptors: np.ndarray) -> None:
         """Learn the vocabulary from local descriptors (N, D), N > 0."""
+        from sklearn.cluster import MiniBatchKMeans  # a second to import, for this only
+
         generator = np.random.default_rng(self.conf["seed"])
         if len(descriptors) > self.conf["max_samples"]:
             chosen = generator.choice(len(descriptors), self.conf["max_samples"], replace=False)
@@ -42,6 +63,11 @@ class VLAD(BaseModel):
         Without local descriptors it is zero.
         """
         descriptors = data["descriptors"][0].T.float()
+        if descriptors.shape[1] != self.vocabulary.shape[1]:
+            raise InputError(
+                f"The vocabulary is of {self.vocabulary.shape[1]}-D descriptors, those of the "
+                f"image are {descriptors.shape[1]}-D."
+            )
         words = torch.cdist(descriptors, self.vocabulary).argmin(dim=1)
         assigned = one_hot(words, len(self.vocabulary)).to(descriptors)
         sums = assigned.T @ descriptors - assigned.sum(0)[:, None] * self.vocabulary

@@ -3,7 +3,6 @@
 import numpy as np
 import torch
 
-from ..descriptors import DIM
 from .tracks import Tracks
 
 
@@ -42,7 +41,7 @@ class PairSampler:
         self.num_observations = int(sum(lengths.sum() for lengths in self.lengths))
 
     def batch(self, number: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw batch `number`: anchors and positives, each (at most size, 128) float32.
+        """Draw batch `number`: anchors and positives, each (at most size, D) float32.
 
         Every point is drawn once at most, so that the other rows are negatives.
         """
@@ -122,7 +121,8 @@ class DescriptorSampler:
         """Return views of observations, augmented or not, and the photos of the same."""
         variant = generator.random(len(indices)) < self.augment
         mirrored = generator.integers(2, size=len(indices)) * self.mirror
-        seen, plain = (np.empty((len(indices), DIM), np.float32) for _ in range(2))
+        shape = len(indices), self.maps[0].descriptors.shape[-1]
+        seen, plain = np.empty(shape, np.float32), np.empty(shape, np.float32)
         for start, end, tracks in zip(self.starts, self.starts[1:], self.maps, strict=False):
             rows = np.flatnonzero((indices >= start) & (indices < end))
             chosen = generator.integers(1, tracks.descriptors.shape[2], size=len(rows))

@@ -4,10 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import h5py
 import numpy as np
+import pycolmap
 import torch
 from safetensors.numpy import load_file, save_file
+from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from confs import features as features_confs
@@ -15,6 +16,7 @@ from confs import features as features_confs
 from .. import (
     colmap,
     extract_features,
+    extractors,
     logger,
     match_features,
     pairs_from_covisibility,
@@ -33,6 +35,7 @@ NUM_COVIS = 20
 MATCHED = "sift"  # which descriptor finds the tracks, whatever they are described with
 # The photo as it is and three photometric variants, each as seen and mirrored.
 VARIANTS = 4
+MAX_SHIFT = 1.5  # pixels between a keypoint and the same one of a variant
 
 
 @dataclass
@@ -40,7 +43,7 @@ class Tracks:
     """Descriptors of the observations of 3D points.
 
     Args:
-        descriptors: (M, 2, V, 128) float16 of unit norm: M observations, as seen and mirrored, in
+        descriptors: (M, 2, V, D) float16 of unit norm: M observations, as seen and mirrored, in
             V photometric variants, the first of which is the photo itself.
         track: (M,) int64, which of the map's points an observation sees, sorted, from 0 on.
         image: (M,) int64, in which image, numbered by name; a patch of PhotoTour is one of its own.
@@ -64,7 +67,14 @@ class Tracks:
         return Tracks(**{key: value[kept] for key, value in vars(self).items()})
 
 
-def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed: int = 0) -> Path:
+def main(
+    images: Path,
+    model: Path,
+    output: Path,
+    descriptor: str = "sift",
+    seed: int = 0,
+    conf: dict | None = None,
+) -> Path:
     """Triangulate the tracks of a map with known poses and describe their observations.
 
     Args:
@@ -73,6 +83,8 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
         output: folder for all files; what it holds already is used.
         descriptor: the base descriptor.
         seed: of the photometric variants.
+        conf: of the feature whose keypoints and descriptors are used, in place of those of `sift`
+            described by `descriptor`, which is then but what its files are called after.
 
     Returns:
         The file of `load`.
@@ -84,7 +96,8 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     if (output / "source.json").exists() and not stamps.is_current(output / "source.json", source):
         raise InputError(f"{output} holds the tracks of another map. Choose another folder.")
     stamps.write(output / "source.json", source)
-    conf = features_confs.feature(MATCHED, features_confs.base(MATCHED))
+    found_by, patches = (descriptor, False) if conf else (MATCHED, True)
+    conf = conf or features_confs.confs[MATCHED]
     pairs = pairs_from_covisibility.main(
         model, output / f"pairs-db-covis{NUM_COVIS}.txt", NUM_COVIS
     )
@@ -93,41 +106,61 @@ def main(images: Path, model: Path, output: Path, descriptor: str = "sift", seed
     # no ratio test: the poses tell right from wrong, and what is ambiguous is worth learning
     matcher = match_features.confs["NN-mutual"]
     matches = match_features.main(matcher, pairs, features.stem, output)
-    sfm = output / f"sfm_{MATCHED}"
+    sfm = output / f"sfm_{found_by}"
     reconstruction = triangulation.main(sfm, model, images, pairs, features, matches)
 
     tracks = output / f"tracks_{descriptor}.safetensors"
     made_from = stamp(descriptor, seed, [sfm / "points3D.bin", features])
     if tracks.exists() and stamps.is_current(tracks.with_suffix(".json"), made_from):
         return tracks
-    images_by_name = {image.name: image for image in reconstruction.images.values()}
-    describe = Descriptor(descriptor).to(device())
+    observed, matched, keypoints = _observations(reconstruction, features, names)
+    describe = PatchDescriber(descriptor) if patches else FeatureDescriber(conf["model"])
     parts = []
     with open_h5(features) as file:
-        keypoints = {name: _keypoints(file, name) for name in names}
-        places = {name: get_colmap_keypoints(file, name)[0] for name in names}
-    matched = {name: point3D_ids(images_by_name[name]) for name in names}
-    observed = complete(
-        reconstruction,
-        {name: np.column_stack([places[name], keypoints[name][:, 2:]]) for name in names},
-        matched,
-    )
-    for number, name in enumerate(tqdm(names, desc="Describing tracks", unit="image")):
-        kept = np.flatnonzero(observed[name] >= 0)
-        if not len(kept):
-            continue
-        generator = np.random.default_rng([seed, number])
-        image, size = extract_features.load_image(images / name, conf["preprocessing"])
-        ratio = np.array(image.shape[:1:-1]) / size
-        scaled = keypoints[name][kept]  # in pixels of the resized image
-        scaled[:, :2] = (scaled[:, :2] + 0.5) * ratio - 0.5
-        scaled[:, 2] *= ratio.mean()
-        described = describe_variants(image[0, 0].numpy(), scaled, describe, generator)
-        ids, xy = observed[name][kept], keypoints[name][kept, :2]
-        parts.append((described, ids, np.full(len(kept), number), xy, matched[name][kept] >= 0))
+        for number, name in enumerate(tqdm(names, desc="Describing tracks", unit="image")):
+            kept = np.flatnonzero(observed[name] >= 0)
+            if not len(kept):
+                continue
+            generator = np.random.default_rng([seed, number])
+            image, size = extract_features.load_image(images / name, conf["preprocessing"])
+            ratio = np.array(image.shape[:1:-1]) / size
+            scaled = keypoints[name][kept]  # in pixels of the resized image
+            scaled[:, :2] = (scaled[:, :2] + 0.5) * ratio - 0.5
+            scaled[:, 2:3] *= ratio.mean()
+            known = get_dataset(file, name, "descriptors")[()].T[kept]
+            described = describe(image, scaled, known, generator)
+            ids, xy = observed[name][kept], keypoints[name][kept, :2]
+            parts.append((described, ids, np.full(len(kept), number), xy, matched[name][kept] >= 0))
     if not parts:
         raise InputError(f"The map {model} gives no tracks.")
     return save(tracks, made_from, *map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _observations(
+    reconstruction: pycolmap.Reconstruction, features: Path, names: list[str]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Find which points the keypoints of the images observe.
+
+    Returns:
+        From image name to the id of the point of each keypoint, -1 where none (N,), completed and
+        as matched; and to the keypoints (N, 4): x, y, scale (pixels), orientation (degrees), or
+        (N, 2) where they have no more, whose tracks cannot be completed.
+    """
+    images = {image.name: image for image in reconstruction.images.values()}
+    matched = {name: point3D_ids(images[name]) for name in names}
+    with open_h5(features) as file:
+        oriented = {"scales", "oris"} <= file[names[0]].keys()
+        columns = ("keypoints", "scales", "oris") if oriented else ("keypoints",)
+        keypoints = {
+            name: np.column_stack([get_dataset(file, name, key)[()] for key in columns])
+            for name in names
+        }
+        keypoints = {name: array.astype(np.float32) for name, array in keypoints.items()}
+        places = {name: get_colmap_keypoints(file, name)[0] for name in names}
+    if not oriented:
+        return matched, matched, keypoints
+    shaped = {name: np.column_stack([places[name], keypoints[name][:, 2:]]) for name in names}
+    return complete(reconstruction, shaped, matched), matched, keypoints
 
 
 def stamp(descriptor: str, seed: int, inputs: list[Path]) -> dict:
@@ -174,36 +207,72 @@ def load(path: Path) -> Tracks:
     return Tracks(**load_file(path))
 
 
-def _keypoints(file: h5py.File, name: str) -> np.ndarray:
-    """Read keypoints (N, 4): x, y, scale (pixels), orientation (degrees)."""
-    columns = [get_dataset(file, name, key)[()] for key in ("keypoints", "scales", "oris")]
-    return np.column_stack(columns).astype(np.float32)
+class PatchDescriber:
+    """Describes keypoints by the patches around them, in a photo and in variants of it."""
+
+    def __init__(self, descriptor: str):
+        self.describe = Descriptor(descriptor).to(device())
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        image: torch.Tensor,
+        keypoints: np.ndarray,
+        known: np.ndarray,
+        generator: np.random.Generator,
+    ) -> np.ndarray:
+        """Describe the keypoints of a photo.
+
+        Args:
+            image: (1, 1, H, W) float32 in [0, 1].
+            keypoints: (N, 4) x, y, scale (pixels), orientation (degrees).
+            known: the descriptors that the keypoints were found with, not used.
+            generator: draws the variants.
+
+        Returns:
+            (N, 2, VARIANTS, D) float16: as seen and mirrored.
+        """
+        described = np.empty((len(keypoints), 2, VARIANTS, DIM), np.float16)
+        photo = image[0, 0].numpy()
+        for variant in range(VARIANTS):
+            view = photometric_variant(photo, generator) if variant else photo
+            patches = extract_patches(torch.from_numpy(view)[None, None], keypoints)
+            described[:, :, variant] = describe_mirrored(patches, self.describe)
+        return described
 
 
-@torch.no_grad()
-def describe_variants(
-    image: np.ndarray,
-    keypoints: np.ndarray,
-    describe: Descriptor,
-    generator: np.random.Generator,
-) -> np.ndarray:
-    """Describe keypoints in a photo and in photometric variants of it.
+class FeatureDescriber:
+    """Describes keypoints by an extractor, which finds them anew in each variant of a photo."""
 
-    Args:
-        image: (H, W) float32 in [0, 1].
-        keypoints: (N, 4) x, y, scale (pixels), orientation (degrees).
-        describe: base descriptor.
-        generator: draws the variants.
+    def __init__(self, model: dict):
+        self.extract = extractors.load(model).eval().to(device())
 
-    Returns:
-        (N, 2, VARIANTS, 128) float16: as seen and mirrored.
-    """
-    described = np.empty((len(keypoints), 2, VARIANTS, DIM), np.float16)
-    for variant in range(VARIANTS):
-        view = photometric_variant(image, generator) if variant else image
-        patches = extract_patches(torch.from_numpy(view)[None, None], keypoints)
-        described[:, :, variant] = describe_mirrored(patches, describe)
-    return described
+    @torch.no_grad()
+    def __call__(
+        self,
+        image: torch.Tensor,
+        keypoints: np.ndarray,
+        known: np.ndarray,
+        generator: np.random.Generator,
+    ) -> np.ndarray:
+        """Describe the keypoints of a photo (1, C, H, W) as `PatchDescriber` does.
+
+        What is not found anew within MAX_SHIFT pixels keeps its `known` descriptor (N, D). Without
+        patches nothing is mirrored: both views are as seen.
+        """
+        described = np.repeat(known[:, None, None].astype(np.float16), VARIANTS, axis=2)
+        photo = image[0].numpy().transpose(1, 2, 0)
+        for variant in range(1, VARIANTS):
+            view = np.atleast_3d(photometric_variant(photo, generator)).transpose(2, 0, 1)
+            features = self.extract({"image": torch.from_numpy(view.copy())[None].to(device())})
+            found = features["keypoints"][0].cpu().numpy()
+            if not len(found):
+                continue
+            distance, nearest = cKDTree(found).query(keypoints[:, :2])
+            near = distance <= MAX_SHIFT
+            descriptors = features["descriptors"][0].T.cpu().numpy()
+            described[near, 0, variant] = descriptors[nearest[near]]
+        return np.repeat(described, 2, axis=1)
 
 
 def describe_mirrored(patches: torch.Tensor, describe: Descriptor) -> np.ndarray:
@@ -219,11 +288,11 @@ def photometric_variant(image: np.ndarray, generator: np.random.Generator) -> np
     """Draw how a camera would see the same under another light: darker, blurred, noisy, 8 bit.
 
     Args:
-        image: (H, W) float32 in [0, 1].
+        image: (H, W) or (H, W, C) float32 in [0, 1].
         generator: draws gamma 0.5-2, gain 0.08-1.2, blur up to 1.5 px and noise up to 2 %.
 
     Returns:
-        (H, W) float32 in [0, 1].
+        As the image, without the last axis if C is 1.
     """
     gamma = 2 ** generator.uniform(-1, 1)
     gain = np.exp(generator.uniform(np.log(0.08), np.log(1.2)))

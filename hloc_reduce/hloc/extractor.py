@@ -1,0 +1,54 @@
+"""An extractor of hloc's as one of this project's."""
+
+import pkgutil
+
+import torch
+from torch.nn.functional import normalize
+
+from ..base_model import BaseModel
+from ..cli import InputError, choose
+from . import extractors_package
+
+
+class HlocExtractor(BaseModel):
+    """The features of an extractor of an installed hloc, as this project's extractors give them.
+
+    `conf` is hloc's configuration: `name` and what that extractor takes.
+    """
+
+    default_conf = {"conf": {}}
+    required_inputs = ("image",)
+
+    def _init(self, conf: dict) -> None:
+        package, load = extractors_package()
+        conf = dict(conf["conf"])
+        name = conf["name"] = str(conf["name"]).removeprefix("hloc.")
+        self.name = choose(
+            "extractor", name, [module.name for module in pkgutil.iter_modules(package.__path__)]
+        )
+        try:
+            self.model = load(package, name)(conf)
+        except ImportError as error:
+            raise InputError(f"hloc's extractor {name} cannot be imported ({error}).") from None
+        self.detection_noise = getattr(self.model, "detection_noise", 1.0)
+
+    @property
+    def descriptor(self) -> str:
+        """The name that a projection of these descriptors is kept under, such as hloc.disk."""
+        kind = self.model.conf.get("descriptor")
+        return f"hloc.{self.name}" + (f".{kind}" if kind else "")
+
+    @torch.no_grad()
+    def _forward(self, data: dict) -> dict:
+        """Extract keypoints (1, N, 2), descriptors (1, D, N) of unit norm and whatever else."""
+        try:
+            features = {key: value[0] for key, value in self.model(data).items()}
+        except AssertionError as error:
+            reason = str(error) or "it refuses the image: is grayscale as it needs it?"
+            raise InputError(f"hloc's extractor {self.name}: {reason}") from None
+        if "descriptors" not in features:
+            raise InputError(f"hloc's extractor {self.name} gives no local descriptors.")
+        features["descriptors"] = normalize(features["descriptors"].float(), dim=0)
+        if "keypoint_scores" in features:
+            features["scores"] = features.pop("keypoint_scores")
+        return {key: value[None] for key, value in features.items()}

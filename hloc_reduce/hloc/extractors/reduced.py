@@ -1,0 +1,24 @@
+"""hloc's extractor `reduced`: any extractor and a frozen projection of its descriptors."""
+
+from hloc.utils.base_model import BaseModel
+
+from hloc_reduce.extractors import load
+
+
+class Reduced(BaseModel):
+    """`hloc_reduce.extractors.reduced` for hloc; the same configuration."""
+
+    required_inputs = ["image"]
+
+    def _init(self, conf: dict) -> None:
+        self.model = load({**conf, "name": "reduced"})
+
+    @property
+    def detection_noise(self) -> float:
+        """The standard deviation of the keypoints in pixels, which hloc stores with them."""
+        return self.model.detection_noise
+
+    def _forward(self, data: dict) -> dict:
+        features = self.model(data)
+        # hloc would store float32 as float16, in which pixels from 1024 on have no fraction
+        return {**features, "keypoints": features["keypoints"].double()}

@@ -1,0 +1,33 @@
+"""hloc's extractor `vlad`: global descriptors made of reduced local ones, for retrieval."""
+
+from hloc.utils.base_model import BaseModel
+
+from hloc_reduce.extractors import load
+from hloc_reduce.extractors.vlad import VLAD as Aggregation
+from hloc_reduce.extractors.vlad import read_vocabulary
+
+
+class VLAD(BaseModel):
+    """Local features of an image, aggregated with the words of a vocabulary.
+
+    `features` is the model configuration of an extractor; `vocabulary` the file that
+    hloc_reduce.aggregate_features wrote of such features, by default one that ships.
+    """
+
+    default_conf = {
+        "features": {
+            "name": "reduced",
+            "base": {"name": "dog", "descriptor": "sift"},
+            "projection": "sift_sv64",
+        },
+        "vocabulary": None,
+    }
+    required_inputs = ["image"]
+
+    def _init(self, conf: dict) -> None:
+        self.extract = load(conf["features"])
+        self.aggregate = Aggregation({})
+        self.aggregate.vocabulary = read_vocabulary(conf["vocabulary"])
+
+    def _forward(self, data: dict) -> dict:
+        return self.aggregate(self.extract(data))

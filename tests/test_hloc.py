@@ -1,0 +1,372 @@
+"""The plugin: with a test double of what it needs of hloc, and with the real hloc (`-m hloc`)."""
+
+import importlib
+import re
+import sys
+from importlib.util import find_spec
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from packaging.version import Version
+from test_projections import trained
+
+import hloc_reduce
+from confs import features
+from confs.matchers import confs as matchers
+from hloc_reduce import (
+    cli,
+    extractors,
+    parsers,
+    projections,
+)
+from hloc_reduce import hloc as plugin
+from hloc_reduce.cli import InputError
+from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.hloc import __main__ as command
+from hloc_reduce.training import __main__ as training
+from hloc_reduce.training import tracks
+
+# --- a test double: what the plugin needs of hloc, and no more
+
+INIT = """
+from packaging import version
+__version__ = "1.5"
+min_version = version.parse("3.13.0")
+"""
+BASE_MODEL = """
+import inspect
+import torch
+
+class BaseModel(torch.nn.Module):
+    default_conf = {}
+    required_inputs = []
+
+    def __init__(self, conf):
+        super().__init__()
+        self.conf = {**self.default_conf, **conf}
+        self._init(self.conf)
+
+    def forward(self, data):
+        return self._forward(data)
+
+def dynamic_load(root, model):
+    path = f"{root.__name__}.{model}"
+    module = __import__(path, fromlist=[""])
+    classes = [c for _, c in inspect.getmembers(module, inspect.isclass) if c.__module__ == path]
+    (model,) = [c for c in classes if issubclass(c, BaseModel)]
+    return model
+"""
+DOTS = """
+import torch
+from ..utils.base_model import BaseModel
+
+class Dots(BaseModel):
+    default_conf = {"number": 5}
+    detection_noise = 2.0
+
+    def _init(self, conf):
+        self.number = conf.pop("number")
+        assert conf.pop("name") == "dots"
+
+    def _forward(self, data):
+        assert data["image"].shape[1] == 3
+        return {
+            "keypoints": [torch.arange(2.0 * self.number).reshape(-1, 2)],
+            "keypoint_scores": (torch.ones(self.number),),
+            "descriptors": [2 * torch.eye(256)[:, : self.number]],
+        }
+"""
+EXTRACT_FEATURES = """
+import argparse
+
+confs = {"sift": {"output": "feats-sift", "model": {"name": "dog"}, "preprocessing": {}}}
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--conf", choices=list(confs))
+    print(confs[parser.parse_args().conf]["output"])
+"""
+MODULES = {
+    "__init__.py": INIT,
+    "utils/__init__.py": "",
+    "utils/base_model.py": BASE_MODEL,
+    "extractors/__init__.py": "",
+    "extractors/dots.py": DOTS,
+    "extract_features.py": EXTRACT_FEATURES,
+    "match_features.py": 'confs = {"NN-ratio": {"output": "hlocs own"}}',
+    "broken.py": "import not_there",
+}
+
+
+@pytest.fixture
+def forgotten(monkeypatch):
+    """Forget what was imported of hloc, before and after a test."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "hloc"]:
+        monkeypatch.delitem(sys.modules, name)
+    yield
+    for name in [name for name in sys.modules if name.partition(".")[0] == "hloc"]:
+        del sys.modules[name]
+
+
+@pytest.fixture
+def double(tmp_path, monkeypatch, forgotten):
+    """A package `hloc` to import, as a folder."""
+    folder = tmp_path / "double/hloc"
+    for name, source in MODULES.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(source)
+    monkeypatch.syspath_prepend(str(folder.parent))
+    return folder
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["hloc", *map(str, arguments)])
+    cli.run(command._main)
+
+
+@pytest.fixture
+def propagated(monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
+
+
+def test_registered_extractors_are_loaded_by_name(double):
+    hloc_reduce.register()
+    package = importlib.import_module("hloc.extractors")
+    load = importlib.import_module("hloc.utils.base_model").dynamic_load
+    conf = importlib.import_module("hloc.extract_features").confs["sift_sv16"]["model"]
+    image = {"image": torch.rand(1, 1, 120, 160)}
+    found = load(package, conf["name"])(conf).eval()(image)
+    expected = extractors.load(features.confs["sift_sv16"]["model"]).eval()(image)
+    torch.testing.assert_close(found["descriptors"], expected["descriptors"])
+    # as float32 hloc would round them to float16
+    assert found["keypoints"].dtype == torch.float64
+    assert load(package, "reduced")({"name": "reduced"}).detection_noise == 1
+    vlad = load(package, "vlad")({"name": "vlad"})(image)["global_descriptor"]
+    assert vlad.shape == (1, 64 * 64) and vlad.norm() == pytest.approx(1, abs=1e-5)
+
+
+def test_confs_are_added_once_and_none_is_replaced(double):
+    added = hloc_reduce.register()
+    confs = importlib.import_module("hloc.extract_features").confs
+    assert confs["sift"]["output"] == "feats-sift" and "sift" not in added
+    assert features.confs.keys() <= confs.keys() and {"vlad", "sift_nested@24"} < set(added)
+    assert confs["mkd"]["model"] == {"name": "reduced", "base": features.base("mkd")}
+    matcher_confs = importlib.import_module("hloc.match_features").confs
+    assert matcher_confs["NN-ratio"] == {"output": "hlocs own"}
+    assert matcher_confs["NN-mutual"] == matchers["NN-mutual"]
+    before = {**confs}
+    assert hloc_reduce.register() == [] and confs == before
+    path = importlib.import_module("hloc.extractors").__path__
+    assert len(path) == 2
+
+
+def test_features_of_files_are_registered_by_their_names(double, tmp_path):
+    (tmp_path / "mine.yaml").write_text("model: {name: dog, max_keypoints: 7}")
+    assert "mine" in hloc_reduce.register([tmp_path / "mine.yaml"])
+    conf = importlib.import_module("hloc.extract_features").confs["mine"]
+    assert conf["model"] == {"name": "reduced", "base": {"name": "dog", "max_keypoints": 7}}
+
+
+def test_a_missing_hloc_is_named(monkeypatch, forgotten):
+    monkeypatch.setattr(plugin, "is_installed", lambda: False)
+    with pytest.raises(InputError, match="hloc is not installed: pip install"):
+        hloc_reduce.register()
+    with pytest.raises(InputError, match="Unknown extractor 'disk'"):
+        extractors.load({"name": "disk"})
+
+
+@pytest.mark.parametrize(
+    "init",
+    [
+        '__version__ = "1.4"',
+        '__version__ = "1.5"',
+        INIT.replace("3.13.0", "3.12.6"),
+    ],
+)
+def test_an_old_hloc_is_refused(double, init):
+    (double / "__init__.py").write_text(init)
+    with pytest.raises(InputError, match="too old.*--upgrade"):
+        hloc_reduce.register()
+
+
+@pytest.mark.parametrize("init", ['__version__ = "1.6"', INIT.replace("3.13.0", "4.2.2")])
+def test_a_newer_hloc_is_taken(double, init):
+    (double / "__init__.py").write_text(init)
+    assert "sift_sv64" in hloc_reduce.register()
+
+
+@pytest.mark.parametrize(("version", "warned"), [("4.2.1", True), ("4.2.0", False)])
+def test_a_pycolmap_without_points_is_warned_of_once(
+    double, version, warned, monkeypatch, caplog, propagated
+):
+    monkeypatch.setattr(pycolmap, "__version__", version)
+    hloc_reduce.register()
+    hloc_reduce.register()
+    warnings = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warnings) == warned
+    assert all("\n" not in record.getMessage() for record in warnings)
+
+
+def test_modules_run_with_the_confs(double, monkeypatch, capsys):
+    run(monkeypatch, "extract_features", "--conf", "sift_sv64")
+    assert capsys.readouterr().out == "feats-dog-sift_sv64\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("extract", "hloc.extract cannot be imported"),
+        ("broken", "hloc.broken cannot be imported .*not_there"),
+        ("match_features", "hloc.match_features has no command line"),
+    ],
+)
+def test_what_cannot_run_is_one_clear_line(double, name, message, monkeypatch, caplog, propagated):
+    with pytest.raises(SystemExit) as exit:
+        run(monkeypatch, name)
+    assert exit.value.code == 2
+    (error,) = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
+    assert re.search(message, error)
+
+
+def test_an_extractor_of_hlocs_is_a_base(double, tmp_path):
+    model = extractors.load({"name": "reduced", "base": {"name": "dots", "number": 3}})
+    assert model.detection_noise == 2 and model.base.descriptor == "hloc.dots"
+    found = model({"image": torch.rand(1, 3, 40, 40)})
+    assert found["keypoints"].shape == (1, 3, 2) and found["scores"].shape == (1, 3)
+    torch.testing.assert_close(found["descriptors"], torch.eye(256)[None, :, :3])
+    with pytest.raises(InputError, match="for sift, not for hloc.dots"):
+        extractors.load({"name": "reduced", "base": {"name": "dots"}, "projection": "sift_sv16"})
+    with pytest.raises(InputError, match="hloc's extractor dots: .*grayscale"):
+        model({"image": torch.rand(1, 1, 40, 40)})
+    with pytest.raises(InputError, match="Unknown extractor 'dosts'. There are: dots"):
+        extractors.load({"name": "dosts"})
+
+
+def test_projections_of_other_dimensions_are_refused_with_both(double, tmp_path):
+    file = tmp_path / "p.safetensors"
+    projections.save(trained((128, 16)), {}, file)
+    conf = {"name": "reduced", "base": {"name": "dots"}, "projection": str(file)}
+    with pytest.raises(InputError, match="for 128-D .* have 256"):
+        extractors.load(conf)({"image": torch.rand(1, 3, 40, 40)})
+
+
+# --- the real hloc
+
+
+def test_a_base_of_hlocs_is_trained_on(double, tmp_path, monkeypatch):
+    """The command line: the name of the file, the dimensions, and what the metadata say."""
+    (tmp_path / "mine.yaml").write_text(
+        "model: {name: dots, number: 3}\npreprocessing: {grayscale: false}"
+    )
+    maps = tmp_path / "town/images", tmp_path / "town/sparse"
+    for folder in maps:
+        folder.mkdir(parents=True)
+    found = np.random.default_rng(0).standard_normal((90, 2, 2, 256)).astype(np.float16)
+    columns = np.arange(90) // 3, np.arange(90), np.zeros((90, 2), np.float32), np.ones(90, bool)
+    asked = []
+    monkeypatch.setattr(tracks, "main", lambda *given: asked.append(given) or tmp_path / "t")
+    monkeypatch.setattr(tracks, "load", lambda _: tracks.Tracks(found, *columns))
+    (tmp_path / "t").touch()
+    arguments = "--base", tmp_path / "mine.yaml", "--scheme", "pca", "--output", tmp_path
+    arguments = *arguments, "--map", ":".join(map(str, maps))
+    train(monkeypatch, *arguments, "--dim", 16)
+    assert asked[0][3] == "mine" and asked[0][-1]["preprocessing"]["grayscale"] is False
+    file = tmp_path / "mine_pca16.safetensors"
+    projection = projections.load(file)
+    assert projection.sizes == (256, 16)
+    assert projection.metadata["descriptor"] == "hloc.dots"
+    assert projection.metadata["base"]["model"] == {"name": "dots", "number": 3}
+    _, conf = features.get(str(tmp_path / "mine.yaml"), file)
+    reduced = extractors.load(conf["model"])({"image": torch.rand(1, 3, 40, 40)})
+    assert reduced["descriptors"].shape == (1, 16, 3)
+    with pytest.raises(InputError, match="for hloc.dots, not for sift"):
+        extractors.load({**conf["model"], "base": features.base("sift")})
+    with pytest.raises(InputError, match="mine has 256 dimensions, which 300 do not reduce"):
+        train(monkeypatch, *arguments, "--dim", 300)
+    with pytest.raises(InputError, match="not the patches of PhotoTour"):
+        train(monkeypatch, *arguments, "--phototour", tmp_path)
+
+
+def train(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["training", *map(str, arguments)])
+    training._main()
+
+
+@pytest.fixture
+def registered(forgotten):
+    if find_spec("hloc") is None:
+        pytest.skip("hloc is not installed")
+    hloc_reduce.register()
+
+
+STAGES = [
+    "extract_features",
+    "pairs_from_covisibility",
+    "match_features",
+    "triangulation",
+    "pairs_from_retrieval",
+    "localize_sfm",
+]
+
+
+def modules(*of_hloc):
+    """The modules of the stages, of hloc or of this project."""
+    return {
+        name: importlib.import_module(f"{'hloc' if name in of_hloc else 'hloc_reduce'}.{name}")
+        for name in STAGES
+    }
+
+
+def localized(stages, dataset, outputs, feature="sift_sv32"):
+    """Run a chain of stages; return the pose errors of the queries (metres, degrees) by name."""
+    images, model = dataset / "images_upright", dataset / "3D-models/aachen_v_1_1"
+    conf, matcher = stages["extract_features"].confs[feature], matchers["NN-ratio"]
+    sfm_pairs, loc_pairs = outputs / "pairs-db.txt", outputs / "pairs-query.txt"
+    local = stages["extract_features"].main(conf, images, outputs)
+    stages["pairs_from_covisibility"].main(model, sfm_pairs, 3)
+    sfm_matches = stages["match_features"].main(matcher, sfm_pairs, local.stem, outputs)
+    stages["triangulation"].main(outputs / "sfm", model, images, sfm_pairs, local, sfm_matches)
+    vlad = importlib.import_module("hloc.extract_features")
+    retrieved = vlad.main(vlad.confs["vlad"], images, outputs)
+    stages["pairs_from_retrieval"].main(
+        retrieved, loc_pairs, 4, query_prefix=["query"], db_prefix=["db"]
+    )
+    loc_matches = stages["match_features"].main(matcher, loc_pairs, local.stem, outputs)
+    stages["localize_sfm"].main(
+        outputs / "sfm",
+        dataset / "queries/*_time_queries_with_intrinsics.txt",
+        loc_pairs,
+        local,
+        loc_matches,
+        outputs / "poses.txt",
+        prepend_camera_name=True,
+    )
+    return errors(outputs / "poses.txt", dataset)
+
+
+def errors(poses, dataset):
+    """The errors (metres, degrees) of the poses that are in a file, by folder/basename."""
+    truth = parsers.parse_poses(dataset / "queries/ground_truth_poses.txt")
+    truth = {"/".join(name.split("/")[-2:]): pose for name, pose in truth.items()}
+    estimates = parsers.parse_poses(poses)
+    return {name: pose_error(pose, truth[name]) for name, pose in estimates.items()}
+
+
+HLOCS_TRIANGULATION = Version(pycolmap.__version__) < plugin.NO_POINTS
+CHAINS = {
+    "hloc's": [name for name in STAGES if name != "triangulation" or HLOCS_TRIANGULATION],
+    "hloc's features and map": ["extract_features"] + ["triangulation"] * HLOCS_TRIANGULATION,
+    "hloc's matches": ["match_features"],
+    "hloc's localization": ["pairs_from_retrieval", "localize_sfm"],
+    "hloc's features and matches": ["extract_features", "match_features"],
+}
+
+
+@pytest.mark.hloc
+@pytest.mark.parametrize("chain", CHAINS)
+def test_any_chain_of_stages_localizes(registered, aachen_layout, tmp_path, chain):
+    found = localized(modules(*CHAINS[chain]), aachen_layout, tmp_path / "outputs")
+    for name in ("day/a.png", "night/a.png"):
+        assert found[name][0] < 0.02 and found[name][1] < 0.5
