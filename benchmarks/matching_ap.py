@@ -69,7 +69,7 @@ def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.M
     nested_name = f"{descriptor}_nested"
     if nested_name in names:
         names.remove(nested_name)
-        names += [f"{nested_name}@{dim}" for dim in nested.PREFIXES]
+        names += [nested_name, *(f"{nested_name}@{dim}" for dim in nested.PREFIXES[1:])]
     files = [file for file in files if file.name.lower().startswith(descriptor)]
     loaded = {name: projections.load(name) for name in names}
     loaded |= {file.name: projections.load(file) for file in files}

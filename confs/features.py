@@ -85,6 +85,8 @@ def read(path: Path) -> dict:
     for part in (model, model.get("base", model) if isinstance(model, dict) else None):
         if not isinstance(part, dict) or "name" not in part:
             raise InputError(f"{path} has no model with a name, such as: model: {{name: dog}}.")
+    if model["name"] == "reduced" and not model.get("projection"):
+        raise InputError(f"{path}: the reduced model names no projection.")
     given = content.get("preprocessing") or {}
     if not isinstance(given, dict):
         raise InputError(f"{path}: preprocessing cannot be {given!r}.")

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable
 
 from . import logger
 
+NEAREST = 8  # names shown in place of an unknown one
+
 
 class InputError(ValueError):
     """Something the user gave is wrong; the message says what and how to mend it."""
@@ -15,21 +17,27 @@ class InputError(ValueError):
 def run(main: Callable[[], None]) -> None:
     """Run a command line: an error that a user can mend is one logged line and exit code 2."""
     try:
+        # argparse would call a module by its file
+        if spec := sys.modules["__main__"].__spec__:
+            sys.argv[0] = f"python -m {spec.name.removesuffix('.__main__')}"
         main()
     except (InputError, OSError) as error:
         logger.error(error)
         sys.exit(2)
     except KeyboardInterrupt:
-        logger.error("Interrupted. Run it again, without --overwrite, to go on from here.")
+        logger.error("Interrupted. The same command, but for any --overwrite, goes on from here.")
         sys.exit(130)
 
 
 def choose(kind: str, name: str, names: Iterable[str]) -> str:
-    """Return `name` if it is one of `names`, else raise an InputError, nearest names first."""
+    """Return `name` if it is one of `names`, else raise an InputError with the nearest names."""
     names = list(names)
     if name not in names:
-        near = difflib.get_close_matches(str(name), names, n=len(names) or 1, cutoff=0)
-        raise InputError(f"Unknown {kind} '{name}'. There are: {', '.join(near) or 'none'}.")
+        by_lower = {known.lower(): known for known in names}
+        near = difflib.get_close_matches(str(name).lower(), by_lower, n=NEAREST, cutoff=0)
+        shown = ", ".join(by_lower[lower] for lower in near) or "none"
+        there_are = "There are" if len(names) <= NEAREST else f"The nearest of {len(names)}"
+        raise InputError(f"Unknown {kind} '{name}'. {there_are}: {shown}.")
     return name
 
 
@@ -42,6 +50,6 @@ class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
         return super()._fill_text(text, width, indent)
 
     def _get_help_string(self, action: argparse.Action) -> str:
-        if action.default in (None, False):
+        if action.default is None or action.default is False:
             return action.help
         return super()._get_help_string(action)

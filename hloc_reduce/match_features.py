@@ -135,7 +135,7 @@ def _main() -> None:
     )
     parser.add_argument("--export_dir", type=Path, required=True, help="folder of the features")
     parser.add_argument("--matches", type=Path, help="the match file itself")
-    parser.add_argument("--conf", default="NN-ratio", help="matcher")
+    parser.add_argument("--conf", default="NN-ratio", help=f"one of {', '.join(confs)}")
     parser.add_argument("--overwrite", action="store_true", help="match anew what is there")
     args = parser.parse_args()
     conf = confs[cli.choose("matcher", args.conf, confs)]

@@ -55,7 +55,9 @@ def main(
     if retrieval != "vlad" and Path(retrieval).suffix in PAIRS_FROM:
         list_h5_names(Path(retrieval))  # a broken file is refused before any work is done
     elif retrieval != "vlad":
-        parse_retrieval(Path(retrieval))
+        retrieved = parse_retrieval(Path(retrieval))
+        if not any(set(map_names) & set(retrieved.get(name, ())) for name in query_names):
+            raise InputError(f"{retrieval} has no pair of a query and a map image.")
 
     folder = results.RunFolder(
         outputs,
@@ -129,7 +131,6 @@ def main(
 
 def _main() -> None:
     parser = argparse.ArgumentParser(
-        prog="python -m pipelines.aachen",
         description=__doc__,
         epilog="example: python -m pipelines.aachen --feature sift_sv64 --demo",
         formatter_class=cli.HelpFormatter,

@@ -1,6 +1,7 @@
 """The main job, from photos to poses, and what it says to wrong input."""
 
 import csv
+import io
 import json
 import shutil
 import sys
@@ -9,8 +10,9 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+import torch
 
-from hloc_reduce import cli
+from hloc_reduce import cli, projections
 from pipelines import aachen
 
 
@@ -101,6 +103,40 @@ def test_a_run_goes_on_where_it_was_stopped(aachen_layout, tmp_path, monkeypatch
     assert (again / summary["poses"]).read_bytes() == (outputs / summary["poses"]).read_bytes()
 
 
+def test_a_wrong_configuration_touches_no_results(aachen_layout, tmp_path, monkeypatch, caplog):
+    """It is refused before a finished run is overwritten, and before it claims a new folder."""
+    outputs, new = tmp_path / "outputs", tmp_path / "new"
+    place = ("--dataset", aachen_layout, "--feature", "sift", "--outputs")
+    run(monkeypatch, *place, outputs)
+    before = {path: path.read_bytes() for path in outputs.rglob("*") if path.is_file()}
+    (tmp_path / "typo.yaml").write_text("model: {name: dog, options: {peak_treshold: 1}}")
+    (tmp_path / "bare.yaml").write_text("model: {name: reduced, base: {name: dog}}")
+    (tmp_path / "no.safetensors").write_text("no projection")
+    (tmp_path / "HardNet_sv.pth").write_bytes(released_file())
+    (tmp_path / "pairs.txt").write_text("other/a.png db/1.png\nquery/day/a.png other/1.png\n")
+    for message, *wrong in (
+        ("The DoG options", "--feature", tmp_path / "typo.yaml"),
+        ("names no projection", "--feature", tmp_path / "bare.yaml"),
+        ("not a projection", "--projection", tmp_path / "no.safetensors"),
+        ("is for mkd, not for sift", "--projection", projections.find("mkd_sv16")),
+        ("is for hardnet, not for sift", "--projection", tmp_path / "HardNet_sv.pth"),
+        ("no pair of a query and a map image", "--retrieval", tmp_path / "pairs.txt"),
+    ):
+        for folder in (outputs, new):
+            arguments = (*place, folder, *wrong, "--overwrite")
+            assert message in refused(monkeypatch, caplog, *arguments)
+    assert {path: path.read_bytes() for path in before} == before and not new.exists()
+
+
+def released_file():
+    """A model as the paper's authors released theirs, untrained."""
+    layers = torch.nn.Sequential(torch.nn.Linear(128, 96), torch.nn.BatchNorm1d(96))
+    layers.append(torch.nn.Linear(96, 16))
+    buffer = io.BytesIO()
+    torch.save(layers.state_dict(), buffer)
+    return buffer.getvalue()
+
+
 def test_retrieval_from_files(aachen_layout, tmp_path, monkeypatch, caplog):
     pairs = tmp_path / "pairs-query-netvlad50.txt"
     pairs.write_text(
@@ -140,7 +176,7 @@ def test_wrong_input(aachen_layout, tmp_path, monkeypatch, caplog):
     outputs = tmp_path / "outputs"
     arguments = ("--dataset", aachen_layout, "--outputs", outputs)
     message = refused(monkeypatch, caplog, *arguments, "--feature", "sift_sv46")
-    assert "sift_sv46" in message and message.index("sift_sv64") < message.index("sift_pca16")
+    assert "sift_sv46" in message and message.index("sift_sv64") < message.index("sift_us64")
     message = refused(monkeypatch, caplog, *arguments, "--matcher", "NN")
     assert "NN-ratio" in message
     message = refused(monkeypatch, caplog, "--dataset", tmp_path / "nowhere")

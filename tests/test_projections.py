@@ -15,9 +15,8 @@ from torch import nn
 import hloc_reduce
 from confs import features
 from confs.features import confs
-from hloc_reduce import projections
+from hloc_reduce import extractors, projections
 from hloc_reduce.cli import InputError
-from hloc_reduce.extract_features import load_extractor
 from hloc_reduce.extractors.reduced import Reduced
 from hloc_reduce.projections import MLP, Projection, released
 
@@ -293,12 +292,12 @@ def test_features_of_a_file(tmp_path):
 )
 def test_a_wrong_model_is_one_clear_error(model, message):
     with pytest.raises(InputError, match=message):
-        load_extractor(model)({"image": torch.rand(1, 1, 64, 64)})
+        extractors.load(model)({"image": torch.rand(1, 1, 64, 64)})
 
 
 def test_dog_wants_grey_images():
     with pytest.raises(InputError, match="grey"):
-        load_extractor({"name": "dog"})({"image": torch.rand(1, 3, 64, 64)})
+        extractors.load({"name": "dog"})({"image": torch.rand(1, 3, 64, 64)})
 
 
 def test_another_projection_of_a_feature():
@@ -313,17 +312,24 @@ def test_another_projection_of_a_feature():
 
 
 @pytest.mark.parametrize(
-    "patches", [torch.rand(32, 32), torch.rand(5, 1, 64, 64), torch.zeros(5, 1, 32, 32).byte()]
+    "patches",
+    [
+        torch.rand(32, 32),
+        torch.rand(5, 1, 64, 64),
+        torch.zeros(5, 1, 32, 32).byte(),
+        np.zeros((5, 1, 32, 32), np.float32),
+    ],
 )
 def test_other_patches_are_refused(patches):
-    with pytest.raises(ValueError, match="float"):
+    with pytest.raises(ValueError, match="float|torch.Tensor"):
         hloc_reduce.describe_patches(patches)
 
 
 def test_no_patches_and_unknown_features():
     assert hloc_reduce.describe_patches(torch.zeros(0, 1, 32, 32), "sift_sv16").shape == (0, 16)
-    with pytest.raises(InputError, match="Unknown feature 'sift_sv63'. There are: sift_sv64"):
-        hloc_reduce.describe_patches(torch.zeros(0, 1, 32, 32), "sift_sv63")
+    for name in ("sift_sv63", "SIFT_sv64"):
+        with pytest.raises(InputError, match=f"feature '{name}'. The nearest of 84: sift_sv64"):
+            hloc_reduce.describe_patches(torch.zeros(0, 1, 32, 32), name)
 
 
 def test_projection_of_other_descriptors_is_refused(tmp_path, textured):
@@ -331,7 +337,7 @@ def test_projection_of_other_descriptors_is_refused(tmp_path, textured):
     conf = {"name": "reduced", "projection": str(tmp_path / "p.safetensors")}
     image = torch.from_numpy(textured / np.float32(255))[None, None]
     with pytest.raises(InputError, match="for 256-D .* have 128"):
-        load_extractor(conf)({"image": image})
+        extractors.load(conf)({"image": image})
 
 
 def test_a_feature_is_called_after_file_and_prefix(tmp_path):

@@ -359,6 +359,19 @@ def test_a_map_is_trained_on(scene, tmp_path, monkeypatch):
     assert path.stat().st_mtime_ns == written
 
 
+def test_a_projection_of_another_training_is_not_replaced(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(tracks, "main", lambda *_: tmp_path / "tracks.safetensors")
+    monkeypatch.setattr(tracks, "load", lambda _: noisy_tracks())
+    (tmp_path / "tracks.safetensors").touch()
+    place = scene.images, scene.model
+    others = [], "sift", "pca", [16], tmp_path, tmp_path
+    (path,) = training.main({"a": place}, *others)
+    written = path.read_bytes()
+    with pytest.raises(InputError, match="is there already, of another training_data. Choose"):
+        training.main({"b": place}, *others)
+    assert path.read_bytes() == written
+
+
 def test_nested_is_trained_once(scene, tmp_path, monkeypatch):
     recipe = {**nested.RECIPES["best"], "steps": 2, "batch_size": 16}
     monkeypatch.setitem(nested.RECIPES, "best", recipe)

@@ -134,7 +134,7 @@ def find(projection: str | Path) -> Path:
         descriptor=descriptor, scheme=scheme, dim=f" --dim {dim}" if dim else ""
     )
     raise InputError(
-        f"The projection {name} does not ship. Train it by '{command}' and add "
+        f"The projection {name} does not ship. Train it by '{command}' and give the pipeline "
         f"'--projection weights/{name}.safetensors{prefix and '@' + prefix}'."
     )
 
@@ -212,7 +212,9 @@ def read_released(path: Path) -> tuple[MLP, dict]:
     for layers, prefixes in ((mlp.linears, linears), (mlp.norms, norms)):
         for layer, prefix in zip(layers, prefixes, strict=True):
             layer.load_state_dict({key: state[prefix + key] for key in layer.state_dict()})
-    return mlp, {"training_data": f"{path.name}, in the form of {released.SOURCE}"}
+    metadata = {"training_data": f"{path.name}, in the form of {released.SOURCE}"}
+    descriptor = path.name.lower().partition("_")[0]  # SIFT_sv_dim64.pth
+    return mlp, metadata | ({"descriptor": descriptor} if descriptor in DESCRIPTORS else {})
 
 
 READERS = {".pth": read_released}

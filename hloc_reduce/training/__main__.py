@@ -11,7 +11,9 @@ from pathlib import Path
 
 import torch
 
-from .. import cli, logger, projections
+from confs import features as features_confs
+
+from .. import cli, extractors, logger, projections
 from ..cli import InputError
 from ..descriptors import DESCRIPTORS, DIM, check_weights
 from ..evaluation.phototour import fpr95
@@ -20,6 +22,7 @@ from . import nested, pca, phototour, ss, sv, tracks, us
 
 SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
 RECIPE_NAMES = ("best", "paper")
+HIDDEN = (512, 512)  # hidden layers of projections of an extractor's own descriptors
 
 
 def main(
@@ -32,25 +35,27 @@ def main(
     cache: Path,
     recipe: str = "best",
     seed: int = 0,
+    conf: dict | None = None,
 ) -> list[Path]:
     """Train the projections of a descriptor to some dimensions.
 
     Args:
         maps: from the name of each map to the folders of its images and its COLMAP model.
         sequences: folders of PhotoTour.
-        descriptor: base descriptor.
+        descriptor: base descriptor, or what the projections of `conf` are called after.
         scheme: a key of `SCHEMES`.
         dims: numbers of output dimensions; not of "nested", which has its own.
         output: folder for `<descriptor>_<scheme><dim>.safetensors`.
         cache: folder for what is computed of maps and sequences, used again by later trainings.
         recipe: "best", or "paper" for its losses, layers and hyper-parameters.
         seed: of everything random.
+        conf: of a feature, to train projections of its descriptors on maps.
 
     Returns:
         The files.
 
     Raises:
-        InputError: when a map or a sequence cannot be used.
+        InputError: when a map or a sequence cannot be used, or has descriptors of fewer dimensions.
     """
     trainer = SCHEMES[scheme]
     if trainer is nested:
@@ -64,14 +69,20 @@ def main(
         )
         for folder in sequences
     } | {
-        name: tracks.main(images, model, cache / name, descriptor, seed)
+        name: tracks.main(images, model, cache / name, descriptor, seed, conf)
         for name, (images, model) in maps.items()
     }
     checksums = {name: checksum(file) for name, file in files.items()}
     data = [tracks.load(file) for file in files.values()]
+    size = data[0].descriptors.shape[-1]
+    if max(paths) > size:
+        raise InputError(f"{descriptor} has {size} dimensions, which {max(paths)} do not reduce.")
+    base = {"descriptor": descriptor}
+    if conf:
+        base = {"descriptor": described_by(conf), "base": conf}
     for dim, path in paths.items():
         metadata = {
-            "descriptor": descriptor,
+            **base,
             "input": "descriptors of unit L2 norm",
             "scheme": scheme,
             "dim": dim,
@@ -89,9 +100,14 @@ def main(
         }
         if path.exists():
             before = projections.load(path).metadata
-            if {key: before.get(key) for key in metadata} == metadata:
+            changed = [key for key in metadata if before.get(key) != metadata[key]]
+            if not changed:
                 logger.info("%s is there already.", path)
                 continue
+            raise InputError(
+                f"{path} is there already, of another {' and '.join(changed)}. "
+                "Choose another --output, or move it away."
+            )
         checkpoint = path.with_suffix(".ckpt")
         mlp = trainer.train(
             data,
@@ -113,10 +129,27 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str) -> dict:
     if trainer is pca:
         return {}
     return {
-        "hidden": list(DESCRIPTORS[descriptor].hidden),
+        "hidden": list(DESCRIPTORS[descriptor].hidden if descriptor in DESCRIPTORS else HIDDEN),
         "distance_weight": trainer.DISTANCE_WEIGHTS.get(descriptor, 0.0),
         **trainer.RECIPES[recipe],
     }
+
+
+def base_of(conf: dict) -> dict:
+    """Return the configuration of the feature that a reduced one is made from."""
+    return {**conf, "model": conf["model"].get("base", conf["model"])}
+
+
+def described_by(conf: dict) -> str:
+    """Return the name of the descriptors of a feature.
+
+    Raises:
+        InputError: when its extractor cannot be made or gives no local features.
+    """
+    model = extractors.load(conf["model"])
+    if not hasattr(model, "descriptor"):
+        raise InputError(f"{conf['model']['name']} gives no local features to project.")
+    return model.descriptor
 
 
 def checksum(path: Path) -> str:
@@ -148,17 +181,23 @@ def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
 
 def _main() -> None:
     parser = argparse.ArgumentParser(
-        prog="python -m hloc_reduce.training",
         description=__doc__,
         epilog="example: python -m hloc_reduce.training --descriptor sift --scheme sv --dim 64 "
         "--map town/images:town/sparse --output weights",
         formatter_class=cli.HelpFormatter,
     )
-    parser.add_argument(
+    base = parser.add_mutually_exclusive_group()
+    base.add_argument(
         "--descriptor",
         nargs="+",
         default=["sift"],
         help=f"base descriptors, of {', '.join(DESCRIPTORS)}",
+    )
+    base.add_argument(
+        "--base",
+        type=Path,
+        metavar="FILE",
+        help="YAML file of a feature of any extractor, also of hloc's, to project instead",
     )
     parser.add_argument(
         "--scheme", nargs="+", default=["sv"], help=f"schemes, of {', '.join(SCHEMES)}"
@@ -200,8 +239,15 @@ def _main() -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random")
     args = parser.parse_args()
+    conf = None
+    if args.base:
+        if args.phototour or args.validate:
+            raise InputError("--base describes photos, not the patches of PhotoTour.")
+        args.descriptor, conf = [args.base.stem], base_of(features_confs.read(args.base))
+        described_by(conf)  # is wrong before any work is done, if it is
     for descriptor in args.descriptor:
-        check_weights(cli.choose("descriptor", descriptor, DESCRIPTORS))
+        if conf is None:
+            check_weights(cli.choose("descriptor", descriptor, DESCRIPTORS))
     for scheme in args.scheme:
         cli.choose("scheme", scheme, SCHEMES)
     if "ss" in args.scheme:
@@ -215,7 +261,7 @@ def _main() -> None:
         phototour.read_pairs(args.validate)
         phototour.read_points(args.validate)
     for dim in args.dim:
-        if not 0 < dim <= DIM:
+        if dim < 1 or (dim > DIM and conf is None):
             raise InputError(f"--dim {dim}: choose 1 to {DIM}.")
     maps = parse_maps(args.map)
     names = [*maps, *(folder.resolve().name for folder in args.phototour)]
@@ -236,6 +282,7 @@ def _main() -> None:
                 args.cache,
                 args.recipe,
                 args.seed,
+                conf,
             )
         ]
         if args.validate:

@@ -1,5 +1,6 @@
 """The loop that all learned schemes share."""
 
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from tqdm import trange
 from .. import logger
 from ..io import replacing
 
-CHECKPOINT_STEPS = 500
+CHECKPOINT_STEPS, CHECKPOINT_SECONDS = 500, 30.0  # whichever comes first
 
 
 def device() -> torch.device:
@@ -54,7 +55,7 @@ def fit(
             for key, part in parts.items():
                 part.load_state_dict(state[key])
             logger.info("Going on from step %d of %s.", start, checkpoint)
-    mean_loss = None
+    mean_loss, saved = None, time.monotonic()
     progress = trange(start, steps, initial=start, total=steps, desc="Training", unit="step")
     for step in progress:
         for parameter in before(step) if before else ():
@@ -66,7 +67,9 @@ def fit(
         schedule.step()
         mean_loss = value.item() if mean_loss is None else 0.99 * mean_loss + 0.01 * value.item()
         progress.set_postfix(loss=f"{mean_loss:.4f}", refresh=False)
-        if (step + 1) % CHECKPOINT_STEPS == 0:
+        late = time.monotonic() - saved > CHECKPOINT_SECONDS
+        if (step + 1) % CHECKPOINT_STEPS == 0 or late:
             with replacing(checkpoint) as temporary:
                 state = {key: part.state_dict() for key, part in parts.items()}
                 torch.save({"step": step + 1, "made_from": made_from, **state}, temporary)
+            saved = time.monotonic()
