@@ -5,22 +5,33 @@ VENV ?= .venv
 PIP_FLAGS ?= --constraint constraints.txt
 BIN := $(VENV)/bin
 
+# the oldest pycolmap that works, in a folder to import from before the environment's own
+OLDEST := 3.13.0
+OLD := $(VENV)/pycolmap-$(OLDEST)
+
 .PHONY: demo test lint clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed
 	$(BIN)/python -m pipelines.aachen --feature sift_sv64 --demo
 
-test: $(VENV)/installed
+test: $(VENV)/installed $(OLD)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m pytest
+	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
+	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest tests/test_dog.py tests/test_stages.py \
+		tests/test_aachen.py::test_plane
 
 # torch by itself first: a pinned version is a CPU build where an index offers one
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet $$(grep '^torch==' constraints.txt)
 	$(BIN)/pip install --quiet $(PIP_FLAGS) --editable '.[dev]'
+	touch $@
+
+$(OLD)/installed: $(VENV)/installed
+	$(BIN)/pip install --quiet --no-deps --upgrade --target $(OLD) pycolmap==$(OLDEST)
 	touch $@
 
 lint: $(VENV)/installed

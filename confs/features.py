@@ -90,7 +90,9 @@ def read(path: Path) -> dict:
     given = content.get("preprocessing") or {}
     if not isinstance(given, dict):
         raise InputError(f"{path}: preprocessing cannot be {given!r}.")
-    unknown = (content.keys() - {"model", "preprocessing"}) | (given.keys() - PREPROCESSING.keys())
+    # what the confs of hloc have besides, `output`, is not needed
+    unknown = content.keys() - {"model", "preprocessing", "output"}
+    unknown |= given.keys() - {*PREPROCESSING, "resize_force"}
     if unknown:
         raise InputError(f"{path}: unknown keys {', '.join(map(str, sorted(unknown, key=str)))}.")
     preprocessing = {**PREPROCESSING, **given}

@@ -64,7 +64,7 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
     return descriptors
 
 
-def register(features: "Iterable[Path]" = ()) -> list[str]:
+def register(features: "Iterable[Path] | Path" = ()) -> list[str]:
     """Add this project's extractors, features and matchers to the installed hloc.
 
     After it hloc's `dynamic_load` finds the extractors `reduced` and `vlad`, and the confs of

@@ -31,13 +31,12 @@ def dog_detector(options: dict) -> Callable[[np.ndarray], np.ndarray]:
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"The DoG options {options} cannot be used ({reason}).") from None
     extraction = pycolmap.FeatureExtractionOptions(sift=sift)
-    if hasattr(pycolmap, "FeatureExtractor"):  # from 4.0 on
-        extractor = pycolmap.FeatureExtractor.create(extraction, pycolmap.Device.cpu)
-    else:
-        extractor = pycolmap.Sift(extraction, pycolmap.Device.cpu)
+    new = hasattr(pycolmap, "FeatureExtractor")  # from 4.0 on
+    make = pycolmap.FeatureExtractor.create if new else pycolmap.Sift
+    extractor = make(extraction, pycolmap.Device.cpu)
 
     def detect(image: np.ndarray) -> np.ndarray:
-        if isinstance(extractor, pycolmap.Sift):
+        if not new:
             keypoints = extractor.extract(image)[0].reshape(-1, 4)
         else:
             found, _ = extractor.extract_from_float32_array(image)
@@ -146,6 +145,19 @@ def write_database(
             database.write_two_view_geometry(*ids, geometry)
 
 
+def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
+    """Make pycolmap's options of a dict of them.
+
+    Raises:
+        InputError: for an option that there is not.
+    """
+    try:
+        return pycolmap.IncrementalPipelineOptions(options)
+    except (AttributeError, TypeError, RuntimeError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"The mapper options {options} cannot be used ({reason}).") from None
+
+
 def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
     """Estimate the two-view geometries of the matches of a database, with hloc's options."""
     options = {"ransac": {"max_num_trials": 20000, "min_inlier_ratio": 0.1, "random_seed": 0}}
@@ -158,7 +170,7 @@ def triangulate_points(
     database: Path,
     image_dir: Path,
     output: Path,
-    options: dict,
+    options: pycolmap.IncrementalPipelineOptions,
     verbose: bool,
 ) -> pycolmap.Reconstruction:
     """Triangulate the verified matches of a database into `output`; poses stay as they are.
@@ -174,7 +186,7 @@ def triangulate_points(
             database,
             image_dir,
             output,
-            options=pycolmap.IncrementalPipelineOptions(options),
+            options=options,
         )
 
 

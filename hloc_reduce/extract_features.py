@@ -50,6 +50,8 @@ def main(
     if feature_path is None:
         feature_path = Path(export_dir) / f"{conf['output']}.h5"
     names = list_images(image_dir, image_list)
+    if overwrite:
+        extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
     with GroupWriter(feature_path, provenance(conf, as_half), overwrite) as writer:
         todo = [name for name in names if name not in writer]
         if not todo:
@@ -61,8 +63,9 @@ def main(
             features = extract(model, image_dir / name, conf["preprocessing"], device)
             uncertainty = features.pop("uncertainty")
             if as_half:
-                for key in features.keys() - {"keypoints", "image_size"}:
-                    features[key] = features[key].astype(np.float16)
+                for key, array in features.items():
+                    if key != "keypoints" and array.dtype.kind == "f":
+                        features[key] = array.astype(np.float16)
             if len(features["keypoints"]) == 0:
                 logger.warning("Image %s has no keypoints.", name)
             writer.add(name, features, {"keypoints": {"uncertainty": uncertainty}})
@@ -74,8 +77,7 @@ def provenance(conf: dict, as_half: bool) -> dict:
     """Return what determines the features: the configuration and the projection's checksum.
 
     Raises:
-        InputError: when the configuration is wrong, or the projection or the weights of its base
-            descriptor are not to be had.
+        InputError: when the projection or the weights of its base descriptor are not to be had.
     """
     made_by = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
     if conf["model"].get("projection") is not None:
@@ -83,7 +85,6 @@ def provenance(conf: dict, as_half: bool) -> dict:
     base = conf["model"].get("base", conf["model"])
     if base["name"] == "dog" and base.get("descriptor") in list(DESCRIPTORS):
         check_weights(base["descriptor"])
-    extractors.load(conf["model"])
     return made_by
 
 
@@ -113,16 +114,20 @@ def list_images(image_dir: Path, image_list: Path | str | Iterable[str] | None =
 def load_image(path: Path, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:
     """Read an image and resize it to at most `resize_max` pixels on its longer side.
 
+    With `resize_force` smaller ones get so many, too.
+
     Returns:
         The image (1, C, H, W) float32 in [0, 1], and its original (width, height).
     """
     image = read_image(path, preprocessing.get("grayscale", False)).astype(np.float32)
     size = np.array(image.shape[1::-1])
     resize_max = preprocessing.get("resize_max")
-    if resize_max and size.max() > resize_max:
+    if resize_max and (size.max() > resize_max or preprocessing.get("resize_force")):
         # one pixel at least: a panorama may be a thousand times wider than high
         new_size = np.maximum(1, np.round(size * (resize_max / size.max())).astype(int))
-        image = cv2.resize(image, new_size.tolist(), interpolation=cv2.INTER_AREA)
+        smaller = (new_size <= size).all()
+        interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR  # as hloc
+        image = cv2.resize(image, new_size.tolist(), interpolation=interpolation)
     image = np.atleast_3d(image).transpose(2, 0, 1) / 255
     return torch.from_numpy(np.ascontiguousarray(image))[None], size
 

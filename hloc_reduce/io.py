@@ -248,6 +248,11 @@ def get_matches(file: h5py.File, name0: str, name1: str) -> tuple[np.ndarray, np
 
 def check_matches(matches: np.ndarray, names: tuple[str, str], sizes: tuple[int, int]) -> None:
     """Raise an InputError if matches (M, 2) refer to keypoints that images do not have."""
+    if len(matches) and matches.min() < 0:
+        raise InputError(
+            f"The matches of {names[0]}, {names[1]} are negative, as hloc's are that have more "
+            "than 32,767 keypoints: match these anew."
+        )
     for column, (name, size) in enumerate(zip(names, sizes, strict=True)):
         if len(matches) and matches[:, column].max() >= size:
             raise InputError(

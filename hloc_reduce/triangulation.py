@@ -16,6 +16,8 @@ from .parsers import parse_retrieval
 
 MAX_EPIPOLAR_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
 STAMP = "made_from.json"
+PARTS = ("cameras", "frames", "images", "points3D", "rigs")
+MADE_BY_HLOC = {"database.db", *(f"{part}.bin" for part in PARTS)}
 
 
 def main(
@@ -58,6 +60,7 @@ def main(
         InputError: when an input is missing or no point can be triangulated.
     """
     options = {"random_seed": 0, "num_threads": 1, **(mapper_options or {})}
+    mapper = colmap.mapper_options(options)
     reference = colmap.read_model(reference_model)
     for path in (pairs, features, matches):
         if not path.is_file():
@@ -75,8 +78,13 @@ def main(
         return colmap.read_model(sfm_dir)
 
     sfm_dir = sfm_dir.resolve()
-    if sfm_dir.exists() and not (sfm_dir / STAMP).exists() and any(sfm_dir.iterdir()):
-        raise InputError(f"{sfm_dir} is not a map of this program, so it is not replaced.")
+    inside = {path.name for path in sfm_dir.iterdir()} if sfm_dir.is_dir() else set()
+    of_hloc = "database.db" in inside and inside <= MADE_BY_HLOC
+    if inside and STAMP not in inside and not of_hloc or sfm_dir == reference_model.resolve():
+        raise InputError(
+            f"{sfm_dir} is not a map that this program or hloc triangulated, so it is not "
+            "replaced. Choose another folder."
+        )
     building = sfm_dir.with_name(f".{sfm_dir.name}.tmp")
     shutil.rmtree(building, ignore_errors=True)
     building.mkdir(parents=True)
@@ -87,7 +95,7 @@ def main(
         colmap.verify_matches(database, pairs, verbose)
     logger.info("Triangulating...")
     reconstruction = colmap.triangulate_points(
-        reference, database, image_dir, building, options, verbose
+        reference, database, image_dir, building, mapper, verbose
     )
     if reconstruction.num_points3D() == 0:
         raise InputError(

@@ -14,6 +14,7 @@ from hloc_reduce import (
     cli,
     demo,
     extract_features,
+    extractors,
     localize_sfm,
     logger,
     match_features,
@@ -59,6 +60,8 @@ def main(
         if not any(set(map_names) & set(retrieved.get(name, ())) for name in query_names):
             raise InputError(f"{retrieval} has no pair of a query and a map image.")
 
+    if overwrite or not (outputs / "conf.json").exists():
+        extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
     folder = results.RunFolder(
         outputs,
         {

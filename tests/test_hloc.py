@@ -1,15 +1,20 @@
 """The plugin: with a test double of what it needs of hloc, and with the real hloc (`-m hloc`)."""
 
+import argparse
 import importlib
 import re
 import sys
+from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 
+import cv2
+import h5py
 import numpy as np
 import pycolmap
 import pytest
 import torch
 from packaging.version import Version
+from scipy.io import savemat
 from test_projections import trained
 
 import hloc_reduce
@@ -18,8 +23,11 @@ from confs.matchers import confs as matchers
 from hloc_reduce import (
     cli,
     extractors,
+    localize_sfm,
+    match_features,
     parsers,
     projections,
+    triangulation,
 )
 from hloc_reduce import hloc as plugin
 from hloc_reduce.cli import InputError
@@ -162,11 +170,34 @@ def test_confs_are_added_once_and_none_is_replaced(double):
     assert len(path) == 2
 
 
+def test_confs_are_copies(double):
+    """hloc's users change an entry in place, for themselves only."""
+    hloc_reduce.register()
+    confs = importlib.import_module("hloc.extract_features").confs
+    confs["sift_sv64"]["preprocessing"]["resize_max"] = 7
+    for conf in (confs["sift_sv32"], confs["vlad"], features.confs["sift_sv64"]):
+        assert conf["preprocessing"]["resize_max"] == 1600
+
+
+def test_a_broken_hloc_and_a_folder_of_its_name(double, monkeypatch):
+    (double / "__init__.py").write_text("import not_there")
+    with pytest.raises(InputError, match="hloc cannot be imported .*not_there"):
+        hloc_reduce.register()
+    # what Python finds where a folder has the name but is no package
+    monkeypatch.setattr(plugin, "find_spec", lambda name: ModuleSpec(name, None))
+    with pytest.raises(InputError, match="hloc is not installed"):
+        hloc_reduce.register()
+
+
 def test_features_of_files_are_registered_by_their_names(double, tmp_path):
     (tmp_path / "mine.yaml").write_text("model: {name: dog, max_keypoints: 7}")
     assert "mine" in hloc_reduce.register([tmp_path / "mine.yaml"])
     conf = importlib.import_module("hloc.extract_features").confs["mine"]
     assert conf["model"] == {"name": "reduced", "base": {"name": "dog", "max_keypoints": 7}}
+    assert hloc_reduce.register([tmp_path / "mine.yaml"]) == []
+    (tmp_path / "sift.yaml").write_text("model: {name: dog, max_keypoints: 7}")
+    with pytest.raises(InputError, match="has a feature sift already: rename .*sift.yaml"):
+        hloc_reduce.register([tmp_path / "sift.yaml"])
 
 
 def test_a_missing_hloc_is_named(monkeypatch, forgotten):
@@ -175,6 +206,8 @@ def test_a_missing_hloc_is_named(monkeypatch, forgotten):
         hloc_reduce.register()
     with pytest.raises(InputError, match="Unknown extractor 'disk'"):
         extractors.load({"name": "disk"})
+    with pytest.raises(InputError, match="hloc is not installed"):
+        extractors.load({"name": "hloc.dog"})
 
 
 @pytest.mark.parametrize(
@@ -197,7 +230,7 @@ def test_a_newer_hloc_is_taken(double, init):
     assert "sift_sv64" in hloc_reduce.register()
 
 
-@pytest.mark.parametrize(("version", "warned"), [("4.2.1", True), ("4.2.0", False)])
+@pytest.mark.parametrize(("version", "warned"), [("4.2.1", True), ("4.2.0", False), ("dev", True)])
 def test_a_pycolmap_without_points_is_warned_of_once(
     double, version, warned, monkeypatch, caplog, propagated
 ):
@@ -220,6 +253,7 @@ def test_modules_run_with_the_confs(double, monkeypatch, capsys):
         ("extract", "hloc.extract cannot be imported"),
         ("broken", "hloc.broken cannot be imported .*not_there"),
         ("match_features", "hloc.match_features has no command line"),
+        ("extractors", "hloc.extractors has no command line"),
     ],
 )
 def test_what_cannot_run_is_one_clear_line(double, name, message, monkeypatch, caplog, propagated):
@@ -238,10 +272,22 @@ def test_an_extractor_of_hlocs_is_a_base(double, tmp_path):
     torch.testing.assert_close(found["descriptors"], torch.eye(256)[None, :, :3])
     with pytest.raises(InputError, match="for sift, not for hloc.dots"):
         extractors.load({"name": "reduced", "base": {"name": "dots"}, "projection": "sift_sv16"})
-    with pytest.raises(InputError, match="hloc's extractor dots: .*grayscale"):
+    with pytest.raises(InputError, match="hloc's extractor dots fails .*grayscale"):
         model({"image": torch.rand(1, 1, 40, 40)})
     with pytest.raises(InputError, match="Unknown extractor 'dosts'. There are: dots"):
         extractors.load({"name": "dosts"})
+
+
+def test_descriptors_that_are_not_on_the_device_of_the_image(double):
+    """As those of hloc's dog are not, which describes on the CPU."""
+    model = extractors.load({"name": "dots"})
+    found = model({"image": torch.empty(1, 3, 40, 40, device="meta")})
+    assert found["descriptors"].device.type == "meta"
+
+
+def test_what_determines_descriptors_is_in_their_name(double):
+    model = extractors.load({"name": "dots", "weights": "indoor"})
+    assert model.descriptor == "hloc.dots.indoor"
 
 
 def test_projections_of_other_dimensions_are_refused_with_both(double, tmp_path):
@@ -250,9 +296,6 @@ def test_projections_of_other_dimensions_are_refused_with_both(double, tmp_path)
     conf = {"name": "reduced", "base": {"name": "dots"}, "projection": str(file)}
     with pytest.raises(InputError, match="for 128-D .* have 256"):
         extractors.load(conf)({"image": torch.rand(1, 3, 40, 40)})
-
-
-# --- the real hloc
 
 
 def test_a_base_of_hlocs_is_trained_on(double, tmp_path, monkeypatch):
@@ -294,6 +337,9 @@ def train(monkeypatch, *arguments):
     training._main()
 
 
+# --- the real hloc
+
+
 @pytest.fixture
 def registered(forgotten):
     if find_spec("hloc") is None:
@@ -319,7 +365,7 @@ def modules(*of_hloc):
     }
 
 
-def localized(stages, dataset, outputs, feature="sift_sv32"):
+def localized(stages, dataset, outputs, feature):
     """Run a chain of stages; return the pose errors of the queries (metres, degrees) by name."""
     images, model = dataset / "images_upright", dataset / "3D-models/aachen_v_1_1"
     conf, matcher = stages["extract_features"].confs[feature], matchers["NN-ratio"]
@@ -355,7 +401,9 @@ def errors(poses, dataset):
 
 
 HLOCS_TRIANGULATION = Version(pycolmap.__version__) < plugin.NO_POINTS
+HLOCS_SIFT = "hloc's own features"  # float16 keypoints
 CHAINS = {
+    HLOCS_SIFT: ["extract_features"],
     "hloc's": [name for name in STAGES if name != "triangulation" or HLOCS_TRIANGULATION],
     "hloc's features and map": ["extract_features"] + ["triangulation"] * HLOCS_TRIANGULATION,
     "hloc's matches": ["match_features"],
@@ -367,6 +415,125 @@ CHAINS = {
 @pytest.mark.hloc
 @pytest.mark.parametrize("chain", CHAINS)
 def test_any_chain_of_stages_localizes(registered, aachen_layout, tmp_path, chain):
-    found = localized(modules(*CHAINS[chain]), aachen_layout, tmp_path / "outputs")
+    feature = "sift" if chain == HLOCS_SIFT else "sift_sv32"
+    found = localized(modules(*CHAINS[chain]), aachen_layout, tmp_path / "outputs", feature)
+    if chain == HLOCS_SIFT:
+        with h5py.File(tmp_path / "outputs/feats-sift.h5") as file:
+            assert file["db/1.png/keypoints"].dtype == np.float16
     for name in ("day/a.png", "night/a.png"):
         assert found[name][0] < 0.02 and found[name][1] < 0.5
+
+
+@pytest.mark.hloc
+def test_hlocs_aachen_pipeline(registered, aachen_layout, tmp_path, monkeypatch):
+    """The code of hloc's pipeline, whose three confs are this project's."""
+    extract = importlib.import_module("hloc.extract_features")
+    match = importlib.import_module("hloc.match_features")
+    monkeypatch.setitem(extract.confs, "netvlad", extract.confs["vlad"])
+    monkeypatch.setitem(extract.confs, "superpoint_max", extract.confs["sift_sv64"])
+    monkeypatch.setitem(match.confs, "superglue", match.confs["NN-ratio"])
+    pipeline = importlib.import_module("hloc.pipelines.Aachen_v1_1.pipeline")
+    if not HLOCS_TRIANGULATION:  # the modules to exchange with such a pycolmap
+        monkeypatch.setattr(pipeline, "triangulation", triangulation)
+        monkeypatch.setattr(pipeline, "localize_sfm", localize_sfm)
+    outputs = tmp_path / "outputs"
+    outputs.mkdir()
+    pipeline.run(argparse.Namespace(dataset=aachen_layout, outputs=outputs, num_covis=3, num_loc=4))
+    (poses,) = outputs.glob("Aachen-v1.1_hloc_*.txt")
+    truth = parsers.parse_poses(aachen_layout / "queries/ground_truth_poses.txt")
+    found = []
+    for line in poses.read_text().splitlines():
+        (tmp_path / "one.txt").write_text(line)
+        ((name, pose),) = parsers.parse_poses(tmp_path / "one.txt").items()
+        found.append((name, pose_error(pose, truth["query/day/a.png"])[0] < 0.02))
+    assert sorted(found) == [("a.png", True), ("a.png", True), ("grey.png", False)]
+
+
+@pytest.mark.hloc
+def test_a_module_of_hlocs_runs_from_the_shell(registered, aachen_layout, tmp_path, monkeypatch):
+    (tmp_path / "mine.yaml").write_text(
+        "model: {name: reduced, base: {name: dog, max_keypoints: 50}, projection: sift_sv16}"
+    )
+    images = aachen_layout / "images_upright"
+    run(
+        monkeypatch,
+        *("--feature", tmp_path / "mine.yaml"),
+        *("extract_features", "--conf", "mine", "--image_dir", images, "--export_dir", tmp_path),
+    )
+    with h5py.File(tmp_path / "feats-mine.h5") as file:
+        assert file["db/1.png/descriptors"].shape == (16, 50)
+        assert file["db/1.png/keypoints"].dtype == np.float64
+
+
+@pytest.mark.hloc
+@pytest.mark.parametrize("name", ["hloc.dog", "hloc.disk"])
+def test_an_extractor_of_the_real_hlocs_is_a_base(registered, name, monkeypatch, textured):
+    if name == "hloc.disk":  # whose weights need a network
+        from kornia.feature import DISK
+
+        monkeypatch.setattr(DISK, "from_pretrained", lambda _: DISK())
+    file = {"name": name, **({"max_keypoints": 40} if name == "hloc.disk" else {})}
+    model = extractors.load({"name": "reduced", "base": file}).eval()
+    assert (
+        model.base.descriptor
+        == {
+            "hloc.dog": "hloc.dog.rootsift",
+            "hloc.disk": "hloc.disk.depth",
+        }[name]
+    )
+    channels = 3 if name == "hloc.disk" else 1
+    image = torch.from_numpy(textured / np.float32(255)).expand(1, channels, -1, -1)
+    found = model({"image": image})
+    number = found["keypoints"].shape[1]
+    assert number > 10 and found["descriptors"].shape == (1, 128, number)
+    torch.testing.assert_close(found["descriptors"].norm(dim=1), torch.ones(1, number))
+    with pytest.raises(InputError, match="for sift, not for hloc"):
+        extractors.load({"name": "reduced", "base": file, "projection": "sift_sv64"})
+
+
+@pytest.mark.hloc
+def test_hlocs_inloc_reads_features_and_matches(registered, tmp_path):
+    """A query and two scans with known points, matched by this project."""
+    generator = np.random.default_rng(0)
+    size, focal, number = (640, 480), 4032 * 28 / 36, 120
+    pixels = np.array([3, 5]) + np.column_stack(
+        np.unravel_index(generator.choice(600 * 400, 2 * number, replace=False), (600, 400))
+    )
+    points = np.column_stack([generator.uniform(-0.5, 0.5, (2 * number, 2)), np.zeros(2 * number)])
+    points[:, 2] = generator.uniform(5, 6, 2 * number)
+    rotation = pycolmap.Rotation3d(np.array([0.02, -0.01, 0.03, 1]) / 1.0007)
+    truth = pycolmap.Rigid3d(rotation, np.array([0.1, -0.2, 0.3]))
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=size[0], height=size[1], params=[focal, 320, 240]
+    )
+    seen = camera.img_from_cam((truth.rotation.matrix() @ points.T).T + truth.translation)
+    descriptors = generator.standard_normal((64, 2 * number))
+    descriptors = (descriptors / np.linalg.norm(descriptors, axis=0)).astype(np.float16)
+    query = "query/iphone7/IMG_0.JPG"
+    scans = [f"database/cutouts/DUC1/02{i}/DUC_cutout_02{i}_0_0.jpg" for i in range(2)]
+    for name in (query, *scans):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(tmp_path / name), np.zeros((480, 640), np.uint8))
+    poses = tmp_path / "database/alignments/DUC1/transformations"
+    poses.mkdir(parents=True)
+    with h5py.File(tmp_path / "features.h5", "w") as file:
+        file[f"{query}/keypoints"] = seen.astype(np.float32)
+        file[f"{query}/descriptors"] = descriptors
+        for i, name in enumerate(scans):
+            half = slice(i * number, (i + 1) * number)
+            file[f"{name}/keypoints"] = pixels[half].astype(np.float32)
+            file[f"{name}/descriptors"] = descriptors[:, half]
+            scan = np.full((480, 640, 3), np.nan)
+            scan[pixels[half, 1], pixels[half, 0]] = points[half]
+            savemat(tmp_path / f"{name}.mat", {"XYZcut": scan})
+            rows = "\n".join(" ".join(map(str, row)) for row in np.eye(4))
+            (poses / f"DUC_trans_02{i}.txt").write_text("\n" * 7 + rows + "\n")
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("".join(f"{query} {name}\n" for name in scans))
+    matches = tmp_path / "matches.h5"
+    match_features.main(matchers["NN-mutual"], pairs, tmp_path / "features.h5", matches=matches)
+    inloc = importlib.import_module("hloc.localize_inloc")
+    inloc.main(tmp_path, pairs, tmp_path / "features.h5", matches, tmp_path / "poses.txt")
+    estimate = parsers.parse_poses(tmp_path / "poses.txt")["IMG_0.JPG"]
+    metres, degrees = pose_error(estimate, truth)
+    assert metres < 0.01 and degrees < 0.1

@@ -297,9 +297,41 @@ def test_what_is_no_map_is_not_replaced(built, tmp_path):
     (folder / "thesis.txt").write_text("years of work")
     arguments = (built.model, built.images, built.pairs, built.features, built.matches)
     for target in (folder, built.model):
-        with pytest.raises(InputError, match="not a map of this program"):
+        with pytest.raises(InputError, match="not a map that this program"):
             triangulation.main(target, *arguments)
     assert (folder / "thesis.txt").exists()
+
+
+def test_a_map_of_hlocs_is_replaced(built):
+    """Such as its empty one with pycolmap 4.2.1, but not one of other files."""
+    arguments = (built.model, built.images, built.pairs, built.features, built.matches)
+    sfm = built.root / "hlocs"
+    sfm.mkdir()
+    for name in ("database.db", "cameras.bin", "images.bin", "points3D.bin"):
+        (sfm / name).write_bytes(b"")
+    (sfm / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="not replaced. Choose another folder"):
+        triangulation.main(sfm, *arguments)
+    (sfm / "notes.txt").unlink()
+    assert triangulation.main(sfm, *arguments).num_points3D() == 300
+    with pytest.raises(InputError, match="not replaced"):
+        triangulation.main(built.model, *arguments, overwrite=True)
+
+
+def test_wrong_mapper_options_are_refused_first(built):
+    arguments = (built.model, built.images, built.pairs, built.features, built.matches)
+    with pytest.raises(InputError, match="mapper options .*no_such"):
+        triangulation.main(built.root / "new", *arguments, mapper_options={"no_such": 1})
+    assert not (built.root / ".new.tmp").exists()
+
+
+def test_overflowed_matches_are_refused(built):
+    """hloc's int16, which wraps to negative numbers."""
+    with h5py.File(built.matches, "a") as file:
+        file["db-0.jpg/db-1.jpg/matches0"][:5] = -200
+    arguments = (built.model, built.images, built.pairs, built.features, built.matches)
+    with pytest.raises(InputError, match="negative, as hloc's"):
+        triangulation.main(built.root / "new", *arguments)
 
 
 def test_matches_of_other_features_are_refused(built):

@@ -31,3 +31,4 @@ def test_wheel_is_complete(tmp_path):
         f"hloc_reduce/projections/weights/{name}.safetensors" for name in projections.names()
     }
     assert weights and weights <= names
+    assert "hloc_reduce/extractors/vlad_sift_sv64.safetensors" in names

@@ -17,12 +17,13 @@ def load(conf: dict) -> nn.Module:
     Raises:
         InputError: when there is no such extractor, or its configuration is wrong.
     """
+    name = str(conf.get("name"))
     ours = [module.name for module in pkgutil.iter_modules(__path__)]
-    if conf["name"] not in ours:
+    if name not in ours:
         from ..hloc import is_installed
 
-        if is_installed():
+        if is_installed() or name.startswith("hloc."):
             from ..hloc.extractor import HlocExtractor
 
             return HlocExtractor({"conf": conf})
-    return dynamic_load(sys.modules[__name__], conf["name"])(conf)
+    return dynamic_load(sys.modules[__name__], name)(conf)

@@ -21,8 +21,9 @@ def read_vocabulary(path: Path | str | None = None) -> torch.Tensor:
     Raises:
         InputError: when the file is not there or is none.
     """
+    path = path or VOCABULARY
     try:
-        return load_file(path or VOCABULARY)["vocabulary"].float()
+        return load_file(path)["vocabulary"].float()
     except (OSError, SafetensorError, KeyError) as error:
         raise InputError(f"{path} is not a vocabulary ({error}).") from None
 

@@ -5,14 +5,12 @@ What follows the name of the module is the module's own.
 
 import argparse
 import ast
-import importlib
-import inspect
 import sys
 from pathlib import Path
 
 from .. import cli
 from ..cli import InputError
-from . import register
+from . import import_module, register
 
 
 def main(name: str, args: list[str]) -> None:
@@ -21,11 +19,8 @@ def main(name: str, args: list[str]) -> None:
     Raises:
         InputError: when hloc has no such module, or it has no command line.
     """
-    try:
-        module = importlib.import_module(f"hloc.{name}")
-    except ImportError as error:
-        raise InputError(f"hloc.{name} cannot be imported ({error}).") from None
-    source = inspect.getsource(module)
+    module = import_module(name)
+    source = Path(module.__file__).read_text() if module.__file__ else ""
     # run as a module it would be executed anew, and with it its confs
     blocks = [
         node
@@ -34,7 +29,7 @@ def main(name: str, args: list[str]) -> None:
     ]
     if not blocks:
         raise InputError(f"hloc.{name} has no command line.")
-    code = compile(ast.Module(blocks, type_ignores=[]), inspect.getsourcefile(module), "exec")
+    code = compile(ast.Module(blocks, type_ignores=[]), module.__file__, "exec")
     sys.argv = [f"python -m hloc_reduce.hloc {name}", *args]
     exec(code, {**vars(module), "__name__": "__main__"})
 

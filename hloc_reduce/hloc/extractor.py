@@ -9,6 +9,13 @@ from ..base_model import BaseModel
 from ..cli import InputError, choose
 from . import extractors_package
 
+# keys of hloc's configurations that say which descriptors there will be
+DETERMINING = ("descriptor", "model_name", "weights")
+
+
+def _reason(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error) else ''}"
+
 
 class HlocExtractor(BaseModel):
     """The features of an extractor of an installed hloc, as this project's extractors give them.
@@ -28,27 +35,35 @@ class HlocExtractor(BaseModel):
         )
         try:
             self.model = load(package, name)(conf)
-        except ImportError as error:
-            raise InputError(f"hloc's extractor {name} cannot be imported ({error}).") from None
+        except Exception as error:  # whatever hloc and its third parties raise
+            raise InputError(
+                f"hloc's extractor {name} cannot be made ({_reason(error)})."
+            ) from None
         self.detection_noise = getattr(self.model, "detection_noise", 1.0)
 
     @property
     def descriptor(self) -> str:
-        """The name that a projection of these descriptors is kept under, such as hloc.disk."""
-        kind = self.model.conf.get("descriptor")
-        return f"hloc.{self.name}" + (f".{kind}" if kind else "")
+        """The name that a projection of these descriptors is kept under: hloc.disk.depth."""
+        chosen = [str(self.model.conf[key]) for key in DETERMINING if self.model.conf.get(key)]
+        return ".".join(["hloc", self.name, *chosen])
 
     @torch.no_grad()
     def _forward(self, data: dict) -> dict:
         """Extract keypoints (1, N, 2), descriptors (1, D, N) of unit norm and whatever else."""
         try:
             features = {key: value[0] for key, value in self.model(data).items()}
-        except AssertionError as error:
-            reason = str(error) or "it refuses the image: is grayscale as it needs it?"
-            raise InputError(f"hloc's extractor {self.name}: {reason}") from None
+        except (torch.cuda.OutOfMemoryError, MemoryError):
+            raise
+        except Exception as error:
+            raise InputError(
+                f"hloc's extractor {self.name} fails ({_reason(error)}). "
+                "Is preprocessing as it needs it, grayscale above all?"
+            ) from error
         if "descriptors" not in features:
             raise InputError(f"hloc's extractor {self.name} gives no local descriptors.")
-        features["descriptors"] = normalize(features["descriptors"].float(), dim=0)
+        # some describe on the CPU, wherever they are
+        descriptors = features["descriptors"].to(data["image"].device).float()
+        features["descriptors"] = normalize(descriptors, dim=0)
         if "keypoint_scores" in features:
             features["scores"] = features.pop("keypoint_scores")
         return {key: value[None] for key, value in features.items()}

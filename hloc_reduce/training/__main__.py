@@ -62,7 +62,8 @@ def main(
         paths = {nested.PREFIXES[0]: output / f"{descriptor}_nested.safetensors"}
     else:
         paths = {dim: output / f"{descriptor}_{scheme}{dim}.safetensors" for dim in dims}
-    settings = complete_recipe(scheme, recipe, descriptor)
+    base = {"descriptor": described_by(conf), "base": conf} if conf else {"descriptor": descriptor}
+    settings = complete_recipe(scheme, recipe, base["descriptor"])
     files = {
         folder.resolve().name: phototour.main(
             folder, cache / folder.resolve().name, descriptor, seed
@@ -77,9 +78,6 @@ def main(
     size = data[0].descriptors.shape[-1]
     if max(paths) > size:
         raise InputError(f"{descriptor} has {size} dimensions, which {max(paths)} do not reduce.")
-    base = {"descriptor": descriptor}
-    if conf:
-        base = {"descriptor": described_by(conf), "base": conf}
     for dim, path in paths.items():
         metadata = {
             **base,

@@ -36,6 +36,7 @@ MATCHED = "sift"  # which descriptor finds the tracks, whatever they are describ
 # The photo as it is and three photometric variants, each as seen and mirrored.
 VARIANTS = 4
 MAX_SHIFT = 1.5  # pixels between a keypoint and the same one of a variant
+NEIGHBORS = 4  # keypoints looked at there
 
 
 @dataclass
@@ -268,10 +269,16 @@ class FeatureDescriber:
             found = features["keypoints"][0].cpu().numpy()
             if not len(found):
                 continue
-            distance, nearest = cKDTree(found).query(keypoints[:, :2])
-            near = distance <= MAX_SHIFT
             descriptors = features["descriptors"][0].T.cpu().numpy()
-            described[near, 0, variant] = descriptors[nearest[near]]
+            # of several at one place, such as of other orientations, the one most alike
+            distance, near = cKDTree(found).query(
+                keypoints[:, :2], k=range(1, NEIGHBORS + 1), distance_upper_bound=MAX_SHIFT
+            )
+            candidates = descriptors[np.minimum(near, len(found) - 1)]
+            likeness = np.einsum("nkd,nd->nk", candidates, known.astype(np.float32))
+            best = np.where(np.isfinite(distance), likeness, -np.inf).argmax(axis=1)
+            again = np.isfinite(distance[:, 0])
+            described[again, 0, variant] = candidates[again, best[again]]
         return np.repeat(described, 2, axis=1)
 
 
