@@ -6,6 +6,7 @@ import sys
 from torch import nn
 
 from ..base_model import dynamic_load
+from ..cli import InputError
 
 
 def load(conf: dict) -> nn.Module:
@@ -27,3 +28,15 @@ def load(conf: dict) -> nn.Module:
 
             return HlocExtractor({"conf": conf})
     return dynamic_load(sys.modules[__name__], name)(conf)
+
+
+def load_local(conf: dict) -> nn.Module:
+    """Make an extractor of local features, whose `descriptor` names what projections are for.
+
+    Raises:
+        InputError: as `load`, or when it gives no local features.
+    """
+    model = load(conf)
+    if not hasattr(model, "descriptor"):
+        raise InputError(f"{conf['name']} gives no local features to project.")
+    return model

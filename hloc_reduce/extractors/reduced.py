@@ -3,7 +3,7 @@
 from .. import projections
 from ..base_model import BaseModel
 from ..cli import InputError
-from . import load
+from . import load_local
 
 
 class Reduced(BaseModel):
@@ -17,9 +17,7 @@ class Reduced(BaseModel):
     required_inputs = ("image",)
 
     def _init(self, conf: dict) -> None:
-        self.base = load(conf["base"])
-        if not hasattr(self.base, "descriptor"):
-            raise InputError(f"{conf['base']['name']} gives no local features to project.")
+        self.base = load_local(conf["base"])
         self.project = None
         if conf["projection"] is None:
             return

@@ -62,7 +62,9 @@ def main(
         paths = {nested.PREFIXES[0]: output / f"{descriptor}_nested.safetensors"}
     else:
         paths = {dim: output / f"{descriptor}_{scheme}{dim}.safetensors" for dim in dims}
-    base = {"descriptor": described_by(conf), "base": conf} if conf else {"descriptor": descriptor}
+    base = {"descriptor": descriptor}
+    if conf:
+        base = {"descriptor": extractors.load_local(conf["model"]).descriptor, "base": conf}
     settings = complete_recipe(scheme, recipe, base["descriptor"])
     files = {
         folder.resolve().name: phototour.main(
@@ -136,18 +138,6 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str) -> dict:
 def base_of(conf: dict) -> dict:
     """Return the configuration of the feature that a reduced one is made from."""
     return {**conf, "model": conf["model"].get("base", conf["model"])}
-
-
-def described_by(conf: dict) -> str:
-    """Return the name of the descriptors of a feature.
-
-    Raises:
-        InputError: when its extractor cannot be made or gives no local features.
-    """
-    model = extractors.load(conf["model"])
-    if not hasattr(model, "descriptor"):
-        raise InputError(f"{conf['model']['name']} gives no local features to project.")
-    return model.descriptor
 
 
 def checksum(path: Path) -> str:
@@ -242,7 +232,7 @@ def _main() -> None:
         if args.phototour or args.validate:
             raise InputError("--base describes photos, not the patches of PhotoTour.")
         args.descriptor, conf = [args.base.stem], base_of(features_confs.read(args.base))
-        described_by(conf)  # is wrong before any work is done, if it is
+        extractors.load_local(conf["model"])  # is wrong before any work is done, if it is
     for descriptor in args.descriptor:
         if conf is None:
             check_weights(cli.choose("descriptor", descriptor, DESCRIPTORS))
