@@ -63,14 +63,20 @@ def main(
             features = extract(model, image_dir / name, conf["preprocessing"], device)
             uncertainty = features.pop("uncertainty")
             if as_half:
-                for key, array in features.items():
-                    if key != "keypoints" and array.dtype.kind == "f":
-                        features[key] = array.astype(np.float16)
+                features = halve(features)
             if len(features["keypoints"]) == 0:
                 logger.warning("Image %s has no keypoints.", name)
             writer.add(name, features, {"keypoints": {"uncertainty": uncertainty}})
     logger.info("Features of %d images are in %s.", len(names), feature_path)
     return feature_path
+
+
+def halve(features: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return features with all numbers but the keypoints as float16."""
+    return {
+        key: array.astype(np.float16) if key != "keypoints" and array.dtype.kind == "f" else array
+        for key, array in features.items()
+    }
 
 
 def provenance(conf: dict, as_half: bool) -> dict:
@@ -80,26 +86,40 @@ def provenance(conf: dict, as_half: bool) -> dict:
         InputError: when the projection or the weights of its base descriptor are not to be had.
     """
     made_by = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
-    if conf["model"].get("projection") is not None:
-        made_by["projection_sha256"] = projections.checksum(conf["model"]["projection"])
+    if (projection := conf["model"].get("projection")) is not None:
+        # a file may be moved
+        made_by["model"] = {**conf["model"], "projection": Path(projection).name}
+        made_by["projection_sha256"] = projections.checksum(projection)
     base = conf["model"].get("base", conf["model"])
     if base["name"] == "dog" and base.get("descriptor") in list(DESCRIPTORS):
         check_weights(base["descriptor"])
     return made_by
 
 
-def list_images(image_dir: Path, image_list: Path | str | Iterable[str] | None = None) -> list[str]:
-    """Return the names of the images of a folder, or of a list, checked to be there."""
-    if not Path(image_dir).is_dir():
-        raise InputError(f"There is no folder {image_dir}.")
+def list_images(
+    image_dir: Path, image_list: Path | str | Iterable[str] | None = None, folder: str = ""
+) -> list[str]:
+    """Return the names of the images of a folder, or of a list, checked to be there.
+
+    Args:
+        image_dir: the folder that names are relative to.
+        image_list: names, or a text file of them; default: every image of `folder`.
+        folder: a folder in `image_dir`.
+
+    Raises:
+        InputError: when there is none, or one of the list is not there.
+    """
+    within = Path(image_dir, folder)
+    if not within.is_dir():
+        raise InputError(f"There is no folder {within}.")
     if image_list is None:
         names = sorted(
             path.relative_to(image_dir).as_posix()
-            for path in Path(image_dir).rglob("*")
+            for path in within.rglob("*")
             if path.suffix.lower() in IMAGE_SUFFIXES
         )
         if not names:
-            raise InputError(f"There is no image in {image_dir}.")
+            raise InputError(f"There is no image in {within}.")
         return names
     names = image_names(image_list)
     missing = [name for name in names if not (image_dir / name).is_file()]
@@ -111,15 +131,26 @@ def list_images(image_dir: Path, image_list: Path | str | Iterable[str] | None =
     return names
 
 
-def load_image(path: Path, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:
+def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:
     """Read an image and resize it to at most `resize_max` pixels on its longer side.
 
     With `resize_force` smaller ones get so many, too.
 
+    Args:
+        image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
+        preprocessing: `grayscale`, `resize_max`, `resize_force` of a feature's configuration.
+
     Returns:
         The image (1, C, H, W) float32 in [0, 1], and its original (width, height).
+
+    Raises:
+        InputError: when it cannot be read.
     """
-    image = read_image(path, preprocessing.get("grayscale", False)).astype(np.float32)
+    grayscale = preprocessing.get("grayscale", False)
+    image = (
+        convert(image, grayscale) if isinstance(image, np.ndarray) else read_image(image, grayscale)
+    )
+    image = image.astype(np.float32)
     size = np.array(image.shape[1::-1])
     resize_max = preprocessing.get("resize_max")
     if resize_max and (size.max() > resize_max or preprocessing.get("resize_force")):
@@ -132,18 +163,33 @@ def load_image(path: Path, preprocessing: dict) -> tuple[torch.Tensor, np.ndarra
     return torch.from_numpy(np.ascontiguousarray(image))[None], size
 
 
+def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
+    """Return pixels (H, W) or (H, W, 3) RGB, uint8, as (H, W) if `grayscale` or else (H, W, 3).
+
+    Raises:
+        InputError: for other arrays.
+    """
+    if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.size == 0:
+        raise InputError(
+            f"An image is uint8 (H, W) or (H, W, 3) RGB, not {image.dtype} {image.shape}."
+        )
+    if image.ndim == 3 and grayscale:
+        return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 and not grayscale else image
+
+
 @torch.no_grad()
 def extract(
-    model: torch.nn.Module, path: Path, preprocessing: dict, device: str = "cpu"
+    model: torch.nn.Module, image: Path | np.ndarray, preprocessing: dict, device: str = "cpu"
 ) -> dict[str, np.ndarray]:
-    """Extract the features of one image.
+    """Extract the features of one image, given as in `load_image`.
 
     Returns:
         keypoints (N, 2) float32 (x, y) in pixels of the original image, centres at integers;
         descriptors (D, N); scores, scales (pixels), oris (degrees) (N,), as far as the model has
         them; image_size (2,) width, height; and the uncertainty of the keypoints in pixels.
     """
-    image, size = load_image(path, preprocessing)
+    image, size = load_image(image, preprocessing)
     features = {
         key: value[0].cpu().numpy() for key, value in model({"image": image.to(device)}).items()
     }

@@ -203,12 +203,17 @@ def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
 
 
 def get_colmap_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
-    """Read keypoints as `get_keypoints` does, with COLMAP's pixel origin: the corner, not centre.
+    """Read keypoints as `get_keypoints` does, with COLMAP's pixel origin."""
+    keypoints, uncertainty = get_keypoints(file, name)
+    return to_colmap(keypoints), uncertainty
+
+
+def to_colmap(keypoints: np.ndarray) -> np.ndarray:
+    """Move keypoints (N, 2), pixel centres at integers, to COLMAP's pixel origin, the corner.
 
     The only place where the half pixel is added.
     """
-    keypoints, uncertainty = get_keypoints(file, name)
-    return keypoints + 0.5, uncertainty
+    return keypoints.astype(np.float64) + 0.5
 
 
 def names_to_pair(name0: str, name1: str, separator: str = "/") -> str:

@@ -46,9 +46,10 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
     """Read queries with intrinsics, one `name MODEL width height params...` a line.
 
     Raises:
-        InputError: for a broken line, with file and line number, or an empty list.
+        InputError: for a broken line, with file and line number, a name that is listed twice, or
+            an empty list.
     """
-    queries = []
+    queries: dict[str, pycolmap.Camera] = {}
     for place, words in _lines(path):
         try:
             name, model, width, height, *params = words
@@ -69,10 +70,12 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
             raise InputError(
                 f"{place}: not a query `name MODEL width height params...` ({reason})."
             ) from None
-        queries.append((name, camera))
+        if name in queries:
+            raise InputError(f"{place}: query {name} is listed twice.")
+        queries[name] = camera
     if not queries:
         raise InputError(f"{path} lists no query.")
-    return queries
+    return list(queries.items())
 
 
 def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]]]:
@@ -88,12 +91,12 @@ def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]
     if not files:
         raise InputError(f"There is no query list {paths}.")
     lists = {path.stem: parse_query_list(path) for path in files}
-    seen: set[str] = set()
+    of_list: dict[str, str] = {}
     for path in files:
         for name, _ in lists[path.stem]:
-            if name in seen:
-                raise InputError(f"{path}: query {name} is listed twice.")
-            seen.add(name)
+            if name in of_list:
+                raise InputError(f"{path}: query {name} is in {of_list[name]} too.")
+            of_list[name] = path.name
     return lists
 
 
@@ -129,18 +132,19 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
 
 
 def write_poses(
-    poses: Mapping[str, pycolmap.Rigid3d], path: Path, prepend_camera_name: bool = False
+    poses: Mapping[str, pycolmap.Rigid3d], path: Path, name_parts: int | None = 1
 ) -> None:
     """Write poses (camera from world) in the submission format of visuallocalization.net.
 
     Args:
         poses: from image name to pose.
-        path: the text file, one `basename qw qx qy qz tx ty tz` a line.
-        prepend_camera_name: write `folder/basename` (RobotCar's format).
+        path: the text file, one `name qw qx qy qz tx ty tz` a line.
+        name_parts: how much of names is written: 1 for `basename`, 2 for `folder/basename`
+            (RobotCar's format), None for all.
     """
     with replacing(path) as temporary, temporary.open("w") as file:
         for name, pose in poses.items():
-            parts = Path(name).parts[-2:] if prepend_camera_name else [Path(name).name]
+            written = name if name_parts is None else "/".join(name.split("/")[-name_parts:])
             x, y, z, w = pose.rotation.quat
             numbers = " ".join(repr(float(value)) for value in (w, x, y, z, *pose.translation))
-            file.write(f"{'/'.join(parts)} {numbers}\n")
+            file.write(f"{written} {numbers}\n")

@@ -4,23 +4,25 @@ import csv
 import json
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from . import logger
 from .cli import InputError
 from .evaluation.poses import pose_error, recall
-from .io import open_h5, replacing
-from .localize_sfm import pose
+from .io import list_h5_names, open_h5, replacing
+from .localization import pose
 
 COLUMNS = (
     "query",
     "list",
     "status",
     "num_matches",
+    "num_without_point",
     "num_correspondences",
     "num_inliers",
     "inlier_ratio",
@@ -29,8 +31,10 @@ COLUMNS = (
     "retrieved",
 )
 # what a run leaves in its folder, but for lists of pairs, which are always written anew
-PRODUCTS = ("*feats-*", ".*.tmp", "sfm_*", "Aachen-*", "queries.csv", "s*.json")
+PRODUCTS = ("*feats-*", ".*.tmp", "sfm*", "*_hloc_*", "queries.csv", "s*.json")
+FINISHED = "map.json"  # says of a map that it is whole
 FAILED = (float("inf"), float("inf"))
+NAMED = 3  # differences that a message names
 
 
 class RunFolder:
@@ -41,32 +45,38 @@ class RunFolder:
         conf: what determines the results.
         overwrite: begin anew, with this configuration; what a run left in the folder is deleted
             first, so that a run that is stopped can go on without `overwrite`.
+        renewed: key of what may be made anew on purpose, which begins anew here too.
 
     Raises:
         InputError: when the folder holds results of another configuration.
     """
 
-    def __init__(self, path: Path, conf: dict, overwrite: bool):
+    def __init__(self, path: Path, conf: dict, overwrite: bool, renewed: str | None = None):
         self.path = path
         conf_file, self._seconds_file = path / "conf.json", path / "seconds.json"
         conf = json.loads(json.dumps(conf))
+        before = None
         if conf_file.exists() and not overwrite:
             try:
                 before = json.loads(conf_file.read_text())
             except ValueError:
                 raise InputError(f"{conf_file} is broken: use --overwrite.") from None
-            keys = [key for key in {**before, **conf} if before.get(key) != conf.get(key)]
-            if keys:
-                raise InputError(
-                    f"{path} holds results of another {' and '.join(keys)}. "
-                    "Choose other --outputs, one folder for each configuration, or --overwrite."
-                )
-        elif conf_file.exists():
+            if renewed in before and before[renewed] != conf[renewed]:
+                logger.info("The %s of the results in %s is a new one.", renewed, path)
+                before, overwrite = None, True
+        if before is not None and (changes := list(_changes(before, conf))):
+            raise InputError(
+                f"{path} holds results of another {' and '.join(changes)}. "
+                "Choose other --outputs, one folder for each configuration, or --overwrite."
+            )
+        if overwrite and conf_file.exists():
+            (path / FINISHED).unlink(missing_ok=True)
             conf_file.unlink()
             for product in (file for pattern in PRODUCTS for file in path.glob(pattern)):
                 shutil.rmtree(product) if product.is_dir() else product.unlink()
-        with replacing(conf_file) as temporary:
-            temporary.write_text(json.dumps(conf, indent=1))
+        if before is None:
+            with replacing(conf_file) as temporary:
+                temporary.write_text(json.dumps(conf, indent=1))
 
     def seconds(self) -> dict[str, float]:
         """Return how long each stage took, all runs together."""
@@ -85,8 +95,22 @@ class RunFolder:
                 temporary.write_text(json.dumps({**seconds, name: round(spent, 3)}, indent=1))
 
 
+def _changes(before: dict, after: dict) -> Iterator[str]:
+    """Name what differs between two configurations, and of what is long which entries."""
+    for key in {**before, **after}:
+        old, new = before.get(key), after.get(key)
+        if old == new:
+            continue
+        if isinstance(old, dict) and isinstance(new, dict):
+            names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+            more = ", ..." if len(names) > NAMED else ""
+            yield f"{key} ({', '.join(names[:NAMED])}{more})"
+        else:
+            yield key
+
+
 def query_table(
-    lists: Mapping[str, list[tuple[str, pycolmap.Camera]]],
+    lists: Mapping[str, Iterable[str]],
     records: Mapping[str, dict],
     truth: Mapping[str, pycolmap.Rigid3d],
 ) -> list[dict]:
@@ -94,25 +118,29 @@ def query_table(
 
     Args:
         lists: the queries of each list.
-        records: of each query, as from `localize_sfm.main`.
+        records: of each query, as from `localization.main`.
         truth: true poses, camera from world, by full name; may lack some or all.
 
     Returns:
         A dict of `COLUMNS` for each query. The error of a query is that of the submitted pose,
-        be it localized or a fallback; it is None where the truth is not known.
+        be it localized or a fallback, and infinite if there is none; it is None where the truth
+        is not known.
     """
     rows = []
     for list_name, queries in lists.items():
-        for name, _ in queries:
+        for name in queries:
             record = records[name]
             correspondences, inliers = record["num_correspondences"], record["num_inliers"]
-            known = name in truth
-            errors = pose_error(pose(record), truth[name]) if known else (None, None)
+            estimate = pose(record)
+            errors = (None, None)
+            if name in truth:
+                errors = pose_error(estimate, truth[name]) if estimate else FAILED
             values = (
                 name,
                 list_name,
-                "localized" if record["localized"] else "fallback",
+                "localized" if record["localized"] else "fallback" if estimate else "failed",
                 record["num_matches"],
+                record["num_without_point"],
                 correspondences,
                 inliers,
                 round(inliers / correspondences, 4) if correspondences else 0.0,
@@ -137,7 +165,7 @@ def summarize_list(rows: list[dict], thresholds: tuple[tuple[float, float], ...]
     Returns:
         Counts, mean inliers, and where the truth is known recall in percent at each of the
         thresholds, and median errors. Recall counts a fallback as a failure; medians are of the
-        submitted poses.
+        submitted poses, None if half of the queries have none.
     """
     summary = {
         "queries": len(rows),
@@ -151,19 +179,21 @@ def summarize_list(rows: list[dict], thresholds: tuple[tuple[float, float], ...]
             error if row["status"] == "localized" else FAILED
             for row, error in zip(known, errors, strict=True)
         ]
-        position, rotation = np.median(errors, axis=0)
+        medians = np.median(errors, axis=0)
+        position, rotation = (float(x) if np.isfinite(x) else None for x in medians)
         summary |= {
             "with_ground_truth": len(known),
             "thresholds_m_deg": [list(limits) for limits in thresholds],
             "recall_percent": [round(value, 2) for value in recall(counted, thresholds)],
-            "median_position_error_m": float(position),
-            "median_rotation_error_deg": float(rotation),
+            "median_position_error_m": position,
+            "median_rotation_error_deg": rotation,
         }
     return summary
 
 
-def bytes_per_keypoint(features: Path, names: list[str]) -> dict[str, float]:
+def bytes_per_keypoint(features: Path) -> dict[str, float]:
     """Measure the size of a feature file: bytes of one descriptor, and of all per keypoint."""
+    names = list_h5_names(features)
     with open_h5(features) as file:
         descriptors = [file[name]["descriptors"] for name in names]
         total = sum(dataset.shape[1] for dataset in descriptors)

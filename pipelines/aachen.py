@@ -10,27 +10,19 @@ from pathlib import Path
 from confs import features as features_confs
 from confs import matchers as matchers_confs
 from hloc_reduce import (
-    aggregate_features,
     cli,
     demo,
     extract_features,
     extractors,
     localize_sfm,
-    logger,
     match_features,
     pairs_from_covisibility,
-    pairs_from_retrieval,
     results,
     triangulation,
 )
-from hloc_reduce.cli import InputError
-from hloc_reduce.datasets import Aachen, thresholds
-from hloc_reduce.io import list_h5_names
-from hloc_reduce.parsers import parse_retrieval
-from hloc_reduce.versions import versions
+from hloc_reduce.datasets import Aachen, thresholds, true_poses
 
-# suffix of a retrieval file -> what makes pairs of it; any other is a text file of pairs
-PAIRS_FROM = {".h5": pairs_from_retrieval.main, ".hdf5": pairs_from_retrieval.main}
+from . import common
 
 
 def main(
@@ -49,16 +41,14 @@ def main(
     feature, feature_conf = features_confs.get(feature, projection)
     matcher_conf = matchers_confs.confs[matcher]
     place = Aachen(dataset)
-    map_names, lists = place.map_names(), place.query_lists()
-    query_names = [name for queries in lists.values() for name, _ in queries]
+    map_names = place.map_names()
+    lists = {name: [query for query, _ in part] for name, part in place.query_lists().items()}
+    query_names = [name for part in lists.values() for name in part]
     place.check_images([*map_names, *query_names])
-    truth = place.true_poses(query_names, ground_truth)
-    if retrieval != "vlad" and Path(retrieval).suffix in PAIRS_FROM:
-        list_h5_names(Path(retrieval))  # a broken file is refused before any work is done
-    elif retrieval != "vlad":
-        retrieved = parse_retrieval(Path(retrieval))
-        if not any(set(map_names) & set(retrieved.get(name, ())) for name in query_names):
-            raise InputError(f"{retrieval} has no pair of a query and a map image.")
+    truth = true_poses(query_names, ground_truth or place.ground_truth, bool(ground_truth))
+    retrieved = common.retrieval_name(retrieval, num_loc)
+    loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
+    common.check_retrieval(retrieval, loc_pairs, query_names, map_names)
 
     if overwrite or not (outputs / "conf.json").exists():
         extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
@@ -76,8 +66,7 @@ def main(
     )
     sfm = outputs / f"sfm_{feature}+{matcher}"
     sfm_pairs = outputs / f"pairs-db-covis{num_covis}.txt"
-    loc_pairs = outputs / f"pairs-query-{Path(retrieval).stem}{num_loc}.txt"
-    poses = outputs / f"Aachen-v1.1_hloc_{feature}+{matcher}_{Path(retrieval).stem}{num_loc}.txt"
+    poses = outputs / f"Aachen-v1.1_hloc_{feature}+{matcher}_{retrieved}.txt"
 
     with folder.stage("extract_features"):
         names = [*map_names, *query_names]
@@ -91,20 +80,12 @@ def main(
             sfm, place.reference_model, place.images, sfm_pairs, features, sfm_matches
         )
     with folder.stage("retrieval"):
-        if retrieval == "vlad":
-            conf = aggregate_features.confs["vlad"]
-            retrieved = aggregate_features.main(conf, features, map_names)
-        else:
-            retrieved = Path(retrieval)
-        select = PAIRS_FROM.get(retrieved.suffix, pairs_from_retrieval.select)
-        select(retrieved, loc_pairs, num_loc, query_list=query_names, db_list=map_names)
+        common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
     with folder.stage("match_queries"):
         loc_matches = match_features.main(matcher_conf, loc_pairs, features.stem, outputs)
     with folder.stage("localization"):
         records = localize_sfm.main(sfm, place.queries, loc_pairs, features, loc_matches, poses)
 
-    rows = results.query_table(lists, records, truth)
-    results.write_csv(rows, outputs / "queries.csv")
     summary = {
         "feature": feature,
         "matcher": matcher,
@@ -114,22 +95,9 @@ def main(
         "num_loc": num_loc,
         "map_images": len(map_names),
         "map_points3D": reconstruction.num_points3D(),
-        "queries": len(rows),
-        "queries_localized": sum(row["status"] == "localized" for row in rows),
-        "lists": {
-            name: results.summarize_list(
-                [row for row in rows if row["list"] == name],
-                thresholds(name),
-            )
-            for name in lists
-        },
-        "bytes_per_keypoint": results.bytes_per_keypoint(features, names),
-        "seconds": folder.seconds(),
-        "versions": versions(),
-        "poses": poses.name,
     }
-    results.write_summary(summary, outputs / "summary.json")
-    return summary
+    limits = {name: thresholds(name) for name in lists}
+    return common.finish(folder, summary, lists, records, truth, limits, features, poses)
 
 
 def _main() -> None:
@@ -147,50 +115,16 @@ def _main() -> None:
         help="render a small town in the data set's layout and localize there "
         "(default --dataset: datasets/demo_town)",
     )
-    parser.add_argument(
-        "--outputs",
-        type=Path,
-        help="folder for all results, of one configuration (default: outputs/<dataset>/<feature>)",
-    )
-    parser.add_argument(
-        "--feature",
-        default="sift_sv64",
-        help="local feature, see --list_features, or a YAML file with its configuration",
-    )
-    parser.add_argument(
-        "--projection",
-        type=Path,
-        help="file of a projection to use with the base descriptor of --feature",
-    )
-    parser.add_argument(
-        "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
-    )
-    parser.add_argument(
-        "--retrieval",
-        default="vlad",
-        metavar="vlad|FILE",
-        help="vlad, or hloc's text file of pairs or h5 file of global descriptors",
-    )
     parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
-    parser.add_argument("--num_loc", type=int, default=50, help="map images of each query")
-    parser.add_argument(
-        "--ground_truth",
-        type=Path,
-        help="true poses of the queries (default: <dataset>/queries/ground_truth_poses.txt)",
+    common.add_dataset_options(
+        parser,
+        outputs="outputs/<dataset>/<feature>",
+        truth="<dataset>/queries/ground_truth_poses.txt",
+        num_loc=50,
     )
-    parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
-    parser.add_argument("--list_features", action="store_true", help="list the features and exit")
     args = parser.parse_args()
-    if args.list_features:
-        print("\n".join(features_confs.confs))
-        return
+    common.check_options(args)
     feature, _ = features_confs.get(args.feature, args.projection)
-    cli.choose("matcher", args.matcher, matchers_confs.confs)
-    if args.retrieval != "vlad" and not Path(args.retrieval).is_file():
-        raise InputError(f"--retrieval {args.retrieval}: neither vlad nor a file that is there.")
-    for option in ("num_covis", "num_loc"):
-        if getattr(args, option) < 1:
-            raise InputError(f"--{option} {getattr(args, option)}: at least 1.")
     default = "datasets/demo_town" if args.demo else "datasets/aachen_v1.1"
     dataset = args.dataset or Path(default)
     outputs = args.outputs or Path("outputs") / dataset.name / feature
@@ -208,21 +142,8 @@ def _main() -> None:
         args.overwrite,
         args.projection,
     )
-    logger.info(
-        "Localized %d of %d queries in %.0f s; %d bytes a descriptor. Results are in %s.",
-        summary["queries_localized"],
-        summary["queries"],
-        sum(summary["seconds"].values()),
-        summary["bytes_per_keypoint"]["descriptor"],
-        outputs,
-    )
-    if any("recall_percent" in result for result in summary["lists"].values()):
-        print(results.recall_table(feature, summary["lists"]))
-    else:
-        print(
-            "The true poses are not known here. For recall, submit "
-            f"{outputs / summary['poses']} to https://www.visuallocalization.net."
-        )
+    submit = "For recall, submit {} to https://www.visuallocalization.net."
+    common.print_result(summary, outputs, submit)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """What tests share: the folder of real data, and a small scene with answers known in advance."""
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
+from scipy.io import savemat
 
 from hloc_reduce import colmap
 
@@ -182,3 +184,65 @@ def aachen_layout(plane) -> Path:
         path.write_text("".join(f"query/{name}.png {intrinsics}" for name in names))
     (root / "queries/ground_truth_poses.txt").write_text("".join(truth))
     return root
+
+
+@pytest.fixture
+def inloc_layout(plane) -> Path:
+    """The photos of the plane in the layout of InLoc: scans on two floors, and three queries.
+
+    Cutouts 0 to 2 are on floor PLA1, 3 on PLA2, in whose frame the plane is 100 m away. Each scan
+    has a frame of its own, and no depth in its left 40 columns. The queries are photo 4 as a.JPG
+    and as b.JPG, and one of a uniform grey.
+    """
+    root = plane / "inloc"
+    (root / "query/iphone7").mkdir(parents=True)
+    reference = pycolmap.Reconstruction(plane / "model")
+    names = []
+    for image in sorted(reference.images.values(), key=lambda image: image.name):
+        photo = cv2.imread(str(plane / "images" / image.name))
+        number, pose = image.name[0], image.cam_from_world()
+        if number == "4":
+            for name, pixels in (("a.JPG", photo), ("grey.JPG", np.full_like(photo, 128))):
+                path = root / f"query/iphone7/{name}"
+                assert cv2.imwrite(str(path), pixels, [cv2.IMWRITE_JPEG_QUALITY, 100])
+                names.append(f"query/iphone7/{name}")
+            shutil.copy(root / names[0], root / "query/iphone7/b.JPG")
+            names.append("query/iphone7/b.JPG")
+            values = " ".join(map(repr, map(float, pose.rotation.quat[[3, 0, 1, 2]])))
+            values += " " + " ".join(map(repr, map(float, pose.translation)))
+            continue
+        floor, shift = ("PLA2", 100.0) if number == "3" else ("PLA1", 0.0)
+        folder = root / f"database/cutouts/{floor}/00{number}"
+        folder.mkdir(parents=True)
+        cutout = folder / f"PLA_cutout_00{number}_0_0.jpg"
+        cv2.imwrite(str(cutout), photo, [cv2.IMWRITE_JPEG_QUALITY, 100])
+        scan_from_world = scan_frame(int(number))
+        v, u = np.mgrid[: SIZE[1], : SIZE[0]]
+        rays = np.stack([u + 0.5 - SIZE[0] / 2, v + 0.5 - SIZE[1] / 2, np.full(u.shape, FOCAL)], -1)
+        rays = rays @ pose.rotation.matrix()  # in the world's frame
+        centre = pose.inverse().translation
+        world = centre - rays * (centre[2] / rays[..., 2:])
+        scan = world @ scan_from_world[:3, :3].T + scan_from_world[:3, 3]
+        scan[:, :40] = np.nan
+        savemat(f"{cutout}.mat", {"XYZcut": scan})
+        world_from_scan = np.linalg.inv(scan_from_world)
+        world_from_scan[0, 3] += shift
+        transformations = root / f"database/alignments/{floor}/transformations"
+        transformations.mkdir(parents=True, exist_ok=True)
+        rows = [" ".join(map(repr, row)) for row in world_from_scan.tolist()]
+        text = "\n".join(["before", *["9 9 9 9"] * 4, "", "after", *rows, ""])
+        (transformations / f"PLA_trans_00{number}.txt").write_text(text)
+    intrinsics = f"SIMPLE_PINHOLE {SIZE[0]} {SIZE[1]} {FOCAL} {SIZE[0] / 2} {SIZE[1] / 2}"
+    queries = root / "queries_with_intrinsics.txt"
+    queries.write_text("".join(f"{name} {intrinsics}\n" for name in sorted(names)))
+    truth = root / "ground_truth_poses.txt"
+    truth.write_text("".join(f"{name} {values}\n" for name in names))
+    return root
+
+
+def scan_frame(number: int) -> np.ndarray:
+    """Return the frame of a scan of `inloc_layout`, scan from world (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = cv2.Rodrigues(np.array([0.3 * number, -0.2, 0.5]))[0]
+    matrix[:3, 3] = [number, 2, -1]
+    return matrix

@@ -243,7 +243,9 @@ def test_without_ground_truth(aachen_layout, tmp_path, monkeypatch, capsys):
 
 
 def test_features_are_listed(monkeypatch, capsys):
-    run(monkeypatch, "--list_features")
+    with pytest.raises(SystemExit) as exit:
+        run(monkeypatch, "--list_features")
+    assert not exit.value.code
     names = capsys.readouterr().out.split()
     assert names[0] == "sift" and "sift_sv16" in names and "sift_pca64" in names
 

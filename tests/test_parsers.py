@@ -52,8 +52,11 @@ def test_query_listed_twice_or_nowhere(tmp_path):
         parsers.parse_query_lists(tmp_path / "*.txt")
     (tmp_path / "day.txt").write_text(line)
     (tmp_path / "night.txt").write_text(line)
-    with pytest.raises(InputError, match="q.jpg is listed twice"):
+    with pytest.raises(InputError, match="night.txt: query q.jpg is in day.txt too"):
         parsers.parse_query_lists(tmp_path / "*.txt")
+    (tmp_path / "night.txt").write_text(line + line)
+    with pytest.raises(InputError, match="night.txt:2: query q.jpg is listed twice"):
+        parsers.parse_query_list(tmp_path / "night.txt")
     (tmp_path / "night.txt").write_text("# nothing\n")
     with pytest.raises(InputError, match="lists no query"):
         parsers.parse_query_lists(tmp_path / "*.txt")

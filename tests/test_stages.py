@@ -9,6 +9,7 @@ import pytest
 
 from hloc_reduce import (
     colmap,
+    localization,
     localize_sfm,
     match_features,
     pairs_from_covisibility,
@@ -182,7 +183,7 @@ def test_queries_are_localized_exactly(built):
     for name, record in records.items():
         assert record["localized"] and record["num_inliers"] == 300
         assert record["num_matches"] == 6 * 300 and record["db"] == "db/0.jpg"
-        metres, degrees = pose_error(localize_sfm.pose(record), built.poses[name])
+        metres, degrees = pose_error(localization.pose(record), built.poses[name])
         assert metres < 1e-4 and degrees < 1e-2
     lines = (built.root / "poses.txt").read_text().splitlines()
     assert [line.split()[0] for line in lines] == ["6.jpg", "7.jpg"]
@@ -210,15 +211,15 @@ def test_clusters_of_covisible_images_are_solved_by_themselves(built):
         for index, point in enumerate(built.seen[image.name]):
             if (point < 120) == late:
                 built.map.delete_observation(image.image_id, index)
-    localizer = localize_sfm.QueryLocalizer(built.map)
     names = [f"db/{i}.jpg" for i in (5, 1, 3, 0, 2)]
-    assert localizer.clusters(names) == [["db/1.jpg", "db/0.jpg", "db/2.jpg"], names[0:3:2]]
-    assert localizer.clusters([]) == [[]]
+    clusters = [["db/1.jpg", "db/0.jpg", "db/2.jpg"], names[0:3:2]]
+    assert localize_sfm.SfmMap(built.map, True).clusters(names) == clusters
+    assert localize_sfm.SfmMap(built.map).clusters(names) == [names]
     whole = built.localize(reference_sfm=built.map)["query/6.jpg"]
     part = built.localize(reference_sfm=built.map, covisibility_clustering=True)["query/6.jpg"]
     assert (whole["num_inliers"], part["num_inliers"]) == (300, 180)
     assert (whole["num_matches"], part["num_matches"]) == (900, 540)
-    assert part["db"] == "db/0.jpg" and part["localized"]
+    assert part["db"] == "db/3.jpg" and part["localized"]  # of the cluster
 
 
 def test_other_options_are_not_answered_from_the_log(built):
@@ -250,7 +251,7 @@ def test_hopeless_queries_fall_back_and_say_so(built):
         record = records[f"query/{i}.jpg"]
         assert not record["localized"] and record["db"] == db, record
         pose = built.poses[db or "db/0.jpg"]
-        assert max(pose_error(localize_sfm.pose(record), pose)) < 1e-6
+        assert max(pose_error(localization.pose(record), pose)) < 1e-6
     assert records["query/8.jpg"]["num_inliers"] == 0
     assert records["query/10.jpg"]["num_matches"] == 40
     assert len((built.root / "poses.txt").read_text().splitlines()) == 5

@@ -1,6 +1,5 @@
 """Frozen projections of descriptors: load, fold, apply, save."""
 
-import hashlib
 import json
 import pickle
 import re
@@ -12,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
 from torch import nn
 
+from .. import stamps
 from ..cli import InputError
 from ..descriptors import DESCRIPTORS
 from ..io import replacing
@@ -147,7 +147,7 @@ def split_prefix(projection: str | Path) -> tuple[str, str]:
 
 def checksum(projection: str | Path) -> str:
     """Return the sha256 of a projection's file, to tell which one made a feature file."""
-    return hashlib.sha256(find(projection).read_bytes()).hexdigest()
+    return stamps.sha256(find(projection))
 
 
 def save(mlp: MLP, metadata: dict, path: Path) -> None:

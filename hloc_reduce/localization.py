@@ -1,0 +1,262 @@
+"""Localize queries in any map: 2D-3D matches through retrieved images, PnP + RANSAC, records."""
+
+import copy
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Protocol
+
+import h5py
+import numpy as np
+import pycolmap
+from tqdm import tqdm
+
+from . import colmap, logger
+from .cli import InputError
+from .io import check_matches, find_pair, get_colmap_keypoints, get_matches, open_h5, replacing
+from .parsers import write_poses
+
+# Three points fit a pose always, and among hundreds of wrong matches a few more agree by chance.
+MIN_INLIERS = 8
+SEED = 0
+RECORDS = 2  # the version of what a record holds
+
+
+class Reference(Protocol):
+    """A map: the 3D points that the keypoints of its images show."""
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether it has an image."""
+
+    def num_keypoints(self, name: str) -> int:
+        """Return how many keypoints an image has."""
+
+    def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the points that keypoints (M,) of an image show.
+
+        Returns:
+            Their ids (M,) int64, -1 where there is none, and coordinates (M, 3).
+        """
+
+    def clusters(self, names: list[str]) -> list[list[str]]:
+        """Split images, one at least, into those whose points are matched together."""
+
+    def fallback(self, names: list[str]) -> pycolmap.Rigid3d | None:
+        """Return what to say of a query without a pose, by its images, best first, if any."""
+
+
+def localize(
+    reference: Reference,
+    keypoints: np.ndarray,
+    camera: pycolmap.Camera,
+    matches: Mapping[str, np.ndarray],
+    config: dict,
+) -> tuple[pycolmap.Rigid3d | None, dict]:
+    """Localize a query.
+
+    Args:
+        reference: the map.
+        keypoints: (N, 2) of the query, COLMAP's pixels.
+        camera: intrinsics.
+        matches: from map images, best first, to (M, 2) indices of the keypoints of the query and
+            of the image.
+        config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
+
+    Returns:
+        The pose (camera from world) or None, and info: `num_inliers`; `num_matches`, with a 3D
+        point, of `num_correspondences` different ones (M); `num_without_point`, the other
+        matches; `camera`, the intrinsics, refined where `config` says so; `db`, the image
+        retrieved first, of the cluster that was localized in; and of that cluster `keypoints`
+        (M,), indices of the query's, `point3D_ids` (M,), `points3D` (M, 3) and `inliers` (M,)
+        bool.
+    """
+    solved = []
+    for names in reference.clusters(list(matches)) if matches else [[]]:
+        info = _correspondences(reference, names, matches)
+        refined = copy.deepcopy(camera)
+        found = colmap.estimate_pose(
+            keypoints[info["keypoints"]], info["points3D"], refined, config, SEED
+        )
+        info |= {
+            "camera": refined,
+            "num_inliers": int(found["num_inliers"]) if found else 0,
+            "inliers": found["inlier_mask"] if found else np.zeros(len(info["keypoints"]), bool),
+            "db": names[0] if names else None,
+        }
+        solved.append((found["cam_from_world"] if found else None, info))
+    return max(solved, key=lambda pose_info: pose_info[1]["num_inliers"])
+
+
+def _correspondences(
+    reference: Reference, names: list[str], matches: Mapping[str, np.ndarray]
+) -> dict:
+    """Collect the different 2D-3D matches through some images, sorted; parts of `info`."""
+    keypoints, ids, points = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 3))]
+    for name in names:
+        shown, xyz = reference.lift(name, matches[name][:, 1])
+        keypoints.append(matches[name][:, 0])
+        ids.append(shown)
+        points.append(xyz)
+    pairs = np.stack([np.concatenate(keypoints), np.concatenate(ids)], 1)
+    known = np.flatnonzero(pairs[:, 1] >= 0)
+    different, first = np.unique(pairs[known], axis=0, return_index=True)
+    return {
+        "num_matches": len(known),
+        "num_without_point": len(pairs) - len(known),
+        "num_correspondences": len(different),
+        "keypoints": different[:, 0],
+        "point3D_ids": different[:, 1],
+        "points3D": np.concatenate(points)[known[first]],
+    }
+
+
+def main(
+    load_reference: Callable[[], Reference],
+    queries: list[tuple[str, pycolmap.Camera]],
+    retrieved: Mapping[str, list[str]],
+    features: Path,
+    matches: Path,
+    results: Path,
+    config: Callable[[str, pycolmap.Camera], dict],
+    made_from: dict,
+    overwrite: bool = False,
+    skip_matches: int | None = None,
+    name_parts: int | None = 1,
+) -> dict[str, dict]:
+    """Localize queries by the files of their features and matches.
+
+    Args:
+        load_reference: gives the map, if there is something to do.
+        queries: names and intrinsics.
+        retrieved: the map images of each query, best first.
+        features: feature file of the queries.
+        matches: match file of the pairs.
+        results: text file of poses, camera from world, one line for every query that has one.
+        config: from the name and the intrinsics of a query to the options of `localize`.
+        made_from: stamp of all that determines the poses; the records of `<results>_logs.jsonl`
+            are used again when it is the same.
+        overwrite: localize anew what is there.
+        skip_matches: leave out retrieved images with fewer matches.
+        name_parts: as of `parsers.write_poses`.
+
+    Returns:
+        A record for each query: `localized` (from MIN_INLIERS inliers on), the pose that is
+        written as `qvec` (w, x, y, z) and `tvec`, the fallback where it is not localized, None
+        where there is none; `camera`, the model, width, height and parameters in a list; and the
+        numbers and `db` of `localize`.
+    """
+    log = _Log(Path(f"{results}_logs.jsonl"), {"records": RECORDS, **made_from}, overwrite)
+    todo = [query for query in queries if query[0] not in log.records]
+    if todo:
+        reference = load_reference()
+        with open_h5(features) as feature_file, open_h5(matches) as match_file, log:
+            _check_some_matched(match_file, queries, retrieved)
+            for name, camera in tqdm(todo, desc="Localizing", unit="query"):
+                keypoints, _ = get_colmap_keypoints(feature_file, name)
+                found = _read_matches(
+                    match_file, name, len(keypoints), retrieved.get(name, []), reference
+                )
+                used = {n: m for n, m in found.items() if len(m) >= (skip_matches or 0)}
+                cam_from_world, info = localize(
+                    reference, keypoints, camera, used, config(name, camera)
+                )
+                log.add(name, _record(reference, list(found), cam_from_world, info))
+    records = {name: log.records[name] for name, _ in queries}
+    poses = {name: pose(record) for name, record in records.items()}
+    submitted = {name: known for name, known in poses.items() if known is not None}
+    write_poses(submitted, results, name_parts)
+    if len(submitted) < len(poses):
+        logger.warning("No pose: %s.", ", ".join(name for name in poses if name not in submitted))
+    localized = sum(record["localized"] for record in records.values())
+    logger.info("Localized %d of %d queries: %s", localized, len(records), results)
+    return records
+
+
+def pose(record: dict) -> pycolmap.Rigid3d | None:
+    """Return the pose of a query's record, camera from world."""
+    if record["qvec"] is None:
+        return None
+    w, x, y, z = record["qvec"]
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(record["tvec"]))
+
+
+def _check_some_matched(
+    match_file: h5py.File,
+    queries: list[tuple[str, pycolmap.Camera]],
+    retrieved: Mapping[str, list[str]],
+) -> None:
+    """Refuse a match file that has not a single pair."""
+    pairs = [(name, other) for name, _ in queries for other in retrieved.get(name, [])]
+    if pairs and not any(find_pair(match_file, *pair)[0] for pair in pairs):
+        raise InputError(
+            f"The pair {pairs[0][0]}, {pairs[0][1]} is not in the match file "
+            f"{match_file.filename}, and no other of the queries is."
+        )
+
+
+def _read_matches(
+    match_file: h5py.File, name: str, num_keypoints: int, names: list[str], reference: Reference
+) -> dict[str, np.ndarray]:
+    """Read the matches of a query with the images of the map that were retrieved for it."""
+    present = [other for other in names if other in reference]
+    if len(present) < len(names):
+        absent = len(names) - len(present)
+        logger.warning("%d images retrieved for %s are not in the map.", absent, name)
+    if not present:
+        logger.warning("No map image was retrieved for %s.", name)
+    elif not any(find_pair(match_file, name, other)[0] for other in present):
+        logger.warning("%s was not matched: %s has none of its pairs.", name, match_file.filename)
+        return {}
+    matches = {other: get_matches(match_file, name, other)[0] for other in present}
+    for other, indices in matches.items():
+        check_matches(indices, (name, other), (num_keypoints, reference.num_keypoints(other)))
+    return matches
+
+
+def _record(
+    reference: Reference, names: list[str], cam_from_world: pycolmap.Rigid3d | None, info: dict
+) -> dict:
+    localized = info["num_inliers"] >= MIN_INLIERS
+    if not localized:
+        cam_from_world = reference.fallback(names) or cam_from_world
+    qvec = tvec = None
+    if cam_from_world is not None:
+        x, y, z, w = cam_from_world.rotation.quat
+        qvec = [float(value) for value in (w, x, y, z)]
+        tvec = [float(value) for value in cam_from_world.translation]
+    camera = info["camera"]
+    numbers = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
+    return {
+        "localized": localized,
+        "qvec": qvec,
+        "tvec": tvec,
+        "camera": [camera.model.name, camera.width, camera.height, *camera.params.tolist()],
+        **{key: info[key] for key in numbers},
+        "db": info["db"] if localized else next(iter(names), None),
+    }
+
+
+class _Log:
+    """Records of queries, one JSON line each, under a first line that says what made them."""
+
+    def __init__(self, path: Path, made_from: dict, overwrite: bool):
+        self.path, self.records = path, {}
+        header = json.dumps(made_from, sort_keys=True)
+        lines = [] if overwrite or not path.exists() else path.read_text().split("\n")
+        if lines and lines[0] == header:
+            # what follows the last line end was cut off by a kill
+            self.records = dict(json.loads(line) for line in lines[1:-1])
+        kept = [json.dumps(item) for item in self.records.items()]
+        with replacing(path) as temporary:
+            temporary.write_text("\n".join([header, *kept]) + "\n")
+
+    def __enter__(self) -> None:
+        self.file = self.path.open("a")
+
+    def __exit__(self, *_) -> None:
+        self.file.close()
+
+    def add(self, name: str, record: dict) -> None:
+        self.records[name] = record
+        self.file.write(json.dumps([name, record]) + "\n")
+        self.file.flush()

@@ -1,0 +1,236 @@
+"""Localize the queries of InLoc: 2D-3D matches through the scans of cutouts, PnP + RANSAC."""
+
+import argparse
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pycolmap
+from tqdm import tqdm
+
+from . import cli, io, localization, logger, scans, stamps
+from .cli import InputError
+from .io import GroupWriter, get_dataset, get_keypoints, list_h5_names, open_h5
+from .parsers import parse_query_lists, parse_retrieval
+
+RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
+RANSAC_SIZE = 4032  # the longer side of such a photo
+CACHED_IMAGES = 128  # points of so many cutouts stay in memory: 20 MB at 8,000 keypoints
+
+
+def main(
+    dataset_dir: Path,
+    retrieval: Path,
+    features: Path,
+    matches: Path,
+    results: Path,
+    skip_matches: int | None = None,
+    queries: Path | list[tuple[str, pycolmap.Camera]] | None = None,
+    ransac_thresh: float = RANSAC_THRESH,
+    points: Path | None = None,
+    overwrite: bool = False,
+) -> dict[str, dict]:
+    """Localize queries in a data set of InLoc's layout.
+
+    Takes what hloc's `localize_inloc.main` takes. Each floor has a frame of its own, so the
+    cutouts of each floor are matched together, and the pose with the most inliers is kept.
+
+    Args:
+        dataset_dir: the folder that image names are relative to.
+        retrieval: pairs of queries and cutouts, best first.
+        features: feature file of queries and cutouts.
+        matches: match file of the pairs.
+        results: text file of poses, camera from world, one line for every query that has one.
+        skip_matches: leave out cutouts with fewer matches.
+        queries: names and intrinsics, or the list of them, or a glob of lists; default: all
+            queries of the pairs, with the intrinsics of `by_iphone7`.
+        ransac_thresh: inliers reproject within so many pixels of a photo of 4032 pixels, of others
+            in proportion.
+        points: h5 file for the 3D points of the keypoints of all retrieved cutouts, from which
+            a later run goes on; default: `<features>-points3D.h5`.
+        overwrite: localize anew what is there.
+
+    Returns:
+        A record for each query, as `localization.main`; a query with too few inliers has the pose
+        that PnP found all the same, if any.
+
+    Raises:
+        InputError: when an input is missing or broken.
+    """
+    if ransac_thresh <= 0:
+        raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
+    retrieved = parse_retrieval(retrieval)
+    if isinstance(queries, Path):
+        queries = [query for part in parse_query_lists(queries).values() for query in part]
+    elif queries is None:
+        queries = by_iphone7(features, retrieved)
+    wanted = [cutout for name, _ in queries for cutout in retrieved.get(name, [])]
+    if not wanted:
+        raise InputError(f"{retrieval} has no pair of a query and a cutout.")
+    points = points or features.with_name(f"{features.stem}-points3D.h5")
+    lift_keypoints(dataset_dir, features, sorted(set(wanted)), points, overwrite)
+
+    def config(_: str, camera: pycolmap.Camera) -> dict:
+        scale = max(camera.width, camera.height) / RANSAC_SIZE
+        return {"estimation": {"ransac": {"max_error": ransac_thresh * scale}}}
+
+    options = {"ransac_thresh": ransac_thresh, "skip_matches": skip_matches}
+    options["queries"] = {name: [c.model.name, *c.params.tolist()] for name, c in queries}
+    with open_h5(points) as file:
+        return localization.main(
+            lambda: ScanMap(file),
+            queries,
+            retrieved,
+            features,
+            matches,
+            results,
+            config,
+            stamps.stamp(options, [retrieval, features, matches]),
+            overwrite,
+            skip_matches=skip_matches,
+        )
+
+
+def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap.Camera]]:
+    """Give queries of a feature file the intrinsics of the benchmark's: 28 mm on 35 mm film."""
+    queries = []
+    with open_h5(features) as file:
+        for name in names:
+            width, height = map(int, get_dataset(file, name, "image_size")[()])
+            params = [max(width, height) * 28 / 36, width / 2, height / 2]
+            camera = pycolmap.Camera(
+                model="SIMPLE_PINHOLE", width=width, height=height, params=params
+            )
+            queries.append((name, camera))
+    return queries
+
+
+def lift_keypoints(
+    dataset_dir: Path, features: Path, cutouts: list[str], output: Path, overwrite: bool = False
+) -> Path:
+    """Write the 3D points that the keypoints of cutouts show, reading each scan once.
+
+    Args:
+        dataset_dir: folder of the data set.
+        features: feature file.
+        cutouts: names of images.
+        output: h5 file, `points3D` (N, 3) float32 of each cutout: metres in the frame of its
+            floor, NaN where the scan has no depth.
+        overwrite: compute anew what is there.
+
+    Returns:
+        `output`; cutouts it holds already are skipped.
+
+    Raises:
+        InputError: when a scan or its transformation is missing or broken.
+    """
+    with open_h5(features) as file:
+        made_by = {"dataset": str(dataset_dir.resolve()), "features": io.provenance(file)}
+        with GroupWriter(output, made_by, overwrite) as writer:
+            todo = [name for name in cutouts if name not in writer]
+            needed = [
+                path
+                for name in todo
+                for path in (
+                    dataset_dir / f"{name}.mat",
+                    scans.transformation_file(dataset_dir, name),
+                )
+            ]
+            missing = [str(path) for path in needed if not path.is_file()]
+            if missing:
+                raise InputError(f"{len(missing)} files of scans are missing: {missing[0]}, ...")
+            for name in tqdm(todo, desc="Reading scans", unit="scan"):
+                keypoints, _ = get_keypoints(file, name)
+                scan = scans.read_scan(dataset_dir / f"{name}.mat")
+                scale = scan.shape[1::-1] / get_dataset(file, name, "image_size")[()]
+                points = scans.interpolate(scan, (keypoints + 0.5) * scale - 0.5)
+                pose = scans.read_transformation(scans.transformation_file(dataset_dir, name))
+                points = points @ pose[:3, :3].T + pose[:3, 3]
+                known = np.isfinite(points[:, 0]).mean() if len(points) else 1
+                if known < 0.5:
+                    logger.warning("%.0f %% of the keypoints of %s have depth.", 100 * known, name)
+                writer.add(name, {"points3D": points.astype(np.float32)})
+    return output
+
+
+class ScanMap:
+    """Keypoints of cutouts and the points that they show, as a `localization.Reference`.
+
+    Args:
+        file: open h5 file of `lift_keypoints`.
+    """
+
+    def __init__(self, file: h5py.File):
+        self.file = file
+        self.points = lru_cache(CACHED_IMAGES)(self._read)
+        # by name, so that no order of queries or cutouts changes anything
+        self.numbers = {
+            name: i for i, name in enumerate(sorted(list_h5_names(Path(file.filename))))
+        }
+
+    def _read(self, name: str) -> np.ndarray:
+        return get_dataset(self.file, name, "points3D")[()].astype(np.float64)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.numbers
+
+    def num_keypoints(self, name: str) -> int:
+        """Return how many keypoints a cutout has."""
+        return len(self.points(name))
+
+    def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ids and coordinates of the points that keypoints of a cutout show.
+
+        Every keypoint of every cutout has a point of its own.
+        """
+        points = self.points(name)[keypoints]
+        ids = (self.numbers[name] << 32) + keypoints
+        return np.where(np.isfinite(points[:, 0]), ids, -1), points
+
+    def clusters(self, names: list[str]) -> list[list[str]]:
+        """Split cutouts by floor, the floor of the first one first."""
+        floors: dict[str, list[str]] = {}
+        for name in names:
+            floors.setdefault(scans.floor_of(name), []).append(name)
+        return list(floors.values())
+
+    def fallback(self, names: list[str]) -> None:
+        """Return None: a cutout has no pose."""
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.localize_inloc --dataset_dir datasets/inloc "
+        "--retrieval pairs-query-netvlad40.txt --features outputs/feats-dog-sift_sv64.h5 "
+        "--matches outputs/matches.h5 --results outputs/poses.txt",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--dataset_dir", type=Path, required=True, help="folder of the data set")
+    parser.add_argument("--retrieval", type=Path, required=True, help="pairs of queries, cutouts")
+    parser.add_argument("--features", type=Path, required=True, help="feature file")
+    parser.add_argument("--matches", type=Path, required=True, help="match file")
+    parser.add_argument("--results", type=Path, required=True, help="text file of poses")
+    parser.add_argument(
+        "--skip_matches", type=int, help="leave out cutouts with fewer matches with the query"
+    )
+    parser.add_argument(
+        "--queries",
+        type=Path,
+        help="query list with intrinsics, or a glob (default: those of the pairs, by an iPhone 7)",
+    )
+    parser.add_argument(
+        "--ransac_thresh",
+        type=float,
+        default=RANSAC_THRESH,
+        help="inliers reproject within so many pixels of a photo of 4032 pixels, of others in "
+        "proportion",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="localize anew what is there")
+    main(**vars(parser.parse_args()))
+
+
+if __name__ == "__main__":
+    cli.run(_main)

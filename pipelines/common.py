@@ -1,0 +1,192 @@
+"""What the pipelines share: options, retrieval, and what a run leaves behind."""
+
+import argparse
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import pycolmap
+
+from confs import features as features_confs
+from confs import matchers as matchers_confs
+from hloc_reduce import aggregate_features, cli, logger, pairs_from_retrieval, results
+from hloc_reduce.cli import InputError
+from hloc_reduce.io import list_h5_names
+from hloc_reduce.parsers import parse_retrieval
+from hloc_reduce.versions import versions
+
+# suffix of a retrieval file -> what makes pairs of it; any other is a text file of pairs
+PAIRS_FROM = {".h5": pairs_from_retrieval.main, ".hdf5": pairs_from_retrieval.main}
+
+
+def add_dataset_options(
+    parser: argparse.ArgumentParser, outputs: str, truth: str, num_loc: int
+) -> None:
+    """Add the options of the pipelines of data sets.
+
+    Args:
+        parser: to add to.
+        outputs: the default of --outputs, in words.
+        truth: the default of --ground_truth, in words.
+        num_loc: the default of --num_loc.
+    """
+    parser.add_argument(
+        "--outputs",
+        type=Path,
+        help=f"folder for all results, of one configuration (default: {outputs})",
+    )
+    add_feature_options(parser)
+    parser.add_argument(
+        "--retrieval",
+        default="vlad",
+        metavar="vlad|FILE",
+        help="vlad, or hloc's text file of pairs or h5 file of global descriptors",
+    )
+    add_localization_options(parser, truth, num_loc)
+
+
+def add_feature_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of features and their matching."""
+    parser.add_argument(
+        "--feature",
+        default="sift_sv64",
+        help="local feature, see --list_features, or a YAML file with its configuration",
+    )
+    parser.add_argument(
+        "--projection",
+        type=Path,
+        help="file of a projection to use with the base descriptor of --feature",
+    )
+    parser.add_argument(
+        "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
+    )
+    parser.add_argument("--list_features", action="store_true", help="list the features and exit")
+
+
+def add_localization_options(parser: argparse.ArgumentParser, truth: str, num_loc: int) -> None:
+    """Add the options of localization; `truth` is the default of --ground_truth, in words."""
+    parser.add_argument("--num_loc", type=int, default=num_loc, help="map images of each query")
+    parser.add_argument(
+        "--ground_truth", type=Path, help=f"true poses of the queries (default: {truth})"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
+
+
+def check_options(args: argparse.Namespace) -> None:
+    """Check options of any pipeline.
+
+    Raises:
+        InputError: for a wrong one.
+        SystemExit: after the features are listed.
+    """
+    if args.list_features:
+        print("\n".join(features_confs.confs))
+        raise SystemExit(0)
+    if args.matcher is not None:
+        cli.choose("matcher", args.matcher, matchers_confs.confs)
+    retrieval = vars(args).get("retrieval", "vlad")
+    if retrieval != "vlad" and not Path(retrieval).is_file():
+        raise InputError(f"--retrieval {retrieval}: neither vlad nor a file that is there.")
+    for option, value in vars(args).items():
+        if option.startswith("num_") and value < 1:
+            raise InputError(f"--{option} {value}: at least 1.")
+
+
+def retrieval_name(retrieval: str, num_loc: int) -> str:
+    """Return what files are called after: `netvlad40` of `pairs-query-netvlad50.txt` and 40."""
+    name = Path(retrieval).stem.removeprefix("pairs-query-")
+    return f"{name.rstrip('0123456789')}{num_loc}"
+
+
+def check_retrieval(
+    retrieval: str, output: Path, query_names: list[str], map_names: list[str]
+) -> None:
+    """Refuse a broken file, or one of other images, or `output`, before any work is done."""
+    if retrieval == "vlad":
+        return
+    if Path(retrieval).resolve() == output.resolve():
+        raise InputError(f"--retrieval {retrieval} would be overwritten: move it elsewhere.")
+    if Path(retrieval).suffix in PAIRS_FROM:
+        list_h5_names(Path(retrieval))
+        return
+    retrieved, names = parse_retrieval(Path(retrieval)), set(map_names)
+    if not any(names & set(retrieved.get(name, ())) for name in query_names):
+        raise InputError(f"{retrieval} has no pair of a query and a map image.")
+
+
+def retrieve(
+    retrieval: str,
+    features: Path | None,
+    output: Path,
+    num_loc: int,
+    query_names: list[str],
+    map_names: list[str],
+) -> Path:
+    """Write the pairs of queries and map images, from a file or by VLAD of `features`."""
+    if retrieval == "vlad":
+        descriptors = aggregate_features.main(aggregate_features.confs["vlad"], features, map_names)
+    else:
+        descriptors = Path(retrieval)
+    select = PAIRS_FROM.get(descriptors.suffix, pairs_from_retrieval.select)
+    return select(descriptors, output, num_loc, query_list=query_names, db_list=map_names)
+
+
+def finish(
+    folder: results.RunFolder,
+    summary: dict,
+    lists: Mapping[str, Iterable[str]],
+    records: Mapping[str, dict],
+    truth: Mapping[str, pycolmap.Rigid3d],
+    thresholds: Mapping[str, tuple[tuple[float, float], ...]],
+    features: Path,
+    poses: Path,
+) -> dict:
+    """Write queries.csv and summary.json.
+
+    Args:
+        folder: of the run.
+        summary: its configuration and counts, which the summary begins with.
+        lists: the queries of each list.
+        records: of each query, as from `localization.main`.
+        truth: true poses, camera from world, of some queries or none.
+        thresholds: of each list, metres and degrees.
+        features: the feature file.
+        poses: the file of poses.
+
+    Returns:
+        The summary.
+    """
+    rows = results.query_table(lists, records, truth)
+    results.write_csv(rows, folder.path / "queries.csv")
+    summary = {
+        **summary,
+        "queries": len(rows),
+        "queries_localized": sum(row["status"] == "localized" for row in rows),
+        "lists": {
+            name: results.summarize_list(
+                [row for row in rows if row["list"] == name], thresholds[name]
+            )
+            for name in lists
+        },
+        "bytes_per_keypoint": results.bytes_per_keypoint(features),
+        "seconds": folder.seconds(),
+        "versions": versions(),
+        "poses": poses.name,
+    }
+    results.write_summary(summary, folder.path / "summary.json")
+    return summary
+
+
+def print_result(summary: dict, outputs: Path, unknown: str) -> None:
+    """Print recall, or where no true pose is known the message `unknown`."""
+    logger.info(
+        "Localized %d of %d queries in %.0f s; %d bytes a descriptor. Results are in %s.",
+        summary["queries_localized"],
+        summary["queries"],
+        sum(summary["seconds"].values()),
+        summary["bytes_per_keypoint"]["descriptor"],
+        outputs,
+    )
+    if any("recall_percent" in result for result in summary["lists"].values()):
+        print(results.recall_table(summary["feature"], summary["lists"]))
+    else:
+        print(f"The true poses are not known here. {unknown.format(outputs / summary['poses'])}")

@@ -1,0 +1,134 @@
+"""Localize the queries of InLoc, or of any RGB-D place in its layout.
+
+Extracts features, retrieves cutouts for each query, lifts their keypoints to 3D by the scans and
+estimates the query's pose; a run that was stopped goes on where it was.
+"""
+
+import argparse
+from pathlib import Path
+
+from confs import features as features_confs
+from confs import matchers as matchers_confs
+from hloc_reduce import (
+    cli,
+    extract_features,
+    extractors,
+    localize_inloc,
+    match_features,
+    results,
+)
+from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
+from hloc_reduce.parsers import parse_retrieval
+
+from . import common
+
+
+def main(
+    dataset: Path,
+    outputs: Path,
+    feature: str = "sift_sv64",
+    matcher: str = "NN-ratio",
+    retrieval: str = "vlad",
+    num_loc: int = 40,
+    ground_truth: Path | None = None,
+    overwrite: bool = False,
+    projection: Path | None = None,
+) -> dict:
+    """Run all stages and return the summary, as in summary.json."""
+    feature, feature_conf = features_confs.get(feature, projection)
+    matcher_conf = matchers_confs.confs[matcher]
+    place = InLoc(dataset)
+    map_names, query_names = place.map_names(), place.query_names()
+    truth = true_poses(query_names, ground_truth or place.ground_truth, bool(ground_truth))
+    lists = place.buildings(query_names, truth)
+    retrieved = common.retrieval_name(retrieval, num_loc)
+    loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
+    common.check_retrieval(retrieval, loc_pairs, query_names, map_names)
+
+    if overwrite or not (outputs / "conf.json").exists():
+        extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
+    folder = results.RunFolder(
+        outputs,
+        {
+            "dataset": str(dataset.resolve()),
+            "feature": extract_features.provenance(feature_conf, as_half=True),
+            "matcher": matcher_conf["model"],
+            "retrieval": retrieval,
+            "num_loc": num_loc,
+        },
+        overwrite,
+    )
+    poses = outputs / f"InLoc_hloc_{feature}+{matcher}_{retrieved}.txt"
+
+    if retrieval != "vlad":  # what is not retrieved needs no features
+        with folder.stage("retrieval"):
+            common.retrieve(retrieval, None, loc_pairs, num_loc, query_names, map_names)
+        map_names = sorted({n for names in parse_retrieval(loc_pairs).values() for n in names})
+    with folder.stage("extract_features"):
+        names = [*map_names, *query_names]
+        features = extract_features.main(feature_conf, dataset, outputs, image_list=names)
+    if retrieval == "vlad":
+        with folder.stage("retrieval"):
+            common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
+    with folder.stage("match_queries"):
+        matches = match_features.main(matcher_conf, loc_pairs, features.stem, outputs)
+    with folder.stage("localization"):
+        records = localize_inloc.main(
+            dataset,
+            loc_pairs,
+            features,
+            matches,
+            poses,
+            queries=place.queries(features),
+            ransac_thresh=place.ransac_thresh,
+        )
+
+    summary = {
+        "feature": feature,
+        "matcher": matcher,
+        "retrieval": retrieval,
+        "dataset": str(dataset),
+        "num_loc": num_loc,
+        "map_images": len(map_names),
+    }
+    limits = dict.fromkeys(lists, INLOC_THRESHOLDS)
+    return common.finish(folder, summary, lists, records, truth, limits, features, poses)
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m pipelines.inloc --feature sift_sv64 "
+        "--retrieval pairs-query-netvlad40.txt",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument(
+        "--dataset", type=Path, default=Path("datasets/inloc"), help="folder of the data set"
+    )
+    common.add_dataset_options(
+        parser,
+        outputs="outputs/<dataset>/<feature>",
+        truth="<dataset>/ground_truth_poses.txt",
+        num_loc=40,
+    )
+    args = parser.parse_args()
+    common.check_options(args)
+    feature, _ = features_confs.get(args.feature, args.projection)
+    outputs = args.outputs or Path("outputs") / args.dataset.name / feature
+    summary = main(
+        args.dataset,
+        outputs,
+        args.feature,
+        args.matcher,
+        args.retrieval,
+        args.num_loc,
+        args.ground_truth,
+        args.overwrite,
+        args.projection,
+    )
+    submit = "For recall, submit {} to https://www.visuallocalization.net."
+    common.print_result(summary, outputs, submit)
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,265 @@
+"""Localization by RGB-D scans, on a plane whose geometry is known and on a real place."""
+
+import csv
+import json
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pycolmap
+import pytest
+from conftest import SHARED
+from scipy.io import savemat
+
+from hloc_reduce import cli, localize_inloc, scans
+from hloc_reduce.cli import InputError
+from hloc_reduce.datasets import InLoc
+from pipelines import inloc
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["inloc", *map(str, arguments)])
+    cli.run(inloc._main)
+
+
+def refused(monkeypatch, caplog, *arguments):
+    """Run with wrong input: exit code 2, one or two lines, no traceback; return the message."""
+    caplog.clear()
+    with pytest.raises(SystemExit) as exit:
+        run(monkeypatch, *arguments)
+    assert exit.value.code == 2
+    (message,) = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
+    assert message.count("\n") < 2
+    return message
+
+
+@pytest.fixture(autouse=True)
+def propagated(monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
+
+
+def outcome(outputs):
+    with (outputs / "queries.csv").open() as file:
+        rows = {row["query"].rpartition("/")[2]: row for row in csv.DictReader(file)}
+    return json.loads((outputs / "summary.json").read_text()), rows
+
+
+def test_points_between_pixels_by_hand():
+    """The point of pixel (x, y) is (x, y, x * y), but for two pixels without depth."""
+    y, x = np.mgrid[:4, :5].astype(float)
+    scan = np.stack([x, y, x * y], -1)
+    scan[1, 3] = scan[3, 4] = np.nan
+    for keypoint, expected in (
+        ((0.5, 0.25), (0.5, 0.25, 0.125)),
+        ((1, 2), (1, 2, 2)),
+        ((2.25, 1.75), (2, 2, 4)),  # its neighbour (3, 1) has no depth, the nearest has
+        ((2.8, 1.3), (3, 2, 6)),  # the nearest has none, (3, 2) is nearer than (2, 1)
+        ((-0.4, 0), (0, 0, 0)),  # outside: on the border
+        ((4.3, 2.6), (4, 2, 8)),  # (4, 3) has no depth
+        ((1.5, 3), (1.5, 3, 4.5)),
+    ):
+        np.testing.assert_allclose(scans.interpolate(scan, np.array([keypoint])), [expected])
+    # where one pixel itself has no depth, one beside it is taken
+    assert np.abs(scans.interpolate(scan, np.array([[3, 1]]))[0, :2] - [3, 1]).sum() == 1
+    some = np.random.default_rng(0).uniform(-1, 5, (20, 2))
+    assert np.isnan(scans.interpolate(np.full((2, 2, 3), np.nan), some)).all()
+    assert scans.interpolate(scan[:1, :1], some).tolist() == [[0, 0, 0]] * 20
+    assert scans.interpolate(scan, np.zeros((0, 2))).shape == (0, 3)
+
+
+def test_files_of_scans_are_checked(tmp_path):
+    name = "database/cutouts/DUC1/024/DUC_cutout_024_0_-30.jpg"
+    path = tmp_path / "database/alignments/DUC1/transformations/DUC_trans_024.txt"
+    assert scans.transformation_file(tmp_path, name) == path and scans.floor_of(name) == "DUC1"
+    with pytest.raises(InputError, match="not the name of a cutout"):
+        scans.floor_of("query/a.jpg")
+    for text in ("", "\n" * 7 + "1 2 3\n" * 4, "\n" * 7 + "1 2 x 4\n" * 4, "\n" * 7 + "nan " * 4):
+        path = tmp_path / "trans.txt"
+        path.write_text(text)
+        with pytest.raises(InputError, match="trans.txt"):
+            scans.read_transformation(path)
+    mat = tmp_path / "a.mat"
+    for content in ({"other": np.zeros(3)}, {"XYZcut": np.zeros((4, 4))}, {"XYZcut": "text"}):
+        savemat(mat, content)
+        with pytest.raises(InputError, match="a.mat"):
+            scans.read_scan(mat)
+    savemat(mat, {"XYZcut": np.zeros((4, 4, 3))})
+    content = mat.read_bytes()
+    for broken in (b"", b"no matlab", content[:200], content[:-50]):
+        mat.write_bytes(broken)
+        with pytest.raises(InputError, match="a.mat"):
+            scans.read_scan(mat)
+    with pytest.raises(InputError, match="absent.mat"):
+        scans.read_scan(tmp_path / "absent.mat")
+
+
+def test_intrinsics_of_the_benchmark(tmp_path):
+    with h5py.File(tmp_path / "f.h5", "w") as file:
+        file["a/image_size"] = np.array([4032, 3024])
+        file["b/image_size"] = np.array([3024, 4032])
+    (_, wide), (_, high) = localize_inloc.by_iphone7(tmp_path / "f.h5", ["a", "b"])
+    assert wide.params.tolist() == [3136, 2016, 1512]
+    assert high.params.tolist() == [3136, 1512, 2016] and (high.width, high.height) == (3024, 4032)
+
+
+def test_plane(inloc_layout, tmp_path, monkeypatch, capsys):
+    outputs = tmp_path / "outputs"
+    arguments = ("--dataset", inloc_layout, "--feature", "sift_sv32", "--outputs")
+    read, original = [], scans.read_scan
+    monkeypatch.setattr(scans, "read_scan", lambda path: read.append(path) or original(path))
+    run(monkeypatch, *arguments, outputs)
+    assert len(read) == len(set(read)) == 4  # of three queries
+    summary, rows = outcome(outputs)
+    # all are nearest to scans of PLA1, which more of the plane's photos are in
+    assert {row["list"] for row in rows.values()} == {"PLA1"}
+    for name in ("a.JPG", "b.JPG"):
+        assert rows[name]["status"] == "localized"
+        assert float(rows[name]["position_error_m"]) < 0.02
+        assert "/PLA1/" in rows[name]["retrieved"]
+        assert int(rows[name]["num_without_point"]) > 0  # of the columns without depth
+    assert rows["a.JPG"]["num_inliers"] == rows["b.JPG"]["num_inliers"]
+    grey = rows["grey.JPG"]
+    assert grey["status"] == "failed" and grey["position_error_m"] == "inf"
+    result = summary["lists"]["PLA1"]
+    assert result["recall_percent"] == [66.67] * 3
+    assert result["thresholds_m_deg"] == [[0.25, 10], [0.5, 10], [1, 10]]
+    poses = (outputs / summary["poses"]).read_text()
+    assert [line.split()[0] for line in poses.splitlines()] == ["a.JPG", "b.JPG"]
+    assert "66.7 / 66.7 / 66.7" in capsys.readouterr().out
+
+    # a second run computes nothing anew and says the same
+    times = {path: path.stat().st_mtime_ns for path in outputs.rglob("*.h5")}
+    run(monkeypatch, *arguments, outputs)
+    assert {path: path.stat().st_mtime_ns for path in times} == times and len(read) == 4
+    assert (outputs / summary["poses"]).read_text() == poses
+
+    # and so does one from nothing, of the queries in another order
+    queries = inloc_layout / "queries_with_intrinsics.txt"
+    queries.write_text("\n".join(reversed(queries.read_text().splitlines())))
+    run(monkeypatch, *arguments, tmp_path / "again")
+    again = (tmp_path / "again" / summary["poses"]).read_text()
+    assert sorted(again.splitlines()) == sorted(poses.splitlines())
+    assert outcome(tmp_path / "again")[1] == rows
+
+
+def test_points_are_those_of_the_plane(inloc_layout, tmp_path, monkeypatch):
+    """In the frame of the floor: z = 0, at the pixel that sees it."""
+    run(monkeypatch, "--dataset", inloc_layout, "--feature", "sift", "--outputs", tmp_path / "o")
+    model = pycolmap.Reconstruction(inloc_layout.parent / "model")
+    camera = next(iter(model.cameras.values()))
+    with (
+        h5py.File(tmp_path / "o/feats-dog-sift.h5") as features,
+        h5py.File(tmp_path / "o/feats-dog-sift-points3D.h5") as points,
+    ):
+        for number in range(4):
+            floor = "PLA2" if number == 3 else "PLA1"
+            name = f"database/cutouts/{floor}/00{number}/PLA_cutout_00{number}_0_0.jpg"
+            xyz = points[name]["points3D"][:].astype(float)
+            keypoints = features[name]["keypoints"][:]
+            without = np.isnan(xyz).any(1)
+            assert (without == (keypoints[:, 0] < 39)).all() and without.any()
+            xyz, keypoints = xyz[~without], keypoints[~without]
+            xyz[:, 0] -= 100 * (number == 3)
+            np.testing.assert_allclose(xyz[:, 2], 0, atol=1e-4)
+            pose = model.find_image_with_name(f"{number}.png").cam_from_world()
+            pixels = camera.img_from_cam(xyz @ pose.rotation.matrix().T + pose.translation)
+            inside = keypoints[:, 0] > 40
+            np.testing.assert_allclose(pixels[inside], keypoints[inside] + 0.5, atol=0.02)
+
+
+def test_retrieval_by_hlocs_pairs(inloc_layout, tmp_path, monkeypatch):
+    """Only what is retrieved is read; a query of which nothing is retrieved has no pose."""
+    pairs = tmp_path / "pairs-query-netvlad40.txt"
+    cutouts = [f"database/cutouts/PLA1/00{i}/PLA_cutout_00{i}_0_0.jpg" for i in (2, 1)]
+    pairs.write_text("".join(f"query/iphone7/a.JPG {cutout}\n" for cutout in cutouts))
+    outputs = tmp_path / "outputs"
+    (inloc_layout / "ground_truth_poses.txt").unlink()
+    (inloc_layout / "database/cutouts/PLA2/003/PLA_cutout_003_0_0.jpg").write_bytes(b"no image")
+    run(
+        monkeypatch,
+        *("--dataset", inloc_layout, "--outputs", outputs, "--retrieval", pairs),
+        *("--num_loc", 30),
+    )
+    summary, rows = outcome(outputs)
+    assert summary["poses"] == "InLoc_hloc_sift_sv64+NN-ratio_netvlad30.txt"
+    assert summary["map_images"] == 2 and list(summary["lists"]) == ["query"]
+    assert rows["a.JPG"]["status"] == "localized" and rows["a.JPG"]["retrieved"] == cutouts[0]
+    assert rows["b.JPG"]["status"] == "failed" and rows["b.JPG"]["retrieved"] == ""
+
+
+def test_queries_of_the_benchmark(inloc_layout, tmp_path, monkeypatch):
+    """Without a list all photos in the folder are queries, taken with an iPhone 7."""
+    (inloc_layout / "queries_with_intrinsics.txt").unlink()
+    place = InLoc(inloc_layout)
+    assert place.query_names() == [f"query/iphone7/{name}.JPG" for name in ("a", "b", "grey")]
+    run(monkeypatch, "--dataset", inloc_layout, "--outputs", tmp_path / "o")
+    _, rows = outcome(tmp_path / "o")
+    # its focal length is 373 pixels there, not 500: closer, but localized
+    assert rows["a.JPG"]["status"] == "localized"
+    assert 0.05 < float(rows["a.JPG"]["position_error_m"]) < 1
+
+
+def test_queries_without_matches_do_not_stop_the_others(inloc_layout, tmp_path, monkeypatch):
+    run(monkeypatch, "--dataset", inloc_layout, "--outputs", tmp_path / "o")
+    (matches,) = (tmp_path / "o").glob("*_matches-*.h5")
+    with h5py.File(matches, "a") as file:
+        for pair in [name for name in file if "a.JPG" in name]:
+            del file[pair]
+    records = localize_inloc.main(
+        inloc_layout,
+        tmp_path / "o/pairs-query-vlad40.txt",
+        tmp_path / "o/feats-dog-sift_sv64.h5",
+        matches,
+        tmp_path / "poses.txt",
+    )
+    assert not records["query/iphone7/a.JPG"]["localized"]
+    assert records["query/iphone7/a.JPG"]["qvec"] is None
+    assert records["query/iphone7/b.JPG"]["localized"]
+    strict = localize_inloc.main(
+        inloc_layout,
+        tmp_path / "o/pairs-query-vlad40.txt",
+        tmp_path / "o/feats-dog-sift_sv64.h5",
+        matches,
+        tmp_path / "poses.txt",
+        skip_matches=10_000,
+    )
+    assert strict["query/iphone7/b.JPG"]["num_matches"] == 0
+
+
+def test_wrong_input(inloc_layout, tmp_path, monkeypatch, caplog):
+    arguments = ("--dataset", inloc_layout, "--outputs", tmp_path / "o")
+    message = refused(monkeypatch, caplog, "--dataset", tmp_path / "nowhere")
+    for part in ("query", "database/cutouts", "database/alignments", "visuallocalization.net"):
+        assert part in message
+    assert "--num_loc 0" in refused(monkeypatch, caplog, *arguments, "--num_loc", 0)
+    mat = inloc_layout / "database/cutouts/PLA1/001/PLA_cutout_001_0_0.jpg.mat"
+    content = mat.read_bytes()
+    mat.unlink()
+    assert f"1 files of scans: {mat}" in refused(monkeypatch, caplog, *arguments)
+    mat.write_bytes(content[: len(content) // 2])
+    assert not (tmp_path / "o").exists()
+    assert f"Cannot read the scan {mat}" in refused(monkeypatch, caplog, *arguments)
+    mat.write_bytes(content)
+    run(monkeypatch, *arguments)  # goes on where it was stopped
+    queries = inloc_layout / "queries_with_intrinsics.txt"
+    text = queries.read_text()
+    queries.write_text(text + text.splitlines()[0])
+    assert "a.JPG is listed twice" in refused(monkeypatch, caplog, *arguments)
+    pairs = tmp_path / "o/pairs-query-vlad40.txt"
+    queries.write_text(text)
+    message = refused(monkeypatch, caplog, *arguments, "--retrieval", pairs)
+    assert "would be overwritten" in message
+
+
+@pytest.mark.skipif(not (SHARED / "scripts").is_dir(), reason="no real place on this machine")
+def test_redkitchen(tmp_path, monkeypatch):
+    """The whole job on a real place, recorded by a depth camera."""
+    root = tmp_path / "redkitchen"
+    script = SHARED / "scripts/make_inloc_layout.py"
+    source = SHARED / "inloc_like/redkitchen"
+    subprocess.run([sys.executable, script, source, root], check=True)
+    run(monkeypatch, "--dataset", root, "--outputs", tmp_path / "o", "--feature", "sift_sv16")
+    result = outcome(tmp_path / "o")[0]["lists"]["RDK1"]
+    assert result["queries"] == 20 and result["recall_percent"][0] >= 90
+    assert result["median_position_error_m"] < 0.02
