@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from confs import retrieval as retrieval_confs
 
-from . import cli, colmap, extractors, io, logger
+from . import cli, colmap, extractors, io, logger, stamps
 from .base_model import dynamic_load
 from .cli import InputError
 from .extractors.vlad import read_vocabulary
@@ -23,7 +23,7 @@ confs = retrieval_confs.confs
 def main(
     conf: dict,
     features: Path,
-    vocabulary_images: list[str],
+    vocabulary_images: list[str] | Path,
     export_dir: Path | None = None,
     overwrite: bool = False,
 ) -> Path:
@@ -32,7 +32,8 @@ def main(
     Args:
         conf: an entry of `confs`.
         features: feature file.
-        vocabulary_images: the images whose features the vocabulary is learned from: the map's.
+        vocabulary_images: the images whose features the vocabulary is learned from: the map's; or
+            the file of a vocabulary that was learned before.
         export_dir: where `<conf["output"]>_<features>.h5` and the vocabulary go; default: beside
             the features.
         overwrite: learn and compute anew what is there.
@@ -47,12 +48,15 @@ def main(
     model = dynamic_load(extractors, conf["model"]["name"])(conf["model"]).eval()
     with open_h5(features) as file:
         made_by = {"model": conf["model"], "features": io.provenance(file)}
+        learned = isinstance(vocabulary_images, Path)
+        vocabulary = vocabulary_images if learned else vocabulary_of(output)
+        if learned:
+            made_by["vocabulary"] = stamps.sha256(vocabulary)
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [name for name in list_h5_names(features) if name not in writer]
             if not todo:
                 return output
-            vocabulary = output.with_suffix(".vocabulary.safetensors")
-            if overwrite or not vocabulary.exists():
+            if not learned and (overwrite or not vocabulary.exists()):
                 if writer.names:
                     raise InputError(f"The vocabulary {vocabulary} of {output} is gone: overwrite.")
                 model.fit(_sample(file, vocabulary_images, conf["model"]["max_samples"]))
@@ -65,6 +69,11 @@ def main(
                 writer.add(name, {"global_descriptor": descriptor.half().numpy()})
     logger.info("Global descriptors are in %s.", output)
     return output
+
+
+def vocabulary_of(descriptors: Path) -> Path:
+    """Return the file of the vocabulary that was learned for a file of global descriptors."""
+    return descriptors.with_suffix(".vocabulary.safetensors")
 
 
 def _sample(file: h5py.File, names: list[str], max_samples: int) -> np.ndarray:

@@ -105,36 +105,61 @@ def cam_from_img(camera: pycolmap.Camera, points2D: np.ndarray) -> np.ndarray:
     return np.nan_to_num(np.asarray(points, np.float64), nan=np.inf)
 
 
-def write_database(
-    path: Path,
-    reference: pycolmap.Reconstruction,
+def write_reference(database: Path, reference: pycolmap.Reconstruction) -> None:
+    """Begin a COLMAP database with the cameras and images of a model, and their ids."""
+    with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
+        for camera in reference.cameras.values():
+            opened.write_camera(camera, use_camera_id=True)
+        for rig in reference.rigs.values():
+            opened.write_rig(rig, use_rig_id=True)
+        for frame in reference.frames.values():
+            opened.write_frame(frame, use_frame_id=True)
+        for image in reference.images.values():
+            opened.write_image(image, use_image_id=True)
+
+
+def import_images(
+    database: Path,
+    image_dir: Path,
+    names: list[str],
+    camera_mode: pycolmap.CameraMode,
+    options: dict,
+) -> None:
+    """Begin a COLMAP database with images, and cameras guessed from their EXIF data.
+
+    Raises:
+        InputError: for an option that there is not.
+    """
+    with pycolmap.Database.open(database):
+        pass
+    try:
+        reader = pycolmap.ImageReaderOptions(options)
+    except (AttributeError, TypeError, RuntimeError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"The image options {options} cannot be used ({reason}).") from None
+    pycolmap.import_images(database, image_dir, camera_mode, image_names=names, options=reader)
+
+
+def write_matches(
+    database: Path,
     keypoints: dict[str, np.ndarray],
     matches: dict[tuple[str, str], tuple[np.ndarray, np.ndarray | None]],
 ) -> None:
-    """Write a COLMAP database with the ids of a reference model.
+    """Write the keypoints and matches of the images of a COLMAP database.
 
     Args:
-        path: the new database.
-        reference: model with cameras, rigs, frames and images.
+        database: with the images.
         keypoints: from image name to (N, 2), COLMAP's pixels.
         matches: from two image names to all and to the verified matches, both (M, 2); None for
             those that `verify_matches` will verify.
     """
-    image_ids = {image.name: image.image_id for image in reference.images.values()}
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        for camera in reference.cameras.values():
-            database.write_camera(camera, use_camera_id=True)
-        for rig in reference.rigs.values():
-            database.write_rig(rig, use_rig_id=True)
-        for frame in reference.frames.values():
-            database.write_frame(frame, use_frame_id=True)
-        for image in reference.images.values():
-            database.write_image(image, use_image_id=True)
+    with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
+        image_ids = {image.name: image.image_id for image in opened.read_all_images()}
         for name, points in keypoints.items():
-            database.write_keypoints(image_ids[name], points.astype(np.float32))
+            opened.write_keypoints(image_ids[name], points.astype(np.float32))
         for (name0, name1), (all_matches, verified) in matches.items():
             ids = image_ids[name0], image_ids[name1]
-            database.write_matches(*ids, all_matches.astype(np.uint32))
+            opened.write_matches(*ids, all_matches.astype(np.uint32))
             if verified is None:
                 continue
             # from 4.2.1 on COLMAP skips a geometry whose configuration is undefined
@@ -142,7 +167,7 @@ def write_database(
                 config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
                 inlier_matches=verified.astype(np.uint32),
             )
-            database.write_two_view_geometry(*ids, geometry)
+            opened.write_two_view_geometry(*ids, geometry)
 
 
 def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
@@ -188,6 +213,37 @@ def triangulate_points(
             output,
             options=options,
         )
+
+
+def incremental_mapping(
+    database: Path,
+    image_dir: Path,
+    output: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    verbose: bool,
+) -> list[pycolmap.Reconstruction]:
+    """Reconstruct the images of a database of verified matches, the largest model first."""
+    output.mkdir()
+    with _log(verbose):
+        models = pycolmap.incremental_mapping(database, image_dir, output, options=options)
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+
+
+def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
+    """Guess the intrinsics of a photo: SIMPLE_RADIAL, its focal length by EXIF.
+
+    Returns:
+        The camera, and whether EXIF gave the focal length; else it is 1.2 times the longer side.
+
+    Raises:
+        InputError: when the image cannot be read.
+    """
+    try:
+        camera = pycolmap.infer_camera_from_image(image)
+    except Exception as error:  # RuntimeError, ValueError, by version
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"Cannot read image {image} ({reason}).") from None
+    return camera, camera.has_prior_focal_length
 
 
 @contextmanager

@@ -51,7 +51,8 @@ def main(
         db_list = [image.name for image in colmap.read_model(db_model).images.values()]
     query_names = _select(descriptors, query_prefix, query_list)
     db_names = _select(db_descriptors, db_prefix, db_list)
-    queries, database = _read(descriptors, query_names), _read(db_descriptors, db_names)
+    queries = read_global(descriptors, query_names)
+    database = read_global(db_descriptors, db_names)
     if queries.shape[1] != database.shape[1]:
         raise InputError(
             f"Global descriptors of {queries.shape[1]} numbers in {descriptors} and of "
@@ -59,15 +60,29 @@ def main(
         )
     pairs = []
     for start in range(0, len(queries), QUERY_BLOCK):
-        similarity = queries[start : start + QUERY_BLOCK] @ database.T
-        similarity[:, ~database.any(axis=1)] = -np.inf  # images without features come last
-        ranking = np.argsort(-similarity, axis=1, kind="stable")[:, : num_matched + 1]
+        ranking = rank(queries[start : start + QUERY_BLOCK], database, num_matched + 1)
         for name, row in zip(query_names[start:], ranking, strict=False):
             others = [db_names[j] for j in row if db_names[j] != name]
             pairs += [(name, other) for other in others[:num_matched]]
     write_pairs(pairs, output)
     logger.info("Retrieved %d pairs for %d queries.", len(pairs), len(query_names))
     return output
+
+
+def rank(queries: np.ndarray, database: np.ndarray, num_matched: int) -> np.ndarray:
+    """Find the most similar images of a database.
+
+    Args:
+        queries: (Q, G) global descriptors of unit norm.
+        database: (N, G) global descriptors of unit norm, or zero for images without features.
+        num_matched: how many to find, at most.
+
+    Returns:
+        (Q, num_matched) rows of the database, best first.
+    """
+    similarity = queries @ database.T
+    similarity[:, ~database.any(axis=1)] = -np.inf  # images without features come last
+    return np.argsort(-similarity, axis=1, kind="stable")[:, :num_matched]
 
 
 def select(
@@ -122,7 +137,12 @@ def _select(
     return selected
 
 
-def _read(path: Path, names: list[str]) -> np.ndarray:
+def read_global(path: Path, names: list[str]) -> np.ndarray:
+    """Read the global descriptors of images (N, G) float32.
+
+    Raises:
+        InputError: when an image has none, or they differ in size.
+    """
     with open_h5(path) as file:
         rows = [get_dataset(file, name, "global_descriptor")[()] for name in names]
     if len({row.shape for row in rows}) > 1:

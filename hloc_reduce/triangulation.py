@@ -2,9 +2,10 @@
 
 import argparse
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pycolmap
 from tqdm import tqdm
@@ -77,10 +78,49 @@ def main(
         logger.info("The map %s is up to date.", sfm_dir)
         return colmap.read_model(sfm_dir)
 
+    with replacing_map(sfm_dir, made_from, reference_model) as building:
+        database = building / "database.db"
+        colmap.write_reference(database, reference)
+        names = [image.name for image in reference.images.values()]
+        keypoints, uncertainty, found = read_matches(
+            names, pairs, features, matches, min_match_score
+        )
+        if skip_geometric_verification:
+            verified = {pair: (indices, indices) for pair, indices in found.items()}
+        elif estimate_two_view_geometries:
+            verified = {pair: (indices, None) for pair, indices in found.items()}
+        else:
+            verified = _verify_by_poses(reference, keypoints, uncertainty, found)
+        colmap.write_matches(database, keypoints, verified)
+        if estimate_two_view_geometries and not skip_geometric_verification:
+            colmap.verify_matches(database, pairs, verbose)
+        logger.info("Triangulating...")
+        reconstruction = colmap.triangulate_points(
+            reference, database, image_dir, building, mapper, verbose
+        )
+        if reconstruction.num_points3D() == 0:
+            raise InputError(
+                f"The map is empty: COLMAP triangulated no point from the matches {matches}. "
+                "Do the poses belong to these images, and do the pairs overlap?"
+            )
+    logger.info("The map %s:\n%s", sfm_dir, reconstruction.summary())
+    return reconstruction
+
+
+@contextmanager
+def replacing_map(
+    sfm_dir: Path, made_from: dict, reference_model: Path | None = None
+) -> Iterator[Path]:
+    """Give a new folder for a COLMAP model, and put it in the place of `sfm_dir` when it is whole.
+
+    Raises:
+        InputError: when `sfm_dir` is `reference_model` or holds something else than such a map.
+    """
     sfm_dir = sfm_dir.resolve()
     inside = {path.name for path in sfm_dir.iterdir()} if sfm_dir.is_dir() else set()
     of_hloc = "database.db" in inside and inside <= MADE_BY_HLOC
-    if inside and STAMP not in inside and not of_hloc or sfm_dir == reference_model.resolve():
+    is_reference = reference_model is not None and sfm_dir == reference_model.resolve()
+    if inside and STAMP not in inside and not of_hloc or is_reference:
         raise InputError(
             f"{sfm_dir} is not a map that this program or hloc triangulated, so it is not "
             "replaced. Choose another folder."
@@ -88,20 +128,7 @@ def main(
     building = sfm_dir.with_name(f".{sfm_dir.name}.tmp")
     shutil.rmtree(building, ignore_errors=True)
     building.mkdir(parents=True)
-    database = building / "database.db"
-    with open_h5(features) as feature_file, open_h5(matches) as match_file:
-        _fill_database(database, reference, pairs, feature_file, match_file, **verification)
-    if estimate_two_view_geometries and not skip_geometric_verification:
-        colmap.verify_matches(database, pairs, verbose)
-    logger.info("Triangulating...")
-    reconstruction = colmap.triangulate_points(
-        reference, database, image_dir, building, mapper, verbose
-    )
-    if reconstruction.num_points3D() == 0:
-        raise InputError(
-            f"The map is empty: COLMAP triangulated no point from the matches {matches}. "
-            "Do the poses belong to these images, and do the pairs overlap?"
-        )
+    yield building
     stamps.write(building / STAMP, made_from)
     replaced = sfm_dir.with_name(f".{sfm_dir.name}.old")
     shutil.rmtree(replaced, ignore_errors=True)
@@ -109,59 +136,82 @@ def main(
         sfm_dir.replace(replaced)
     building.replace(sfm_dir)
     shutil.rmtree(replaced, ignore_errors=True)
-    logger.info("The map %s:\n%s", sfm_dir, reconstruction.summary())
-    return reconstruction
 
 
-def _fill_database(
-    path: Path,
+def read_matches(
+    names: list[str], pairs: Path, features: Path, matches: Path, min_match_score: float | None
+) -> tuple[dict[str, np.ndarray], dict[str, float], dict[tuple[str, str], np.ndarray]]:
+    """Read the keypoints of images and the matches of pairs of them, each unordered pair once.
+
+    Args:
+        names: the images.
+        pairs: text file of pairs.
+        features: feature file.
+        matches: match file.
+        min_match_score: take matches of a higher score only.
+
+    Returns:
+        From image to keypoints (N, 2), COLMAP's pixels; from image to their uncertainty in
+        pixels; from pair to matches (M, 2).
+
+    Raises:
+        InputError: when something is missing, or a pair names another image.
+    """
+    keypoints, uncertainty, found = {}, {}, {}
+    with open_h5(features) as file:
+        for name in tqdm(names, desc="Reading keypoints", unit="image"):
+            keypoints[name], uncertainty[name] = get_colmap_keypoints(file, name)
+    with open_h5(matches) as file:
+        for name0, names1 in parse_retrieval(pairs).items():
+            for name1 in names1:
+                if name0 not in keypoints or name1 not in keypoints:
+                    absent = name1 if name0 in keypoints else name0
+                    raise InputError(f"{pairs}: image {absent} is not in the reference model.")
+                if name0 == name1 or (name0, name1) in found or (name1, name0) in found:
+                    continue
+                indices, scores = get_matches(file, name0, name1)
+                sizes = len(keypoints[name0]), len(keypoints[name1])
+                check_matches(indices, (name0, name1), sizes)
+                found[name0, name1] = (
+                    indices[scores > min_match_score] if min_match_score else indices
+                )
+    return keypoints, uncertainty, found
+
+
+def _verify_by_poses(
     reference: pycolmap.Reconstruction,
-    pairs: Path,
-    feature_file: h5py.File,
-    match_file: h5py.File,
-    skip_geometric_verification: bool,
-    estimate_two_view_geometries: bool,
-    min_match_score: float | None,
-) -> None:
-    """Write cameras, poses, keypoints and the verified matches into a COLMAP database."""
-    images = {image.name: image for image in reference.images.values()}
-    keypoints, rays, thresholds = {}, {}, {}
-    for name, image in tqdm(images.items(), desc="Reading keypoints", unit="image"):
-        camera = reference.cameras[image.camera_id]
-        keypoints[name], uncertainty = get_colmap_keypoints(feature_file, name)
-        rays[name] = colmap.cam_from_img(camera, keypoints[name])
-        thresholds[name] = camera.cam_from_img_threshold(MAX_EPIPOLAR_ERROR * uncertainty)
+    keypoints: dict[str, np.ndarray],
+    uncertainty: dict[str, float],
+    matches: dict[tuple[str, str], np.ndarray],
+) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]:
+    """Find the matches that lie on the epipolar lines of the known poses.
 
+    Returns:
+        From pair to all matches and to those (M, 2).
+    """
+    poses, rays, thresholds = {}, {}, {}
+    for image in reference.images.values():
+        camera, name = reference.cameras[image.camera_id], image.name
+        poses[name] = image.cam_from_world()
+        rays[name] = colmap.cam_from_img(camera, keypoints[name])
+        thresholds[name] = camera.cam_from_img_threshold(MAX_EPIPOLAR_ERROR * uncertainty[name])
     verified, ratios = {}, []
-    for name0, names1 in parse_retrieval(pairs).items():
-        for name1 in names1:
-            if name0 not in images or name1 not in images:
-                absent = name1 if name0 in images else name0
-                raise InputError(f"{pairs}: image {absent} is not in the reference model.")
-            if name0 == name1 or (name0, name1) in verified or (name1, name0) in verified:
-                continue
-            matches, scores = get_matches(match_file, name0, name1)
-            check_matches(matches, (name0, name1), (len(keypoints[name0]), len(keypoints[name1])))
-            if min_match_score:
-                matches = matches[scores > min_match_score]
-            if skip_geometric_verification or estimate_two_view_geometries:
-                verified[name0, name1] = matches, matches if skip_geometric_verification else None
-                continue
-            errors0, errors1 = epipolar_errors(
-                images[name1].cam_from_world() * images[name0].cam_from_world().inverse(),
-                rays[name0][matches[:, 0]],
-                rays[name1][matches[:, 1]],
-            )
-            valid = (errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])
-            verified[name0, name1] = matches, matches[valid]
-            if len(matches):
-                ratios.append(valid.mean())
+    for (name0, name1), indices in matches.items():
+        errors0, errors1 = epipolar_errors(
+            poses[name1] * poses[name0].inverse(),
+            rays[name0][indices[:, 0]],
+            rays[name1][indices[:, 1]],
+        )
+        valid = (errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])
+        verified[name0, name1] = indices, indices[valid]
+        if len(indices):
+            ratios.append(valid.mean())
     if ratios:
         logger.info(
             "Matches on epipolar lines: mean %.1f %%, median %.1f %%, min %.1f %%, max %.1f %%.",
             *(100 * np.array([np.mean(ratios), np.median(ratios), min(ratios), max(ratios)])),
         )
-    colmap.write_database(path, reference, keypoints, verified)
+    return verified
 
 
 def epipolar_errors(

@@ -5,7 +5,6 @@ from the tracks.
 """
 
 import argparse
-import hashlib
 import json
 from pathlib import Path
 
@@ -13,10 +12,11 @@ import torch
 
 from confs import features as features_confs
 
-from .. import cli, extractors, logger, projections
+from .. import cli, extractors, logger, projections, stamps
 from ..cli import InputError
 from ..descriptors import DESCRIPTORS, DIM, check_weights
 from ..evaluation.phototour import fpr95
+from ..maps import Map, is_map
 from ..versions import versions
 from . import nested, pca, phototour, ss, sv, tracks, us
 
@@ -75,7 +75,7 @@ def main(
         name: tracks.main(images, model, cache / name, descriptor, seed, conf)
         for name, (images, model) in maps.items()
     }
-    checksums = {name: checksum(file) for name, file in files.items()}
+    checksums = {name: stamps.sha256(file) for name, file in files.items()}
     data = [tracks.load(file) for file in files.values()]
     size = data[0].descriptors.shape[-1]
     if max(paths) > size:
@@ -140,31 +140,35 @@ def base_of(conf: dict) -> dict:
     return {**conf, "model": conf["model"].get("base", conf["model"])}
 
 
-def checksum(path: Path) -> str:
-    """Return the sha256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
-    """Parse `images:model` pairs into name -> (images, model).
+    """Parse `images:model`, or folders of maps of `pipelines.localize`.
 
     A map is named after the folder that its images folder lies in.
+
+    Returns:
+        From name to the folders of images and of the COLMAP model.
+
+    Raises:
+        InputError: when a folder is not there, or two maps have one name.
     """
-    maps = {}
+    folders = {}
     for value in values:
-        images, separator, model = value.rpartition(":")
-        if not separator:
-            raise InputError(f"--map {value}: not of the form images:model.")
-        images, model = Path(images), Path(model)
+        if is_map(Path(value)):
+            built = Map(Path(value))
+            images, model = built.images, built.sfm
+        else:
+            images, separator, model = value.rpartition(":")
+            if not separator:
+                raise InputError(f"--map {value}: neither a map nor of the form images:model.")
+            images, model = Path(images), Path(model)
         for folder in (images, model):
             if not folder.is_dir():
                 raise InputError(f"--map {value}: there is no folder {folder}.")
         name = images.resolve().parent.name
-        if name in maps:
+        if name in folders:
             raise InputError(f"--map {value}: another map is called {name} too.")
-        maps[name] = images, model
-    return maps
+        folders[name] = images, model
+    return folders
 
 
 def _main() -> None:
@@ -201,8 +205,9 @@ def _main() -> None:
         "--map",
         action="append",
         default=[],
-        metavar="IMAGES:MODEL",
-        help="folder of images and folder of their COLMAP model; may be repeated",
+        metavar="IMAGES:MODEL|MAP",
+        help="folder of images and folder of their COLMAP model, or a map of pipelines.localize; "
+        "may be repeated",
     )
     parser.add_argument(
         "--phototour",

@@ -1,0 +1,217 @@
+"""Maps to localize in: the points, features and global descriptors of photos, kept in a folder."""
+
+import json
+import shutil
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+
+from confs import features as features_confs
+from confs import matchers as matchers_confs
+
+from . import (
+    aggregate_features,
+    colmap,
+    extract_features,
+    extractors,
+    logger,
+    match_features,
+    pairs_from_covisibility,
+    pairs_from_retrieval,
+    projections,
+    reconstruction,
+    stamps,
+    triangulation,
+)
+from .cli import InputError
+from .extract_features import list_images
+from .io import replacing
+from .results import FINISHED, RunFolder
+
+FINGERPRINTS = "fingerprints.json"
+RETRIEVAL = aggregate_features.confs["vlad"]
+
+
+class Map:
+    """A map that `main` made; what it needs is in its folder, which may be moved.
+
+    Args:
+        folder: of the map.
+
+    Raises:
+        InputError: when the folder is not there, is no map or not a finished one.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        try:
+            content = json.loads((folder / FINISHED).read_text())
+            self.id: str = content["id"]
+            self.feature: str = content["feature"]
+            self.matcher: str = content["matcher"]
+            self.images: Path = Path(content["image_dir"])
+            self._conf = content["conf"]
+        except (OSError, ValueError, KeyError, TypeError):
+            raise InputError(
+                f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}."
+            ) from None
+        missing = [path for path in (self.features, self.descriptors) if not path.is_file()]
+        if missing:
+            raise InputError(f"The map {folder} is broken: it has no {missing[0].name}.")
+
+    @property
+    def conf(self) -> dict:
+        """The configuration of the map's features, for more images."""
+        return _with_projection(self._conf, lambda name: str(self.folder / name))
+
+    @property
+    def sfm(self) -> Path:
+        """The folder of the COLMAP model."""
+        return self.folder / "sfm"
+
+    @property
+    def features(self) -> Path:
+        """The feature file of the map images."""
+        return self.folder / f"{self._conf['output']}.h5"
+
+    @property
+    def descriptors(self) -> Path:
+        """The h5 file of the global descriptors of the map images."""
+        return self.folder / f"{RETRIEVAL['output']}_{self.features.stem}.h5"
+
+    @property
+    def vocabulary(self) -> Path:
+        """The file of the vocabulary of the global descriptors."""
+        return aggregate_features.vocabulary_of(self.descriptors)
+
+    def names(self) -> list[str]:
+        """List the images that have a pose."""
+        return sorted(image.name for image in colmap.read_model(self.sfm).images.values())
+
+
+def main(
+    map_dir: Path,
+    image_dir: Path,
+    model: Path | None = None,
+    feature: str = "sift_sv64",
+    projection: Path | None = None,
+    matcher: str = "NN-ratio",
+    num_covis: int = 20,
+    overwrite: bool = False,
+) -> Map:
+    """Build a map, or open one that was made from the same.
+
+    Args:
+        map_dir: the folder of the map.
+        image_dir: folder of the images.
+        model: COLMAP model with their poses; None to reconstruct them, in a frame and scale of
+            their own.
+        feature: as in `confs.features.get`.
+        projection: likewise.
+        matcher: a key of `confs.matchers`.
+        num_covis: pairs of each image: the most covisible of the model, or if it has no points
+            the most similar.
+        overwrite: build anew.
+
+    Returns:
+        The map.
+
+    Raises:
+        InputError: when the folder has a map that was made from something else, or something is
+            missing or wrong.
+    """
+    feature, conf = features_confs.get(feature, projection)
+    matcher_conf = matchers_confs.confs[matcher]
+    model_files: dict[str, Path] = {}
+    names = None
+    if model is not None:
+        reference = colmap.read_model(model)
+        names = sorted(image.name for image in reference.images.values())
+        if not names:
+            raise InputError(f"The model {model} has no images.")
+        model_files = {
+            path.name: path
+            for path in sorted(model.iterdir())
+            if path.stem in triangulation.PARTS and path.is_file()
+        }
+    names = list_images(image_dir, names)
+    made_by = extract_features.provenance(conf, as_half=True)
+    if overwrite or not (map_dir / "conf.json").exists():
+        extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
+    files = {f"images/{name}": image_dir / name for name in names}
+    files |= {f"model/{name}": path for name, path in model_files.items()}
+    fingerprints = stamps.fingerprints(files, map_dir / FINGERPRINTS)
+    folder = RunFolder(
+        map_dir,
+        {
+            "feature": made_by,
+            "matcher": matcher_conf["model"],
+            "num_covis": num_covis,
+            "images": {name: fingerprints[f"images/{name}"][2] for name in names},
+            "model": {name: fingerprints[f"model/{name}"][2] for name in model_files},
+        },
+        overwrite,
+    )
+    if (map_dir / FINISHED).exists():
+        return Map(map_dir)
+
+    logger.info("Building the map %s of %d images.", map_dir, len(names))
+    stamps.write(map_dir / FINGERPRINTS, fingerprints)
+    conf = _keep_projection(conf, map_dir)
+    with folder.stage("extract_features"):
+        features = extract_features.main(conf, image_dir, map_dir, image_list=names)
+    with folder.stage("retrieval"):
+        descriptors = aggregate_features.main(RETRIEVAL, features, names)
+    pairs = map_dir / f"pairs-db-{num_covis}.txt"
+    with folder.stage("pairs"):
+        if model is not None and reference.num_points3D():
+            pairs_from_covisibility.main(model, pairs, num_covis)
+        else:
+            pairs_from_retrieval.main(descriptors, pairs, num_covis)
+    with folder.stage("match_map"):
+        matches = match_features.main(matcher_conf, pairs, features.stem, map_dir)
+    with folder.stage("triangulation" if model is not None else "reconstruction"):
+        inputs = (image_dir, pairs, features, matches)
+        if model is not None:
+            sfm = triangulation.main(map_dir / "sfm", model, *inputs)
+        else:
+            sfm = reconstruction.main(map_dir / "sfm", *inputs, image_list=names)
+    summary = {
+        "id": uuid.uuid4().hex,
+        "feature": feature,
+        "matcher": matcher,
+        "image_dir": str(image_dir.resolve()),
+        "model": str(model.resolve()) if model is not None else None,
+        "conf": _with_projection(conf, lambda path: Path(path).name),
+        "images": len(names),
+        "images_with_pose": sfm.num_reg_images(),
+        "points3D": sfm.num_points3D(),
+        "seconds": folder.seconds(),
+    }
+    stamps.write(map_dir / FINISHED, summary)
+    return Map(map_dir)
+
+
+def _with_projection(conf: dict, change: Callable[[str], str]) -> dict:
+    """Return the configuration of a feature with another path of its projection, if it has one."""
+    model = dict(conf["model"])
+    if model.get("projection") is not None:
+        model["projection"] = change(model["projection"])
+    return {**conf, "model": model}
+
+
+def _keep_projection(conf: dict, folder: Path) -> dict:
+    """Copy the projection of a feature into a folder and return the configuration with it."""
+
+    def copy(projection: str) -> str:
+        source, prefix = projections.find(projection), projections.split_prefix(projection)[1]
+        with replacing(folder / source.name) as temporary:
+            shutil.copyfile(source, temporary)
+        return f"{folder / source.name}{prefix and f'@{prefix}'}"
+
+    return _with_projection(conf, copy)
+
+
+def is_map(folder: Path) -> bool:
+    """Return whether a folder is a map of `main`'s, finished or not, rather than a COLMAP model."""
+    return any((folder / name).exists() for name in (FINISHED, FINGERPRINTS))

@@ -1,0 +1,245 @@
+"""Localize photos in a map of one's own.
+
+Builds the map from photos and a COLMAP model of them, or from photos alone, once; later runs
+localize other photos in it. Without --query_images only the map is built. The feature is sift_sv64
+and the matcher NN-ratio, if no other is given or the map is not of another.
+"""
+
+import argparse
+import re
+from collections import Counter
+from pathlib import Path
+
+from confs import features as features_confs
+from confs import matchers as matchers_confs
+from hloc_reduce import (
+    aggregate_features,
+    cli,
+    extract_features,
+    intrinsics,
+    localize_sfm,
+    logger,
+    maps,
+    match_features,
+    pairs_from_retrieval,
+    results,
+)
+from hloc_reduce.cli import InputError
+from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
+from hloc_reduce.maps import Map
+from hloc_reduce.parsers import parse_query_lists
+
+from . import common
+
+FEATURE, MATCHER = "sift_sv64", "NN-ratio"
+NOT_IN_NAMES = r"[^\w.-]+"  # of a glob
+
+
+def open_map(
+    outputs: Path,
+    map_images: Path | None = None,
+    map: Path | None = None,
+    feature: str | None = None,
+    projection: Path | None = None,
+    matcher: str | None = None,
+    num_covis: int = 20,
+    overwrite: bool = False,
+) -> Map:
+    """Build a map in `outputs`, or open one that was built before.
+
+    Args:
+        outputs: its folder map is that of a new map.
+        map_images: folder of the photos of the map; None to open `map`.
+        map: COLMAP model of the photos, or a map that was built.
+        feature: default: sift_sv64, or that of the map.
+        projection: of one's own.
+        matcher: default: NN-ratio, or that of the map.
+        num_covis: pairs of each map image.
+        overwrite: build anew.
+    """
+    if map_images is None:
+        if map is None:
+            raise InputError("Give --map_images, the folder of the photos to build a map of.")
+        built = Map(map)
+        name, _ = features_confs.get(feature or FEATURE, projection)
+        wanted = {"feature": name if feature or projection else None, "matcher": matcher}
+        for option, value in wanted.items():
+            if value not in (None, getattr(built, option)):
+                raise InputError(f"The map {map} is of --{option} {getattr(built, option)}.")
+        return built
+    if map is not None and maps.is_map(map):
+        raise InputError(
+            f"--map {map} is a map that was built: leave --map_images out to localize in it, "
+            "or give the COLMAP model that it was built from."
+        )
+    return maps.main(
+        outputs / "map",
+        map_images,
+        map,
+        feature or FEATURE,
+        projection,
+        matcher or MATCHER,
+        num_covis,
+        overwrite,
+    )
+
+
+def main(
+    built: Map,
+    query_images: Path,
+    outputs: Path,
+    queries: Path | None = None,
+    num_loc: int = 50,
+    ground_truth: Path | None = None,
+    overwrite: bool = False,
+) -> dict:
+    """Localize queries in a map and return the summary, as in summary.json."""
+    matcher_conf = matchers_confs.confs[built.matcher]
+    cameras = {}
+    if queries is None:
+        names = extract_features.list_images(query_images)
+        lists = {query_images.resolve().name: names}
+        cameras = {name: intrinsics.infer(query_images / name) for name in names}
+        queries = outputs / "queries_with_intrinsics.txt"
+    else:
+        parts = parse_query_lists(queries)
+        lists = {stem: [name for name, _ in part] for stem, part in parts.items()}
+    names = [name for part in lists.values() for name in part]
+    extract_features.list_images(query_images, names)
+    truth = true_poses(names, ground_truth, True) if ground_truth else {}
+
+    folder = results.RunFolder(
+        outputs,
+        {
+            "map": built.id,
+            "query_images": str(query_images.resolve()),
+            "queries": str(queries.resolve()),
+            "num_loc": num_loc,
+        },
+        overwrite,
+        renewed="map",
+    )
+    sources = dict.fromkeys(names, "list")
+    sources |= {name: source for name, (_, source) in cameras.items()}
+    if cameras:
+        intrinsics.write_queries(cameras, queries)
+    for source, said in (("EXIF", "from EXIF data"), ("guess", "guessed")):
+        if some := [name for name in names if sources[name] == source]:
+            logger.info(
+                "Intrinsics of %d queries are %s; the focal length is refined with the pose: %s",
+                *(len(some), said, ", ".join(some)),
+            )
+    loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
+    poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
+
+    with folder.stage("extract_features"):
+        features = extract_features.main(built.conf, query_images, outputs, image_list=names)
+    with folder.stage("retrieval"):
+        descriptors = aggregate_features.main(maps.RETRIEVAL, features, built.vocabulary)
+        pairs_from_retrieval.main(
+            descriptors,
+            loc_pairs,
+            num_loc,
+            query_list=names,
+            db_list=built.names(),
+            db_descriptors=built.descriptors,
+        )
+    with folder.stage("match_queries"):
+        matches = outputs / f"{features.stem}_{matcher_conf['output']}_{loc_pairs.stem}.h5"
+        match_features.main(
+            matcher_conf, loc_pairs, features, matches=matches, features_ref=built.features
+        )
+    with folder.stage("localization"):
+        records = localize_sfm.main(
+            built.sfm,
+            queries,
+            loc_pairs,
+            features,
+            matches,
+            poses,
+            refinements={
+                name: intrinsics.REFINEMENTS[source]
+                for name, source in sources.items()
+                if source != "list"
+            },
+            full_names=True,
+        )
+    summary = {
+        "feature": built.feature,
+        "matcher": built.matcher,
+        "retrieval": "vlad",
+        "map": str(built.folder),
+        "num_loc": num_loc,
+        "map_images": len(built.names()),
+        "intrinsics": Counter(sources.values()),
+    }
+    limits = dict.fromkeys(lists, DAY_THRESHOLDS)
+    return common.finish(folder, summary, lists, records, truth, limits, features, poses)
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m pipelines.localize --map sparse --map_images photos "
+        "--query_images new --outputs outputs/place",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="MODEL|MAP",
+        help="COLMAP model of the photos in --map_images, or a map that was built before",
+    )
+    parser.add_argument(
+        "--map_images", type=Path, help="photos of the map; without --map they are reconstructed"
+    )
+    parser.add_argument("--query_images", type=Path, help="folder of the photos to localize")
+    parser.add_argument(
+        "--queries",
+        type=Path,
+        help="query list with intrinsics, or a glob of several (default: all photos of "
+        "--query_images, with intrinsics of EXIF data or guessed)",
+    )
+    parser.add_argument(
+        "--outputs",
+        type=Path,
+        required=True,
+        help="folder for the map, in map, and for the results, in queries-<name>",
+    )
+    parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
+    common.add_feature_options(parser)
+    common.add_localization_options(parser, "none", 50)
+    parser.set_defaults(feature=None, matcher=None)  # those of a map that was built
+    args = parser.parse_args()
+    common.check_options(args)
+    if args.queries is not None and args.query_images is None:
+        raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
+    built = open_map(
+        args.outputs,
+        args.map_images,
+        args.map,
+        args.feature,
+        args.projection,
+        args.matcher,
+        args.num_covis,
+        args.overwrite,
+    )
+    if args.query_images is None:
+        print(f"The map {built.folder} is there. Localize photos in it with --query_images.")
+        return
+    name = (args.queries or args.query_images.resolve()).stem
+    outputs = args.outputs / f"queries-{re.sub(NOT_IN_NAMES, '', name).strip('._-')}"
+    summary = main(
+        built,
+        args.query_images,
+        outputs,
+        args.queries,
+        args.num_loc,
+        args.ground_truth,
+        args.overwrite,
+    )
+    common.print_result(summary, outputs, "The poses, camera from world, are in {}.")
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,379 @@
+"""A map of one's own: built once, localized in by files and in memory; reconstruction."""
+
+import csv
+import json
+import os
+import shutil
+import sys
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from hloc_reduce import (
+    cli,
+    intrinsics,
+    localization,
+    maps,
+    match_features,
+    parsers,
+    projections,
+    reconstruction,
+)
+from hloc_reduce.cli import InputError
+from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.localizer import Localizer
+from hloc_reduce.training.__main__ import parse_maps
+from pipelines import aachen, localize
+
+LISTS = "*_time_queries_with_intrinsics.txt"
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["localize", *map(str, arguments)])
+    cli.run(localize._main)
+
+
+def refused(monkeypatch, caplog, *arguments):
+    """Run with wrong input: exit code 2, one or two lines, no traceback; return the message."""
+    caplog.clear()
+    with pytest.raises(SystemExit) as exit:
+        run(monkeypatch, *arguments)
+    assert exit.value.code == 2
+    (message,) = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
+    assert message.count("\n") < 2
+    return message
+
+
+@pytest.fixture(autouse=True)
+def propagated(monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
+
+
+@pytest.fixture
+def place(aachen_layout, tmp_path):
+    """The options that build a map of the plane, and the folder of its outputs."""
+    model, images = aachen_layout / "3D-models/aachen_v_1_1", aachen_layout / "images_upright"
+    outputs = tmp_path / "outputs"
+    build = ("--map", model, "--map_images", images, "--outputs", outputs)
+    return build, images, outputs
+
+
+def state(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+def outcome(folder):
+    with (folder / "queries.csv").open() as file:
+        rows = {row["query"]: row for row in csv.DictReader(file)}
+    return json.loads((folder / "summary.json").read_text()), rows
+
+
+def test_the_same_as_the_pipeline_of_aachen(place, aachen_layout, tmp_path, monkeypatch, capsys):
+    """And the same one photo at a time."""
+    build, images, outputs = place
+    queries = aachen_layout / "queries" / LISTS
+    truth = aachen_layout / "queries/ground_truth_poses.txt"
+    new = ("--queries", queries, "--query_images", images, "--ground_truth", truth)
+    run(monkeypatch, *build, *new, "--feature", "sift_sv24")
+    summary, rows = outcome(outputs / "queries-time_queries_with_intrinsics")
+    assert summary["intrinsics"] == {"list": 3} and summary["feature"] == "sift_sv24"
+    assert "100.0 / 100.0 / 100.0" in capsys.readouterr().out
+
+    place = ("--dataset", aachen_layout, "--outputs", tmp_path / "aachen")
+    monkeypatch.setattr(sys, "argv", ["aachen", *map(str, place), "--feature", "sift_sv24"])
+    cli.run(aachen._main)
+    expected = outcome(tmp_path / "aachen")[1]
+    assert rows == expected and rows["query/day/a.png"]["status"] == "localized"
+
+    localizer = Localizer(outputs / "map")
+    poses = parsers.parse_poses(outputs / "queries-time_queries_with_intrinsics" / summary["poses"])
+    for name, camera in [q for part in parsers.parse_query_lists(queries).values() for q in part]:
+        pose, info = localizer.localize(images / name, camera)
+        row = rows[name]
+        for key in ("num_matches", "num_correspondences", "num_inliers"):
+            assert info[key] == int(row[key])
+        assert info["retrieved"][0] == row["retrieved"] and info["intrinsics"] == "given"
+        if row["status"] == "localized":
+            assert max(pose_error(pose, poses[name])) < 1e-9
+            assert len(info["points2D"]) == len(info["points3D"]) == info["num_correspondences"]
+            assert info["inliers"].sum() == info["num_inliers"]
+            projected = camera.img_from_cam(
+                info["points3D"] @ pose.rotation.matrix().T + pose.translation
+            )
+            errors = np.linalg.norm(projected - info["points2D"], axis=1)
+            assert errors[info["inliers"]].max() < 12
+        else:
+            assert pose is None and info["num_inliers"] == 0
+
+
+def test_a_map_is_built_once(place, monkeypatch, caplog, capsys):
+    build, images, outputs = place
+    run(monkeypatch, *build)
+    assert "Localize photos in it with --query_images" in capsys.readouterr().out
+    before = state(outputs / "map")
+    for folder in ("query/day", "query/night"):
+        run(monkeypatch, *build, "--query_images", images / folder)
+    assert state(outputs / "map") == before
+    summary, rows = outcome(outputs / "queries-day")
+    assert set(rows) == {"a.png", "grey.png"} and summary["intrinsics"] == {"guess": 2}
+    night = state(outputs / "queries-night")
+    run(monkeypatch, *build, "--query_images", images / "query/day")
+    assert state(outputs / "queries-night") == night
+
+    # it may be moved, and used without what it was built from
+    moved = outputs.parent / "moved"
+    (outputs / "map").rename(moved)
+    shutil.move(images / "db", outputs.parent / "db")
+    run(
+        monkeypatch,
+        *("--map", moved, "--query_images", images / "query/day", "--outputs", outputs),
+        *("--feature", "sift_sv64"),
+    )
+    assert outcome(outputs / "queries-day")[0]["map"] == str(moved)
+    message = refused(
+        monkeypatch, caplog, "--map", moved, "--outputs", outputs, "--feature", "sift_sv32"
+    )
+    assert "is of --feature sift_sv64" in message
+    message = refused(
+        monkeypatch, caplog, "--map", moved, "--outputs", outputs, "--map_images", images
+    )
+    assert "leave --map_images out" in message
+
+
+def test_what_has_changed_is_noticed(place, aachen_layout, monkeypatch, caplog):
+    build, images, outputs = place
+    new = ("--query_images", images / "query/day")
+    run(monkeypatch, *build, *new)
+    before, results = state(outputs / "map"), state(outputs / "queries-day")
+    message = refused(monkeypatch, caplog, *build, "--feature", "sift_sv16")
+    assert "another feature (model, projection_sha256)" in message and "--overwrite" in message
+    photo = images / "db/2.png"
+    os.utime(photo, ns=(0, 0))  # copied, say: its content is what counts
+    run(monkeypatch, *build)
+    content = photo.read_bytes()
+    cv2.imwrite(str(photo), 255 - cv2.imread(str(photo)))
+    assert "another images (db/2.png)" in refused(monkeypatch, caplog, *build)
+    photo.unlink()
+    assert "1 of 4 images are not in" in refused(monkeypatch, caplog, *build)
+    photo.write_bytes(content)
+    model = aachen_layout / "3D-models/aachen_v_1_1"
+    reference = pycolmap.Reconstruction(model)
+    reference.deregister_frame(reference.find_image_with_name("db/3.png").frame_id)
+    reference.write(model)
+    message = refused(monkeypatch, caplog, *build)
+    assert "images (db/3.png) and model (" in message and "images.bin" in message
+    assert state(outputs / "map") == before
+
+    # rebuilt on purpose: the results of the map before are not kept for it
+    run(monkeypatch, *build, "--overwrite")
+    assert maps.Map(outputs / "map").names() == ["db/0.png", "db/1.png", "db/2.png"]
+    run(monkeypatch, *build, *new)
+    after = state(outputs / "queries-day")
+    assert all(after[path] > results[path] for path in results)
+    assert outcome(outputs / "queries-day")[0]["map_images"] == 3
+
+
+def test_a_build_that_was_stopped_goes_on(place, monkeypatch, caplog):
+    build, images, outputs = place
+    photo = images / "db/3.png"
+    content = photo.read_bytes()
+    photo.write_bytes(b"no image")
+    assert "Cannot read image" in refused(monkeypatch, caplog, *build)
+    with pytest.raises(InputError, match="not a finished one"):
+        maps.Map(outputs / "map")
+    message = refused(
+        monkeypatch,
+        caplog,
+        "--map",
+        outputs / "map",
+        "--outputs",
+        outputs,
+        "--query_images",
+        images,
+    )
+    assert "not a finished one" in message
+    photo.write_bytes(content)
+    assert "another images (db/3.png)" in refused(monkeypatch, caplog, *build)
+    run(monkeypatch, *build, "--overwrite")
+    (outputs / "map/map.json").unlink()
+    before = state(outputs / "map")
+    run(monkeypatch, *build)
+    again = state(outputs / "map")
+    kept = [path for path in before if path.suffix in (".h5", ".bin", ".txt")]
+    assert len(kept) > 6 and all(again[path] == before[path] for path in kept)
+
+
+def test_a_projection_is_kept_with_the_map(place, tmp_path, monkeypatch):
+    """The map works when the file it was made with is gone."""
+    build, images, outputs = place
+    mine = tmp_path / "mine.safetensors"
+    shutil.copy(projections.find("sift_nested"), mine)
+    run(monkeypatch, *build, "--feature", "sift", "--projection", f"{mine}@24")
+    built = maps.Map(outputs / "map")
+    assert built.feature == "mine@24"
+    mine.unlink()
+    pose, info = Localizer(outputs / "map").localize(images / "query/day/a.png")
+    assert pose is not None and info["intrinsics"] == "guess"
+    run(
+        monkeypatch,
+        *("--map", outputs / "map", "--query_images", images / "query/day"),
+        *("--outputs", tmp_path / "other"),
+    )
+    assert outcome(tmp_path / "other/queries-day")[0]["bytes_per_keypoint"]["descriptor"] == 48
+
+
+def test_a_model_of_poses_only(place, aachen_layout, monkeypatch):
+    """Without points nothing is covisible: similar images are matched."""
+    build, images, outputs = place
+    model = aachen_layout / "3D-models/aachen_v_1_1"
+    reference = pycolmap.Reconstruction(model)
+    for point in list(reference.point3D_ids()):
+        reference.delete_point3D(point)
+    reference.write(model)
+    run(monkeypatch, *build, "--num_covis", 2)
+    assert len(parsers.parse_retrieval(outputs / "map/pairs-db-2.txt")) == 4
+    pose, _ = Localizer(outputs / "map").localize(images / "query/day/a.png")
+    assert pose is not None
+
+
+def with_exif(photo, path, focal_35mm):
+    """Write a JPEG whose EXIF data give the focal length in 35 mm film."""
+    ifd = b"\x01\x00" + b"\x05\xa4\x03\x00\x01\x00\x00\x00" + focal_35mm.to_bytes(4, "little")
+    root = b"\x01\x00" + b"\x69\x87\x04\x00\x01\x00\x00\x00" + (26).to_bytes(4, "little")
+    tiff = b"II*\x00\x08\x00\x00\x00" + root + b"\x00" * 4 + ifd + b"\x00" * 4
+    segment = b"Exif\x00\x00" + tiff
+    _, jpeg = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    length = (len(segment) + 2).to_bytes(2, "big")
+    path.write_bytes(b"\xff\xd8\xff\xe1" + length + segment + jpeg.tobytes()[2:])
+
+
+def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, monkeypatch, caplog):
+    """The camera has 500 pixels; 36 mm say 499 (of the diagonal), a guess is 576."""
+    build, images, outputs = place
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    photo = cv2.imread(str(images / "query/day/a.png"))
+    with_exif(photo, photos / "exif.jpg", 36)
+    cv2.imwrite(str(photos / "guess.png"), photo)
+    assert intrinsics.infer(photo)[0].params.tolist() == [576, 240, 180, 0]
+    truth = parsers.parse_poses(aachen_layout / "queries/ground_truth_poses.txt")["query/day/a.png"]
+    caplog.set_level("INFO")
+    run(monkeypatch, *build, "--query_images", photos)
+    assert "1 queries are from EXIF data" in caplog.text and "1 queries are guessed" in caplog.text
+    summary, rows = outcome(outputs / "queries-photos")
+    assert summary["intrinsics"] == {"EXIF": 1, "guess": 1}
+    listed = outputs / "queries-photos/queries_with_intrinsics.txt"
+    cameras = dict(parsers.parse_query_list(listed))
+    assert abs(cameras["exif.jpg"].params[0] - 499) < 1 and cameras["guess.png"].params[0] == 576
+    poses = parsers.parse_poses(outputs / "queries-photos" / summary["poses"])
+    localizer = Localizer(outputs / "map")
+    for name in ("exif.jpg", "guess.png"):
+        assert rows[name]["status"] == "localized"
+        metres, degrees = pose_error(poses[name], truth)
+        assert metres < 0.1 and degrees < 1, name  # 2.2 m away
+        pose, info = localizer.localize(photos / name)
+        assert max(pose_error(pose, poses[name])) < 1e-9
+        assert abs(info["camera"].params[0] - 500) < 25
+    # pixels are localized as files are, but have no EXIF data
+    pixels = cv2.imread(str(photos / "guess.png"))[:, :, ::-1]
+    pose, info = localizer.localize(np.ascontiguousarray(pixels))
+    assert info["intrinsics"] == "guess" and max(pose_error(pose, poses["guess.png"])) < 0.1
+    for wrong in (pixels.astype(float), pixels[None], np.zeros((0, 3), np.uint8)):
+        with pytest.raises(InputError, match="uint8"):
+            localizer.localize(wrong)
+
+
+def test_wrong_input(place, tmp_path, monkeypatch, caplog):
+    build, images, outputs = place
+    assert "Give --map_images" in refused(monkeypatch, caplog, "--outputs", outputs)
+    assert "--query_images, too" in refused(monkeypatch, caplog, *build, "--queries", "list.txt")
+    assert "is not a COLMAP model" in refused(monkeypatch, caplog, "--map", images, *build[2:])
+    assert "is not a map" in refused(monkeypatch, caplog, "--map", images, "--outputs", outputs)
+    message = refused(monkeypatch, caplog, "--map_images", tmp_path / "nowhere", *build[4:])
+    assert "no folder" in message and "nowhere" in message
+    assert "Unknown matcher" in refused(monkeypatch, caplog, *build, "--matcher", "NN")
+    assert "--num_covis 0" in refused(monkeypatch, caplog, *build, "--num_covis", 0)
+    assert not (outputs / "map").exists()
+    run(monkeypatch, *build)
+    queries = tmp_path / "list.txt"
+    queries.write_text("query/day/gone.png PINHOLE 480 360 500 500 240 180\n")
+    new = ("--queries", queries, "--query_images", images)
+    assert "query/day/gone.png" in refused(monkeypatch, caplog, *build, *new)
+    assert not (outputs / "queries-list").exists()
+
+
+def test_a_map_to_train_on(place, monkeypatch):
+    build, images, outputs = place
+    run(monkeypatch, *build)
+    (name, folders), *others = parse_maps([str(outputs / "map")]).items()
+    assert (name, folders) == ("dataset", (images, outputs / "map/sfm")) and not others
+    with pytest.raises(InputError, match="another map is called dataset"):
+        parse_maps([str(outputs / "map"), f"{images}:{outputs / 'map/sfm'}"])
+    with pytest.raises(InputError, match="neither a map nor"):
+        parse_maps([str(outputs)])
+
+
+def similarity(points, truth):
+    """Fit truth = scale * rotation @ point + translation; return the residuals."""
+    centre, true_centre = points.mean(0), truth.mean(0)
+    u, s, vt = np.linalg.svd((truth - true_centre).T @ (points - centre))
+    flip = np.diag([1, 1, np.linalg.det(u @ vt)])
+    scale = (s * np.diag(flip)).sum() / ((points - centre) ** 2).sum()
+    return truth - true_centre - scale * (points - centre) @ (u @ flip @ vt).T
+
+
+def test_reconstruction_from_matches_alone(scene, tmp_path):
+    """Poses up to a similarity, though the focal length is guessed; an image apart is left out."""
+    names = [f"db/{i}.jpg" for i in range(6)]
+    pairs, matches = tmp_path / "pairs.txt", tmp_path / "matches.h5"
+    parsers.write_pairs([(a, b) for a in names for b in names if a < b], pairs)
+    match_features.main(match_features.confs["NN-ratio"], pairs, scene.features, matches=matches)
+    arguments = (scene.images, pairs, scene.features, matches)
+    shared = {"camera_mode": pycolmap.CameraMode.SINGLE, "image_list": names}
+    model = reconstruction.main(tmp_path / "sfm", *arguments, **shared)
+    assert model.num_reg_images() == 6 and model.num_points3D() == 300
+    (camera,) = model.cameras.values()
+    assert abs(camera.params[0] - 500) < 5
+    centres = [image.projection_center() for image in model.images.values()]
+    true = [scene.poses[i.name].inverse().translation for i in model.images.values()]
+    assert np.linalg.norm(similarity(np.array(centres), np.array(true)), axis=1).max() < 0.01
+    image = model.find_image_with_name("db/2.jpg")
+    points = np.array([model.points3D[p.point3D_id].xyz for p in image.points2D])
+    residuals = similarity(points, scene.points[scene.seen["db/2.jpg"]])
+    assert np.linalg.norm(residuals, axis=1).max() < 0.01
+
+    written = state(tmp_path / "sfm")
+    reconstruction.main(tmp_path / "sfm", *arguments, **shared)
+    assert state(tmp_path / "sfm") == written
+    again = reconstruction.main(tmp_path / "again", *arguments, **shared)
+    for point in model.point3D_ids():
+        assert (model.points3D[point].xyz == again.points3D[point].xyz).all()
+
+    with pytest.raises(InputError, match="mapper options"):
+        reconstruction.main(tmp_path / "no", *arguments, mapper_options={"no_such": 1})
+    with pytest.raises(InputError, match="image options"):
+        reconstruction.main(tmp_path / "no", *arguments, **shared, image_options={"no_such": 1})
+    parsers.write_pairs([("db/0.jpg", "db/1.jpg")], pairs)
+    with pytest.raises(InputError, match="could not reconstruct"):
+        reconstruction.main(tmp_path / "no", *arguments, **shared, min_match_score=1.5)
+    assert not (tmp_path / "no").exists()
+
+
+def test_photos_alone(plane, tmp_path, monkeypatch):
+    """A map without any model: what is localized in it has its frame and scale."""
+    images = plane / "images"
+    new = tmp_path / "new"
+    new.mkdir()
+    shutil.move(images / "4.png", new / "4.png")
+    outputs = tmp_path / "outputs"
+    run(monkeypatch, "--map_images", images, "--query_images", new, "--outputs", outputs)
+    built = maps.Map(outputs / "map")
+    summary, rows = outcome(outputs / "queries-new")
+    assert summary["map_images"] == len(built.names()) >= 3
+    assert rows["4.png"]["status"] == "localized"
+
+
+def test_records_of_failed_queries_have_no_pose():
+    assert localization.pose({"qvec": None, "tvec": None}) is None
