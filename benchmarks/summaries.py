@@ -1,4 +1,4 @@
-"""Print a Markdown table of the summary.json of finished runs of pipelines.aachen."""
+"""Print a Markdown table of the summary.json of finished runs of any pipeline."""
 
 import argparse
 import json
@@ -20,7 +20,7 @@ def rows(summary: dict) -> list[str]:
         error = (
             f"{100 * result['median_position_error_m']:.2f} cm, "
             f"{result['median_rotation_error_deg']:.3f}°"
-            if recall
+            if result.get("median_position_error_m") is not None
             else ""
         )
         cells = (
@@ -31,7 +31,7 @@ def rows(summary: dict) -> list[str]:
             recall,
             error,
             f"{result['mean_inliers']:.0f}",
-            f"{summary['map_points3D']:,}",
+            f"{summary['map_points3D']:,}" if "map_points3D" in summary else "",
             f"{sum(summary['seconds'].values()):.0f}",
         )
         lines.append(f"| {' | '.join(map(str, cells))} |")

@@ -9,6 +9,8 @@ if TYPE_CHECKING:
 
     import torch
 
+    from .localizer import Localizer
+
 __version__ = "0.1.0"
 
 logger = logging.getLogger("hloc_reduce")
@@ -20,6 +22,15 @@ if not logger.handlers:
     logger.addHandler(_handler)
     logger.setLevel(logging.INFO)
     logger.propagate = False
+
+
+def __getattr__(name: str) -> "type[Localizer]":
+    """Import `Localizer` when it is asked for: it takes seconds."""
+    if name == "Localizer":
+        from .localizer import Localizer
+
+        return Localizer
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "torch.Tensor":

@@ -130,18 +130,24 @@ class InLoc:
         """List the cutouts.
 
         Raises:
-            InputError: when there is none, or one lacks its scan.
+            InputError: when there is none.
         """
         paths = sorted(self.cutouts.glob("*/*/*_cutout_*.jpg"))
         if not paths:
             raise InputError(f"{self.cutouts} has no <floor>/<scan>/<building>_cutout_*.jpg.")
-        names = [path.relative_to(self.root).as_posix() for path in paths]
-        files = {path.with_name(f"{path.name}.mat") for path in paths}
+        return [path.relative_to(self.root).as_posix() for path in paths]
+
+    def check_scans(self, names: list[str]) -> None:
+        """Check that the scans of cutouts are there, before any work is done.
+
+        Raises:
+            InputError: naming a file that is missing.
+        """
+        files = {self.root / f"{name}.mat" for name in names}
         files |= {scans.transformation_file(self.root, name) for name in names}
         missing = sorted(file for file in files if not file.is_file())
         if missing:
             raise InputError(f"{self.root} lacks {len(missing)} files of scans: {missing[0]}, ...")
-        return names
 
     def query_names(self) -> list[str]:
         """List the queries: those of `query_list` where there is one, else all photos."""

@@ -130,17 +130,6 @@ def lift_keypoints(
         made_by = {"dataset": str(dataset_dir.resolve()), "features": io.provenance(file)}
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [name for name in cutouts if name not in writer]
-            needed = [
-                path
-                for name in todo
-                for path in (
-                    dataset_dir / f"{name}.mat",
-                    scans.transformation_file(dataset_dir, name),
-                )
-            ]
-            missing = [str(path) for path in needed if not path.is_file()]
-            if missing:
-                raise InputError(f"{len(missing)} files of scans are missing: {missing[0]}, ...")
             for name in tqdm(todo, desc="Reading scans", unit="scan"):
                 keypoints, _ = get_keypoints(file, name)
                 scan = scans.read_scan(dataset_dir / f"{name}.mat")

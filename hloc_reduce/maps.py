@@ -50,6 +50,8 @@ class Map:
             self.feature: str = content["feature"]
             self.matcher: str = content["matcher"]
             self.images: Path = Path(content["image_dir"])
+            self.num_images: int = content["images_with_pose"]
+            self.num_points3D: int = content["points3D"]
             self._conf = content["conf"]
         except (OSError, ValueError, KeyError, TypeError):
             raise InputError(

@@ -108,12 +108,15 @@ def select(
         InputError: when no pair is left.
     """
     retrieved, database = parse_retrieval(pairs), set(db_list)
-    selected = []
+    selected, absent = [], 0
     for query in query_list:
         names = [name for name in retrieved.get(query, []) if name in database]
+        absent += len(retrieved.get(query, [])) - len(names)
         if not names:
             logger.warning("%s has no pair for query %s.", pairs, query)
         selected += [(query, name) for name in names[:num_matched]]
+    if absent:
+        logger.warning("%d pairs of %s are with images that are not in the map.", absent, pairs)
     if not selected:
         raise InputError(f"{pairs} has no pair of a query and a map image.")
     write_pairs(selected, output)

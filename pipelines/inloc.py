@@ -44,6 +44,8 @@ def main(
     retrieved = common.retrieval_name(retrieval, num_loc)
     loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
     common.check_retrieval(retrieval, loc_pairs, query_names, map_names)
+    if retrieval == "vlad":
+        place.check_scans(map_names)
 
     if overwrite or not (outputs / "conf.json").exists():
         extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
@@ -64,6 +66,7 @@ def main(
         with folder.stage("retrieval"):
             common.retrieve(retrieval, None, loc_pairs, num_loc, query_names, map_names)
         map_names = sorted({n for names in parse_retrieval(loc_pairs).values() for n in names})
+        place.check_scans(map_names)
     with folder.stage("extract_features"):
         names = [*map_names, *query_names]
         features = extract_features.main(feature_conf, dataset, outputs, image_list=names)

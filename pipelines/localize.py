@@ -170,7 +170,8 @@ def main(
         "retrieval": "vlad",
         "map": str(built.folder),
         "num_loc": num_loc,
-        "map_images": len(built.names()),
+        "map_images": built.num_images,
+        "map_points3D": built.num_points3D,
         "intrinsics": Counter(sources.values()),
     }
     limits = dict.fromkeys(lists, DAY_THRESHOLDS)

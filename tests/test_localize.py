@@ -12,6 +12,7 @@ import pycolmap
 import pytest
 
 from hloc_reduce import (
+    Localizer,
     cli,
     intrinsics,
     localization,
@@ -23,7 +24,6 @@ from hloc_reduce import (
 )
 from hloc_reduce.cli import InputError
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.localizer import Localizer
 from hloc_reduce.training.__main__ import parse_maps
 from pipelines import aachen, localize
 

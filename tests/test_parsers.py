@@ -93,5 +93,5 @@ def test_poses_round_trip_by_base_name(file, seed):
     parsers.write_poses({"query/day/a.jpg": pose}, file)
     ((name, read),) = parsers.parse_poses(file).items()
     assert name == "a.jpg" and max(pose_error(read, pose)) < 1e-6
-    parsers.write_poses({"query/day/a.jpg": pose}, file, prepend_camera_name=True)
+    parsers.write_poses({"query/day/a.jpg": pose}, file, name_parts=2)
     assert list(parsers.parse_poses(file)) == ["day/a.jpg"]
