@@ -23,20 +23,21 @@ confs = retrieval_confs.confs
 def main(
     conf: dict,
     features: Path,
-    vocabulary_images: list[str] | Path,
+    vocabulary_images: list[str] | None = None,
     export_dir: Path | None = None,
     overwrite: bool = False,
+    vocabulary: Path | None = None,
 ) -> Path:
     """Compute a global descriptor of every image of a feature file.
 
     Args:
         conf: an entry of `confs`.
         features: feature file.
-        vocabulary_images: the images whose features the vocabulary is learned from: the map's; or
-            the file of a vocabulary that was learned before.
+        vocabulary_images: the images whose features a vocabulary is learned from: the map's.
         export_dir: where `<conf["output"]>_<features>.h5` and the vocabulary go; default: beside
             the features.
         overwrite: learn and compute anew what is there.
+        vocabulary: file of a vocabulary to use instead, such as the map's for queries.
 
     Returns:
         The h5 file of global descriptors, `global_descriptor` (G,) float16 of unit norm.
@@ -48,15 +49,16 @@ def main(
     model = dynamic_load(extractors, conf["model"]["name"])(conf["model"]).eval()
     with open_h5(features) as file:
         made_by = {"model": conf["model"], "features": io.provenance(file)}
-        learned = isinstance(vocabulary_images, Path)
-        vocabulary = vocabulary_images if learned else vocabulary_of(output)
-        if learned:
+        learn = vocabulary is None
+        if learn:
+            vocabulary = vocabulary_of(output)
+        else:
             made_by["vocabulary"] = stamps.sha256(vocabulary)
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [name for name in list_h5_names(features) if name not in writer]
             if not todo:
                 return output
-            if not learned and (overwrite or not vocabulary.exists()):
+            if learn and (overwrite or not vocabulary.exists()):
                 if writer.names:
                     raise InputError(f"The vocabulary {vocabulary} of {output} is gone: overwrite.")
                 model.fit(_sample(file, vocabulary_images, conf["model"]["max_samples"]))

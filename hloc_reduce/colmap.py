@@ -128,7 +128,7 @@ def import_images(
     """Begin a COLMAP database with images, and cameras guessed from their EXIF data.
 
     Raises:
-        InputError: for an option that there is not.
+        InputError: for an option that there is not, or an image that COLMAP skips.
     """
     with pycolmap.Database.open(database):
         pass
@@ -138,6 +138,13 @@ def import_images(
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"The image options {options} cannot be used ({reason}).") from None
     pycolmap.import_images(database, image_dir, camera_mode, image_names=names, options=reader)
+    with pycolmap.Database.open(database) as opened:
+        imported = {image.name for image in opened.read_all_images()}
+    if skipped := [name for name in names if name not in imported]:
+        raise InputError(
+            f"COLMAP takes {len(skipped)} images of {image_dir} not, because they cannot be read "
+            f"or do not share a camera: {', '.join(skipped[:5])}"
+        )
 
 
 def write_matches(

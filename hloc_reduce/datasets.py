@@ -168,22 +168,28 @@ class InLoc:
         return CALIBRATED_THRESH if calibrated else localize_inloc.RANSAC_THRESH
 
     def buildings(
-        self, names: list[str], truth: Mapping[str, pycolmap.Rigid3d]
+        self, names: list[str], truth: Mapping[str, pycolmap.Rigid3d], map_names: list[str]
     ) -> dict[str, list[str]]:
-        """Group queries by the floor, such as DUC1, of the scan that is nearest to where they were.
+        """Group queries by floor, such as DUC1, if there are several.
 
-        Those whose true pose is not known are the group "query", if there are several floors.
+        Args:
+            names: the queries.
+            truth: their true poses. A query belongs to the floor of the scan that is nearest to
+                its true position, or if that is not known, to the group "query".
+            map_names: cutouts.
         """
-        files = sorted(self.alignments.glob("*/transformations/*_trans_*.txt"))
-        floors = [path.parent.parent.name for path in files]
-        positions = np.array([scans.read_transformation(path)[:3, 3] for path in files])
-        groups: dict[str, list[str]] = {floor: [] for floor in sorted(set(floors))}
+        floors = sorted({scans.floor_of(name) for name in map_names})
+        if len(floors) == 1 or not truth:
+            return {floors[0] if len(floors) == 1 else "query": names}
+        near = {scans.transformation_file(self.root, n): scans.floor_of(n) for n in map_names}
+        positions = np.array([scans.read_transformation(path)[:3, 3] for path in near])
+        groups: dict[str, list[str]] = {floor: [] for floor in [*floors, "query"]}
         for name in names:
-            floor = floors[0] if len(groups) == 1 else "query"
+            floor = "query"
             if name in truth:
                 centre = truth[name].inverse().translation
-                floor = floors[np.linalg.norm(positions - centre, axis=1).argmin()]
-            groups.setdefault(floor, []).append(name)
+                floor = list(near.values())[np.linalg.norm(positions - centre, axis=1).argmin()]
+            groups[floor].append(name)
         return {floor: group for floor, group in groups.items() if group}
 
 

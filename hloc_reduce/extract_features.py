@@ -120,13 +120,24 @@ def list_images(
         )
         if not names:
             raise InputError(f"There is no image in {within}.")
-        return names
-    names = image_names(image_list)
+        return _check_names(names)
+    names = _check_names(image_names(image_list))
     missing = [name for name in names if not (image_dir / name).is_file()]
     if missing:
         raise InputError(
             f"{len(missing)} of {len(names)} images are not in {image_dir}: "
             f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+        )
+    return names
+
+
+def _check_names(names: list[str]) -> list[str]:
+    """Refuse names that no list of hloc's can hold."""
+    wrong = [name for name in names if len(name.split()) != 1 or name.startswith("#")]
+    if wrong:
+        raise InputError(
+            f"{len(wrong)} names of images have spaces or begin with #, as none in a list of pairs "
+            f"can: {', '.join(map(repr, wrong[:3]))}. Rename them."
         )
     return names
 

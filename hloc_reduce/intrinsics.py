@@ -47,5 +47,7 @@ def write_queries(cameras: Mapping[str, tuple[pycolmap.Camera, str]], path: Path
         params = " ".join(map(repr, camera.params.tolist()))
         lines.append(f"# {source}")
         lines.append(f"{name} {camera.model.name} {camera.width} {camera.height} {params}")
-    with replacing(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
+    text = "\n".join(lines) + "\n"
+    if not path.exists() or path.read_text() != text:  # what is made from it is up to date then
+        with replacing(path) as temporary:
+            temporary.write_text(text)

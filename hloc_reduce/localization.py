@@ -206,7 +206,7 @@ def _read_matches(
         logger.warning("No map image was retrieved for %s.", name)
     elif not any(find_pair(match_file, name, other)[0] for other in present):
         logger.warning("%s was not matched: %s has none of its pairs.", name, match_file.filename)
-        return {}
+        return {other: np.zeros((0, 2), np.int64) for other in present}
     matches = {other: get_matches(match_file, name, other)[0] for other in present}
     for other, indices in matches.items():
         check_matches(indices, (name, other), (num_keypoints, reference.num_keypoints(other)))

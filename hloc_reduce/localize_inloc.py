@@ -1,7 +1,8 @@
 """Localize the queries of InLoc: 2D-3D matches through the scans of cutouts, PnP + RANSAC."""
 
 import argparse
-from collections.abc import Iterable
+import hashlib
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,12 +13,12 @@ from tqdm import tqdm
 
 from . import cli, io, localization, logger, scans, stamps
 from .cli import InputError
-from .io import GroupWriter, get_dataset, get_keypoints, list_h5_names, open_h5
+from .io import GroupWriter, get_dataset, get_keypoints, open_h5
 from .parsers import parse_query_lists, parse_retrieval
 
 RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
 RANSAC_SIZE = 4032  # the longer side of such a photo
-CACHED_IMAGES = 128  # points of so many cutouts stay in memory: 20 MB at 8,000 keypoints
+CACHED_IMAGES = 128  # points of so many cutouts stay in memory: 25 MB at 8,000 keypoints
 
 
 def main(
@@ -77,10 +78,15 @@ def main(
         return {"estimation": {"ransac": {"max_error": ransac_thresh * scale}}}
 
     options = {"ransac_thresh": ransac_thresh, "skip_matches": skip_matches}
-    options["queries"] = {name: [c.model.name, *c.params.tolist()] for name, c in queries}
+    options["queries"] = {
+        name: [camera.model.name, camera.width, camera.height, *camera.params.tolist()]
+        for name, camera in queries
+    }
+    poses = {cutout: scans.read_pose(dataset_dir, cutout) for cutout in sorted(set(wanted))}
+    options["scans"] = hashlib.sha256(np.array(list(poses.values())).tobytes()).hexdigest()
     with open_h5(points) as file:
         return localization.main(
-            lambda: ScanMap(file),
+            lambda: ScanMap(file, poses),
             queries,
             retrieved,
             features,
@@ -117,14 +123,14 @@ def lift_keypoints(
         features: feature file.
         cutouts: names of images.
         output: h5 file, `points3D` (N, 3) float32 of each cutout: metres in the frame of its
-            floor, NaN where the scan has no depth.
+            scan, NaN where that has no depth.
         overwrite: compute anew what is there.
 
     Returns:
         `output`; cutouts it holds already are skipped.
 
     Raises:
-        InputError: when a scan or its transformation is missing or broken.
+        InputError: when a scan is missing or broken.
     """
     with open_h5(features) as file:
         made_by = {"dataset": str(dataset_dir.resolve()), "features": io.provenance(file)}
@@ -135,8 +141,6 @@ def lift_keypoints(
                 scan = scans.read_scan(dataset_dir / f"{name}.mat")
                 scale = scan.shape[1::-1] / get_dataset(file, name, "image_size")[()]
                 points = scans.interpolate(scan, (keypoints + 0.5) * scale - 0.5)
-                pose = scans.read_transformation(scans.transformation_file(dataset_dir, name))
-                points = points @ pose[:3, :3].T + pose[:3, 3]
                 known = np.isfinite(points[:, 0]).mean() if len(points) else 1
                 if known < 0.5:
                     logger.warning("%.0f %% of the keypoints of %s have depth.", 100 * known, name)
@@ -149,18 +153,19 @@ class ScanMap:
 
     Args:
         file: open h5 file of `lift_keypoints`.
+        poses: from cutout to the pose of its scan, floor from scan (4, 4).
     """
 
-    def __init__(self, file: h5py.File):
-        self.file = file
+    def __init__(self, file: h5py.File, poses: Mapping[str, np.ndarray]):
+        self.file, self.poses = file, poses
         self.points = lru_cache(CACHED_IMAGES)(self._read)
         # by name, so that no order of queries or cutouts changes anything
-        self.numbers = {
-            name: i for i, name in enumerate(sorted(list_h5_names(Path(file.filename))))
-        }
+        self.numbers = {name: number for number, name in enumerate(sorted(poses))}
 
     def _read(self, name: str) -> np.ndarray:
-        return get_dataset(self.file, name, "points3D")[()].astype(np.float64)
+        points = get_dataset(self.file, name, "points3D")[()].astype(np.float64)
+        pose = self.poses[name]
+        return points @ pose[:3, :3].T + pose[:3, 3]
 
     def __contains__(self, name: str) -> bool:
         return name in self.numbers

@@ -23,12 +23,14 @@ from . import (
     stamps,
     triangulation,
 )
-from .cli import InputError
+from .cli import InputError, choose
 from .extract_features import list_images
 from .io import replacing
-from .results import FINISHED, RunFolder
+from .results import RunFolder
 
+FINISHED = "map.json"  # is written when all else is there
 FINGERPRINTS = "fingerprints.json"
+PLACE = "place.txt"  # stays when the map is built anew
 RETRIEVAL = aggregate_features.confs["vlad"]
 
 
@@ -45,17 +47,25 @@ class Map:
     def __init__(self, folder: Path):
         self.folder = folder
         try:
+            self.place = (folder / PLACE).read_text()
             content = json.loads((folder / FINISHED).read_text())
-            self.id: str = content["id"]
-            self.feature: str = content["feature"]
-            self.matcher: str = content["matcher"]
-            self.images: Path = Path(content["image_dir"])
-            self.num_images: int = content["images_with_pose"]
-            self.num_points3D: int = content["points3D"]
-            self._conf = content["conf"]
-        except (OSError, ValueError, KeyError, TypeError):
+            self.id = str(content["id"])
+            self.feature = _file_name(content["feature"])
+            self.matcher = choose("matcher", content["matcher"], matchers_confs.confs)
+            self.images = Path(content["image_dir"])
+            self.num_images = int(content["images_with_pose"])
+            self.num_points3D = int(content["points3D"])
+            conf = content["conf"]
+            self._conf = {
+                "output": _file_name(conf["output"]),
+                "model": dict(conf["model"]),
+                "preprocessing": dict(conf["preprocessing"]),
+            }
+            _with_projection(self._conf, _file_name)
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(
-                f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}."
+                f"{folder} is not a map, or not a finished one: it has no sound {FINISHED} "
+                f"({type(error).__name__}: {error})."
             ) from None
         missing = [path for path in (self.features, self.descriptors) if not path.is_file()]
         if missing:
@@ -65,6 +75,22 @@ class Map:
     def conf(self) -> dict:
         """The configuration of the map's features, for more images."""
         return _with_projection(self._conf, lambda name: str(self.folder / name))
+
+    def check_feature(self, feature: str, projection: Path | None = None) -> None:
+        """Refuse a feature that is not the map's.
+
+        Args:
+            feature: as in `confs.features.get`.
+            projection: likewise.
+
+        Raises:
+            InputError: if it is another, or has the same name but another projection.
+        """
+        name, conf = features_confs.get(feature, projection)
+        made_by = extract_features.provenance(conf, as_half=True)
+        if json.loads((self.folder / "conf.json").read_text())["feature"] != made_by:
+            other = "" if name != self.feature else f", but not of the {name} that it is now"
+            raise InputError(f"The map {self.folder} is of --feature {self.feature}{other}.")
 
     @property
     def sfm(self) -> Path:
@@ -142,7 +168,7 @@ def main(
         extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
     files = {f"images/{name}": image_dir / name for name in names}
     files |= {f"model/{name}": path for name, path in model_files.items()}
-    fingerprints = stamps.fingerprints(files, map_dir / FINGERPRINTS)
+    fingerprints = stamps.fingerprints(files, stamps.read(map_dir / FINGERPRINTS))
     folder = RunFolder(
         map_dir,
         {
@@ -153,9 +179,13 @@ def main(
             "model": {name: fingerprints[f"model/{name}"][2] for name in model_files},
         },
         overwrite,
+        inputs=[path for path in (image_dir, model, projection) if path is not None],
     )
     if (map_dir / FINISHED).exists():
         return Map(map_dir)
+    if not (map_dir / PLACE).exists():
+        with replacing(map_dir / PLACE) as temporary:
+            temporary.write_text(uuid.uuid4().hex)
 
     logger.info("Building the map %s of %d images.", map_dir, len(names))
     stamps.write(map_dir / FINGERPRINTS, fingerprints)
@@ -192,6 +222,13 @@ def main(
     }
     stamps.write(map_dir / FINISHED, summary)
     return Map(map_dir)
+
+
+def _file_name(name: str) -> str:
+    """Return a name that leads out of no folder, or raise a ValueError."""
+    if Path(name).name != name:
+        raise ValueError(f"{name!r} is not the name of a file")
+    return name
 
 
 def _with_projection(conf: dict, change: Callable[[str], str]) -> dict:

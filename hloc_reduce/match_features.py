@@ -32,6 +32,8 @@ def main(
 ) -> Path:
     """Match all pairs of a list, each unordered pair once.
 
+    With another file of the second images, whose names may be those of the first, each pair once.
+
     Args:
         conf: an entry of `confs`.
         pairs: text file of pairs.
@@ -42,7 +44,7 @@ def main(
         overwrite: match anew what is there.
 
     Returns:
-        The match file; pairs it holds already, in either order, are skipped.
+        The match file; pairs it holds already are skipped.
 
     Raises:
         InputError: for an image without features, or no path for the matches.
@@ -65,7 +67,7 @@ def main(
             matches, provenance(conf, file0, file1), overwrite, compression="gzip"
         ) as writer,
     ):
-        todo = unmatched_pairs(pairs, writer)
+        todo = unmatched_pairs(pairs, writer, ordered=features_ref not in (None, feature_path))
         if todo:
             _match(conf, todo, file0, file1, writer)
     logger.info("Matches of the pairs %s are in %s.", pairs.name, matches)
@@ -80,14 +82,20 @@ def provenance(conf: dict, *feature_files: h5py.File) -> dict:
     return made_by
 
 
-def unmatched_pairs(pairs: Path, matched: GroupWriter) -> list[tuple[str, str]]:
-    """List the unordered pairs of a file that are not matched yet, in the file's order."""
+def unmatched_pairs(
+    pairs: Path, matched: GroupWriter, ordered: bool = False
+) -> list[tuple[str, str]]:
+    """List the pairs of a file that are not matched yet, in the file's order.
+
+    Unless `ordered`, a pair is the same as its reverse.
+    """
     todo: dict[tuple[str, str], None] = {}
     for name0, names1 in parse_retrieval(pairs).items():
         for name1 in names1:
-            seen = (name1, name0) in todo or any(
-                names_to_pair(*names, separator) in matched
-                for names in ((name0, name1), (name1, name0))
+            same = [(name0, name1)] if ordered else [(name0, name1), (name1, name0)]
+            seen = any(
+                names in todo or names_to_pair(*names, separator) in matched
+                for names in same
                 for separator in "/_"
             )
             if not seen:

@@ -46,6 +46,7 @@ def main(
     """
     if num_matched < 1:
         raise InputError(f"num_matched is {num_matched}: at least 1.")
+    same_file = db_descriptors in (None, descriptors)  # else equal names are other images
     db_descriptors = db_descriptors or descriptors
     if db_model is not None:
         db_list = [image.name for image in colmap.read_model(db_model).images.values()]
@@ -62,7 +63,7 @@ def main(
     for start in range(0, len(queries), QUERY_BLOCK):
         ranking = rank(queries[start : start + QUERY_BLOCK], database, num_matched + 1)
         for name, row in zip(query_names[start:], ranking, strict=False):
-            others = [db_names[j] for j in row if db_names[j] != name]
+            others = [db_names[j] for j in row if not same_file or db_names[j] != name]
             pairs += [(name, other) for other in others[:num_matched]]
     write_pairs(pairs, output)
     logger.info("Retrieved %d pairs for %d queries.", len(pairs), len(query_names))

@@ -1,6 +1,7 @@
 """Reconstruct a map from matches of images of which nothing else is known."""
 
 import argparse
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -94,6 +95,7 @@ def main(
                 f"{matches}. Do enough of them overlap?"
             )
         models[0].write(building)
+        shutil.rmtree(building / "models")
     missing = sorted(set(names) - {image.name for image in models[0].images.values()})
     if missing:
         logger.warning("%d images are not in the map: %s.", len(missing), ", ".join(missing))

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from . import logger
 from .cli import InputError
 from .evaluation.poses import pose_error, recall
 from .io import list_h5_names, open_h5, replacing
@@ -30,9 +29,10 @@ COLUMNS = (
     "rotation_error_deg",
     "retrieved",
 )
-# what a run leaves in its folder, but for lists of pairs, which are always written anew
-PRODUCTS = ("*feats-*", ".*.tmp", "sfm*", "*_hloc_*", "queries.csv", "s*.json")
-FINISHED = "map.json"  # says of a map that it is whole
+# what a run leaves in its folder, first what says that it is whole; but for lists of pairs, which
+# are always written anew
+PRODUCTS = ("map.json", "*feats-*", ".*.tmp", "sfm*", "*_hloc_*", "queries.csv", "s*.json")
+DELETING = {"is": "being deleted"}
 FAILED = (float("inf"), float("inf"))
 NAMED = 3  # differences that a message names
 
@@ -45,36 +45,51 @@ class RunFolder:
         conf: what determines the results.
         overwrite: begin anew, with this configuration; what a run left in the folder is deleted
             first, so that a run that is stopped can go on without `overwrite`.
-        renewed: key of what may be made anew on purpose, which begins anew here too.
+        inputs: files and folders that the run reads, which are not to be deleted.
+        stale: where the configuration is the same, begin anew all the same: what the results
+            were made from has changed.
 
     Raises:
-        InputError: when the folder holds results of another configuration.
+        InputError: when the folder holds results of another configuration, or an input that would
+            be deleted.
     """
 
-    def __init__(self, path: Path, conf: dict, overwrite: bool, renewed: str | None = None):
+    def __init__(
+        self,
+        path: Path,
+        conf: dict,
+        overwrite: bool,
+        inputs: Iterable[Path] = (),
+        stale: bool = False,
+    ):
         self.path = path
         conf_file, self._seconds_file = path / "conf.json", path / "seconds.json"
         conf = json.loads(json.dumps(conf))
         before = None
         if conf_file.exists() and not overwrite:
             try:
-                before = json.loads(conf_file.read_text())
-            except ValueError:
+                before = dict(json.loads(conf_file.read_text()))
+            except (ValueError, TypeError):
                 raise InputError(f"{conf_file} is broken: use --overwrite.") from None
-            if renewed in before and before[renewed] != conf[renewed]:
-                logger.info("The %s of the results in %s is a new one.", renewed, path)
-                before, overwrite = None, True
-        if before is not None and (changes := list(_changes(before, conf))):
-            raise InputError(
-                f"{path} holds results of another {' and '.join(changes)}. "
-                "Choose other --outputs, one folder for each configuration, or --overwrite."
-            )
+            changes = _changes(before, conf)
+            if before == DELETING or not changes and stale:
+                overwrite = True
+            elif changes:
+                named = " and ".join(f"{key}{which}" for key, which in changes.items())
+                raise InputError(
+                    f"{path} holds results of another {named}. "
+                    "Choose other --outputs, one folder for each configuration, or --overwrite."
+                )
         if overwrite and conf_file.exists():
-            (path / FINISHED).unlink(missing_ok=True)
-            conf_file.unlink()
+            for file in inputs:
+                if path.resolve() in file.resolve().parents:
+                    raise InputError(f"{file} is in {path}, which is to be made anew: move it.")
+            # whoever finds this, because the deletion was cut short, deletes again
+            with replacing(conf_file) as temporary:
+                temporary.write_text(json.dumps(DELETING))
             for product in (file for pattern in PRODUCTS for file in path.glob(pattern)):
                 shutil.rmtree(product) if product.is_dir() else product.unlink()
-        if before is None:
+        if overwrite or before is None:
             with replacing(conf_file) as temporary:
                 temporary.write_text(json.dumps(conf, indent=1))
 
@@ -95,18 +110,19 @@ class RunFolder:
                 temporary.write_text(json.dumps({**seconds, name: round(spent, 3)}, indent=1))
 
 
-def _changes(before: dict, after: dict) -> Iterator[str]:
-    """Name what differs between two configurations, and of what is long which entries."""
+def _changes(before: dict, after: dict) -> dict[str, str]:
+    """Return the keys whose values differ, each with the entries that differ where it is long."""
+    changes = {}
     for key in {**before, **after}:
         old, new = before.get(key), after.get(key)
         if old == new:
             continue
+        changes[key] = ""
         if isinstance(old, dict) and isinstance(new, dict):
             names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
             more = ", ..." if len(names) > NAMED else ""
-            yield f"{key} ({', '.join(names[:NAMED])}{more})"
-        else:
-            yield key
+            changes[key] = f" ({', '.join(names[:NAMED])}{more})"
+    return changes
 
 
 def query_table(

@@ -42,12 +42,17 @@ def _parts(cutout: str) -> list[str]:
     return parts
 
 
-def read_transformation(path: Path) -> np.ndarray:
-    """Read the pose of a scan, world from scan (4, 4) in metres, the one "after GICP".
+def read_pose(root: Path, cutout: str) -> np.ndarray:
+    """Read the pose of the scan of a cutout, floor from scan (4, 4) in metres, "after GICP".
 
     Raises:
-        InputError: when the file is not there or has no such matrix.
+        InputError: when its file is not there or has no such matrix.
     """
+    return read_transformation(transformation_file(root, cutout))
+
+
+def read_transformation(path: Path) -> np.ndarray:
+    """Read the pose of a scan from its file, as `read_pose`."""
     try:
         lines = path.read_text().splitlines()[TRANSFORMATION]
         matrix = np.array([[float(word) for word in line.split()] for line in lines])

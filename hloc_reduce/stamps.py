@@ -22,10 +22,15 @@ def stamp(options: dict, inputs: list[Path]) -> dict:
 
 def is_current(path: Path, expected: dict) -> bool:
     """Return whether the stamp file `path` is there and says what is expected."""
+    return bool(expected) and read(path) == json.loads(json.dumps(expected))
+
+
+def read(path: Path) -> dict:
+    """Read a stamp file; one that is not there or broken is empty."""
     try:
-        return json.loads(path.read_text()) == json.loads(json.dumps(expected))
-    except (OSError, ValueError):
-        return False
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
+        return {}
 
 
 def write(path: Path, made_from: dict) -> None:
@@ -34,26 +39,27 @@ def write(path: Path, made_from: dict) -> None:
         temporary.write_text(json.dumps(made_from, indent=1))
 
 
-def fingerprints(files: Mapping[str, Path], known: Path) -> dict[str, list]:
+def fingerprints(files: Mapping[str, Path], before: Mapping[str, list]) -> dict[str, list]:
     """Compute the size, the time and the sha256 of files.
 
     Args:
         files: from name to path.
-        known: file of earlier ones. What has the size and time that it had there is not read.
+        before: earlier ones. A file that still has its size and time is not read.
 
     Returns:
         From name to [size, time, digest].
     """
-    try:
-        before = json.loads(known.read_text())
-    except (OSError, ValueError):
-        before = {}
     statuses = {name: path.stat() for name, path in files.items()}
     now = {name: [status.st_size, status.st_mtime_ns] for name, status in statuses.items()}
     changed = [name for name in now if before.get(name, [])[:2] != now[name]]
     for name in tqdm(changed, desc="Reading files", unit="file"):
         now[name].append(sha256(files[name]))
     return {name: value if len(value) == 3 else before[name] for name, value in now.items()}
+
+
+def changed(before: Mapping[str, list], now: Mapping[str, list]) -> list[str]:
+    """Return the names whose fingerprints are in both, but of other contents."""
+    return [name for name in now if name in before and before[name][2] != now[name][2]]
 
 
 def sha256(path: Path) -> str:

@@ -48,7 +48,7 @@ def main(
     truth = true_poses(query_names, ground_truth or place.ground_truth, bool(ground_truth))
     retrieved = common.retrieval_name(retrieval, num_loc)
     loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
-    common.check_retrieval(retrieval, loc_pairs, query_names, map_names)
+    common.check_retrieval(retrieval, loc_pairs, num_loc, query_names, map_names)
 
     if overwrite or not (outputs / "conf.json").exists():
         extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
@@ -63,6 +63,7 @@ def main(
             "num_loc": num_loc,
         },
         overwrite,
+        inputs=[Path(retrieval)] if retrieval != "vlad" else [],
     )
     sfm = outputs / f"sfm_{feature}+{matcher}"
     sfm_pairs = outputs / f"pairs-db-covis{num_covis}.txt"

@@ -98,19 +98,25 @@ def retrieval_name(retrieval: str, num_loc: int) -> str:
 
 
 def check_retrieval(
-    retrieval: str, output: Path, query_names: list[str], map_names: list[str]
-) -> None:
-    """Refuse a broken file, or one of other images, or `output`, before any work is done."""
+    retrieval: str, output: Path, num_loc: int, query_names: list[str], map_names: list[str]
+) -> list[str]:
+    """Refuse a broken file, or one of other images, or `output`, before any work is done.
+
+    Returns:
+        The map images that may be retrieved: those of a list of pairs, or else all.
+    """
     if retrieval == "vlad":
-        return
+        return map_names
     if Path(retrieval).resolve() == output.resolve():
         raise InputError(f"--retrieval {retrieval} would be overwritten: move it elsewhere.")
     if Path(retrieval).suffix in PAIRS_FROM:
         list_h5_names(Path(retrieval))
-        return
-    retrieved, names = parse_retrieval(Path(retrieval)), set(map_names)
-    if not any(names & set(retrieved.get(name, ())) for name in query_names):
+        return map_names
+    pairs, names = parse_retrieval(Path(retrieval)), set(map_names)
+    found = [[other for other in pairs.get(name, ()) if other in names] for name in query_names]
+    if not any(found):
         raise InputError(f"{retrieval} has no pair of a query and a map image.")
+    return sorted({other for others in found for other in others[:num_loc]})
 
 
 def retrieve(

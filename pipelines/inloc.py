@@ -18,7 +18,6 @@ from hloc_reduce import (
     results,
 )
 from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
-from hloc_reduce.parsers import parse_retrieval
 
 from . import common
 
@@ -39,13 +38,14 @@ def main(
     matcher_conf = matchers_confs.confs[matcher]
     place = InLoc(dataset)
     map_names, query_names = place.map_names(), place.query_names()
-    truth = true_poses(query_names, ground_truth or place.ground_truth, bool(ground_truth))
-    lists = place.buildings(query_names, truth)
     retrieved = common.retrieval_name(retrieval, num_loc)
     loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
-    common.check_retrieval(retrieval, loc_pairs, query_names, map_names)
-    if retrieval == "vlad":
-        place.check_scans(map_names)
+    # what is not retrieved needs neither features nor a scan
+    used = common.check_retrieval(retrieval, loc_pairs, num_loc, query_names, map_names)
+    extract_features.list_images(dataset, [*used, *query_names])
+    place.check_scans(used)
+    truth = true_poses(query_names, ground_truth or place.ground_truth, bool(ground_truth))
+    lists = place.buildings(query_names, truth, used)
 
     if overwrite or not (outputs / "conf.json").exists():
         extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
@@ -59,20 +59,15 @@ def main(
             "num_loc": num_loc,
         },
         overwrite,
+        inputs=[Path(retrieval)] if retrieval != "vlad" else [],
     )
     poses = outputs / f"InLoc_hloc_{feature}+{matcher}_{retrieved}.txt"
 
-    if retrieval != "vlad":  # what is not retrieved needs no features
-        with folder.stage("retrieval"):
-            common.retrieve(retrieval, None, loc_pairs, num_loc, query_names, map_names)
-        map_names = sorted({n for names in parse_retrieval(loc_pairs).values() for n in names})
-        place.check_scans(map_names)
     with folder.stage("extract_features"):
-        names = [*map_names, *query_names]
+        names = [*used, *query_names]
         features = extract_features.main(feature_conf, dataset, outputs, image_list=names)
-    if retrieval == "vlad":
-        with folder.stage("retrieval"):
-            common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
+    with folder.stage("retrieval"):
+        common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, used)
     with folder.stage("match_queries"):
         matches = match_features.main(matcher_conf, loc_pairs, features.stem, outputs)
     with folder.stage("localization"):
@@ -92,7 +87,7 @@ def main(
         "retrieval": retrieval,
         "dataset": str(dataset),
         "num_loc": num_loc,
-        "map_images": len(map_names),
+        "map_images": len(used),
     }
     limits = dict.fromkeys(lists, INLOC_THRESHOLDS)
     return common.finish(folder, summary, lists, records, truth, limits, features, poses)

@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from pathlib import Path
 
-from confs import features as features_confs
 from confs import matchers as matchers_confs
 from hloc_reduce import (
     aggregate_features,
@@ -23,6 +22,7 @@ from hloc_reduce import (
     match_features,
     pairs_from_retrieval,
     results,
+    stamps,
 )
 from hloc_reduce.cli import InputError
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
@@ -32,13 +32,14 @@ from hloc_reduce.parsers import parse_query_lists
 from . import common
 
 FEATURE, MATCHER = "sift_sv64", "NN-ratio"
+MADE_FROM = "made_from.json"  # the map and the photos of queries
 NOT_IN_NAMES = r"[^\w.-]+"  # of a glob
 
 
 def open_map(
     outputs: Path,
     map_images: Path | None = None,
-    map: Path | None = None,
+    model_or_map: Path | None = None,
     feature: str | None = None,
     projection: Path | None = None,
     matcher: str | None = None,
@@ -49,33 +50,32 @@ def open_map(
 
     Args:
         outputs: its folder map is that of a new map.
-        map_images: folder of the photos of the map; None to open `map`.
-        map: COLMAP model of the photos, or a map that was built.
-        feature: default: sift_sv64, or that of the map.
+        map_images: folder of the photos of the map; None to open a map that was built.
+        model_or_map: COLMAP model of the photos, or that map.
+        feature: default: sift_sv64 for a new map; any other than that of an old one is refused.
         projection: of one's own.
-        matcher: default: NN-ratio, or that of the map.
+        matcher: likewise, NN-ratio.
         num_covis: pairs of each map image.
         overwrite: build anew.
     """
     if map_images is None:
-        if map is None:
+        if model_or_map is None:
             raise InputError("Give --map_images, the folder of the photos to build a map of.")
-        built = Map(map)
-        name, _ = features_confs.get(feature or FEATURE, projection)
-        wanted = {"feature": name if feature or projection else None, "matcher": matcher}
-        for option, value in wanted.items():
-            if value not in (None, getattr(built, option)):
-                raise InputError(f"The map {map} is of --{option} {getattr(built, option)}.")
+        built = Map(model_or_map)
+        if feature or projection:
+            built.check_feature(feature or FEATURE, projection)
+        if matcher not in (None, built.matcher):
+            raise InputError(f"The map {model_or_map} is of --matcher {built.matcher}.")
         return built
-    if map is not None and maps.is_map(map):
+    if model_or_map is not None and maps.is_map(model_or_map):
         raise InputError(
-            f"--map {map} is a map that was built: leave --map_images out to localize in it, "
-            "or give the COLMAP model that it was built from."
+            f"--map {model_or_map} is a map that was built: leave out --map_images to localize in "
+            "it, or give the COLMAP model that it was built from."
         )
     return maps.main(
         outputs / "map",
         map_images,
-        map,
+        model_or_map,
         feature or FEATURE,
         projection,
         matcher or MATCHER,
@@ -108,17 +108,30 @@ def main(
     extract_features.list_images(query_images, names)
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
+    made_from = outputs / MADE_FROM
+    before = stamps.read(made_from)
+    files = {name: query_images / name for name in names}
+    now = {"map": built.id, "queries": stamps.fingerprints(files, before.get("queries", {}))}
+    changed = stamps.changed(before.get("queries", {}), now["queries"])
+    if before and before["map"] != now["map"]:
+        changed.append(f"the map {built.folder}")
+    if changed:
+        logger.info("Localizing anew, because of changes: %s.", ", ".join(changed))
     folder = results.RunFolder(
         outputs,
         {
-            "map": built.id,
+            "map": built.place,
             "query_images": str(query_images.resolve()),
             "queries": str(queries.resolve()),
             "num_loc": num_loc,
         },
         overwrite,
-        renewed="map",
+        inputs=[query_images] if cameras else [query_images, queries],
+        stale=bool(changed),
     )
+    if not changed:  # photos that are not in this list may be in the next
+        now["queries"] = {**before.get("queries", {}), **now["queries"]}
+    stamps.write(made_from, now)
     sources = dict.fromkeys(names, "list")
     sources |= {name: source for name, (_, source) in cameras.items()}
     if cameras:
@@ -135,7 +148,7 @@ def main(
     with folder.stage("extract_features"):
         features = extract_features.main(built.conf, query_images, outputs, image_list=names)
     with folder.stage("retrieval"):
-        descriptors = aggregate_features.main(maps.RETRIEVAL, features, built.vocabulary)
+        descriptors = aggregate_features.main(maps.RETRIEVAL, features, vocabulary=built.vocabulary)
         pairs_from_retrieval.main(
             descriptors,
             loc_pairs,
@@ -204,7 +217,6 @@ def _main() -> None:
     parser.add_argument(
         "--outputs",
         type=Path,
-        required=True,
         help="folder for the map, in map, and for the results, in queries-<name>",
     )
     parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
@@ -213,6 +225,8 @@ def _main() -> None:
     parser.set_defaults(feature=None, matcher=None)  # those of a map that was built
     args = parser.parse_args()
     common.check_options(args)
+    if args.outputs is None:
+        raise InputError("Give --outputs, a folder.")
     if args.queries is not None and args.query_images is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
     built = open_map(

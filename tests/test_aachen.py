@@ -1,46 +1,31 @@
 """The main job, from photos to poses, and what it says to wrong input."""
 
-import csv
 import io
-import json
 import shutil
-import sys
 
+import command
 import cv2
 import h5py
 import numpy as np
 import pytest
 import torch
+from command import outcome
 
 from hloc_reduce import cli, projections
 from pipelines import aachen
 
 
 def run(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["aachen", *map(str, arguments)])
-    cli.run(aachen._main)
+    command.run(monkeypatch, aachen, *arguments)
 
 
 def refused(monkeypatch, caplog, *arguments):
-    """Run with wrong input: exit code 2, one or two lines, no traceback; return the message."""
-    caplog.clear()
-    with pytest.raises(SystemExit) as exit:
-        run(monkeypatch, *arguments)
-    assert exit.value.code == 2
-    (message,) = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
-    assert message.count("\n") < 2
-    return message
+    return command.refused(monkeypatch, caplog, aachen, *arguments)
 
 
 @pytest.fixture(autouse=True)
 def propagated(monkeypatch):
     monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
-
-
-def outcome(outputs):
-    with (outputs / "queries.csv").open() as file:
-        rows = {row["query"]: row for row in csv.DictReader(file)}
-    return json.loads((outputs / "summary.json").read_text()), rows
 
 
 def test_plane(aachen_layout, tmp_path, monkeypatch, capsys):

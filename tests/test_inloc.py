@@ -1,15 +1,14 @@
 """Localization by RGB-D scans, on a plane whose geometry is known and on a real place."""
 
-import csv
-import json
 import subprocess
 import sys
 
+import command
 import h5py
 import numpy as np
 import pycolmap
 import pytest
-from conftest import SHARED
+from conftest import SHARED, scan_frame
 from scipy.io import savemat
 
 from hloc_reduce import cli, localize_inloc, scans
@@ -19,19 +18,11 @@ from pipelines import inloc
 
 
 def run(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["inloc", *map(str, arguments)])
-    cli.run(inloc._main)
+    command.run(monkeypatch, inloc, *arguments)
 
 
 def refused(monkeypatch, caplog, *arguments):
-    """Run with wrong input: exit code 2, one or two lines, no traceback; return the message."""
-    caplog.clear()
-    with pytest.raises(SystemExit) as exit:
-        run(monkeypatch, *arguments)
-    assert exit.value.code == 2
-    (message,) = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
-    assert message.count("\n") < 2
-    return message
+    return command.refused(monkeypatch, caplog, inloc, *arguments)
 
 
 @pytest.fixture(autouse=True)
@@ -40,9 +31,9 @@ def propagated(monkeypatch):
 
 
 def outcome(outputs):
-    with (outputs / "queries.csv").open() as file:
-        rows = {row["query"].rpartition("/")[2]: row for row in csv.DictReader(file)}
-    return json.loads((outputs / "summary.json").read_text()), rows
+    """Return the summary, and the rows of queries.csv by base name."""
+    summary, rows = command.outcome(outputs)
+    return summary, {name.rpartition("/")[2]: row for name, row in rows.items()}
 
 
 def test_points_between_pixels_by_hand():
@@ -74,9 +65,9 @@ def test_files_of_scans_are_checked(tmp_path):
     assert scans.transformation_file(tmp_path, name) == path and scans.floor_of(name) == "DUC1"
     with pytest.raises(InputError, match="not the name of a cutout"):
         scans.floor_of("query/a.jpg")
-    for text in ("", "\n" * 7 + "1 2 3\n" * 4, "\n" * 7 + "1 2 x 4\n" * 4, "\n" * 7 + "nan " * 4):
+    for row in ("", "1 2 3", "1 2 x 4", "1 2 3 nan"):
         path = tmp_path / "trans.txt"
-        path.write_text(text)
+        path.write_text("\n" * 7 + f"{row}\n" * 4)
         with pytest.raises(InputError, match="trans.txt"):
             scans.read_transformation(path)
     mat = tmp_path / "a.mat"
@@ -143,6 +134,13 @@ def test_plane(inloc_layout, tmp_path, monkeypatch, capsys):
     assert outcome(tmp_path / "again")[1] == rows
 
 
+def shifted(number):
+    """Return the frame of a photo's floor from the world: 100 m apart for photo 3."""
+    matrix = np.eye(4)
+    matrix[0, 3] = 100 * (number == 3)
+    return matrix
+
+
 def test_points_are_those_of_the_plane(inloc_layout, tmp_path, monkeypatch):
     """In the frame of the floor: z = 0, at the pixel that sees it."""
     run(monkeypatch, "--dataset", inloc_layout, "--feature", "sift", "--outputs", tmp_path / "o")
@@ -160,7 +158,9 @@ def test_points_are_those_of_the_plane(inloc_layout, tmp_path, monkeypatch):
             without = np.isnan(xyz).any(1)
             assert (without == (keypoints[:, 0] < 39)).all() and without.any()
             xyz, keypoints = xyz[~without], keypoints[~without]
-            xyz[:, 0] -= 100 * (number == 3)
+            pose = scans.read_pose(inloc_layout, name)
+            np.testing.assert_allclose(pose @ scan_frame(number), shifted(number), atol=1e-9)
+            xyz = xyz @ pose[:3, :3].T + pose[:3, 3] - shifted(number)[:3, 3]
             np.testing.assert_allclose(xyz[:, 2], 0, atol=1e-4)
             pose = model.find_image_with_name(f"{number}.png").cam_from_world()
             pixels = camera.img_from_cam(xyz @ pose.rotation.matrix().T + pose.translation)
@@ -176,6 +176,7 @@ def test_retrieval_by_hlocs_pairs(inloc_layout, tmp_path, monkeypatch):
     outputs = tmp_path / "outputs"
     (inloc_layout / "ground_truth_poses.txt").unlink()
     (inloc_layout / "database/cutouts/PLA2/003/PLA_cutout_003_0_0.jpg").write_bytes(b"no image")
+    (inloc_layout / "database/alignments/PLA2/transformations/PLA_trans_003.txt").unlink()
     run(
         monkeypatch,
         *("--dataset", inloc_layout, "--outputs", outputs, "--retrieval", pairs),
@@ -183,7 +184,7 @@ def test_retrieval_by_hlocs_pairs(inloc_layout, tmp_path, monkeypatch):
     )
     summary, rows = outcome(outputs)
     assert summary["poses"] == "InLoc_hloc_sift_sv64+NN-ratio_netvlad30.txt"
-    assert summary["map_images"] == 2 and list(summary["lists"]) == ["query"]
+    assert summary["map_images"] == 2 and list(summary["lists"]) == ["PLA1"]
     assert rows["a.JPG"]["status"] == "localized" and rows["a.JPG"]["retrieved"] == cutouts[0]
     assert rows["b.JPG"]["status"] == "failed" and rows["b.JPG"]["retrieved"] == ""
 
@@ -242,6 +243,20 @@ def test_wrong_input(inloc_layout, tmp_path, monkeypatch, caplog):
     assert f"Cannot read the scan {mat}" in refused(monkeypatch, caplog, *arguments)
     mat.write_bytes(content)
     run(monkeypatch, *arguments)  # goes on where it was stopped
+    before, poses = outcome(tmp_path / "o")
+    transformation = inloc_layout / "database/alignments/PLA1/transformations/PLA_trans_001.txt"
+    text = transformation.read_text()
+    transformation.write_text("\n".join(text.splitlines()[:9]))
+    assert "no 4x4 matrix" in refused(monkeypatch, caplog, *arguments)
+    # where scans are is not kept with what they show
+    for path in transformation.parent.iterdir():
+        lines = path.read_text().splitlines() if path != transformation else text.splitlines()
+        row = lines[9].split()
+        lines[9] = " ".join([*row[:3], repr(float(row[3]) + 5)])
+        path.write_text("\n".join(lines))
+    run(monkeypatch, *arguments)
+    moved = outcome(tmp_path / "o")[1]["a.JPG"]
+    assert moved["status"] == "localized" and 4.9 < float(moved["position_error_m"]) < 5.1
     queries = inloc_layout / "queries_with_intrinsics.txt"
     text = queries.read_text()
     queries.write_text(text + text.splitlines()[0])

@@ -1,19 +1,21 @@
 """A map of one's own: built once, localized in by files and in memory; reconstruction."""
 
-import csv
 import json
 import os
 import shutil
 import sys
 
+import command
 import cv2
 import numpy as np
 import pycolmap
 import pytest
+from command import outcome
 
 from hloc_reduce import (
     Localizer,
     cli,
+    colmap,
     intrinsics,
     localization,
     maps,
@@ -24,6 +26,7 @@ from hloc_reduce import (
 )
 from hloc_reduce.cli import InputError
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.training import tracks
 from hloc_reduce.training.__main__ import parse_maps
 from pipelines import aachen, localize
 
@@ -31,24 +34,20 @@ LISTS = "*_time_queries_with_intrinsics.txt"
 
 
 def run(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["localize", *map(str, arguments)])
-    cli.run(localize._main)
+    command.run(monkeypatch, localize, *arguments)
 
 
 def refused(monkeypatch, caplog, *arguments):
-    """Run with wrong input: exit code 2, one or two lines, no traceback; return the message."""
-    caplog.clear()
-    with pytest.raises(SystemExit) as exit:
-        run(monkeypatch, *arguments)
-    assert exit.value.code == 2
-    (message,) = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
-    assert message.count("\n") < 2
-    return message
+    return command.refused(monkeypatch, caplog, localize, *arguments)
 
 
 @pytest.fixture(autouse=True)
 def propagated(monkeypatch):
     monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
+
+
+def state(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture
@@ -58,16 +57,6 @@ def place(aachen_layout, tmp_path):
     outputs = tmp_path / "outputs"
     build = ("--map", model, "--map_images", images, "--outputs", outputs)
     return build, images, outputs
-
-
-def state(folder):
-    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
-
-
-def outcome(folder):
-    with (folder / "queries.csv").open() as file:
-        rows = {row["query"]: row for row in csv.DictReader(file)}
-    return json.loads((folder / "summary.json").read_text()), rows
 
 
 def test_the_same_as_the_pipeline_of_aachen(place, aachen_layout, tmp_path, monkeypatch, capsys):
@@ -118,9 +107,13 @@ def test_a_map_is_built_once(place, monkeypatch, caplog, capsys):
     assert state(outputs / "map") == before
     summary, rows = outcome(outputs / "queries-day")
     assert set(rows) == {"a.png", "grey.png"} and summary["intrinsics"] == {"guess": 2}
-    night = state(outputs / "queries-night")
+    # a second run computes nothing: but for what sums up, no file is written
+    day = state(outputs / "queries-day")
     run(monkeypatch, *build, "--query_images", images / "query/day")
-    assert state(outputs / "queries-night") == night
+    again = state(outputs / "queries-day")
+    written = {path.name for path in day if again[path] != day[path]}
+    summing = {"queries.csv", "summary.json", "seconds.json", "made_from.json", summary["poses"]}
+    assert written == {*summing, f"{summary['poses']}_logs.jsonl"} and set(day) == set(again)
 
     # it may be moved, and used without what it was built from
     moved = outputs.parent / "moved"
@@ -132,14 +125,15 @@ def test_a_map_is_built_once(place, monkeypatch, caplog, capsys):
         *("--feature", "sift_sv64"),
     )
     assert outcome(outputs / "queries-day")[0]["map"] == str(moved)
-    message = refused(
-        monkeypatch, caplog, "--map", moved, "--outputs", outputs, "--feature", "sift_sv32"
-    )
-    assert "is of --feature sift_sv64" in message
+    given = ("--map", moved, "--outputs", outputs)
+    message = refused(monkeypatch, caplog, *given, "--feature", "sift_sv32")
+    assert "is of --feature sift_sv64." in message
+    message = refused(monkeypatch, caplog, *given, "--matcher", "NN-mutual")
+    assert "is of --matcher NN-ratio." in message
     message = refused(
         monkeypatch, caplog, "--map", moved, "--outputs", outputs, "--map_images", images
     )
-    assert "leave --map_images out" in message
+    assert "leave out --map_images" in message
 
 
 def test_what_has_changed_is_noticed(place, aachen_layout, monkeypatch, caplog):
@@ -171,8 +165,109 @@ def test_what_has_changed_is_noticed(place, aachen_layout, monkeypatch, caplog):
     assert maps.Map(outputs / "map").names() == ["db/0.png", "db/1.png", "db/2.png"]
     run(monkeypatch, *build, *new)
     after = state(outputs / "queries-day")
-    assert all(after[path] > results[path] for path in results)
+    assert all(after[path] > results[path] for path in results if path.suffix in (".h5", ".csv"))
     assert outcome(outputs / "queries-day")[0]["map_images"] == 3
+
+
+def test_results_of_another_map_are_kept(place, tmp_path, monkeypatch, caplog):
+    build, images, outputs = place
+    new = ("--query_images", images / "query/day")
+    run(monkeypatch, *build, *new)
+    results = state(outputs / "queries-day")
+    other = tmp_path / "other"
+    run(monkeypatch, *build[:4], "--outputs", other)
+    message = refused(monkeypatch, caplog, "--map", other / "map", *new, "--outputs", outputs)
+    assert "another map. " in message
+    (images / "query/night").rename(tmp_path / "day")  # of the same name
+    message = refused(monkeypatch, caplog, *build, "--query_images", tmp_path / "day")
+    assert "another query_images. " in message
+    assert state(outputs / "queries-day") == results
+
+
+def test_queries_that_have_changed_are_localized_anew(place, monkeypatch):
+    build, images, outputs = place
+    run(monkeypatch, *build, "--query_images", images / "query/day")
+    assert outcome(outputs / "queries-day")[1]["grey.png"]["status"] == "fallback"
+    shutil.copy(images / "query/day/a.png", images / "query/day/grey.png")
+    shutil.copy(images / "query/day/a.png", images / "query/day/new.png")
+    run(monkeypatch, *build, "--query_images", images / "query/day")
+    rows = outcome(outputs / "queries-day")[1]
+    assert [row["status"] for row in rows.values()] == ["localized"] * 3
+    assert len({row["num_inliers"] for row in rows.values()}) == 1
+
+
+def test_queries_called_as_map_photos(place, tmp_path, monkeypatch):
+    """They are other photos: every pair is matched, also one that looks like another's reverse."""
+    build, images, outputs = place
+    new = tmp_path / "new/db"
+    new.mkdir(parents=True)
+    for name in ("0.png", "1.png", "3.png"):
+        shutil.copy(images / "query/day/a.png", new / name)
+    run(monkeypatch, *build, "--query_images", new.parent)
+    summary, rows = outcome(outputs / "queries-new")
+    assert set(rows) == {"db/0.png", "db/1.png", "db/3.png"}
+    assert len({tuple(row.values())[2:] for row in rows.values()}) == 1
+    localizer = Localizer(outputs / "map")
+    pose, info = localizer.localize(new / "1.png")
+    assert (
+        info["num_matches"] == int(rows["db/1.png"]["num_matches"]) and len(info["retrieved"]) == 4
+    )
+    poses = parsers.parse_poses(outputs / "queries-new" / summary["poses"])
+    assert max(pose_error(pose, poses["db/1.png"])) < 1e-9
+
+
+def test_inputs_are_not_deleted(place, tmp_path, monkeypatch, caplog):
+    build, images, outputs = place
+    run(monkeypatch, *build)
+    before = state(outputs / "map")
+    arguments = ("--map", outputs / "map/sfm", *build[2:], "--overwrite", "--feature", "sift")
+    message = refused(monkeypatch, caplog, *arguments)
+    assert "map/sfm is in" in message and "move it" in message
+    assert state(outputs / "map") == before
+
+
+def test_a_deletion_that_was_cut_short_goes_on(place, monkeypatch):
+    """Nothing of the map before gets into the new one."""
+    build, images, outputs = place
+    run(monkeypatch, *build)
+    old = (outputs / "map/feats-dog-sift_sv64.h5").read_bytes()
+    unlink = type(outputs).unlink
+
+    def killed(path, *arguments, **options):
+        if path.name.startswith("feats-"):
+            raise KeyboardInterrupt
+        unlink(path, *arguments, **options)
+
+    with monkeypatch.context() as context:
+        context.setattr(type(outputs), "unlink", killed)
+        with pytest.raises(SystemExit):
+            run(monkeypatch, *build, "--overwrite")
+    with pytest.raises(InputError, match="not a finished one"):
+        maps.Map(outputs / "map")
+    assert (outputs / "map/feats-dog-sift_sv64.h5").read_bytes() == old
+    run(monkeypatch, *build)
+    assert (outputs / "map/feats-dog-sift_sv64.h5").read_bytes() != old  # it has another id
+
+
+def test_a_broken_map_is_refused(place, tmp_path, monkeypatch, caplog):
+    build, images, outputs = place
+    run(monkeypatch, *build)
+    file = outputs / "map/map.json"
+    sound = json.loads(file.read_text())
+    for key, value in (
+        ("feature", "/../../x"),
+        ("matcher", "no_such"),
+        ("conf", {**sound["conf"], "output": "../x"}),
+        ("conf", {"output": "x"}),
+        ("conf", {**sound["conf"], "model": {"projection": "../x.safetensors"}}),
+        ("points3D", None),
+    ):
+        file.write_text(json.dumps({**sound, key: value}))
+        with pytest.raises(InputError, match=r"no sound map.json|Unknown matcher"):
+            maps.Map(outputs / "map")
+    file.write_text("[]")
+    arguments = ("--map", outputs / "map", "--outputs", tmp_path / "x", "--query_images", images)
+    assert "no sound map.json" in refused(monkeypatch, caplog, *arguments)
 
 
 def test_a_build_that_was_stopped_goes_on(place, monkeypatch, caplog):
@@ -213,6 +308,10 @@ def test_a_projection_is_kept_with_the_map(place, tmp_path, monkeypatch):
     run(monkeypatch, *build, "--feature", "sift", "--projection", f"{mine}@24")
     built = maps.Map(outputs / "map")
     assert built.feature == "mine@24"
+    built.check_feature("sift", f"{mine}@24")
+    shutil.copy(projections.find("mkd_nested"), mine)  # trained again, say
+    with pytest.raises(InputError, match="but not of the mine@24 that it is now"):
+        built.check_feature("sift", f"{mine}@24")
     mine.unlink()
     pose, info = Localizer(outputs / "map").localize(images / "query/day/a.png")
     assert pose is not None and info["intrinsics"] == "guess"
@@ -294,6 +393,14 @@ def test_wrong_input(place, tmp_path, monkeypatch, caplog):
     message = refused(monkeypatch, caplog, "--map_images", tmp_path / "nowhere", *build[4:])
     assert "no folder" in message and "nowhere" in message
     assert "Unknown matcher" in refused(monkeypatch, caplog, *build, "--matcher", "NN")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in ("IMG 1.png", "#2.png"):
+        shutil.copy(images / "db/1.png", photos / name)
+        message = refused(monkeypatch, caplog, "--map_images", photos, *build[4:])
+        assert repr(name) in message and "Rename" in message
+        (photos / name).unlink()
+    assert "Give --outputs" in refused(monkeypatch, caplog, *build[:4])
     assert "--num_covis 0" in refused(monkeypatch, caplog, *build, "--num_covis", 0)
     assert not (outputs / "map").exists()
     run(monkeypatch, *build)
@@ -307,10 +414,16 @@ def test_wrong_input(place, tmp_path, monkeypatch, caplog):
 def test_a_map_to_train_on(place, monkeypatch):
     build, images, outputs = place
     run(monkeypatch, *build)
-    (name, folders), *others = parse_maps([str(outputs / "map")]).items()
-    assert (name, folders) == ("dataset", (images, outputs / "map/sfm")) and not others
-    with pytest.raises(InputError, match="another map is called dataset"):
-        parse_maps([str(outputs / "map"), f"{images}:{outputs / 'map/sfm'}"])
+    folders = images, outputs / "map/sfm"
+    assert parse_maps([str(outputs / "map")]) == {"outputs": folders}
+    assert parse_maps([f"{images}:{outputs / 'map/sfm'}"]) == {"dataset": folders}
+    with pytest.raises(InputError, match="another map is called outputs"):
+        parse_maps([str(outputs / "map")] * 2)
+    cache = outputs / "cache"
+    tracks.main(*folders, cache)
+    run(monkeypatch, *build, "--overwrite")
+    with pytest.raises(InputError, match="tracks of another map"):
+        tracks.main(*folders, cache)
     with pytest.raises(InputError, match="neither a map nor"):
         parse_maps([str(outputs)])
 
@@ -359,6 +472,10 @@ def test_reconstruction_from_matches_alone(scene, tmp_path):
     with pytest.raises(InputError, match="could not reconstruct"):
         reconstruction.main(tmp_path / "no", *arguments, **shared, min_match_score=1.5)
     assert not (tmp_path / "no").exists()
+    cv2.imwrite(str(scene.images / "db/3.jpg"), np.zeros((100, 100), np.uint8))
+    parsers.write_pairs([(a, b) for a in names for b in names if a < b], pairs)
+    with pytest.raises(InputError, match="do not share a camera: db/3.jpg"):
+        reconstruction.main(tmp_path / "no", *arguments, **shared)
 
 
 def test_photos_alone(plane, tmp_path, monkeypatch):
@@ -371,8 +488,15 @@ def test_photos_alone(plane, tmp_path, monkeypatch):
     run(monkeypatch, "--map_images", images, "--query_images", new, "--outputs", outputs)
     built = maps.Map(outputs / "map")
     summary, rows = outcome(outputs / "queries-new")
-    assert summary["map_images"] == len(built.names()) >= 3
+    assert summary["map_images"] == len(built.names()) == 4
     assert rows["4.png"]["status"] == "localized"
+    poses = parsers.parse_poses(outputs / "queries-new" / summary["poses"])
+    model = colmap.read_model(built.sfm)
+    poses |= {image.name: image.cam_from_world() for image in model.images.values()}
+    true = pycolmap.Reconstruction(plane / "model").images.values()
+    centres = np.array([poses[image.name].inverse().translation for image in true])
+    known = np.array([image.projection_center() for image in true])
+    assert np.linalg.norm(similarity(centres, known), axis=1).max() < 0.1  # of 2.2
 
 
 def test_records_of_failed_queries_have_no_pose():

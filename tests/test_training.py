@@ -121,7 +121,7 @@ def test_paper_recipe_is_the_papers(tmp_path, monkeypatch):
 
     monkeypatch.setattr(PairSampler, "batch", counted)
     monkeypatch.setattr(torch.optim.Adam, "step", observed)
-    recipe = training.complete_recipe("sv", "paper", "sift")
+    recipe = training.complete_recipe("sv", "paper", "sift", "sift_sv64")
     mlp = sv.train([noisy_tracks()], 16, recipe, 0, tmp_path / "c")
     assert mlp.sizes == (128, 512, 512, 16)
     assert numbers == list(range(20))  # 1,600 observations are two batches an epoch
@@ -279,10 +279,10 @@ def test_a_last_batch_of_one_is_left_out(scheme, batch_size, tmp_path):
 
 def test_the_papers_hyper_parameters():
     """Sec. III-D; those of the classification layer are of the authors' code."""
-    recipe = training.complete_recipe("us", "paper", "hardnet")
+    recipe = training.complete_recipe("us", "paper", "hardnet", "hardnet_us64")
     assert recipe["distance_weight"] == 0.1 and recipe["hidden"] == [96]
     assert (recipe["epochs"], recipe["lr"], recipe["batch_size"]) == (5, 0.001, 1024)
-    recipe = training.complete_recipe("ss", "paper", "sift")
+    recipe = training.complete_recipe("ss", "paper", "sift", "sift_ss64")
     assert recipe["hidden"] == [512, 512] and not recipe["distance_weight"]
     assert (recipe["epochs"], recipe["lr"], recipe["batch_size"]) == (200, 0.001, 256)
     assert recipe["cluster_epochs"] == 10 and recipe["final_lr"] == 1
@@ -382,6 +382,42 @@ def test_nested_is_trained_once(scene, tmp_path, monkeypatch):
     (path,) = training.main(*arguments)
     written = path.stat().st_mtime_ns
     assert training.main(*arguments) == [path] and path.stat().st_mtime_ns == written
+
+
+def test_tuning_begins_with_what_ships(scene, tmp_path, monkeypatch):
+    """Without a step of learning the weights are those that ship; with some they are better."""
+    monkeypatch.setattr(tracks, "main", lambda *_: tmp_path / "tracks.safetensors")
+    monkeypatch.setattr(tracks, "load", lambda _: noisy_tracks())
+    (tmp_path / "tracks.safetensors").touch()
+    shipped, _ = projections.read("sift_sv16")
+    others = [], "sift", "sv", [16]
+    for scheme, steps, lr in ((sv, 1, 0.0), (sv, 60, 1e-3)):
+        recipe = {**scheme.RECIPES["tune"], "steps": steps, "lr": lr, "batch_size": 100}
+        monkeypatch.setitem(scheme.RECIPES, "tune", recipe)
+        output = tmp_path / str(steps)
+        place = {"a": (scene.images, scene.model)}
+        (path,) = training.main(place, *others, output, tmp_path, "tune")
+        tuned, metadata = projections.read(path)
+        assert metadata["recipe"]["begin_with"] == "sift_sv16" and metadata["recipe"]["lr"] == lr
+        same = torch.equal(tuned.linears[0].weight, shipped.linears[0].weight)
+        assert same == (steps == 1)
+    assert held_out_precision(tuned) > 3 * held_out_precision(shipped.eval())
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("--scheme", "us"), "Unknown recipe of us 'tune'"),
+        (("--dim", 48), "sift_sv48 does not ship"),
+        (("--scheme", "nested", "--descriptor", "hardnet"), "hardnet_nested does not ship"),
+    ],
+)
+def test_what_cannot_be_tuned(scene, tmp_path, monkeypatch, arguments, message):
+    monkeypatch.setattr(training, "check_weights", lambda name: None)
+    place = ("--map", f"{scene.images}:{scene.model}", "--cache", tmp_path / "cache")
+    with pytest.raises(InputError, match=message):
+        run(monkeypatch, *place, "--recipe", "tune", *arguments)
+    assert not (tmp_path / "cache").exists()
 
 
 def run(monkeypatch, *arguments):

@@ -88,7 +88,9 @@ def test_hardnet_is_trained_with_the_distance_loss(sequence, tmp_path, monkeypat
         assert project.sizes[0] == 128 and project.dim == (64 if scheme == "nested" else 24)
         assert project.sizes[1:-1] == (() if scheme == "pca" else (96,))
         assert project.metadata["recipe"].get("distance_weight") == weight
-    assert training.complete_recipe("us", "paper", "hardnet")["distance_weight"] == 0.1
+    assert (
+        training.complete_recipe("us", "paper", "hardnet", "hardnet_us64")["distance_weight"] == 0.1
+    )
 
 
 def test_broken_sequences_are_refused(sequence, tmp_path):

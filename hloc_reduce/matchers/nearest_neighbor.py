@@ -66,7 +66,8 @@ def mutual_nearest(
     """
     chosen = descriptors0 if rows is None else descriptors0[rows]
     if min(len(chosen), len(descriptors1)) == 0:
-        return torch.full((len(chosen),), -1), torch.zeros(len(chosen))
+        nothing = torch.full((len(chosen),), -1, device=chosen.device)
+        return nothing, chosen.new_zeros(len(chosen))
     # as in hloc, a lone descriptor on either side, which has no second best, skips the test
     if min(len(descriptors0), len(descriptors1)) == 1:
         ratio_threshold = None

@@ -175,18 +175,29 @@ def load(projection: str | Path) -> Projection:
     Raises:
         InputError: when it is not there or is not a projection.
     """
-    path, prefix = find(projection), split_prefix(projection)[1]
+    loaded, (name, prefix) = Projection(*read(projection)), split_prefix(projection)
+    if not prefix:
+        return loaded
+    if loaded.metadata.get("scheme") != "nested" or not prefix.isdigit():
+        stem = Path(name).stem
+        raise InputError(f"{stem} is not nested: it has no first {prefix} numbers of use.")
+    return loaded.cut(int(prefix))
+
+
+def read(projection: str | Path) -> tuple[MLP, dict]:
+    """Read the network of a projection as it was trained, and its metadata.
+
+    Raises:
+        InputError: when it is not there or is not a projection.
+    """
+    path = find(projection)
     try:
         mlp, metadata = READERS.get(path.suffix, read_safetensors)(path)
-        loaded = Projection(mlp, metadata)
+        Projection(mlp)
     except BROKEN as error:
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"{path} is not a projection ({reason}).") from None
-    if not prefix:
-        return loaded
-    if metadata.get("scheme") != "nested" or not prefix.isdigit():
-        raise InputError(f"{path.stem} is not nested: it has no first {prefix} numbers of use.")
-    return loaded.cut(int(prefix))
+    return mlp, metadata
 
 
 def read_safetensors(path: Path) -> tuple[MLP, dict]:

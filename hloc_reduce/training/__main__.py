@@ -1,7 +1,7 @@
 """Train projections on COLMAP maps or on PhotoTour patches.
 
 Extracts, matches and triangulates the images of each map with the poses of its model, and learns
-from the tracks.
+from the tracks. A map of one's own that pipelines.localize built will do.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from ..versions import versions
 from . import nested, pca, phototour, ss, sv, tracks, us
 
 SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
-RECIPE_NAMES = ("best", "paper")
+RECIPE_NAMES = ("best", "paper", "tune")
 HIDDEN = (512, 512)  # hidden layers of projections of an extractor's own descriptors
 
 
@@ -47,7 +47,8 @@ def main(
         dims: numbers of output dimensions; not of "nested", which has its own.
         output: folder for `<descriptor>_<scheme><dim>.safetensors`.
         cache: folder for what is computed of maps and sequences, used again by later trainings.
-        recipe: "best", or "paper" for its losses, layers and hyper-parameters.
+        recipe: "best", "paper" for its losses, layers and hyper-parameters, or "tune" to begin
+            with the projection that ships and learn what is particular to a place of one's own.
         seed: of everything random.
         conf: of a feature, to train projections of its descriptors on maps.
 
@@ -65,7 +66,10 @@ def main(
     base = {"descriptor": descriptor}
     if conf:
         base = {"descriptor": extractors.load_local(conf["model"]).descriptor, "base": conf}
-    settings = complete_recipe(scheme, recipe, base["descriptor"])
+    settings = {
+        path: complete_recipe(scheme, recipe, base["descriptor"], path.stem)
+        for path in paths.values()
+    }
     files = {
         folder.resolve().name: phototour.main(
             folder, cache / folder.resolve().name, descriptor, seed
@@ -94,7 +98,7 @@ def main(
                 }
                 for name, part in zip(files, data, strict=True)
             },
-            "recipe": {"name": recipe, **settings},
+            "recipe": {"name": recipe, **settings[path]},
             "seed": seed,
             "versions": versions(),
         }
@@ -112,7 +116,7 @@ def main(
         mlp = trainer.train(
             data,
             dim,
-            settings,
+            settings[path],
             seed,
             checkpoint=checkpoint,
             made_from=json.dumps(metadata, sort_keys=True),
@@ -123,16 +127,29 @@ def main(
     return list(paths.values())
 
 
-def complete_recipe(scheme: str, recipe: str, descriptor: str) -> dict:
-    """Return the hyper-parameters of a scheme's recipe for a descriptor."""
+def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dict:
+    """Return the hyper-parameters of a scheme's recipe for a descriptor.
+
+    Args:
+        scheme: a key of `SCHEMES`.
+        recipe: of `RECIPE_NAMES`.
+        descriptor: base descriptor, or another.
+        name: of the projection; "tune" begins with the one of this name that ships.
+
+    Raises:
+        InputError: when the scheme has no such recipe, or there is nothing to begin with.
+    """
     trainer = SCHEMES[scheme]
     if trainer is pca:
         return {}
-    return {
+    settings = {
         "hidden": list(DESCRIPTORS[descriptor].hidden if descriptor in DESCRIPTORS else HIDDEN),
         "distance_weight": trainer.DISTANCE_WEIGHTS.get(descriptor, 0.0),
-        **trainer.RECIPES[recipe],
+        **trainer.RECIPES[cli.choose(f"recipe of {scheme}", recipe, trainer.RECIPES)],
     }
+    if recipe == "tune":
+        settings |= {"begin_with": name, "begin_with_sha256": projections.checksum(name)}
+    return settings
 
 
 def base_of(conf: dict) -> dict:
@@ -143,7 +160,7 @@ def base_of(conf: dict) -> dict:
 def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
     """Parse `images:model`, or folders of maps of `pipelines.localize`.
 
-    A map is named after the folder that its images folder lies in.
+    A map is named after the folder that its images folder, or the folder of the map, lies in.
 
     Returns:
         From name to the folders of images and of the COLMAP model.
@@ -156,15 +173,16 @@ def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
         if is_map(Path(value)):
             built = Map(Path(value))
             images, model = built.images, built.sfm
+            name = built.folder.resolve().parent.name
         else:
             images, separator, model = value.rpartition(":")
             if not separator:
                 raise InputError(f"--map {value}: neither a map nor of the form images:model.")
             images, model = Path(images), Path(model)
+            name = images.resolve().parent.name
         for folder in (images, model):
             if not folder.is_dir():
                 raise InputError(f"--map {value}: there is no folder {folder}.")
-        name = images.resolve().parent.name
         if name in folders:
             raise InputError(f"--map {value}: another map is called {name} too.")
         folders[name] = images, model
@@ -223,7 +241,12 @@ def _main() -> None:
         metavar="DIR",
         help="folder of another PhotoTour sequence, to print the FPR95 of its pairs",
     )
-    parser.add_argument("--recipe", default="best", help=f"one of {', '.join(RECIPE_NAMES)}")
+    parser.add_argument(
+        "--recipe",
+        default="best",
+        help=f"one of {', '.join(RECIPE_NAMES)}; tune is for one's own map and begins with the "
+        "projection that ships",
+    )
     parser.add_argument(
         "--output", type=Path, default=Path("outputs/training"), help="folder for the projections"
     )

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from ..projections import MLP
+from ..projections import MLP, read
 from .loop import device, fit
 from .losses import distance_loss, triplet_loss
 from .sampling import PairSampler
@@ -37,6 +37,8 @@ RECIPES = {
         "maps_per_batch": 2,
     },
 }
+# begins with a projection that ships, for one's own map
+RECIPES["tune"] = {**RECIPES["best"], "steps": 1000, "lr": 1e-3}
 DISTANCE_WEIGHTS = {"hardnet": 3.0}  # beta
 
 
@@ -50,7 +52,8 @@ def train(
         dim: number of output dimensions.
         recipe: an entry of `RECIPES` with `hidden`, the sizes of the hidden layers,
             `distance_weight`, that of the distance loss, and perhaps `prefixes`: numbers of
-            dimensions, the first so many of which are to be good descriptors too.
+            dimensions, the first so many of which are to be good descriptors too; and
+            `begin_with`: a projection to begin with, as of `projections.find`.
         seed: of the initial weights and the batches.
         checkpoint: file from which a killed training goes on; the caller deletes it.
         made_from: says what the training is made from; a checkpoint of another is not used.
@@ -63,7 +66,11 @@ def train(
     sampler = PairSampler(maps, **drawing, seed=seed)
     size, place = recipe["batch_size"], device()
     steps = recipe.get("steps") or recipe["epochs"] * -(-sampler.num_observations // size)
-    mlp = MLP([maps[0].descriptors.shape[-1], *recipe["hidden"], dim]).train().to(place)
+    if "begin_with" in recipe:
+        mlp, _ = read(recipe["begin_with"])
+    else:
+        mlp = MLP([maps[0].descriptors.shape[-1], *recipe["hidden"], dim])
+    mlp.train().to(place)
 
     def loss(step: int) -> torch.Tensor:
         descriptors = torch.cat(sampler.batch(step, size)).to(place)

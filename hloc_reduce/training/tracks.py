@@ -28,6 +28,7 @@ from ..colmap import point3D_ids
 from ..descriptors import DIM, Descriptor
 from ..extractors.dog import extract_patches
 from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
+from ..maps import Map, is_map
 from .completion import complete
 from .loop import device
 
@@ -94,6 +95,8 @@ def main(
         InputError: when the map cannot be read or gives no tracks.
     """
     source = {"images": str(images.resolve()), "model": str(model.resolve())}
+    if is_map(model.parent):  # which may have been built anew, of other photos
+        source["map"] = Map(model.parent).id
     if (output / "source.json").exists() and not stamps.is_current(output / "source.json", source):
         raise InputError(f"{output} holds the tracks of another map. Choose another folder.")
     stamps.write(output / "source.json", source)
