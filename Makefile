@@ -21,7 +21,8 @@ test: $(VENV)/installed $(OLD)/installed
 	$(BIN)/python -m pytest
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest tests/test_dog.py tests/test_stages.py \
-		tests/test_aachen.py::test_plane
+		tests/test_aachen.py::test_plane tests/test_inloc.py::test_plane tests/test_localize.py \
+		-k "not test_localize or intrinsics or reconstruction or the_same_as"
 
 # torch by itself first: a pinned version is a CPU build where an index offers one
 $(VENV)/installed: pyproject.toml constraints.txt

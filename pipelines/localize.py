@@ -113,7 +113,7 @@ def main(
     files = {name: query_images / name for name in names}
     now = {"map": built.id, "queries": stamps.fingerprints(files, before.get("queries", {}))}
     changed = stamps.changed(before.get("queries", {}), now["queries"])
-    if before and before["map"] != now["map"]:
+    if before and before.get("map") != now["map"]:
         changed.append(f"the map {built.folder}")
     if changed:
         logger.info("Localizing anew, because of changes: %s.", ", ".join(changed))
@@ -243,7 +243,8 @@ def _main() -> None:
         print(f"The map {built.folder} is there. Localize photos in it with --query_images.")
         return
     name = (args.queries or args.query_images.resolve()).stem
-    outputs = args.outputs / f"queries-{re.sub(NOT_IN_NAMES, '', name).strip('._-')}"
+    name = re.sub(NOT_IN_NAMES, "", name).strip("._-")
+    outputs = args.outputs / f"queries-{name or 'all'}"
     summary = main(
         built,
         args.query_images,
