@@ -1,0 +1,47 @@
+"""Print how long a Localizer takes for photos, one at a time, by stage."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from hloc_reduce import Localizer, cli
+from hloc_reduce.extract_features import list_images
+
+STAGES = ("extraction", "retrieval", "matching", "pose")
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python benchmarks/localizer.py --map outputs/place/map "
+        "--query_images photos",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--map", type=Path, required=True, help="map of pipelines.localize")
+    parser.add_argument("--query_images", type=Path, required=True, help="folder of photos")
+    args = parser.parse_args()
+    localizer = Localizer(args.map)
+    photos = [args.query_images / name for name in list_images(args.query_images)]
+    localizer.localize(photos[0])  # what is done once only
+    seconds = []
+    for photo in tqdm(photos, desc="Localizing", unit="photo"):
+        _, info = localizer.localize(photo)
+        seconds.append([info["seconds"][stage] for stage in STAGES])
+    seconds = np.array(seconds)
+    keypoints = np.mean([len(descriptors) for descriptors in localizer.descriptors.values()])
+    print(
+        f"{len(photos)} photos, map of {len(localizer.names)} with {keypoints:.0f} keypoints each, "
+        f"{torch.get_num_threads()} threads"
+    )
+    print("| seconds | " + " | ".join(STAGES) + " | all but extraction |")
+    print("| --- |" + " ---: |" * (len(STAGES) + 1))
+    for name, reduce in (("mean", np.mean), ("median", np.median), ("max", np.max)):
+        cells = [*reduce(seconds, axis=0), reduce(seconds[:, 1:].sum(axis=1))]
+        print(f"| {name} | " + " | ".join(f"{cell:.3f}" for cell in cells) + " |")
+
+
+if __name__ == "__main__":
+    cli.run(_main)
