@@ -13,11 +13,9 @@ from hloc_reduce import (
     cli,
     demo,
     extract_features,
-    extractors,
     localize_sfm,
     match_features,
     pairs_from_covisibility,
-    results,
     triangulation,
 )
 from hloc_reduce.datasets import Aachen, thresholds, true_poses
@@ -50,20 +48,9 @@ def main(
     loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
     common.check_retrieval(retrieval, loc_pairs, num_loc, query_names, map_names)
 
-    if overwrite or not (outputs / "conf.json").exists():
-        extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
-    folder = results.RunFolder(
-        outputs,
-        {
-            "dataset": str(dataset.resolve()),
-            "feature": extract_features.provenance(feature_conf, as_half=True),
-            "matcher": matcher_conf["model"],
-            "retrieval": retrieval,
-            "num_covis": num_covis,
-            "num_loc": num_loc,
-        },
-        overwrite,
-        inputs=[Path(retrieval)] if retrieval != "vlad" else [],
+    numbers = {"num_covis": num_covis, "num_loc": num_loc}
+    folder = common.run_folder(
+        outputs, dataset, feature_conf, matcher_conf, retrieval, numbers, overwrite
     )
     sfm = outputs / f"sfm_{feature}+{matcher}"
     sfm_pairs = outputs / f"pairs-db-covis{num_covis}.txt"
@@ -92,8 +79,7 @@ def main(
         "matcher": matcher,
         "retrieval": retrieval,
         "dataset": str(dataset),
-        "num_covis": num_covis,
-        "num_loc": num_loc,
+        **numbers,
         "map_images": len(map_names),
         "map_points3D": reconstruction.num_points3D(),
     }

@@ -8,7 +8,15 @@ import pycolmap
 
 from confs import features as features_confs
 from confs import matchers as matchers_confs
-from hloc_reduce import aggregate_features, cli, logger, pairs_from_retrieval, results
+from hloc_reduce import (
+    aggregate_features,
+    cli,
+    extract_features,
+    extractors,
+    logger,
+    pairs_from_retrieval,
+    results,
+)
 from hloc_reduce.cli import InputError
 from hloc_reduce.io import list_h5_names
 from hloc_reduce.parsers import parse_retrieval
@@ -117,6 +125,42 @@ def check_retrieval(
     if not any(found):
         raise InputError(f"{retrieval} has no pair of a query and a map image.")
     return sorted({other for others in found for other in others[:num_loc]})
+
+
+def run_folder(
+    outputs: Path,
+    dataset: Path,
+    feature_conf: dict,
+    matcher_conf: dict,
+    retrieval: str,
+    numbers: dict[str, int],
+    overwrite: bool,
+) -> results.RunFolder:
+    """Open the output folder of a data set's pipeline, or refuse it, before any work is done.
+
+    Args:
+        outputs: the folder.
+        dataset: of the data set.
+        feature_conf: configuration of the feature.
+        matcher_conf: of the matcher.
+        retrieval: --retrieval.
+        numbers: --num_...
+        overwrite: begin anew.
+    """
+    if overwrite or not (outputs / "conf.json").exists():
+        extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
+    return results.RunFolder(
+        outputs,
+        {
+            "dataset": str(dataset.resolve()),
+            "feature": extract_features.provenance(feature_conf, as_half=True),
+            "matcher": matcher_conf["model"],
+            "retrieval": retrieval,
+            **numbers,
+        },
+        overwrite,
+        inputs=[] if retrieval == "vlad" else [Path(retrieval)],
+    )
 
 
 def retrieve(

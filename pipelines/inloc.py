@@ -12,10 +12,8 @@ from confs import matchers as matchers_confs
 from hloc_reduce import (
     cli,
     extract_features,
-    extractors,
     localize_inloc,
     match_features,
-    results,
 )
 from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
 
@@ -47,19 +45,9 @@ def main(
     truth = true_poses(query_names, ground_truth or place.ground_truth, bool(ground_truth))
     lists = place.buildings(query_names, truth, used)
 
-    if overwrite or not (outputs / "conf.json").exists():
-        extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
-    folder = results.RunFolder(
-        outputs,
-        {
-            "dataset": str(dataset.resolve()),
-            "feature": extract_features.provenance(feature_conf, as_half=True),
-            "matcher": matcher_conf["model"],
-            "retrieval": retrieval,
-            "num_loc": num_loc,
-        },
-        overwrite,
-        inputs=[Path(retrieval)] if retrieval != "vlad" else [],
+    numbers = {"num_loc": num_loc}
+    folder = common.run_folder(
+        outputs, dataset, feature_conf, matcher_conf, retrieval, numbers, overwrite
     )
     poses = outputs / f"InLoc_hloc_{feature}+{matcher}_{retrieved}.txt"
 
@@ -67,7 +55,7 @@ def main(
         names = [*used, *query_names]
         features = extract_features.main(feature_conf, dataset, outputs, image_list=names)
     with folder.stage("retrieval"):
-        common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, used)
+        common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
     with folder.stage("match_queries"):
         matches = match_features.main(matcher_conf, loc_pairs, features.stem, outputs)
     with folder.stage("localization"):
@@ -86,7 +74,7 @@ def main(
         "matcher": matcher,
         "retrieval": retrieval,
         "dataset": str(dataset),
-        "num_loc": num_loc,
+        **numbers,
         "map_images": len(used),
     }
     limits = dict.fromkeys(lists, INLOC_THRESHOLDS)
