@@ -41,6 +41,12 @@ def choose(kind: str, name: str, names: Iterable[str]) -> str:
     return name
 
 
+def some(names: Iterable[str], number: int = 5) -> str:
+    """Name the first few of many."""
+    names = list(names)
+    return ", ".join(names[:number]) + (", ..." if len(names) > number else "")
+
+
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
     """Shows defaults, except of options that have none, and keeps an example on its line."""
 

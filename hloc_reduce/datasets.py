@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 
 from . import colmap, extract_features, localize_inloc, logger, scans
-from .cli import InputError
+from .cli import InputError, some
 from .parsers import parse_poses, parse_query_list, parse_query_lists
 
 # position and rotation thresholds (metres, degrees), as in the paper's tables
@@ -147,7 +147,9 @@ class InLoc:
         files |= {scans.transformation_file(self.root, name) for name in names}
         missing = sorted(file for file in files if not file.is_file())
         if missing:
-            raise InputError(f"{self.root} lacks {len(missing)} files of scans: {missing[0]}, ...")
+            raise InputError(
+                f"{self.root} lacks {len(missing)} files of scans: {some(map(str, missing), 2)}"
+            )
 
     def query_names(self) -> list[str]:
         """List the queries: those of `query_list` where there is one, else all photos."""
@@ -158,6 +160,7 @@ class InLoc:
     def queries(self, features: Path) -> list[tuple[str, pycolmap.Camera]]:
         """Return the queries with the intrinsics of `query_list`, or else of the benchmark."""
         if not self.query_list.is_file():
+            logger.info("There is no %s: queries are taken for an iPhone 7's.", self.query_list)
             return localize_inloc.by_iphone7(features, self.query_names())
         return parse_query_list(self.query_list)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from tqdm import tqdm
 
-from . import colmap, logger
+from . import cli, colmap, logger
 from .cli import InputError
 from .io import check_matches, find_pair, get_colmap_keypoints, get_matches, open_h5, replacing
 from .parsers import write_poses
@@ -151,6 +151,7 @@ def main(
         reference = load_reference()
         with open_h5(features) as feature_file, open_h5(matches) as match_file, log:
             _check_some_matched(match_file, queries, retrieved)
+            _check_sizes(feature_file, todo)
             for name, camera in tqdm(todo, desc="Localizing", unit="query"):
                 keypoints, _ = get_colmap_keypoints(feature_file, name)
                 found = _read_matches(
@@ -165,8 +166,8 @@ def main(
     poses = {name: pose(record) for name, record in records.items()}
     submitted = {name: known for name, known in poses.items() if known is not None}
     write_poses(submitted, results, name_parts)
-    if len(submitted) < len(poses):
-        logger.warning("No pose: %s.", ", ".join(name for name in poses if name not in submitted))
+    if failed := [name for name in poses if name not in submitted]:
+        logger.warning("%d queries have no pose: %s.", len(failed), cli.some(failed))
     localized = sum(record["localized"] for record in records.values())
     logger.info("Localized %d of %d queries: %s", localized, len(records), results)
     return records
@@ -194,6 +195,22 @@ def _check_some_matched(
         )
 
 
+def _check_sizes(feature_file: h5py.File, queries: list[tuple[str, pycolmap.Camera]]) -> None:
+    """Warn of intrinsics that are for photos of another size."""
+    wrong = []
+    for name, camera in queries:
+        if "image_size" in feature_file.get(name, ()):
+            width, height = map(int, feature_file[name]["image_size"][()])
+            if (width, height) != (camera.width, camera.height):
+                wrong.append(f"{name} ({camera.width}x{camera.height}, not {width}x{height})")
+    if wrong:
+        logger.warning(
+            "The intrinsics of %d queries are for another size than that of the photo, so that "
+            "their poses are wrong: %s.",
+            *(len(wrong), cli.some(wrong)),
+        )
+
+
 def _read_matches(
     match_file: h5py.File, name: str, num_keypoints: int, names: list[str], reference: Reference
 ) -> dict[str, np.ndarray]:
@@ -202,9 +219,7 @@ def _read_matches(
     if len(present) < len(names):
         absent = len(names) - len(present)
         logger.warning("%d images retrieved for %s are not in the map.", absent, name)
-    if not present:
-        logger.warning("No map image was retrieved for %s.", name)
-    elif not any(find_pair(match_file, name, other)[0] for other in present):
+    if present and not any(find_pair(match_file, name, other)[0] for other in present):
         logger.warning("%s was not matched: %s has none of its pairs.", name, match_file.filename)
         return {other: np.zeros((0, 2), np.int64) for other in present}
     matches = {other: get_matches(match_file, name, other)[0] for other in present}

@@ -11,6 +11,7 @@ from confs import matchers as matchers_confs
 
 from . import colmap, extract_features, extractors, intrinsics, localization
 from .base_model import dynamic_load
+from .cli import InputError
 from .extractors.vlad import read_vocabulary
 from .io import get_dataset, open_h5, to_colmap
 from .localize_sfm import RANSAC_THRESH, SfmMap, merged
@@ -77,7 +78,7 @@ class Localizer:
             "guess"), and `seconds` by stage.
 
         Raises:
-            InputError: when the image cannot be read.
+            InputError: when the image cannot be read, or the camera is of another size.
         """
         image = image if isinstance(image, np.ndarray) else Path(image)
         seconds, start = {}, time.perf_counter()
@@ -91,6 +92,12 @@ class Localizer:
             refinement = intrinsics.REFINEMENTS[source]
         features = extract_features.extract(self.extractor, image, self.preprocessing, self.device)
         features = extract_features.halve(features)  # as they are in the map
+        width, height = map(int, features["image_size"])
+        if (camera.width, camera.height) != (width, height):
+            raise InputError(
+                f"The camera is of {camera.width}x{camera.height} pixels, the photo has "
+                f"{width}x{height}."
+            )
         descriptors = torch.from_numpy(features["descriptors"])
         lap("extraction")
         retrieved = self._retrieve(descriptors)

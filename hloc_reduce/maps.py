@@ -62,10 +62,11 @@ class Map:
                 "preprocessing": dict(conf["preprocessing"]),
             }
             _with_projection(self._conf, _file_name)
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError):
             raise InputError(
-                f"{folder} is not a map, or not a finished one: it has no sound {FINISHED} "
-                f"({type(error).__name__}: {error})."
+                f"There is no folder {folder}."
+                if not folder.is_dir()
+                else f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}."
             ) from None
         missing = [path for path in (self.features, self.descriptors) if not path.is_file()]
         if missing:
@@ -90,7 +91,10 @@ class Map:
         made_by = extract_features.provenance(conf, as_half=True)
         if json.loads((self.folder / "conf.json").read_text())["feature"] != made_by:
             other = "" if name != self.feature else f", but not of the {name} that it is now"
-            raise InputError(f"The map {self.folder} is of --feature {self.feature}{other}.")
+            raise InputError(
+                f"The map {self.folder} is of --feature {self.feature}{other}. "
+                "Leave it out to localize in this map."
+            )
 
     @property
     def sfm(self) -> Path:
@@ -169,15 +173,20 @@ def main(
     files = {f"images/{name}": image_dir / name for name in names}
     files |= {f"model/{name}": path for name, path in model_files.items()}
     fingerprints = stamps.fingerprints(files, stamps.read(map_dir / FINGERPRINTS))
+    made_from = {
+        "feature": made_by,
+        "matcher": matcher_conf["model"],
+        "num_covis": num_covis,
+        "images": {name: fingerprints[f"images/{name}"][2] for name in names},
+        "model": {name: fingerprints[f"model/{name}"][2] for name in model_files},
+    }
+    before = stamps.read(map_dir / "conf.json")
+    if before and before != made_from and not (map_dir / FINISHED).exists():
+        logger.info("The map %s, which was not finished, is begun anew.", map_dir)
+        overwrite = True
     folder = RunFolder(
         map_dir,
-        {
-            "feature": made_by,
-            "matcher": matcher_conf["model"],
-            "num_covis": num_covis,
-            "images": {name: fingerprints[f"images/{name}"][2] for name in names},
-            "model": {name: fingerprints[f"model/{name}"][2] for name in model_files},
-        },
+        made_from,
         overwrite,
         inputs=[path for path in (image_dir, model, projection) if path is not None],
     )

@@ -66,7 +66,7 @@ def main(
             others = [db_names[j] for j in row if not same_file or db_names[j] != name]
             pairs += [(name, other) for other in others[:num_matched]]
     write_pairs(pairs, output)
-    logger.info("Retrieved %d pairs for %d queries.", len(pairs), len(query_names))
+    logger.info("Retrieved %d pairs for %d images.", len(pairs), len(query_names))
     return output
 
 
@@ -109,15 +109,17 @@ def select(
         InputError: when no pair is left.
     """
     retrieved, database = parse_retrieval(pairs), set(db_list)
-    selected, absent = [], 0
+    selected, absent, without = [], 0, []
     for query in query_list:
         names = [name for name in retrieved.get(query, []) if name in database]
         absent += len(retrieved.get(query, [])) - len(names)
         if not names:
-            logger.warning("%s has no pair for query %s.", pairs, query)
+            without.append(query)
         selected += [(query, name) for name in names[:num_matched]]
     if absent:
         logger.warning("%d pairs of %s are with images that are not in the map.", absent, pairs)
+    if without:
+        logger.warning("%s has no pair for %d queries: %s.", pairs, len(without), cli.some(without))
     if not selected:
         raise InputError(f"{pairs} has no pair of a query and a map image.")
     write_pairs(selected, output)

@@ -77,7 +77,7 @@ class RunFolder:
             elif changes:
                 named = " and ".join(f"{key}{which}" for key, which in changes.items())
                 raise InputError(
-                    f"{path} holds results of another {named}. "
+                    f"What {path} was made from differs: {named}. "
                     "Choose other --outputs, one folder for each configuration, or --overwrite."
                 )
         if overwrite and conf_file.exists():

@@ -75,6 +75,7 @@ def main(
         "retrieval": retrieval,
         "dataset": str(dataset),
         **numbers,
+        "intrinsics": {"list" if place.query_list.is_file() else "iphone7": len(query_names)},
         "map_images": len(used),
     }
     limits = dict.fromkeys(lists, INLOC_THRESHOLDS)

@@ -61,6 +61,10 @@ def open_map(
     if map_images is None:
         if model_or_map is None:
             raise InputError("Give --map_images, the folder of the photos to build a map of.")
+        if any(model_or_map.glob("cameras.*")):
+            raise InputError(
+                f"{model_or_map} is a COLMAP model: give its photos, --map_images, too."
+            )
         built = Map(model_or_map)
         if feature or projection:
             built.check_feature(feature or FEATURE, projection)
@@ -140,7 +144,7 @@ def main(
         if some := [name for name in names if sources[name] == source]:
             logger.info(
                 "Intrinsics of %d queries are %s; the focal length is refined with the pose: %s",
-                *(len(some), said, ", ".join(some)),
+                *(len(some), said, cli.some(some)),
             )
     loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
     poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"

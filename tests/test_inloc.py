@@ -187,6 +187,7 @@ def test_retrieval_by_hlocs_pairs(inloc_layout, tmp_path, monkeypatch):
     assert summary["map_images"] == 2 and list(summary["lists"]) == ["PLA1"]
     assert rows["a.JPG"]["status"] == "localized" and rows["a.JPG"]["retrieved"] == cutouts[0]
     assert rows["b.JPG"]["status"] == "failed" and rows["b.JPG"]["retrieved"] == ""
+    assert summary["intrinsics"] == {"list": 3}
 
 
 def test_queries_of_the_benchmark(inloc_layout, tmp_path, monkeypatch):

@@ -142,13 +142,13 @@ def test_what_has_changed_is_noticed(place, aachen_layout, monkeypatch, caplog):
     run(monkeypatch, *build, *new)
     before, results = state(outputs / "map"), state(outputs / "queries-day")
     message = refused(monkeypatch, caplog, *build, "--feature", "sift_sv16")
-    assert "another feature (model, projection_sha256)" in message and "--overwrite" in message
+    assert "differs: feature (model, projection_sha256)" in message and "--overwrite" in message
     photo = images / "db/2.png"
     os.utime(photo, ns=(0, 0))  # copied, say: its content is what counts
     run(monkeypatch, *build)
     content = photo.read_bytes()
     cv2.imwrite(str(photo), 255 - cv2.imread(str(photo)))
-    assert "another images (db/2.png)" in refused(monkeypatch, caplog, *build)
+    assert "differs: images (db/2.png)" in refused(monkeypatch, caplog, *build)
     photo.unlink()
     assert "1 of 4 images are not in" in refused(monkeypatch, caplog, *build)
     photo.write_bytes(content)
@@ -177,10 +177,10 @@ def test_results_of_another_map_are_kept(place, tmp_path, monkeypatch, caplog):
     other = tmp_path / "other"
     run(monkeypatch, *build[:4], "--outputs", other)
     message = refused(monkeypatch, caplog, "--map", other / "map", *new, "--outputs", outputs)
-    assert "another map. " in message
+    assert "differs: map. " in message
     (images / "query/night").rename(tmp_path / "day")  # of the same name
     message = refused(monkeypatch, caplog, *build, "--query_images", tmp_path / "day")
-    assert "another query_images. " in message
+    assert "differs: query_images. " in message
     assert state(outputs / "queries-day") == results
 
 
@@ -290,8 +290,7 @@ def test_a_build_that_was_stopped_goes_on(place, monkeypatch, caplog):
     )
     assert "not a finished one" in message
     photo.write_bytes(content)
-    assert "another images (db/3.png)" in refused(monkeypatch, caplog, *build)
-    run(monkeypatch, *build, "--overwrite")
+    run(monkeypatch, *build)  # nothing was finished: the photo that changed is no matter
     (outputs / "map/map.json").unlink()
     before = state(outputs / "map")
     run(monkeypatch, *build)
@@ -379,6 +378,16 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, monkeypat
     pixels = cv2.imread(str(photos / "guess.png"))[:, :, ::-1]
     pose, info = localizer.localize(np.ascontiguousarray(pixels))
     assert info["intrinsics"] == "guess" and max(pose_error(pose, poses["guess.png"])) < 0.1
+    with pytest.raises(InputError, match="of 240x180 pixels, the photo has 480x360"):
+        localizer.localize(
+            photos / "guess.png",
+            pycolmap.Camera(model="SIMPLE_PINHOLE", width=240, height=180, params=[250, 120, 90]),
+        )
+    small = tmp_path / "small.txt"
+    small.write_text("guess.png SIMPLE_PINHOLE 240 180 250 120 90\n")
+    run(monkeypatch, *build, "--query_images", photos, "--queries", small)
+    assert "1 queries are for another size" in caplog.text
+    assert "guess.png (240x180, not 480x360)" in caplog.text
     for wrong in (pixels.astype(float), pixels[None], np.zeros((0, 3), np.uint8)):
         with pytest.raises(InputError, match="uint8"):
             localizer.localize(wrong)
@@ -390,6 +399,8 @@ def test_wrong_input(place, tmp_path, monkeypatch, caplog):
     assert "--query_images, too" in refused(monkeypatch, caplog, *build, "--queries", "list.txt")
     assert "is not a COLMAP model" in refused(monkeypatch, caplog, "--map", images, *build[2:])
     assert "is not a map" in refused(monkeypatch, caplog, "--map", images, "--outputs", outputs)
+    message = refused(monkeypatch, caplog, *build[:2], "--outputs", outputs)
+    assert "is a COLMAP model: give its photos" in message
     message = refused(monkeypatch, caplog, "--map_images", tmp_path / "nowhere", *build[4:])
     assert "no folder" in message and "nowhere" in message
     assert "Unknown matcher" in refused(monkeypatch, caplog, *build, "--matcher", "NN")
