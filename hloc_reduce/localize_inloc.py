@@ -30,7 +30,6 @@ def main(
     skip_matches: int | None = None,
     queries: Path | list[tuple[str, pycolmap.Camera]] | None = None,
     ransac_thresh: float = RANSAC_THRESH,
-    points: Path | None = None,
     overwrite: bool = False,
 ) -> dict[str, dict]:
     """Localize queries in a data set of InLoc's layout.
@@ -49,13 +48,12 @@ def main(
             queries of the pairs, with the intrinsics of `by_iphone7`.
         ransac_thresh: inliers reproject within so many pixels of a photo of 4032 pixels, of others
             in proportion.
-        points: h5 file for the 3D points of the keypoints of all retrieved cutouts, from which
-            a later run goes on; default: `<features>-points3D.h5`.
         overwrite: localize anew what is there.
 
     Returns:
         A record for each query, as `localization.main`; a query with too few inliers has the pose
-        that PnP found all the same, if any.
+        that PnP found all the same, if any. What the keypoints of cutouts show is kept in
+        `<features>-points3D.h5`, from which a later run goes on.
 
     Raises:
         InputError: when an input is missing or broken.
@@ -70,7 +68,7 @@ def main(
     wanted = [cutout for name, _ in queries for cutout in retrieved.get(name, [])]
     if not wanted:
         raise InputError(f"{retrieval} has no pair of a query and a cutout.")
-    points = points or features.with_name(f"{features.stem}-points3D.h5")
+    points = features.with_name(f"{features.stem}-points3D.h5")
     lift_keypoints(dataset_dir, features, sorted(set(wanted)), points, overwrite)
 
     def config(_: str, camera: pycolmap.Camera) -> dict:
