@@ -1,19 +1,21 @@
 """Local features: base descriptors, 128-D, their projections, and those of a user's own file.
 
 `<descriptor>_<scheme><dim>` are the paper's; `<descriptor>_nested` is 64-D, and
-`<descriptor>_nested@<dim>` its first numbers.
+`<descriptor>_nested@<dim>` its first numbers. `colmap_sift` is COLMAP's own SIFT.
 """
 
+from argparse import ArgumentParser
 from pathlib import Path
 
 import yaml
 
 from hloc_reduce import projections
 from hloc_reduce.cli import InputError, choose
-from hloc_reduce.descriptors import DESCRIPTORS
+from hloc_reduce.descriptors import COLMAP, DESCRIPTORS
+from hloc_reduce.storage import STORAGES
 
-SCHEMES = ("pca", "us", "ss", "sv")
 DIMS = (64, 32, 24, 16)
+SCHEMES = dict.fromkeys(DESCRIPTORS, ("pca", "us", "ss", "sv")) | {COLMAP: ("pca", "sv")}
 
 PREPROCESSING = {"grayscale": True, "resize_max": 1600}
 
@@ -30,35 +32,39 @@ def feature(name: str, model: dict) -> dict:
 
 def names(descriptor: str) -> list[str]:
     """List the projections of a base descriptor."""
+    reduced = [f"{descriptor}_{scheme}{dim}" for scheme in SCHEMES[descriptor] for dim in DIMS]
+    if descriptor == COLMAP:
+        return reduced
     nested = f"{descriptor}_nested"
-    return [f"{descriptor}_{scheme}{dim}" for scheme in SCHEMES for dim in DIMS] + [
-        nested,
-        *(f"{nested}@{dim}" for dim in DIMS[1:]),
-    ]
+    return [*reduced, nested, *(f"{nested}@{dim}" for dim in DIMS[1:])]
 
 
-confs = {name: feature(name, base(name)) for name in DESCRIPTORS} | {
+confs = {name: feature(name, base(name)) for name in SCHEMES} | {
     name: feature(name, {"name": "reduced", "base": base(descriptor), "projection": name})
-    for descriptor in DESCRIPTORS
+    for descriptor in SCHEMES
     for name in names(descriptor)
 }
 
 
-def get(name: str, projection: Path | None = None) -> tuple[str, dict]:
+def get(name: str, projection: Path | None = None, storage: str = STORAGES[0]) -> tuple[str, dict]:
     """Return the name and the configuration of a feature.
 
     Args:
         name: a key of `confs`, or the path of a YAML file with a `model` and perhaps
             `preprocessing`; that feature is called as the file.
         projection: file of another projection of the same base; the feature is called after it.
+        storage: how descriptors are kept, one of `storage.STORAGES`.
 
     Raises:
         InputError: for an unknown name or a file that is none.
     """
+    choose("storage", storage, STORAGES)
     if Path(name).suffix in (".yaml", ".yml"):
         name, conf = Path(name).stem, read(Path(name))
     else:
         conf = confs[choose("feature", name, confs)]
+    if storage != STORAGES[0]:
+        conf = {**conf, "storage": storage}
     if projection is None:
         return name, conf
     model = {
@@ -69,6 +75,15 @@ def get(name: str, projection: Path | None = None) -> tuple[str, dict]:
     file, prefix = projections.split_prefix(projection)
     name = Path(file).stem + (prefix and f"@{prefix}")
     return name, {**conf, "output": feature(name, model)["output"], "model": model}
+
+
+def add_storage_option(parser: ArgumentParser) -> None:
+    """Add --storage."""
+    parser.add_argument(
+        "--storage",
+        default=STORAGES[0],
+        help=f"how descriptors are kept, one of {', '.join(STORAGES)}; hloc reads no uint8",
+    )
 
 
 def read(path: Path) -> dict:

@@ -15,7 +15,8 @@ from . import cli, colmap, extractors, io, logger, stamps
 from .base_model import dynamic_load
 from .cli import InputError
 from .extractors.vlad import read_vocabulary
-from .io import GroupWriter, get_dataset, list_h5_names, open_h5, replacing
+from .io import GroupWriter, list_h5_names, open_h5, replacing
+from .storage import get_descriptors
 
 confs = retrieval_confs.confs
 
@@ -66,7 +67,7 @@ def main(
                     temporary.write_bytes(save({"vocabulary": model.vocabulary}))
             model.vocabulary = read_vocabulary(vocabulary)
             for name in tqdm(todo, desc="Aggregating", unit="image"):
-                local = torch.from_numpy(get_dataset(file, name, "descriptors")[()])
+                local = torch.from_numpy(get_descriptors(file, name).T)
                 descriptor = model({"descriptors": local[None]})["global_descriptor"][0]
                 writer.add(name, {"global_descriptor": descriptor.half().numpy()})
     logger.info("Global descriptors are in %s.", output)
@@ -83,7 +84,7 @@ def _sample(file: h5py.File, names: list[str], max_samples: int) -> np.ndarray:
     share = -(-max_samples // max(len(names), 1))
     samples = []
     for name in names:
-        descriptors = get_dataset(file, name, "descriptors")[()].T
+        descriptors = get_descriptors(file, name)
         samples.append(descriptors[:: -(-len(descriptors) // share) or 1])
     if not sum(map(len, samples)):
         raise InputError(f"No image for the vocabulary has features in {file.filename}.")

@@ -1,8 +1,11 @@
 """The parts of pycolmap whose interface or behaviour differs between versions."""
 
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
+from threading import get_ident
 
 import numpy as np
 import pycolmap
@@ -12,42 +15,58 @@ from .cli import InputError
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
 
 
-def dog_detector(options: dict) -> Callable[[np.ndarray], np.ndarray]:
-    """Make COLMAP's DoG detector on the CPU.
+def detect_dog(image: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray]:
+    """Detect and describe keypoints by COLMAP's SIFT on the CPU, in one thread.
 
     Args:
+        image: (H, W) float32 in [0, 1].
         options: of pycolmap's SiftExtractionOptions.
 
     Returns:
-        A function from an image (H, W) float32 in [0, 1] to keypoints (N, 4) float32: x, y with
-        pixel centres at integers, scale in pixels, orientation in degrees from x towards y.
-
-    Raises:
-        InputError: for an option that there is not.
+        Keypoints (N, 4) float32: x, y with pixel centres at integers, scale in pixels, orientation
+        in degrees from x towards y; and COLMAP's descriptors (N, 128) float32 of unit norm.
     """
+    extractor = _sift_extractor(json.dumps(options, sort_keys=True), get_ident())
+    if hasattr(extractor, "extract_from_float32_array"):  # from 4.0 on
+        found, described = extractor.extract_from_float32_array(image)
+        keypoints = np.array(
+            [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found], np.float32
+        )
+        descriptors = described.data.astype(np.float32)
+    else:
+        keypoints, descriptors = extractor.extract(image)
+    x_y, scale, orientation = np.split(keypoints.reshape(-1, 4), [2, 3], axis=1)
+    descriptors = descriptors.reshape(-1, 128)
+    norm = np.linalg.norm(descriptors, axis=1, keepdims=True)
+    # the origin of both is COLMAP's, the corner
+    return (
+        np.concatenate([x_y - 0.5, scale, np.rad2deg(orientation)], axis=1),
+        np.divide(descriptors, norm, out=np.zeros_like(descriptors), where=norm > 0),
+    )
+
+
+@lru_cache(maxsize=256)
+def _sift_extractor(options: str, _: int) -> "pycolmap.FeatureExtractor":
+    """Make the extractor of a thread; COLMAP's has state of its own."""
+    extraction = _extraction_options(json.loads(options))
+    new = hasattr(pycolmap, "FeatureExtractor")  # from 4.0 on
+    return (pycolmap.FeatureExtractor.create if new else pycolmap.Sift)(
+        extraction, pycolmap.Device.cpu
+    )
+
+
+def check_dog_options(options: dict) -> None:
+    """Raise an InputError for an option of `detect_dog` that there is not."""
+    _extraction_options(options)
+
+
+def _extraction_options(options: dict) -> pycolmap.FeatureExtractionOptions:
     try:
         sift = pycolmap.SiftExtractionOptions(options)
-    except (AttributeError, TypeError, RuntimeError) as error:
+    except (AttributeError, TypeError, RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"The DoG options {options} cannot be used ({reason}).") from None
-    extraction = pycolmap.FeatureExtractionOptions(sift=sift)
-    new = hasattr(pycolmap, "FeatureExtractor")  # from 4.0 on
-    make = pycolmap.FeatureExtractor.create if new else pycolmap.Sift
-    extractor = make(extraction, pycolmap.Device.cpu)
-
-    def detect(image: np.ndarray) -> np.ndarray:
-        if not new:
-            keypoints = extractor.extract(image)[0].reshape(-1, 4)
-        else:
-            found, _ = extractor.extract_from_float32_array(image)
-            keypoints = np.array(
-                [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found], np.float32
-            ).reshape(-1, 4)
-        x_y, scale, orientation = np.split(keypoints, [2, 3], axis=1)
-        # the origin of both is COLMAP's, the corner
-        return np.concatenate([x_y - 0.5, scale, np.rad2deg(orientation)], axis=1)
-
-    return detect
+    return pycolmap.FeatureExtractionOptions(sift=sift)
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:

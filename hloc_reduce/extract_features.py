@@ -1,21 +1,25 @@
 """Extract local features from images into an h5 file."""
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from loky import ProcessPoolExecutor
 from tqdm import tqdm
 
 from confs import features as features_confs
 
-from . import cli, extractors, logger, projections
+from . import cli, colmap, extractors, logger, parallel, projections
 from .cli import InputError
 from .descriptors import DESCRIPTORS, check_weights
+from .extractors.dog import DoG
 from .io import GroupWriter, read_image
 from .parsers import image_names
+from .storage import store
+from .trace import span
 
 confs = features_confs.confs
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
@@ -36,7 +40,7 @@ def main(
         conf: an entry of `confs`.
         image_dir: the folder that the image names are relative to.
         export_dir: where `<conf["output"]>.h5` goes.
-        as_half: store everything but keypoints as float16.
+        as_half: store everything but keypoints as float16, unless `conf` says how.
         image_list: names, or a text file of them; default: every image of the folder.
         feature_path: the h5 file itself, instead of `export_dir`.
         overwrite: extract anew what is there.
@@ -49,6 +53,7 @@ def main(
     """
     if feature_path is None:
         feature_path = Path(export_dir) / f"{conf['output']}.h5"
+    storage = conf.get("storage", "float16" if as_half else "float32")
     names = list_images(image_dir, image_list)
     if overwrite:
         extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
@@ -57,35 +62,59 @@ def main(
         if not todo:
             logger.info("All %d images are in %s.", len(names), feature_path)
             return feature_path
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-        model = extractors.load(conf["model"]).eval().to(device)
-        for name in tqdm(todo, desc="Extracting features", unit="image"):
-            features = extract(model, image_dir / name, conf["preprocessing"], device)
+        extracted = extract_all(conf, [image_dir / name for name in todo])
+        progress = tqdm(extracted, desc="Extracting features", unit="image", total=len(todo))
+        for name, features in zip(todo, progress, strict=True):
             uncertainty = features.pop("uncertainty")
-            if as_half:
-                features = halve(features)
             if len(features["keypoints"]) == 0:
                 logger.warning("Image %s has no keypoints.", name)
-            writer.add(name, features, {"keypoints": {"uncertainty": uncertainty}})
+            arrays, attrs = store(features, storage)
+            writer.add(name, arrays, attrs | {"keypoints": {"uncertainty": uncertainty}})
     logger.info("Features of %d images are in %s.", len(names), feature_path)
     return feature_path
 
 
-def halve(features: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return features with all numbers but the keypoints as float16."""
-    return {
-        key: array.astype(np.float16) if key != "keypoints" and array.dtype.kind == "f" else array
-        for key, array in features.items()
-    }
+def extract_all(conf: dict, images: list[Path]) -> Iterator[dict[str, np.ndarray]]:
+    """Extract the features of images on all cores, and yield them in order.
+
+    COLMAP's detector, which lets no other thread of its process run, gets processes. An extractor
+    of another kind takes one image after the other, on all cores or a GPU.
+
+    Args:
+        conf: an entry of `confs`.
+        images: files.
+    """
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    model = extractors.load(conf["model"]).eval().to(device)
+    base = getattr(model, "base", model)
+    workers = min(parallel.cores(), len(images))
+    if workers == 1 or not isinstance(base, DoG):
+        for image in images:
+            yield extract(model, image, conf["preprocessing"], device)
+        return
+    with ProcessPoolExecutor(workers) as processes:
+
+        def detect(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            with span("detect"):
+                return processes.submit(colmap.detect_dog, image, base.conf["options"]).result()
+
+        yield from parallel.ordered(
+            "extract",
+            lambda image: extract(model, image, conf["preprocessing"], device, detect),
+            images,
+            workers,
+        )
 
 
-def provenance(conf: dict, as_half: bool) -> dict:
+def provenance(conf: dict, as_half: bool = True) -> dict:
     """Return what determines the features: the configuration and the projection's checksum.
 
     Raises:
         InputError: when the projection or the weights of its base descriptor are not to be had.
     """
     made_by = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
+    if "storage" in conf:
+        made_by["storage"] = conf["storage"]
     if (projection := conf["model"].get("projection")) is not None:
         # a file may be moved
         made_by["model"] = {**conf["model"], "projection": Path(projection).name}
@@ -191,9 +220,20 @@ def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
 
 @torch.no_grad()
 def extract(
-    model: torch.nn.Module, image: Path | np.ndarray, preprocessing: dict, device: str = "cpu"
+    model: torch.nn.Module,
+    image: Path | np.ndarray,
+    preprocessing: dict,
+    device: str = "cpu",
+    detect: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Extract the features of one image, given as in `load_image`.
+    """Extract the features of one image.
+
+    Args:
+        model: an extractor.
+        image: as of `load_image`.
+        preprocessing: as of `load_image`.
+        device: of the model.
+        detect: finds DoG keypoints in place of the model, as `colmap.detect_dog`.
 
     Returns:
         keypoints (N, 2) float32 (x, y) in pixels of the original image, centres at integers;
@@ -201,9 +241,10 @@ def extract(
         them; image_size (2,) width, height; and the uncertainty of the keypoints in pixels.
     """
     image, size = load_image(image, preprocessing)
-    features = {
-        key: value[0].cpu().numpy() for key, value in model({"image": image.to(device)}).items()
-    }
+    data = {"image": image.to(device)}
+    if detect is not None:
+        data["detected"] = detect(image[0, 0].numpy())
+    features = {key: value[0].cpu().numpy() for key, value in model(data).items()}
     ratio = (size / np.array(image.shape[:1:-1])).astype(np.float32)
     features["keypoints"] = (features["keypoints"] + 0.5) * ratio - 0.5
     if "scales" in features:
@@ -229,22 +270,16 @@ def _main() -> None:
         help="feature, see pipelines.aachen --list_features, or a YAML file of one",
     )
     parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
-    parser.add_argument(
-        "--as_half",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="store all but the keypoints as float16",
-    )
+    features_confs.add_storage_option(parser)
     parser.add_argument("--overwrite", action="store_true", help="extract anew what is there")
     args = parser.parse_args()
     if args.export_dir is None and args.feature_path is None:
         raise InputError("Give --export_dir or --feature_path.")
-    _, conf = features_confs.get(args.conf)
+    _, conf = features_confs.get(args.conf, storage=args.storage)
     main(
         conf,
         args.image_dir,
         args.export_dir,
-        args.as_half,
         image_list=args.image_list,
         feature_path=args.feature_path,
         overwrite=args.overwrite,

@@ -13,6 +13,7 @@ import cv2
 import h5py
 import numpy as np
 
+from . import trace
 from .cli import InputError
 
 
@@ -119,7 +120,8 @@ class GroupWriter:
     def __exit__(self, error: type | None, *_) -> None:
         self._flush()
         if error is None:
-            self._merge()
+            with trace.span("merge"):
+                self._merge()
 
     def add(self, name: str, arrays: dict[str, np.ndarray], attrs: dict | None = None) -> None:
         """Add a group of arrays; `attrs` maps the name of an array to its attributes."""
@@ -147,7 +149,8 @@ class GroupWriter:
     def _flush(self) -> None:
         if self.buffer:
             number = len(self._finished())
-            with replacing(self.pieces / f"{number:06d}.h5") as temporary:
+            piece = self.pieces / f"{number:06d}.h5"
+            with trace.span("write"), replacing(piece) as temporary:
                 self._write(temporary)
         self.buffer.clear()
         self.buffer_bytes = 0

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from tqdm import tqdm
 
-from . import cli, colmap, logger
+from . import cli, colmap, logger, parallel
 from .cli import InputError
 from .io import check_matches, find_pair, get_colmap_keypoints, get_matches, open_h5, replacing
 from .parsers import write_poses
@@ -152,16 +152,23 @@ def main(
         with open_h5(features) as feature_file, open_h5(matches) as match_file, log:
             _check_some_matched(match_file, queries, retrieved)
             _check_sizes(feature_file, todo)
-            for name, camera in tqdm(todo, desc="Localizing", unit="query"):
-                keypoints, _ = get_colmap_keypoints(feature_file, name)
-                found = _read_matches(
-                    match_file, name, len(keypoints), retrieved.get(name, []), reference
-                )
+
+            def solve(task: tuple) -> dict:
+                name, camera, keypoints, found = task
                 used = {n: m for n, m in found.items() if len(m) >= (skip_matches or 0)}
                 cam_from_world, info = localize(
                     reference, keypoints, camera, used, config(name, camera)
                 )
-                log.add(name, _record(reference, list(found), cam_from_world, info))
+                return _record(reference, list(found), cam_from_world, info)
+
+            tasks = (
+                (name, camera, *_read(feature_file, match_file, name, retrieved, reference))
+                for name, camera in todo
+            )
+            solved = parallel.ordered("localize", solve, tasks)
+            progress = tqdm(solved, desc="Localizing", unit="query", total=len(todo))
+            for (name, _), record in zip(todo, progress, strict=True):
+                log.add(name, record)
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose(record) for name, record in records.items()}
     submitted = {name: known for name, known in poses.items() if known is not None}
@@ -211,21 +218,27 @@ def _check_sizes(feature_file: h5py.File, queries: list[tuple[str, pycolmap.Came
         )
 
 
-def _read_matches(
-    match_file: h5py.File, name: str, num_keypoints: int, names: list[str], reference: Reference
-) -> dict[str, np.ndarray]:
-    """Read the matches of a query with the images of the map that were retrieved for it."""
+def _read(
+    feature_file: h5py.File,
+    match_file: h5py.File,
+    name: str,
+    retrieved: Mapping[str, list[str]],
+    reference: Reference,
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Read the keypoints of a query, and its matches with the images that were retrieved for it."""
+    keypoints, _ = get_colmap_keypoints(feature_file, name)
+    names = retrieved.get(name, [])
     present = [other for other in names if other in reference]
     if len(present) < len(names):
         absent = len(names) - len(present)
         logger.warning("%d images retrieved for %s are not in the map.", absent, name)
     if present and not any(find_pair(match_file, name, other)[0] for other in present):
         logger.warning("%s was not matched: %s has none of its pairs.", name, match_file.filename)
-        return {other: np.zeros((0, 2), np.int64) for other in present}
+        return keypoints, {other: np.zeros((0, 2), np.int64) for other in present}
     matches = {other: get_matches(match_file, name, other)[0] for other in present}
     for other, indices in matches.items():
-        check_matches(indices, (name, other), (num_keypoints, reference.num_keypoints(other)))
-    return matches
+        check_matches(indices, (name, other), (len(keypoints), reference.num_keypoints(other)))
+    return keypoints, matches
 
 
 def _record(

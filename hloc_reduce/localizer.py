@@ -9,15 +9,16 @@ import torch
 
 from confs import matchers as matchers_confs
 
-from . import colmap, extract_features, extractors, intrinsics, localization
+from . import colmap, extract_features, extractors, intrinsics, localization, parallel
 from .base_model import dynamic_load
 from .cli import InputError
 from .extractors.vlad import read_vocabulary
-from .io import get_dataset, open_h5, to_colmap
+from .io import open_h5, to_colmap
 from .localize_sfm import RANSAC_THRESH, SfmMap, merged
 from .maps import RETRIEVAL, Map
 from .matchers.nearest_neighbor import mutual_nearest
 from .pairs_from_retrieval import rank, read_global
+from .storage import get_descriptors, restore, store
 
 
 class Localizer:
@@ -45,6 +46,7 @@ class Localizer:
         built = Map(Path(map_dir))
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.preprocessing = built.conf["preprocessing"]
+        self.storage = built.storage
         self.ratio_threshold = matchers_confs.confs[built.matcher]["model"].get("ratio_threshold")
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
         self.extractor = extractors.load(built.conf["model"]).eval().to(self.device)
@@ -56,8 +58,8 @@ class Localizer:
         self.descriptors, self.shown = {}, {}
         with open_h5(built.features) as file:
             for name in self.names:
-                descriptors = torch.from_numpy(get_dataset(file, name, "descriptors")[()].T)
-                self.descriptors[name] = descriptors.contiguous().to(self.device)
+                descriptors = torch.from_numpy(get_descriptors(file, name))
+                self.descriptors[name] = descriptors.to(self.device)
                 shown = np.flatnonzero(self.reference.point_rows(name) >= 0)
                 self.shown[name] = torch.from_numpy(shown).to(self.device)
 
@@ -91,18 +93,18 @@ class Localizer:
             camera, source = intrinsics.infer(image)
             refinement = intrinsics.REFINEMENTS[source]
         features = extract_features.extract(self.extractor, image, self.preprocessing, self.device)
-        features = extract_features.halve(features)  # as they are in the map
         width, height = map(int, features["image_size"])
         if (camera.width, camera.height) != (width, height):
             raise InputError(
                 f"The camera is of {camera.width}x{camera.height} pixels, the photo has "
                 f"{width}x{height}."
             )
-        descriptors = torch.from_numpy(features["descriptors"])
+        # as they are in the map
+        descriptors = torch.from_numpy(restore(*store(features, self.storage)))
         lap("extraction")
         retrieved = self._retrieve(descriptors)
         lap("retrieval")
-        matches = self._match(descriptors.T.contiguous().to(self.device).float(), retrieved)
+        matches = self._match(descriptors.to(self.device), retrieved)
         lap("matching")
         config = {"estimation": {"ransac": {"max_error": self.ransac_thresh}}}
         keypoints = to_colmap(features["keypoints"])
@@ -120,21 +122,20 @@ class Localizer:
         return cam_from_world if localized else None, info
 
     def _retrieve(self, descriptors: torch.Tensor) -> list[str]:
-        """Return the names of the map images most similar to local descriptors (D, N)."""
-        query = self.vlad({"descriptors": descriptors[None]})["global_descriptor"]
+        """Return the names of the map images most similar to local descriptors (N, D)."""
+        query = self.vlad({"descriptors": descriptors.T[None]})["global_descriptor"]
         query = query.half().float().numpy()  # as they are in the map
         return [self.names[j] for j in rank(query, self.global_descriptors, self.num_loc)[0]]
 
-    @torch.no_grad()
     def _match(self, descriptors: torch.Tensor, names: list[str]) -> dict[str, np.ndarray]:
         """Match descriptors (N, D) with those of map images that show a point."""
-        matches = {}
-        for name in names:
+
+        def match(name: str) -> np.ndarray:
             shown = self.shown[name]
             found, _ = mutual_nearest(
-                self.descriptors[name].float(), descriptors, self.ratio_threshold, shown
+                self.descriptors[name], descriptors, self.ratio_threshold, shown
             )
             matched = found >= 0
-            pairs = torch.stack([found[matched], shown[matched]], dim=1).cpu().numpy()
-            matches[name] = pairs
-        return matches
+            return torch.stack([found[matched], shown[matched]], dim=1).cpu().numpy()
+
+        return dict(zip(names, parallel.ordered("match", match, names), strict=True))

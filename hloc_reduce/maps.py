@@ -27,6 +27,7 @@ from .cli import InputError, choose
 from .extract_features import list_images
 from .io import replacing
 from .results import RunFolder
+from .storage import STORAGES
 
 FINISHED = "map.json"  # is written when all else is there
 FINGERPRINTS = "fingerprints.json"
@@ -61,6 +62,8 @@ class Map:
                 "model": dict(conf["model"]),
                 "preprocessing": dict(conf["preprocessing"]),
             }
+            if "storage" in conf:
+                self._conf["storage"] = choose("storage", conf["storage"], STORAGES)
             _with_projection(self._conf, _file_name)
         except (OSError, ValueError, KeyError, TypeError):
             raise InputError(
@@ -87,14 +90,19 @@ class Map:
         Raises:
             InputError: if it is another, or has the same name but another projection.
         """
-        name, conf = features_confs.get(feature, projection)
-        made_by = extract_features.provenance(conf, as_half=True)
+        name, conf = features_confs.get(feature, projection, self.storage)
+        made_by = extract_features.provenance(conf)
         if json.loads((self.folder / "conf.json").read_text())["feature"] != made_by:
             other = "" if name != self.feature else f", but not of the {name} that it is now"
             raise InputError(
                 f"The map {self.folder} is of --feature {self.feature}{other}. "
                 "Leave it out to localize in this map."
             )
+
+    @property
+    def storage(self) -> str:
+        """How descriptors are kept, as in `confs.features.get`."""
+        return self._conf.get("storage", STORAGES[0])
 
     @property
     def sfm(self) -> Path:
@@ -130,6 +138,7 @@ def main(
     matcher: str = "NN-ratio",
     num_covis: int = 20,
     overwrite: bool = False,
+    storage: str = STORAGES[0],
 ) -> Map:
     """Build a map, or open one that was made from the same.
 
@@ -144,6 +153,7 @@ def main(
         num_covis: pairs of each image: the most covisible of the model, or if it has no points
             the most similar.
         overwrite: build anew.
+        storage: as in `confs.features.get`.
 
     Returns:
         The map.
@@ -152,7 +162,7 @@ def main(
         InputError: when the folder has a map that was made from something else, or something is
             missing or wrong.
     """
-    feature, conf = features_confs.get(feature, projection)
+    feature, conf = features_confs.get(feature, projection, storage)
     matcher_conf = matchers_confs.confs[matcher]
     model_files: dict[str, Path] = {}
     names = None
@@ -167,7 +177,7 @@ def main(
             if path.stem in triangulation.PARTS and path.is_file()
         }
     names = list_images(image_dir, names)
-    made_by = extract_features.provenance(conf, as_half=True)
+    made_by = extract_features.provenance(conf)
     if overwrite or not (map_dir / "conf.json").exists():
         extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
     files = {f"images/{name}": image_dir / name for name in names}
@@ -228,6 +238,7 @@ def main(
         "images_with_pose": sfm.num_reg_images(),
         "points3D": sfm.num_points3D(),
         "seconds": folder.seconds(),
+        "bytes": folder.bytes(),
     }
     stamps.write(map_dir / FINISHED, summary)
     return Map(map_dir)

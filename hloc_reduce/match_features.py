@@ -1,7 +1,7 @@
 """Match the local features of image pairs into an h5 file."""
 
 import argparse
-from functools import lru_cache
+from collections import OrderedDict
 from pathlib import Path
 
 import h5py
@@ -11,14 +11,17 @@ from tqdm import tqdm
 
 from confs import matchers as matchers_confs
 
-from . import cli, io, logger, matchers
+from . import cli, io, logger, matchers, parallel
 from .base_model import dynamic_load
 from .cli import InputError
-from .io import GroupWriter, get_dataset, names_to_pair, open_h5
+from .io import GroupWriter, names_to_pair, open_h5
+from .matchers.nearest_neighbor import GPU_BYTES
 from .parsers import parse_retrieval
+from .storage import get_descriptors
 
 confs = matchers_confs.confs
-CACHED_IMAGES = 128  # descriptors of so many images stay in memory: 1 GB at 8,000 x 128
+CACHE_BYTES = 2**30  # descriptors that stay in memory: of 500 images at 8,000 x 64
+PAIRS_ON_GPU = 64  # handed to a GPU at once, which matches as many together as its memory allows
 
 
 def main(
@@ -29,6 +32,7 @@ def main(
     matches: Path | None = None,
     features_ref: Path | None = None,
     overwrite: bool = False,
+    gpu_bytes: int = GPU_BYTES,
 ) -> Path:
     """Match all pairs of a list, each unordered pair once.
 
@@ -42,6 +46,7 @@ def main(
         matches: the match file itself; needed where `features` is a path.
         features_ref: feature file of the second images; default: `features`.
         overwrite: match anew what is there.
+        gpu_bytes: how much memory of a GPU the similarities of descriptors may take.
 
     Returns:
         The match file; pairs it holds already are skipped.
@@ -69,7 +74,7 @@ def main(
     ):
         todo = unmatched_pairs(pairs, writer, ordered=features_ref not in (None, feature_path))
         if todo:
-            _match(conf, todo, file0, file1, writer)
+            _match(conf, todo, file0, file1, writer, gpu_bytes)
     logger.info("Matches of the pairs %s are in %s.", pairs.name, matches)
     return matches
 
@@ -103,31 +108,65 @@ def unmatched_pairs(
     return list(todo)
 
 
-@torch.no_grad()
 def _match(
     conf: dict,
     pairs: list[tuple[str, str]],
     file0: h5py.File,
     file1: h5py.File,
     writer: GroupWriter,
+    gpu_bytes: int,
 ) -> None:
+    """Match pairs while others are read and written, which this thread does."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    matcher = dynamic_load(matchers, conf["model"]["name"])(conf["model"]).eval().to(device)
+    matcher = dynamic_load(matchers, conf["model"]["name"])(conf["model"]).eval()
+    read = DescriptorCache(CACHE_BYTES)
+    size, workers = (1, parallel.cores()) if device == "cpu" else (PAIRS_ON_GPU, 1)
+    batches = [pairs[i : i + size] for i in range(0, len(pairs), size)]
 
-    @lru_cache(CACHED_IMAGES)
-    def descriptors(file: h5py.File, name: str) -> torch.Tensor:
-        array = get_dataset(file, name, "descriptors")[()]
-        return torch.from_numpy(array).to(device).float()[None]
+    def match(batch: list[tuple[torch.Tensor, torch.Tensor]]) -> list[dict[str, np.ndarray]]:
+        on_device = [(part0.to(device), part1.to(device)) for part0, part1 in batch]
+        return [
+            {
+                "matches0": matches.cpu().numpy().astype(np.int32),
+                "matching_scores0": scores.cpu().numpy().astype(np.float16),
+            }
+            for matches, scores in matcher.match(on_device, gpu_bytes)
+        ]
 
-    for name0, name1 in tqdm(pairs, desc="Matching", unit="pair", smoothing=0.1):
-        prediction = matcher(
-            {"descriptors0": descriptors(file0, name0), "descriptors1": descriptors(file1, name1)}
-        )
-        arrays = {
-            "matches0": prediction["matches0"][0].cpu().numpy().astype(np.int32),
-            "matching_scores0": prediction["matching_scores0"][0].cpu().numpy().astype(np.float16),
-        }
-        writer.add(names_to_pair(name0, name1), arrays)
+    descriptors = (
+        [(read(file0, name0), read(file1, name1)) for name0, name1 in batch] for batch in batches
+    )
+    results = parallel.ordered("match", match, descriptors, workers)
+    with tqdm(total=len(pairs), desc="Matching", unit="pair", smoothing=0.1) as progress:
+        for batch, matched in zip(batches, results, strict=True):
+            for names, arrays in zip(batch, matched, strict=True):
+                writer.add(names_to_pair(*names), arrays)
+            progress.update(len(batch))
+
+
+class DescriptorCache:
+    """Reads descriptors and keeps those used last in memory.
+
+    Args:
+        max_bytes: how much memory they may take.
+    """
+
+    def __init__(self, max_bytes: int):
+        self.max_bytes, self.bytes = max_bytes, 0
+        self.kept: OrderedDict[tuple[str, str], torch.Tensor] = OrderedDict()
+
+    def __call__(self, file: h5py.File, name: str) -> torch.Tensor:
+        """Return the descriptors (N, D) float32 of an image in an open feature file."""
+        key = file.filename, name
+        if key in self.kept:
+            self.kept.move_to_end(key)
+            return self.kept[key]
+        descriptors = torch.from_numpy(get_descriptors(file, name))
+        self.kept[key] = descriptors
+        self.bytes += descriptors.nbytes
+        while self.bytes > self.max_bytes and len(self.kept) > 1:
+            self.bytes -= self.kept.popitem(last=False)[1].nbytes
+        return descriptors
 
 
 def _main() -> None:

@@ -33,12 +33,10 @@ def main(model: Path, output: Path, num_matched: int) -> Path:
     counts = covisibility([colmap.point3D_ids(image) for image in images])
     pairs = []
     for i, image in enumerate(images):
-        row = counts[[i]].tocoo()
-        # most covisible first, then in the order of the ids
-        order = np.lexsort((row.coords[1], -row.data))[:num_matched]
-        if not len(order):
+        others = most_covisible(counts, i, num_matched)
+        if not len(others):
             logger.warning("Image %s has no covisible image.", image.name)
-        pairs += [(image.name, images[j].name) for j in row.coords[1][order]]
+        pairs += [(image.name, images[j].name) for j in others]
     if not pairs:
         raise cli.InputError(f"The model {model} has no covisible images: has it 3D points?")
     write_pairs(pairs, output)
@@ -65,6 +63,12 @@ def covisibility(point3D_ids: list[np.ndarray]) -> "coo_array":
     counts = counts.tocsr()
     counts.eliminate_zeros()
     return counts
+
+
+def most_covisible(counts: "coo_array", i: int, number: int) -> np.ndarray:
+    """Return the images that share most points with image `i`, best first, at most `number`."""
+    row = counts[[i]].tocoo()
+    return row.coords[1][np.lexsort((row.coords[1], -row.data))[:number]]
 
 
 def _main() -> None:

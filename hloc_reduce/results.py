@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from . import stamps, trace
 from .cli import InputError
 from .evaluation.poses import pose_error, recall
 from .io import list_h5_names, open_h5, replacing
 from .localization import pose
+from .storage import stored_descriptors
 
 COLUMNS = (
     "query",
@@ -32,6 +34,8 @@ COLUMNS = (
 # what a run leaves in its folder, first what says that it is whole; but for lists of pairs, which
 # are always written anew
 PRODUCTS = ("map.json", "*feats-*", ".*.tmp", "sfm*", "*_hloc_*", "queries.csv", "s*.json")
+STAGES = "stages.json"
+BOOKKEEPING = {"conf.json", STAGES, "summary.json", "queries.csv", "trace.json"}
 DELETING = {"is": "being deleted"}
 FAILED = (float("inf"), float("inf"))
 NAMED = 3  # differences that a message names
@@ -63,7 +67,7 @@ class RunFolder:
         stale: bool = False,
     ):
         self.path = path
-        conf_file, self._seconds_file = path / "conf.json", path / "seconds.json"
+        conf_file, self._stages_file = path / "conf.json", path / STAGES
         conf = json.loads(json.dumps(conf))
         before = None
         if conf_file.exists() and not overwrite:
@@ -95,19 +99,49 @@ class RunFolder:
 
     def seconds(self) -> dict[str, float]:
         """Return how long each stage took, all runs together."""
-        return json.loads(self._seconds_file.read_text()) if self._seconds_file.exists() else {}
+        return {name: stage["seconds"] for name, stage in stamps.read(self._stages_file).items()}
+
+    def bytes(self) -> dict[str, int]:
+        """Return how large the files and folders are that each stage wrote."""
+        sizes = {name: size for name, (size, _) in self._contents().items()}
+        return {
+            name: sum(sizes.get(written, 0) for written in stage["wrote"])
+            for name, stage in stamps.read(self._stages_file).items()
+        }
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Measure a stage; what a run that failed spent counts too."""
-        start = time.perf_counter()
+        contents, start = self._contents(), time.perf_counter()
         try:
-            yield
+            with trace.span(name):
+                yield
         finally:
-            seconds = self.seconds()
-            spent = seconds.get(name, 0.0) + time.perf_counter() - start
-            with replacing(self._seconds_file) as temporary:
-                temporary.write_text(json.dumps({**seconds, name: round(spent, 3)}, indent=1))
+            stages = stamps.read(self._stages_file)
+            before = stages.get(name, {"seconds": 0.0, "wrote": []})
+            spent = before["seconds"] + time.perf_counter() - start
+            changed = {
+                written
+                for written, state in self._contents().items()
+                if contents.get(written) != state
+            }
+            wrote = sorted(changed.union(before["wrote"]))
+            stages[name] = {"seconds": round(spent, 3), "wrote": wrote}
+            stamps.write(self._stages_file, stages)
+
+    def _contents(self) -> dict[str, tuple[int, int]]:
+        """Return the size and the time of the last change of all that stages wrote, by name."""
+        contents = {}
+        for path in self.path.iterdir():
+            if path.name in BOOKKEEPING or path.name.startswith("."):
+                continue
+            files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
+            states = [file.stat() for file in files]
+            contents[path.name] = (
+                sum(state.st_size for state in states),
+                max((state.st_mtime_ns for state in states), default=0),
+            )
+        return contents
 
 
 def _changes(before: dict, after: dict) -> dict[str, str]:
@@ -211,7 +245,7 @@ def bytes_per_keypoint(features: Path) -> dict[str, float]:
     """Measure the size of a feature file: bytes of one descriptor, and of all per keypoint."""
     names = list_h5_names(features)
     with open_h5(features) as file:
-        descriptors = [file[name]["descriptors"] for name in names]
+        descriptors = [stored_descriptors(file, name) for name in names]
         total = sum(dataset.shape[1] for dataset in descriptors)
         size = descriptors[0].shape[0] * descriptors[0].dtype.itemsize
     return {

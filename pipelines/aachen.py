@@ -16,9 +16,11 @@ from hloc_reduce import (
     localize_sfm,
     match_features,
     pairs_from_covisibility,
+    trace,
     triangulation,
 )
 from hloc_reduce.datasets import Aachen, thresholds, true_poses
+from hloc_reduce.storage import STORAGES
 
 from . import common
 
@@ -34,9 +36,10 @@ def main(
     ground_truth: Path | None = None,
     overwrite: bool = False,
     projection: Path | None = None,
+    storage: str = STORAGES[0],
 ) -> dict:
     """Run all stages and return the summary, as in summary.json."""
-    feature, feature_conf = features_confs.get(feature, projection)
+    feature, feature_conf = features_confs.get(feature, projection, storage)
     matcher_conf = matchers_confs.confs[matcher]
     place = Aachen(dataset)
     map_names = place.map_names()
@@ -117,18 +120,20 @@ def _main() -> None:
     outputs = args.outputs or Path("outputs") / dataset.name / feature
     if args.demo:
         demo.main(dataset)
-    summary = main(
-        dataset,
-        outputs,
-        args.feature,
-        args.matcher,
-        args.retrieval,
-        args.num_covis,
-        args.num_loc,
-        args.ground_truth,
-        args.overwrite,
-        args.projection,
-    )
+    with trace.recording(outputs / "trace.json" if args.profile else None):
+        summary = main(
+            dataset,
+            outputs,
+            args.feature,
+            args.matcher,
+            args.retrieval,
+            args.num_covis,
+            args.num_loc,
+            args.ground_truth,
+            args.overwrite,
+            args.projection,
+            args.storage,
+        )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)
 

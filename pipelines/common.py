@@ -64,6 +64,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="file of a projection to use with the base descriptor of --feature",
     )
+    features_confs.add_storage_option(parser)
     parser.add_argument(
         "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
     )
@@ -77,6 +78,11 @@ def add_localization_options(parser: argparse.ArgumentParser, truth: str, num_lo
         "--ground_truth", type=Path, help=f"true poses of the queries (default: {truth})"
     )
     parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
+    parser.add_argument(
+        "--profile",
+        action="store_true",
+        help="write trace.json, of what ran when, for https://ui.perfetto.dev",
+    )
 
 
 def check_options(args: argparse.Namespace) -> None:
@@ -153,7 +159,7 @@ def run_folder(
         outputs,
         {
             "dataset": str(dataset.resolve()),
-            "feature": extract_features.provenance(feature_conf, as_half=True),
+            "feature": extract_features.provenance(feature_conf),
             "matcher": matcher_conf["model"],
             "retrieval": retrieval,
             **numbers,
@@ -219,6 +225,7 @@ def finish(
         },
         "bytes_per_keypoint": results.bytes_per_keypoint(features),
         "seconds": folder.seconds(),
+        "bytes": folder.bytes(),
         "versions": versions(),
         "poses": poses.name,
     }

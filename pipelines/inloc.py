@@ -14,8 +14,10 @@ from hloc_reduce import (
     extract_features,
     localize_inloc,
     match_features,
+    trace,
 )
 from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
+from hloc_reduce.storage import STORAGES
 
 from . import common
 
@@ -30,9 +32,10 @@ def main(
     ground_truth: Path | None = None,
     overwrite: bool = False,
     projection: Path | None = None,
+    storage: str = STORAGES[0],
 ) -> dict:
     """Run all stages and return the summary, as in summary.json."""
-    feature, feature_conf = features_confs.get(feature, projection)
+    feature, feature_conf = features_confs.get(feature, projection, storage)
     matcher_conf = matchers_confs.confs[matcher]
     place = InLoc(dataset)
     map_names, query_names = place.map_names(), place.query_names()
@@ -102,17 +105,19 @@ def _main() -> None:
     common.check_options(args)
     feature, _ = features_confs.get(args.feature, args.projection)
     outputs = args.outputs or Path("outputs") / args.dataset.name / feature
-    summary = main(
-        args.dataset,
-        outputs,
-        args.feature,
-        args.matcher,
-        args.retrieval,
-        args.num_loc,
-        args.ground_truth,
-        args.overwrite,
-        args.projection,
-    )
+    with trace.recording(outputs / "trace.json" if args.profile else None):
+        summary = main(
+            args.dataset,
+            outputs,
+            args.feature,
+            args.matcher,
+            args.retrieval,
+            args.num_loc,
+            args.ground_truth,
+            args.overwrite,
+            args.projection,
+            args.storage,
+        )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)
 

@@ -23,11 +23,13 @@ from hloc_reduce import (
     pairs_from_retrieval,
     results,
     stamps,
+    trace,
 )
 from hloc_reduce.cli import InputError
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.maps import Map
 from hloc_reduce.parsers import parse_query_lists
+from hloc_reduce.storage import STORAGES
 
 from . import common
 
@@ -45,6 +47,7 @@ def open_map(
     matcher: str | None = None,
     num_covis: int = 20,
     overwrite: bool = False,
+    storage: str | None = None,
 ) -> Map:
     """Build a map in `outputs`, or open one that was built before.
 
@@ -57,6 +60,7 @@ def open_map(
         matcher: likewise, NN-ratio.
         num_covis: pairs of each map image.
         overwrite: build anew.
+        storage: of descriptors; likewise, float16.
     """
     if map_images is None:
         if model_or_map is None:
@@ -68,6 +72,8 @@ def open_map(
         built = Map(model_or_map)
         if feature or projection:
             built.check_feature(feature or FEATURE, projection)
+        if storage not in (None, built.storage):
+            raise InputError(f"The map {model_or_map} is of --storage {built.storage}.")
         if matcher not in (None, built.matcher):
             raise InputError(f"The map {model_or_map} is of --matcher {built.matcher}.")
         return built
@@ -85,6 +91,7 @@ def open_map(
         matcher or MATCHER,
         num_covis,
         overwrite,
+        storage or STORAGES[0],
     )
 
 
@@ -226,13 +233,18 @@ def _main() -> None:
     parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
     common.add_feature_options(parser)
     common.add_localization_options(parser, "none", 50)
-    parser.set_defaults(feature=None, matcher=None)  # those of a map that was built
+    parser.set_defaults(feature=None, matcher=None, storage=None)  # those of a map that was built
     args = parser.parse_args()
     common.check_options(args)
     if args.outputs is None:
         raise InputError("Give --outputs, a folder.")
     if args.queries is not None and args.query_images is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
+    with trace.recording(args.outputs / "trace.json" if args.profile else None):
+        _run(args)
+
+
+def _run(args: argparse.Namespace) -> None:
     built = open_map(
         args.outputs,
         args.map_images,
@@ -242,6 +254,7 @@ def _main() -> None:
         args.matcher,
         args.num_covis,
         args.overwrite,
+        args.storage,
     )
     if args.query_images is None:
         print(f"The map {built.folder} is there. Localize photos in it with --query_images.")

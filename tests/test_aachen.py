@@ -42,6 +42,11 @@ def test_plane(aachen_layout, tmp_path, monkeypatch, capsys):
     assert summary["bytes_per_keypoint"]["descriptor"] == 64
     assert summary["map_points3D"] > 100 and summary["versions"]["pycolmap"]
     assert len(summary["seconds"]) == 7
+    written = {"match_map": "*covis*.h5", "match_queries": "*pairs-query*.h5"}
+    for stage, files in written.items():
+        (file,) = outputs.glob(files)
+        assert summary["bytes"][stage] == file.stat().st_size
+    assert summary["bytes"].keys() == summary["seconds"].keys()
     good, grey = rows["query/day/a.png"], rows["query/day/grey.png"]
     assert good["status"] == "localized" and float(good["position_error_m"]) < 0.02
     assert 0 < int(good["num_inliers"]) <= int(good["num_matches"])

@@ -32,11 +32,17 @@ def test_descriptors_are_of_unit_norm_and_do_not_depend_on_the_batch(name, base_
 
 @pytest.mark.parametrize(
     ("name", "module"),
-    [("mkd", kornia.feature.MKDDescriptor), ("tfeat", lambda: kornia.feature.TFeat(True))],
+    [
+        ("sift", lambda: kornia.feature.SIFTDescriptor(32, 8, 4, rootsift=False)),
+        ("mkd", kornia.feature.MKDDescriptor),
+        ("tfeat", lambda: kornia.feature.TFeat(True)),
+    ],
 )
 def test_descriptors_are_kornias(name, module, base_weights):
     describe = available(name)
-    patches = torch.rand(5, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    patches = torch.rand(7, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    patches[5] = 0.5  # flat
+    patches[6] = torch.linspace(0, 1, 32)  # a ramp: one orientation, that of bin 0
     with torch.no_grad():
         expected = torch.nn.functional.normalize(module().eval()(patches), dim=1)
     torch.testing.assert_close(describe(patches), expected)

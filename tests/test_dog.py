@@ -2,7 +2,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from kornia.feature.laf import extract_patches_from_pyramid, laf_from_center_scale_ori
 
+from confs import features as features_confs
 from hloc_reduce import extract_features
 from hloc_reduce.cli import InputError
 from hloc_reduce.extractors.dog import DoG, extract_patches
@@ -57,6 +59,67 @@ def test_patch_is_centred_on_its_keypoint_and_scaled():
     assert patch.mean() == pytest.approx(100, abs=1e-3)
     # 32 samples over a side of 12 * scale
     assert (patch[:, -1] - patch[:, 0]).mean() == pytest.approx(24 * 31 / 32, abs=1e-3)
+
+
+@pytest.mark.parametrize("size", [(240, 320), (201, 175), (70, 64), (40, 33)])
+def test_patches_are_kornias(size):
+    generator = np.random.default_rng(0)
+    image = torch.from_numpy(generator.random((1, 1, *size), np.float32))
+    keypoints = np.column_stack(
+        [
+            generator.uniform(-3, size[1] + 3, 300),
+            generator.uniform(-3, size[0] + 3, 300),
+            np.exp(generator.uniform(0, 4, 300)),
+            generator.uniform(-360, 360, 300),
+        ]
+    ).astype(np.float32)
+    x_y, scale, orientation = torch.from_numpy(keypoints).split([2, 1, 1], 1)
+    lafs = laf_from_center_scale_ori(x_y[None], scale[None, ..., None] * 6, -orientation[None])
+    expected = extract_patches_from_pyramid(image, lafs, PS=32)[0]
+    torch.testing.assert_close(extract_patches(image, keypoints), expected, atol=1e-3, rtol=0)
+
+
+def test_no_patches():
+    patches = extract_patches(torch.zeros(1, 1, 50, 60), np.zeros((0, 4), np.float32))
+    assert patches.shape == (0, 1, 32, 32)
+
+
+@pytest.mark.parametrize("normalization", ["L2", "L1_ROOT"])
+def test_colmaps_own_descriptors(textured, normalization):
+    """They are of unit norm, and of the keypoints that patches would be cut around."""
+    options = {"first_octave": 0, "peak_threshold": 0.01, "normalization": normalization}
+    own = detect(textured, descriptor="colmap_sift", options=options)
+    patches = detect(textured)
+    np.testing.assert_array_equal(own["keypoints"], patches["keypoints"])
+    np.testing.assert_allclose(np.linalg.norm(own["descriptors"], axis=0), 1, atol=1e-5)
+    few = detect(textured, descriptor="colmap_sift", options=options, max_keypoints=20)
+    best = np.argsort(-own["scales"], kind="stable")[:20]
+    np.testing.assert_array_equal(few["descriptors"], own["descriptors"][:, best])
+    assert detect(np.full((64, 64), 9, np.uint8), descriptor="colmap_sift")["scores"].size == 0
+
+
+def test_all_cores_extract_the_same(tmp_path, textured):
+    """Also when an image of the many cannot be read."""
+    images = []
+    for i in range(6):
+        images.append(tmp_path / f"{i}.png")
+        cv2.imwrite(str(images[-1]), np.roll(textured, 17 * i, axis=1))
+    threads = torch.get_num_threads()
+    for name in ("sift_sv16", "colmap_sift"):
+        extracted = []
+        for number in (1, 3):
+            torch.set_num_threads(number)
+            extracted.append(list(extract_features.extract_all(features_confs.confs[name], images)))
+        torch.set_num_threads(threads)
+        for alone, together in zip(*extracted, strict=True):
+            for key in alone:
+                np.testing.assert_array_equal(alone[key], together[key])
+    images[3].write_bytes(b"no image")
+    torch.set_num_threads(2)
+    results = extract_features.extract_all(features_confs.confs["sift"], images)
+    with pytest.raises(InputError, match="Cannot read image .*3.png"):
+        list(results)
+    torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("angle", [30, 90, 200])

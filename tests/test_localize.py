@@ -112,7 +112,7 @@ def test_a_map_is_built_once(place, monkeypatch, caplog, capsys):
     run(monkeypatch, *build, "--query_images", images / "query/day")
     again = state(outputs / "queries-day")
     written = {path.name for path in day if again[path] != day[path]}
-    summing = {"queries.csv", "summary.json", "seconds.json", "made_from.json", summary["poses"]}
+    summing = {"queries.csv", "summary.json", "stages.json", "made_from.json", summary["poses"]}
     assert written == {*summing, f"{summary['poses']}_logs.jsonl"} and set(day) == set(again)
 
     # it may be moved, and used without what it was built from

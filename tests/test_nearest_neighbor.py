@@ -1,7 +1,12 @@
 import pytest
 import torch
 
-from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
+from hloc_reduce.matchers.nearest_neighbor import (
+    NearestNeighbor,
+    _batches,
+    mutual_nearest,
+    mutual_nearest_padded,
+)
 
 
 def unit(number, dim, seed):
@@ -53,3 +58,34 @@ def test_no_descriptors_no_matches(sizes):
 def test_a_lone_descriptor_skips_the_ratio_test():
     matches, _ = match(unit(5, 8, 0), unit(1, 8, 1), 0.8)
     assert (matches >= 0).sum() == 1
+
+
+@pytest.mark.parametrize("ratio_threshold", [None, 0.8, 0.95])
+def test_padded_pairs_match_as_single_ones(ratio_threshold):
+    sizes = [(200, 300), (300, 2), (2, 150), (5, 1), (1, 5), (1, 1), (300, 300)]
+    base = unit(300, 16, 0)
+    other = torch.nn.functional.normalize(base + 0.5 * unit(300, 16, 1), dim=1).flip(0)
+    pairs = [(base[:n], other[:m]) for n, m in sizes]
+    padded = mutual_nearest_padded(*zip(*pairs, strict=True), ratio_threshold)
+    for pair, (matches, cosines) in zip(pairs, padded, strict=True):
+        expected, expected_cosines = mutual_nearest(*pair, ratio_threshold)
+        assert matches.tolist() == expected.tolist()
+        torch.testing.assert_close(cosines, expected_cosines)
+
+
+def test_padded_empty_descriptors_have_no_match():
+    ((first, _), (second, _)) = mutual_nearest_padded(
+        [unit(5, 8, 0), unit(3, 8, 1)], [unit(0, 8, 2), unit(4, 8, 3)], 0.8
+    )
+    assert first.tolist() == [-1] * 5 and len(second) == 3
+
+
+def test_batches_fit_into_memory():
+    sizes = [(10, 20), (0, 5), (10, 21), (100, 100), (12, 20), (5, 0), (11, 20)]
+    batches = list(_batches(sizes, 4 * 3 * 12 * 21))
+    assert sorted(i for batch in batches for i in batch) == list(range(len(sizes)))
+    assert [3] in batches and [1] in batches and [5] in batches  # too large, and empty
+    assert max(map(len, batches)) > 1
+    for batch in batches:
+        height, width = (max(column) for column in zip(*(sizes[i] for i in batch), strict=True))
+        assert len(batch) == 1 or 4 * len(batch) * height * width <= 4 * 3 * 12 * 21

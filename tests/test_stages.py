@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
+import torch
 
 from hloc_reduce import (
     colmap,
@@ -202,6 +203,35 @@ def test_localization_is_resumed_and_repeated_exactly(built):
     assert log.read_text().splitlines(keepends=True) == lines
     assert built.localize(overwrite=True) == first
     assert built.localize(reference_sfm=built.map) == first
+
+
+def test_poses_do_not_depend_on_the_number_of_cores(built):
+    threads, records = torch.get_num_threads(), []
+    for number in (1, 3):
+        torch.set_num_threads(number)
+        records.append(built.localize(overwrite=True))
+    torch.set_num_threads(threads)
+    assert records[0] == records[1]
+
+
+def test_descriptors_in_memory_are_bounded(tmp_path):
+    path = tmp_path / "f.h5"
+    with GroupWriter(path, {}) as writer:
+        for name in "abcd":
+            writer.add(name, {"descriptors": np.full((4, 10), ord(name), np.float16)})
+    with h5py.File(path) as file:
+        read = match_features.DescriptorCache(max_bytes=2 * 4 * 10 * 4)
+        first = read(file, "a")
+        assert first.shape == (10, 4) and first.is_contiguous()
+        read(file, "b")
+        assert read(file, "a") is first  # and is the last one used now
+        read(file, "c")
+        assert read(file, "a") is first
+        assert {name for _, name in read.kept} == {"a", "c"} and read.bytes == 320
+        assert read(file, "d")[0, 0] == ord("d")
+        small = match_features.DescriptorCache(max_bytes=1)
+        assert small(file, "a")[0, 0] == ord("a") and small(file, "b")[0, 0] == ord("b")
+        assert len(small.kept) == 1
 
 
 def test_clusters_of_covisible_images_are_solved_by_themselves(built):

@@ -11,9 +11,11 @@ from kornia import feature
 from torch import nn
 
 from ..cli import InputError, choose
+from .sift import SIFT
 
 PATCH_SIZE = 32
 DIM = 128
+COLMAP = "colmap_sift"  # COLMAP's own SIFT, a base descriptor that takes no patches
 TIMEOUT = 5  # seconds to wait for a server
 
 
@@ -22,7 +24,7 @@ class Base:
     """A base descriptor.
 
     Args:
-        make: returns the kornia module that maps (N, 1, 32, 32) in [0, 1] to (N, 128).
+        make: returns the module that maps (N, 1, 32, 32) in [0, 1] to (N, 128).
         urls: of the weights that kornia downloads to torch's cache, the first that answers; none
             for a descriptor without.
         hidden: the sizes of the hidden layers of its projections: two for hand-crafted descriptors,
@@ -35,7 +37,7 @@ class Base:
 
 
 DESCRIPTORS = {
-    "sift": Base(lambda: feature.SIFTDescriptor(PATCH_SIZE, 8, 4, rootsift=False)),
+    "sift": Base(lambda: SIFT(PATCH_SIZE)),
     "mkd": Base(
         feature.MKDDescriptor,
         ("https://github.com/manyids2/mkd_pytorch/raw/master/mkd_pytorch/mkd-concat-64.pth",),
@@ -70,7 +72,7 @@ class Descriptor(nn.Module):
         InputError: for an unknown name, or when its weights are neither cached nor to be had.
     """
 
-    batch_size = 128  # kornia's SIFT is five times slower in batches of 1,024 on a CPU
+    batch_size = 128  # whose intermediate results stay in the cache of a CPU
 
     def __init__(self, name: str):
         super().__init__()

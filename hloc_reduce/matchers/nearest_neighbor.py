@@ -1,10 +1,14 @@
 """Mutual nearest neighbours with a ratio test."""
 
+from collections.abc import Iterator
+
 import torch
+from torch.nn.utils.rnn import pad_sequence
 
 from ..base_model import BaseModel
 
-BLOCK = 256  # rows of the similarity matrix in memory at once
+BLOCK = 128  # rows of the similarity matrix at once, which stay in the cache of a CPU
+GPU_BYTES = 2**30  # similarities in the memory of a GPU at once
 
 
 def nearest(
@@ -22,8 +26,9 @@ def nearest(
         Its index (N,) int64, -1 where it does not pass, and its cosine (N,).
     """
     indices, cosines = [], []
-    buffer = descriptors0.new_empty(min(BLOCK, len(descriptors0)), len(descriptors1))
-    for rows in descriptors0.split(BLOCK):
+    block = BLOCK if descriptors0.is_cpu else max(1, GPU_BYTES // 4 // len(descriptors1))
+    buffer = descriptors0.new_empty(min(block, len(descriptors0)), len(descriptors1))
+    for rows in descriptors0.split(block):
         # new memory for every block would cost as much as the product
         similarity = torch.mm(rows, descriptors1.T, out=buffer[: len(rows)])
         index = _argmax(similarity)
@@ -33,7 +38,7 @@ def nearest(
             similarity.scatter_(1, index[:, None], -torch.inf)
             second = similarity.amax(dim=1)
             # squared distances of unit vectors are 2 - 2 * cosine
-            accepted = 2 * (1 - best) <= ratio_threshold**2 * 2 * (1 - second)
+            accepted = 1 - best <= ratio_threshold**2 * (1 - second)
             index = torch.where(accepted, index, -1)
         indices.append(index)
         cosines.append(best)
@@ -82,6 +87,61 @@ def mutual_nearest(
     return torch.where(matched, forward, -1), cosine
 
 
+def mutual_nearest_padded(
+    descriptors0: list[torch.Tensor],
+    descriptors1: list[torch.Tensor],
+    ratio_threshold: float | None,
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Match several pairs as `mutual_nearest` does, at once, as suits a GPU.
+
+    Args:
+        descriptors0: of P pairs (N, D), N > 0, of unit norm.
+        descriptors1: of these (M, D), M > 0, of unit norm.
+        ratio_threshold: as of `nearest`.
+
+    Returns:
+        Of each pair the index of the match of each descriptor0 (N,) int64, or -1, and its cosine
+        (N,).
+    """
+    sizes = [
+        torch.tensor([len(part) for part in descriptors], device=descriptors[0].device)
+        for descriptors in (descriptors0, descriptors1)
+    ]
+    padded0, padded1 = (
+        pad_sequence(part, batch_first=True) for part in (descriptors0, descriptors1)
+    )
+    similarity = padded0 @ padded1.mT
+    real0, real1 = (
+        torch.arange(padded.shape[1], device=padded.device) < size[:, None]
+        for padded, size in zip((padded0, padded1), sizes, strict=True)
+    )
+    if len(sizes[0]) > 1:
+        similarity.masked_fill_(~(real0[:, :, None] & real1[:, None]), -torch.inf)
+    lone = torch.minimum(*sizes) == 1
+    forward, cosine = _nearest_padded(similarity, 2, ratio_threshold, lone)
+    backward, _ = _nearest_padded(similarity, 1, ratio_threshold, lone)
+    own = torch.arange(padded0.shape[1], device=padded0.device)
+    matched = (forward >= 0) & (backward.gather(1, forward.clamp(min=0)) == own)
+    matches = torch.where(matched & real0, forward, -1)
+    return [(matches[i, :n], cosine[i, :n]) for i, n in enumerate(sizes[0].tolist())]
+
+
+def _nearest_padded(
+    similarity: torch.Tensor, dim: int, ratio_threshold: float | None, lone: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Do what `nearest` does along a dimension of cosines (P, N, M); `lone` (P,) skip the test."""
+    best, index = similarity.max(dim)
+    accepted = best > -torch.inf  # nothing is the nearest of padding
+    if ratio_threshold is None:
+        return torch.where(accepted, index, -1), best
+    hidden = index.unsqueeze(dim)
+    similarity.scatter_(dim, hidden, -torch.inf)
+    second = similarity.amax(dim)
+    similarity.scatter_(dim, hidden, best.unsqueeze(dim))
+    accepted &= (1 - best <= ratio_threshold**2 * (1 - second)) | lone[:, None]
+    return torch.where(accepted, index, -1), best
+
+
 class NearestNeighbor(BaseModel):
     """The matches of hloc's `nearest_neighbor`: mutual, and both ways through the ratio test."""
 
@@ -89,18 +149,61 @@ class NearestNeighbor(BaseModel):
     required_inputs = ("descriptors0", "descriptors1")
 
     @torch.no_grad()
+    def match(
+        self, pairs: list[tuple[torch.Tensor, torch.Tensor]], gpu_bytes: int = GPU_BYTES
+    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Match descriptors of unit norm, on a GPU several pairs at once.
+
+        Args:
+            pairs: of descriptors (N, D) and (M, D).
+            gpu_bytes: what similarities may take of the memory of a GPU. A pair that needs more is
+                matched in blocks.
+
+        Returns:
+            Of each pair matches0 (N,) int64, the index in 1 or -1, and matching_scores0 (N,) in
+            [0, 1].
+        """
+        ratio_threshold = self.conf["ratio_threshold"]
+        found = {}
+        if all(descriptors.is_cpu for pair in pairs for descriptors in pair):
+            batches = [[i] for i in range(len(pairs))]
+        else:
+            batches = _batches([(len(first), len(second)) for first, second in pairs], gpu_bytes)
+        for batch in batches:
+            parts = [pairs[i] for i in batch]
+            if len(batch) == 1:
+                matched = [mutual_nearest(*parts[0], ratio_threshold)]
+            else:
+                matched = mutual_nearest_padded(*zip(*parts, strict=True), ratio_threshold)
+            found.update(zip(batch, matched, strict=True))
+        results = [found[i] for i in range(len(pairs))]
+        return [(m, torch.where(m >= 0, (cosine + 1) / 2, 0)) for m, cosine in results]
+
     def _forward(self, data: dict) -> dict:
         """Match descriptors (1, D, N) of unit norm with descriptors (1, D, M).
 
         Returns:
-            matches0 (1, N) int64, the index in 1 or -1, and matching_scores0 (1, N) in [0, 1].
+            matches0 (1, N) and matching_scores0 (1, N), as of `match`.
         """
-        matches, cosine = mutual_nearest(
-            data["descriptors0"][0].T.contiguous(),
-            data["descriptors1"][0].T.contiguous(),
-            self.conf["ratio_threshold"],
-        )
-        return {
-            "matches0": matches[None],
-            "matching_scores0": torch.where(matches >= 0, (cosine + 1) / 2, 0)[None],
-        }
+        pair = (data["descriptors0"][0].T.contiguous(), data["descriptors1"][0].T.contiguous())
+        ((matches, scores),) = self.match([pair])
+        return {"matches0": matches[None], "matching_scores0": scores[None]}
+
+
+def _batches(sizes: list[tuple[int, int]], max_bytes: int) -> Iterator[list[int]]:
+    """Split pairs of (N, M) descriptors into batches whose similarities, padded, take so much.
+
+    Pairs of similar sizes come together. One that is too large, or empty, is alone.
+    """
+    empty = [i for i, size in enumerate(sizes) if 0 in size]
+    yield from ([i] for i in empty)
+    batch, height, width = [], 0, 0
+    for i in sorted(set(range(len(sizes))).difference(empty), key=sizes.__getitem__):
+        n, m = sizes[i]
+        height, width = max(height, n), max(width, m)
+        if batch and 4 * (len(batch) + 1) * height * width > max_bytes:
+            yield batch
+            batch, height, width = [], n, m
+        batch.append(i)
+    if batch:
+        yield batch

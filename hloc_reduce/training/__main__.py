@@ -14,7 +14,7 @@ from confs import features as features_confs
 
 from .. import cli, extractors, logger, projections, stamps
 from ..cli import InputError
-from ..descriptors import DESCRIPTORS, DIM, check_weights
+from ..descriptors import COLMAP, DESCRIPTORS, DIM, check_weights
 from ..evaluation.phototour import fpr95
 from ..maps import Map, is_map
 from ..versions import versions
@@ -22,6 +22,7 @@ from . import nested, pca, phototour, ss, sv, tracks, us
 
 SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
 RECIPE_NAMES = ("best", "paper", "tune")
+BASES = (*DESCRIPTORS, COLMAP)
 HIDDEN = (512, 512)  # hidden layers of projections of an extractor's own descriptors
 
 
@@ -201,7 +202,7 @@ def _main() -> None:
         "--descriptor",
         nargs="+",
         default=["sift"],
-        help=f"base descriptors, of {', '.join(DESCRIPTORS)}",
+        help=f"base descriptors, of {', '.join(BASES)}",
     )
     base.add_argument(
         "--base",
@@ -261,9 +262,11 @@ def _main() -> None:
             raise InputError("--base describes photos, not the patches of PhotoTour.")
         args.descriptor, conf = [args.base.stem], base_of(features_confs.read(args.base))
         extractors.load_local(conf["model"])  # is wrong before any work is done, if it is
-    for descriptor in args.descriptor:
-        if conf is None:
-            check_weights(cli.choose("descriptor", descriptor, DESCRIPTORS))
+    for descriptor in [] if conf else args.descriptor:
+        if cli.choose("descriptor", descriptor, BASES) in DESCRIPTORS:
+            check_weights(descriptor)
+        elif args.phototour or args.validate:
+            raise InputError(f"{descriptor} describes photos, not the patches of PhotoTour.")
     for scheme in args.scheme:
         cli.choose("scheme", scheme, SCHEMES)
     if "ss" in args.scheme:
@@ -298,7 +301,7 @@ def _main() -> None:
                 args.cache,
                 args.recipe,
                 args.seed,
-                conf,
+                conf or (None if descriptor in DESCRIPTORS else features_confs.confs[descriptor]),
             )
         ]
         if args.validate:

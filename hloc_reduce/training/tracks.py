@@ -25,10 +25,11 @@ from .. import (
 )
 from ..cli import InputError
 from ..colmap import point3D_ids
-from ..descriptors import DIM, Descriptor
+from ..descriptors import COLMAP, DIM, Descriptor
 from ..extractors.dog import extract_patches
 from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
 from ..maps import Map, is_map
+from ..storage import get_descriptors
 from .completion import complete
 from .loop import device
 
@@ -131,7 +132,7 @@ def main(
             scaled = keypoints[name][kept]  # in pixels of the resized image
             scaled[:, :2] = (scaled[:, :2] + 0.5) * ratio - 0.5
             scaled[:, 2:3] *= ratio.mean()
-            known = get_dataset(file, name, "descriptors")[()].T[kept]
+            known = get_descriptors(file, name)[kept]
             described = describe(image, scaled, known, generator)
             ids, xy = observed[name][kept], keypoints[name][kept, :2]
             parts.append((described, ids, np.full(len(kept), number), xy, matched[name][kept] >= 0))
@@ -249,7 +250,8 @@ class FeatureDescriber:
     """Describes keypoints by an extractor, which finds them anew in each variant of a photo."""
 
     def __init__(self, model: dict):
-        self.extract = extractors.load(model).eval().to(device())
+        self.extract = extractors.load_local(model).eval().to(device())
+        self.mirror = MIRRORS.get(self.extract.descriptor, np.copy)
 
     @torch.no_grad()
     def __call__(
@@ -262,7 +264,7 @@ class FeatureDescriber:
         """Describe the keypoints of a photo (1, C, H, W) as `PatchDescriber` does.
 
         What is not found anew within MAX_SHIFT pixels keeps its `known` descriptor (N, D). Without
-        patches nothing is mirrored: both views are as seen.
+        patches nothing but COLMAP's SIFT is mirrored: both views are as seen.
         """
         described = np.repeat(known[:, None, None].astype(np.float16), VARIANTS, axis=2)
         photo = image[0].numpy().transpose(1, 2, 0)
@@ -282,7 +284,17 @@ class FeatureDescriber:
             best = np.where(np.isfinite(distance), likeness, -np.inf).argmax(axis=1)
             again = np.isfinite(distance[:, 0])
             described[again, 0, variant] = candidates[again, best[again]]
-        return np.repeat(described, 2, axis=1)
+        return np.concatenate([described, self.mirror(described)], axis=1)
+
+
+def mirror_colmap_sift(descriptors: np.ndarray) -> np.ndarray:
+    """Return COLMAP's SIFT (..., 128) of keypoints mirrored as by `describe_mirrored`."""
+    bins = descriptors.reshape(*descriptors.shape[:-1], 4, 4, 8)  # rows, columns, orientations
+    mirrored = np.roll(bins[..., ::-1, :, ::-1], 1, axis=-1)  # orientation 0 stays
+    return mirrored.reshape(descriptors.shape)
+
+
+MIRRORS = {COLMAP: mirror_colmap_sift}
 
 
 def describe_mirrored(patches: torch.Tensor, describe: Descriptor) -> np.ndarray:

@@ -1,0 +1,215 @@
+"""Run pairs, matching and their files at shares of the size of Aachen Day-Night v1.1.
+
+The names of images and queries and hloc's 50 retrieved images of each query are the real ones; the
+features are synthesized. A part of the keypoints of an image are looks at landmarks, of which it
+sees a window of a long row; its neighbours in the order of names see much of the same, and a query
+what the first image retrieved for it sees. The other keypoints are clutter. For each share a new
+process writes the features, counts covisible landmarks, makes the pairs (40 of each map image, of
+which every other is another's reverse, so that 20 are left; 50 of each query, others standing in
+for map images that are left out), matches them and checks the matches. The cache of descriptors is
+scaled with the share, so that it misses as often as at full size. Prints a Markdown table, and the
+line through the first and the last share continued to the whole data set.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from hloc_reduce import cli, match_features, pairs_from_retrieval
+from hloc_reduce.cli import InputError
+from hloc_reduce.io import GroupWriter, find_pair, get_dataset, get_matches, open_h5
+from hloc_reduce.pairs_from_covisibility import covisibility, most_covisible
+from hloc_reduce.parsers import image_names, parse_query_list, parse_retrieval, write_pairs
+from hloc_reduce.storage import STORAGES, store
+
+NUM_COVIS, NUM_LOC = 40, 50
+SEEN = 0.15  # of the keypoints show landmarks
+STEP = 0.04  # of these are left behind from one image of the row to the next
+NOISE = 0.35  # length of what one look adds to the descriptor of a landmark
+CHECKED = 200  # pairs whose matches are checked
+SUMMED = ("images", "pairs", "features_s", "pairs_s", "matching_s", "feature_MB", "match_MB")
+
+
+def ids_of(place: int, number: int) -> np.ndarray:
+    """Return the landmarks that the image at a place in the row sees."""
+    seen = int(SEEN * number)
+    return np.arange(seen) + int(place * STEP * seen)
+
+
+def unit(generator: np.random.Generator, number: int, dim: int) -> np.ndarray:
+    """Draw descriptors (N, D) float32 of unit norm."""
+    drawn = generator.standard_normal((number, dim), np.float32)
+    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+
+def synthesize(places: dict[str, int], path: Path, dim: int, number: int, storage: str) -> None:
+    """Write the features of images, given their places in the row."""
+    with GroupWriter(path, {"synthesized": [dim, number, storage]}) as writer:
+        for name, place in places.items():
+            ids = ids_of(place, number)
+            blocks = [  # of 1,000 landmarks, which are the same in all images
+                unit(np.random.default_rng([0, block]), 1000, dim)
+                for block in range(ids[0] // 1000, ids[-1] // 1000 + 1)
+            ]
+            landmarks = np.concatenate(blocks)[ids[0] % 1000 :][: len(ids)]
+            generator = np.random.default_rng([1, *name.encode()])
+            looks = landmarks + NOISE * unit(generator, len(ids), dim)
+            looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+            clutter = unit(generator, number - len(ids), dim)
+            order = generator.permutation(number)
+            arrays, attrs = store(
+                {"descriptors": np.concatenate([looks, clutter])[order].T}, storage
+            )
+            arrays["ids"] = np.concatenate([ids, np.full(number - len(ids), -1)])[order]
+            writer.add(name, arrays, attrs)
+
+
+def make_pairs(data: Path, folder: Path, share: float, number: int) -> tuple[dict[str, int], Path]:
+    """Write the pairs of a share of the map images and queries; return their places in the row."""
+    database = image_names(data / "database_images.txt")
+    database = database[: max(NUM_LOC, round(share * len(database)))]
+    lists = sorted(data.glob("*_time_queries_with_intrinsics.txt"))
+    queries = [name for path in lists for name, _ in parse_query_list(path)]
+    queries = queries[:: round(1 / share)]
+    places = {name: i for i, name in enumerate(database)}
+    counts = covisibility([ids_of(i, number) for i in range(len(database))])
+    pairs = [
+        (database[i], database[j])
+        for i in range(len(database))
+        for j in most_covisible(counts, i, NUM_COVIS)
+    ]
+    retrieved = parse_retrieval(data / "pairs-query-netvlad50.txt")
+    listed = []
+    for query in queries:
+        present = [name for name in retrieved[query] if name in places]
+        start = hash_of(query) % len(database)
+        others = database[start:] + database[:start]
+        listed += [(query, name) for name in dict.fromkeys(present + others[:NUM_LOC])]
+        places[query] = places[(present or others)[0]]
+    write_pairs(listed, folder / "listed.txt")
+    pairs_from_retrieval.select(
+        folder / "listed.txt", folder / "loc.txt", NUM_LOC, queries, database
+    )
+    pairs += [
+        (q, name) for q, names in parse_retrieval(folder / "loc.txt").items() for name in names
+    ]
+    write_pairs(pairs, folder / "pairs.txt")
+    return places, folder / "pairs.txt"
+
+
+def hash_of(name: str) -> int:
+    """Return a number that is the same for a name in every run."""
+    return int.from_bytes(name.encode()[-8:], "big")
+
+
+def check(features: Path, matches: Path, pairs: list[tuple[str, str]]) -> tuple[float, float]:
+    """Return which share of common landmarks is matched, and of the matches is right."""
+    common = found = right = 0
+    with open_h5(features) as file, open_h5(matches) as match_file:
+        for names in pairs:
+            ids = [get_dataset(file, name, "ids")[()] for name in names]
+            common += len(np.intersect1d(*(part[part >= 0] for part in ids)))
+            if find_pair(match_file, *names)[0] is None:
+                raise InputError(f"The pair {names} is not there.")
+            indices, _ = get_matches(match_file, *names)
+            first, second = ids[0][indices[:, 0]], ids[1][indices[:, 1]]
+            found += len(indices)
+            right += int(((first == second) & (first >= 0)).sum())
+    return right / max(common, 1), right / max(found, 1)
+
+
+def run(data: Path, share: float, dim: int, number: int, storage: str) -> dict:
+    """Run everything once and measure it."""
+    match_features.CACHE_BYTES = int(share * match_features.CACHE_BYTES)
+    with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as temporary:
+        folder, start = Path(temporary), time.perf_counter()
+        places, pairs_file = make_pairs(data, folder, share, number)
+        paired = time.perf_counter()
+        features = folder / "features.h5"
+        synthesize(places, features, dim, number, storage)
+        written = time.perf_counter()
+        conf = match_features.confs["NN-ratio"]
+        matches = match_features.main(conf, pairs_file, features, matches=folder / "matches.h5")
+        matched = time.perf_counter()
+        pairs = [(q, name) for q, names in parse_retrieval(pairs_file).items() for name in names]
+        unordered = {frozenset(pair) for pair in pairs}
+        found, right = check(features, matches, pairs[:: -(-len(pairs) // CHECKED)])
+        return {
+            "share": share,
+            "images": len(places),
+            "pairs": len(unordered),
+            "pairs_s": paired - start,
+            "features_s": written - paired,
+            "matching_s": matched - written,
+            "feature_MB": features.stat().st_size / 1e6,
+            "match_MB": matches.stat().st_size / 1e6,
+            "peak_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "found": 100 * found,
+            "right": 100 * right,
+        }
+
+
+def line(rows: list[dict]) -> dict:
+    """Continue the line through the first and the last row to a share of 1."""
+    first, last = rows[0], rows[-1]
+    further = (1 - first["share"]) / (last["share"] - first["share"])
+    return {"share": 1} | {key: first[key] + further * (last[key] - first[key]) for key in SUMMED}
+
+
+def print_row(row: dict, columns: list[str]) -> None:
+    """Print a row of a Markdown table."""
+    cells = [f"{row[key]:,.4g}" if key in row else "" for key in columns]
+    print(f"| {' | '.join(cells)} |", flush=True)
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python benchmarks/aachen_scale.py --data aachen_v1.1 --share 0.01 0.02",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument(
+        "--data", type=Path, required=True, help="folder of database_images.txt and query lists"
+    )
+    parser.add_argument("--share", type=float, nargs="+", default=[0.01, 0.02], help="of the size")
+    parser.add_argument("--dim", type=int, default=64, help="numbers of a descriptor")
+    parser.add_argument("--keypoints", type=int, default=8000, help="of each image")
+    parser.add_argument("--storage", default=STORAGES[0], help=f"one of {', '.join(STORAGES)}")
+    parser.add_argument("--once", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    cli.choose("storage", args.storage, STORAGES)
+    if not all(0 < share <= 1 for share in args.share):
+        raise InputError("--share: above 0 and at most 1.")
+    if args.once:
+        measured = run(args.data, args.share[0], args.dim, args.keypoints, args.storage)
+        print(json.dumps(measured))
+        return
+    rows = []
+    for share in sorted(args.share):
+        options = {"data": args.data, "dim": args.dim, "keypoints": args.keypoints}
+        options |= {"share": share, "storage": args.storage}
+        given = [word for key, value in options.items() for word in (f"--{key}", str(value))]
+        done = subprocess.run(
+            [sys.executable, __file__, "--once", *given], stdout=subprocess.PIPE, text=True
+        )
+        if done.returncode:
+            raise InputError(f"The share {share} failed.")
+        rows.append(json.loads(done.stdout))
+        columns = list(rows[0])
+        if len(rows) == 1:
+            print(f"| {' | '.join(columns)} |\n|{' ---: |' * len(columns)}")
+        print_row(rows[-1], columns)
+    if len(rows) > 1:
+        print_row(line(rows), columns)
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,148 @@
+"""Time this project and hloc on a place in Aachen's layout, stage by stage, all images paired.
+
+hloc extracts `sift` and matches with NN-ratio; this project does so with each --feature. All begin
+with nothing and end with poses, each time in a new process; they take turns, and of several rounds
+the fastest of each is shown. Needs the real hloc and the pycolmap that it is made for. Prints a
+Markdown table: seconds of each stage and of all, how many times faster than hloc; then bytes,
+recall at the finest threshold and inliers.
+"""
+
+import argparse
+import itertools
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from hloc_reduce import cli, colmap
+from hloc_reduce.cli import InputError
+from hloc_reduce.datasets import Aachen, thresholds, true_poses
+from hloc_reduce.evaluation.poses import pose_error, recall
+from hloc_reduce.parsers import parse_poses, write_pairs
+
+STAGES = ("extraction", "matching", "triangulation", "localization")
+HLOC = "hloc"
+
+
+def stages_of(name: str) -> dict[str, Callable]:
+    """Return the functions of the stages, hloc's or this project's, and the features' conf."""
+    if name == HLOC:
+        from hloc import extract_features, localize_sfm, match_features, triangulation
+
+        conf = extract_features.confs["sift"]
+    else:
+        from confs import features as features_confs
+        from hloc_reduce import extract_features, localize_sfm, match_features, triangulation
+
+        _, conf = features_confs.get(name)
+    return {
+        "conf": conf,
+        "matcher": match_features.confs["NN-ratio"],
+        "extract": extract_features.main,
+        "match": match_features.main,
+        "triangulate": triangulation.main,
+        "localize": localize_sfm.main,
+    }
+
+
+def run(name: str, dataset: Path, outputs: Path) -> dict:
+    """Localize the queries of a place and measure how long each stage takes."""
+    place = Aachen(dataset)
+    database = place.map_names()
+    lists = {key: [query for query, _ in part] for key, part in place.query_lists().items()}
+    queries = [query for part in lists.values() for query in part]
+    sfm_pairs, loc_pairs = outputs / "pairs-sfm.txt", outputs / "pairs-loc.txt"
+    write_pairs(list(itertools.combinations(database, 2)), sfm_pairs)
+    write_pairs(list(itertools.product(queries, database)), loc_pairs)
+    used, seconds = stages_of(name), {}
+    start = time.perf_counter()
+
+    def lap(stage: str) -> None:
+        seconds[stage] = time.perf_counter() - start - sum(seconds.values())
+
+    conf = used["conf"]
+    features = used["extract"](conf, place.images, outputs, image_list=[*database, *queries])
+    lap("extraction")
+    matches, loc_matches = (
+        used["match"](used["matcher"], pairs, conf["output"], outputs)
+        for pairs in (sfm_pairs, loc_pairs)
+    )
+    lap("matching")
+    sfm, poses = outputs / "sfm", outputs / "poses.txt"
+    used["triangulate"](sfm, place.reference_model, place.images, sfm_pairs, features, matches)
+    lap("triangulation")
+    used["localize"](sfm, place.queries, loc_pairs, features, loc_matches, poses)
+    lap("localization")
+    truth = true_poses(queries, place.ground_truth, True)
+    estimates = parse_poses(poses)
+    finest = []
+    for key, part in lists.items():
+        errors = [
+            pose_error(estimates[Path(query).name], truth[query])
+            if Path(query).name in estimates
+            else (np.inf, np.inf)
+            for query in part
+        ]
+        finest.append(recall(errors, thresholds(key)[:1])[0])
+    return {
+        "seconds": seconds,
+        "points": colmap.read_model(sfm).num_points3D(),
+        "feature_MB": features.stat().st_size / 1e6,
+        "match_MB": sum(path.stat().st_size for path in (matches, loc_matches)) / 1e6,
+        "recall": finest,
+    }
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python benchmarks/against_hloc.py --dataset herz-jesus",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--dataset", type=Path, required=True, help="with true poses of queries")
+    parser.add_argument(
+        "--feature", nargs="+", default=["sift_sv64", "colmap_sift_sv64"], help="of this project"
+    )
+    parser.add_argument("--rounds", type=int, default=2, help="in which all take turns")
+    parser.add_argument("--once", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.once:
+        with tempfile.TemporaryDirectory() as temporary:
+            print("\n" + json.dumps(run(args.once, args.dataset, Path(temporary))))
+        return
+    names = [HLOC, *args.feature]
+    best: dict[str, dict] = {}
+    for _ in range(args.rounds):
+        for name in names:
+            command = [sys.executable, __file__, "--dataset", str(args.dataset), "--once", name]
+            done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+            if done.returncode:
+                raise InputError(f"{name} failed.")
+            result = json.loads(done.stdout.splitlines()[-1])
+            total = sum(result["seconds"].values())
+            if name not in best or total < sum(best[name]["seconds"].values()):
+                best[name] = result
+    print(f"| s | {' | '.join(STAGES)} | all | hloc / this |")
+    print("| --- |" + " ---: |" * (len(STAGES) + 2))
+    reference = sum(best[HLOC]["seconds"].values())
+    for name in names:
+        seconds = best[name]["seconds"]
+        total = sum(seconds.values())
+        cells = [f"{seconds[stage]:.2f}" for stage in STAGES]
+        print(f"| {name} | {' | '.join(cells)} | {total:.2f} | {reference / total:.2f} |")
+    print("\n| | points | MB features | MB matches | recall at the finest threshold, % |")
+    print("| --- | ---: | ---: | ---: | ---: |")
+    for name in names:
+        result = best[name]
+        reached = " / ".join(f"{value:.1f}" for value in result["recall"])
+        sizes = f"{result['feature_MB']:.1f} | {result['match_MB']:.2f}"
+        print(f"| {name} | {result['points']:,} | {sizes} | {reached} |")
+
+
+if __name__ == "__main__":
+    cli.run(_main)

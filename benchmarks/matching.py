@@ -1,0 +1,163 @@
+"""Time the matching of image pairs: mutual nearest neighbours with a ratio test.
+
+Columns: hloc's nearest_neighbor (the installed hloc's, or else the same computation in torch); ours
+for one pair at a time and for a run of pairs, each core on one of its own; faiss's exact search,
+both ways; the bare matrix product into memory that is there already, which no exact search that
+uses it can be faster than. Milliseconds a pair, the least of several rounds in which all take
+turns; then how many times faster than hloc. A tenth of the descriptors of a pair match.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from hloc_reduce import cli, parallel
+from hloc_reduce.cli import InputError
+from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
+
+RATIO = 0.8
+MATCHING = 0.1  # of the descriptors
+DIMS = (128, 64, 32, 24, 16)
+
+Pair = tuple[torch.Tensor, torch.Tensor]
+
+
+def make_pair(number: int, dim: int, seed: int, device: str) -> Pair:
+    """Draw two images' descriptors (N, D) of unit norm."""
+    generator = torch.Generator().manual_seed(seed)
+    first, second = (
+        torch.nn.functional.normalize(torch.randn(number, dim, generator=generator), dim=1)
+        for _ in range(2)
+    )
+    matching = int(MATCHING * number)
+    second[:matching] = first[:matching] + 0.3 * second[:matching]
+    second = torch.nn.functional.normalize(second, dim=1)
+    return first.to(device), second[torch.randperm(number, generator=generator)].to(device)
+
+
+def hloc_matcher(device: str) -> tuple[str, Callable[[Pair], torch.Tensor]]:
+    """Return hloc's matcher and what it is called, or the same computation where hloc is not."""
+    try:
+        from hloc.matchers.nearest_neighbor import NearestNeighbor as Original
+    except ImportError:
+        return "torch", plain
+    model = Original({"ratio_threshold": RATIO}).eval().to(device)
+
+    def match(pair: Pair) -> torch.Tensor:
+        data = {f"descriptors{i}": part.T[None] for i, part in enumerate(pair)}
+        return model(data)["matches0"][0]
+
+    return "hloc", match
+
+
+def plain(pair: Pair) -> torch.Tensor:
+    """Match as hloc does: the whole similarity matrix, and the best two of rows and columns."""
+    similarity = pair[0] @ pair[1].T
+    nearest = []
+    for view in (similarity, similarity.T):
+        (best, second), index = view.topk(2, dim=1)[0].T, view.topk(2, dim=1)[1][:, 0]
+        nearest.append(torch.where(1 - best <= RATIO**2 * (1 - second), index, -1))
+    forward, backward = nearest
+    own = torch.arange(len(forward), device=forward.device)
+    return torch.where((forward >= 0) & (backward[forward] == own), forward, -1)
+
+
+def faiss_both_ways(pair: Pair) -> torch.Tensor:
+    """Match by exact searches for the best two, forth and back."""
+    import faiss
+
+    nearest = []
+    for queries, others in (pair, pair[::-1]):
+        cosines, indices = faiss.knn(queries.numpy(), others.numpy(), 2, faiss.METRIC_INNER_PRODUCT)
+        accepted = 1 - cosines[:, 0] <= RATIO**2 * (1 - cosines[:, 1])
+        nearest.append(np.where(accepted, indices[:, 0], -1))
+    forward, backward = nearest
+    mutual = (forward >= 0) & (backward[forward] == np.arange(len(forward)))
+    return torch.from_numpy(np.where(mutual, forward, -1))
+
+
+def methods(number: int, device: str) -> dict[str, Callable[[list[Pair]], list]]:
+    """Return what is compared, each a function of a list of pairs."""
+    reference, match = hloc_matcher(device)
+    ours = NearestNeighbor({"ratio_threshold": RATIO})
+    memory = torch.empty(number, number, device=device)
+    batches = 1 if device == "cpu" else 64
+
+    def run(pairs: list[Pair]) -> list:
+        parts = [pairs[i : i + batches] for i in range(0, len(pairs), batches)]
+        workers = None if device == "cpu" else 1
+        found = parallel.ordered("match", ours.match, parts, workers)
+        return [matches for part in found for matches, _ in part]
+
+    compared = {
+        reference: lambda pairs: [match(pair) for pair in pairs],
+        "ours, one pair": lambda pairs: [ours.match([pair])[0][0] for pair in pairs],
+        "ours, run": run,
+        "faiss": lambda pairs: [faiss_both_ways(pair) for pair in pairs],
+        "product": lambda pairs: [torch.mm(pair[0], pair[1].T, out=memory) for pair in pairs][:0],
+    }
+    if device != "cpu":
+        del compared["faiss"]
+    return compared
+
+
+@torch.no_grad()
+def measure(number: int, dim: int, pairs: int, rounds: int, device: str) -> dict[str, float]:
+    """Return the least seconds a pair of each method; check that they find the same."""
+    data = [make_pair(number, dim, seed, device) for seed in range(pairs)]
+    compared = methods(number, device)
+    seconds = dict.fromkeys(compared, np.inf)
+    expected = None
+    for _ in range(rounds):
+        for name, method in compared.items():
+            start = time.perf_counter()
+            found = method(data)
+            if device != "cpu":
+                torch.cuda.synchronize()
+            seconds[name] = min(seconds[name], (time.perf_counter() - start) / pairs)
+            if expected is None:
+                expected = found
+            for matches, right in zip(found, expected, strict=False):
+                if differing := int((matches.cpu() != right.cpu()).sum()):
+                    print(f"{name}, {dim}: {differing} of {number} differ", file=sys.stderr)
+    return seconds
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python benchmarks/matching.py --keypoints 8000",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--keypoints", type=int, default=8000, help="of each image")
+    parser.add_argument("--pairs", type=int, default=8, help="in a run")
+    parser.add_argument("--rounds", type=int, default=5, help="in which all take turns")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    args = parser.parse_args()
+    if min(args.keypoints, args.pairs, args.rounds) < 1:
+        raise InputError("--keypoints, --pairs and --rounds: at least 1.")
+    if args.device != "cpu" and not torch.cuda.is_available():
+        raise InputError("There is no GPU.")
+    names = None
+    for dim in DIMS:
+        seconds = measure(args.keypoints, dim, args.pairs, args.rounds, args.device)
+        if names is None:
+            names = list(seconds)
+            print(f"{args.keypoints} x {args.keypoints}, {torch.get_num_threads()} threads, ms")
+            print(f"| dimensions | {' | '.join(names)} | one pair | run | run / product |")
+            print("| ---: |" + " ---: |" * (len(names) + 3))
+        times = " | ".join(f"{1e3 * value:.0f}" for value in seconds.values())
+        reference, one, run = (seconds[name] for name in names[:3])
+        over = run / seconds["product"]
+        print(
+            f"| {dim} | {times} | {reference / one:.1f}x | {reference / run:.1f}x | {over:.1f} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,70 @@
+import json
+import threading
+import time
+
+import pytest
+import torch
+
+from hloc_reduce import parallel, trace
+
+
+def test_in_order_whoever_is_faster():
+    def slow_first(i):
+        time.sleep(0.05 * (i == 0))
+        return i, threading.get_ident()
+
+    results = list(parallel.ordered("test", slow_first, range(20), 4))
+    assert [i for i, _ in results] == list(range(20))
+    assert len({thread for _, thread in results}) > 1
+    assert threading.get_ident() not in {thread for _, thread in results}
+
+
+def test_items_are_drawn_as_workers_get_free():
+    """Not all are in memory at once, however slow the work and the reader are."""
+    drawn = []
+    items = (drawn.append(i) or i for i in range(1000))
+    results = parallel.ordered("test", lambda i: i, items, 2)
+    assert next(results) == 0
+    assert len(drawn) <= 1 + 2 * parallel.BACKLOG + 1
+    results.close()
+
+
+def test_one_thread_of_torch_in_each_worker():
+    before = torch.get_num_threads()
+    threads = list(parallel.ordered("test", lambda _: torch.get_num_threads(), range(4), 2))
+    assert threads == [1] * 4 and torch.get_num_threads() == before
+
+
+def test_an_error_ends_it():
+    done = []
+
+    def fail(i):
+        if i == 3:
+            raise ValueError("the third")
+        done.append(i)
+        return i
+
+    results = parallel.ordered("test", fail, range(1000), 2)
+    with pytest.raises(ValueError, match="the third"):
+        list(results)
+    assert len(done) < 30
+
+
+def test_trace_shows_what_ran_where(tmp_path):
+    with trace.recording(tmp_path / "new/trace.json"), trace.span("stage"):
+        list(parallel.ordered("work", time.sleep, [0.01] * 3, 2))
+    with trace.span("later"):
+        pass
+    events = json.loads((tmp_path / "new/trace.json").read_text())["traceEvents"]
+    assert sorted({event["name"] for event in events}) == ["read to work", "stage", "work"]
+    (stage,) = [event for event in events if event["name"] == "stage"]
+    work = [event for event in events if event["name"] == "work"]
+    assert len(work) == 3 and all(event["dur"] >= 1e4 for event in work)
+    assert all(stage["tid"] != event["tid"] for event in work)
+    assert all(stage["ts"] <= e["ts"] <= stage["ts"] + stage["dur"] for e in work)
+
+
+def test_nothing_is_recorded_unasked(tmp_path):
+    with trace.recording(None), trace.span("stage"):
+        pass
+    assert list(tmp_path.iterdir()) == []
