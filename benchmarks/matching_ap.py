@@ -2,14 +2,14 @@
 
 From each point of a map two observations in different images are drawn. All first descriptors are
 ranked by the distance to their nearest second descriptor; correct is the same point. The columns of
-the maps and their mean are for tracks as triangulated from the mutual nearest neighbours of
-`sift`. "completed" adds the observations that it missed and geometry found, and "dark" takes
-photometric variants (darkness, blur, noise) of the second photos, too. "photo pairs" is as hloc
-matches, one photo with another, completed: the observations in one of the points that both see,
-with all observations in the other; mean over the pairs of photos. Prints Markdown tables of
-percentages, means over several draws: for each base descriptor one with a row for itself, each
-projection of it that ships and each `--projection` whose name begins with its name; then one of the
-means by number of dimensions.
+the maps and their mean are for tracks as triangulated from the mutual nearest neighbours of `sift`,
+or of `colmap_sift` for that, which has keypoints of its own. "completed" adds the observations that
+it missed and geometry found, and "dark" takes photometric variants (darkness, blur, noise) of the
+second photos, too. "photo pairs" is as hloc matches, one photo with another, completed: the
+observations in one of the points that both see, with all observations in the other; mean over the
+pairs of photos. Prints Markdown tables of percentages, means over several draws: for each base
+descriptor one with a row for itself, each projection of it that ships and each `--projection` whose
+name begins with its name; then one of the means by number of dimensions.
 """
 
 import argparse
@@ -23,7 +23,7 @@ import torch
 
 from hloc_reduce import cli, projections
 from hloc_reduce.cli import InputError
-from hloc_reduce.descriptors import DESCRIPTORS, DIM
+from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, DIM
 from hloc_reduce.evaluation.matching import average_precision
 from hloc_reduce.training import nested, tracks
 from hloc_reduce.training.__main__ import parse_maps
@@ -65,7 +65,7 @@ def photo_pairs(data: tracks.Tracks) -> list[tuple[torch.Tensor, torch.Tensor]]:
 
 def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.Module]:
     """Load what projects a descriptor, by name, nested ones at each of their sizes."""
-    names = [name for name in projections.names() if name.split("_")[0] == descriptor]
+    names = [name for name in projections.names() if name.rpartition("_")[0] == descriptor]
     nested_name = f"{descriptor}_nested"
     if nested_name in names:
         names.remove(nested_name)
@@ -119,7 +119,7 @@ def _main() -> None:
     args = parser.parse_args()
 
     for descriptor in args.descriptor:
-        cli.choose("descriptor", descriptor, DESCRIPTORS)
+        cli.choose("descriptor", descriptor, [*DESCRIPTORS, COLMAP])
     for file in args.projection:
         if not file.name.lower().startswith(tuple(args.descriptor)):
             raise InputError(f"{file}: its name does not begin with a descriptor's.")

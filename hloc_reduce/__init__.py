@@ -57,8 +57,8 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
     from confs.features import confs
 
     from . import projections
-    from .cli import choose
-    from .descriptors import Descriptor
+    from .cli import InputError, choose
+    from .descriptors import DESCRIPTORS, Descriptor
 
     if not isinstance(patches, torch.Tensor):
         raise ValueError(f"Patches are a torch.Tensor, not {type(patches).__name__}.")
@@ -69,6 +69,8 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
         )
     model = confs[choose("feature", feature, confs)]["model"]
     base = model.get("base", model)["descriptor"]
+    if base not in DESCRIPTORS:
+        raise InputError(f"{feature} is of photos, not of patches.")
     descriptors = Descriptor(base).to(patches.device)(patches.float())
     if "projection" in model:
         descriptors = projections.load(model["projection"]).to(patches.device)(descriptors)

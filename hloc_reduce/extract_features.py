@@ -2,17 +2,17 @@
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from loky import ProcessPoolExecutor
 from tqdm import tqdm
 
 from confs import features as features_confs
 
-from . import cli, colmap, extractors, logger, parallel, projections
+from . import cli, colmap, extractors, logger, parallel, processes, projections
 from .cli import InputError
 from .descriptors import DESCRIPTORS, check_weights
 from .extractors.dog import DoG
@@ -92,11 +92,17 @@ def extract_all(conf: dict, images: list[Path]) -> Iterator[dict[str, np.ndarray
         for image in images:
             yield extract(model, image, conf["preprocessing"], device)
         return
-    with ProcessPoolExecutor(workers) as processes:
+    with processes.pool(workers) as pool:
 
         def detect(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            with span("detect"):
-                return processes.submit(colmap.detect_dog, image, base.conf["options"]).result()
+            try:
+                with span("detect"):
+                    return pool.submit(colmap.detect_dog, image, base.conf["options"]).result()
+            except BrokenExecutor:
+                raise InputError(
+                    "A process that detects keypoints was killed, perhaps for want of memory: "
+                    "try fewer cores, for example OMP_NUM_THREADS=1. Nothing finished is lost."
+                ) from None
 
         yield from parallel.ordered(
             "extract",

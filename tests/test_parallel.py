@@ -1,11 +1,16 @@
 import json
+import os
+import signal
+import subprocess
+import sys
 import threading
 import time
+from concurrent.futures import BrokenExecutor
 
 import pytest
 import torch
 
-from hloc_reduce import parallel, trace
+from hloc_reduce import parallel, processes, trace
 
 
 def test_in_order_whoever_is_faster():
@@ -68,3 +73,35 @@ def test_nothing_is_recorded_unasked(tmp_path):
     with trace.recording(None), trace.span("stage"):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+def test_processes_work_and_end_with_a_script(tmp_path):
+    """Of any kind: without a main guard, which multiprocessing would ask for, and killed."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, time\n"
+        "from hloc_reduce import processes\n"
+        "with processes.pool(2) as pool:\n"
+        "    print(pool.submit(os.getpid).result(), flush=True)\n"
+        "    pool.submit(time.sleep, 100).result()\n"
+    )
+    with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as running:
+        worker = int(running.stdout.readline())
+        assert worker != running.pid
+        running.kill()
+    for _ in range(100):
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.2)
+    pytest.fail("the worker is still there")
+
+
+def test_a_killed_process_is_an_error():
+    with processes.pool(2) as pool:
+        worker = pool.submit(os.getpid).result()
+        os.kill(worker, signal.SIGKILL)
+        with pytest.raises(BrokenExecutor):
+            for _ in range(50):
+                pool.submit(time.sleep, 0.1).result()

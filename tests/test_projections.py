@@ -104,11 +104,11 @@ def test_what_ships_says_where_it_comes_from(name):
 def test_everything_ships_in_25_megabytes():
     expected = {
         name
-        for descriptor in ("sift", "mkd", "tfeat")
+        for descriptor in ("sift", "mkd", "tfeat", "colmap_sift")
         for name in features.names(descriptor)
         if "@" not in name
     }
-    assert set(projections.names()) == expected and len(expected) == 51
+    assert set(projections.names()) == expected and len(expected) == 59
     assert sum(path.stat().st_size for path in projections.WEIGHTS.iterdir()) < 25e6
 
 
@@ -129,7 +129,7 @@ def test_the_authors_sift_models(dim):
 
 
 def test_the_papers_68_features_have_names():
-    paper = [name for name in confs if "nested" not in name]
+    paper = [name for name in confs if "nested" not in name and "colmap" not in name]
     assert len(paper) == 68
     for name in ("hardnet_us24", "tfeat_ss16", "mkd_pca32", "mkd", "mkd_nested@32"):
         assert confs[name]["output"] == f"feats-dog-{name}"
@@ -328,8 +328,10 @@ def test_other_patches_are_refused(patches):
 def test_no_patches_and_unknown_features():
     assert hloc_reduce.describe_patches(torch.zeros(0, 1, 32, 32), "sift_sv16").shape == (0, 16)
     for name in ("sift_sv63", "SIFT_sv64"):
-        with pytest.raises(InputError, match=f"feature '{name}'. The nearest of 84: sift_sv64"):
+        with pytest.raises(InputError, match=f"feature '{name}'. The nearest of 93: sift_sv64"):
             hloc_reduce.describe_patches(torch.zeros(0, 1, 32, 32), name)
+    with pytest.raises(InputError, match="colmap_sift_sv16 is of photos, not of patches"):
+        hloc_reduce.describe_patches(torch.zeros(0, 1, 32, 32), "colmap_sift_sv16")
 
 
 def test_projection_of_other_descriptors_is_refused(tmp_path, textured):

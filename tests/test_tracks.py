@@ -11,7 +11,7 @@ import torch
 
 from confs import features
 from hloc_reduce.cli import InputError
-from hloc_reduce.colmap import point3D_ids
+from hloc_reduce.colmap import detect_dog, point3D_ids
 from hloc_reduce.training import tracks
 from hloc_reduce.training.completion import complete
 
@@ -48,6 +48,31 @@ def test_tracks_of_a_plane(plane):
     model = pycolmap.Reconstruction(plane / "out/sfm_sift")
     assert data.matched.sum() == model.compute_num_observations()
     assert data.only(data.matched).num_tracks == model.num_points3D()
+
+
+def test_colmaps_sift_is_mirrored_by_hand(textured):
+    """It is what COLMAP finds in the mirrored photo, oriented alike."""
+    photo = textured.astype(np.float32) / 255
+    options = {"first_octave": 0, "peak_threshold": 0.01}
+    keypoints, descriptors = detect_dog(photo, options)
+    others, mirrored = detect_dog(np.ascontiguousarray(photo[::-1]), options)
+    others[:, 1], others[:, 3] = len(photo) - 1 - others[:, 1], -others[:, 3]
+    compared = [
+        tracks.mirror_colmap_sift(descriptors[i]) @ mirrored[j]
+        for i, keypoint in enumerate(keypoints)
+        for j in np.flatnonzero(np.abs(others[:, :2] - keypoint[:2]).max(1) < 0.1)
+        if abs((others[j, 3] - keypoint[3] + 180) % 360 - 180) < 1
+        and abs(others[j, 2] / keypoint[2] - 1) < 0.01
+    ]
+    assert len(compared) > len(keypoints) / 2 and np.median(compared) > 0.999
+
+
+def test_tracks_of_colmaps_sift(plane):
+    data = tracks.load(tracks.main(plane / "images", plane / "model", plane / "out", "colmap_sift"))
+    assert data.num_tracks > 100 and not data.matched.all()
+    photos, mirrored = data.descriptors[:, 0], data.descriptors[:, 1]
+    assert (tracks.mirror_colmap_sift(photos) == mirrored).all()
+    assert not (plane / "out/feats-dog-sift.h5").exists()
 
 
 def test_tracks_are_computed_once_and_the_same(plane):

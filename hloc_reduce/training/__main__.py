@@ -23,7 +23,10 @@ from . import nested, pca, phototour, ss, sv, tracks, us
 SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
 RECIPE_NAMES = ("best", "paper", "tune")
 BASES = (*DESCRIPTORS, COLMAP)
-HIDDEN = (512, 512)  # hidden layers of projections of an extractor's own descriptors
+# hidden layers of projections of an extractor's own descriptors; COLMAP's are so soon computed that
+# larger ones would take 5 % of the time
+HIDDEN = {COLMAP: (256, 256)}
+HIDDEN_BY_DEFAULT = (512, 512)
 
 
 def main(
@@ -144,7 +147,11 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
     if trainer is pca:
         return {}
     settings = {
-        "hidden": list(DESCRIPTORS[descriptor].hidden if descriptor in DESCRIPTORS else HIDDEN),
+        "hidden": list(
+            DESCRIPTORS[descriptor].hidden
+            if descriptor in DESCRIPTORS
+            else HIDDEN.get(descriptor, HIDDEN_BY_DEFAULT)
+        ),
         "distance_weight": trainer.DISTANCE_WEIGHTS.get(descriptor, 0.0),
         **trainer.RECIPES[cli.choose(f"recipe of {scheme}", recipe, trainer.RECIPES)],
     }
@@ -301,7 +308,7 @@ def _main() -> None:
                 args.cache,
                 args.recipe,
                 args.seed,
-                conf or (None if descriptor in DESCRIPTORS else features_confs.confs[descriptor]),
+                conf,
             )
         ]
         if args.validate:

@@ -25,7 +25,7 @@ from .. import (
 )
 from ..cli import InputError
 from ..colmap import point3D_ids
-from ..descriptors import COLMAP, DIM, Descriptor
+from ..descriptors import COLMAP, DESCRIPTORS, DIM, Descriptor
 from ..extractors.dog import extract_patches
 from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
 from ..maps import Map, is_map
@@ -84,7 +84,7 @@ def main(
         images: folder of the images.
         model: COLMAP model with their poses.
         output: folder for all files; what it holds already is used.
-        descriptor: the base descriptor.
+        descriptor: the base descriptor; one that takes no patches has keypoints of its own.
         seed: of the photometric variants.
         conf: of the feature whose keypoints and descriptors are used, in place of those of `sift`
             described by `descriptor`, which is then but what its files are called after.
@@ -101,6 +101,8 @@ def main(
     if (output / "source.json").exists() and not stamps.is_current(output / "source.json", source):
         raise InputError(f"{output} holds the tracks of another map. Choose another folder.")
     stamps.write(output / "source.json", source)
+    if conf is None and descriptor not in DESCRIPTORS:
+        conf = features_confs.confs[descriptor]
     found_by, patches = (descriptor, False) if conf else (MATCHED, True)
     conf = conf or features_confs.confs[MATCHED]
     pairs = pairs_from_covisibility.main(
