@@ -59,12 +59,12 @@ def list_h5_names(path: Path) -> list[str]:
     """List the groups of an h5 file that hold data sets, in the order of their names."""
     names: dict[str, None] = {}
 
-    def visit(_: str, item: h5py.Group | h5py.Dataset) -> None:
-        if isinstance(item, h5py.Dataset):
-            names[item.parent.name.strip("/")] = None
+    def visit(name: bytes, info: h5py.h5o.ObjInfo) -> None:
+        if info.type == h5py.h5o.TYPE_DATASET:
+            names[name.decode().rpartition("/")[0]] = None
 
-    with open_h5(path) as file:
-        file.visititems(visit)
+    with open_h5(path) as file:  # visititems would make an object of each
+        h5py.h5o.visit(file.id, visit, info=True)
     return list(names)
 
 
@@ -162,8 +162,10 @@ class GroupWriter:
             for name, (arrays, attrs) in self.buffer.items():
                 group = file.create_group(name)
                 for key, array in arrays.items():
-                    compression = self.compression if array.size else None
-                    dataset = group.create_dataset(key, data=array, compression=compression)
+                    packed = {}
+                    if self.compression and array.size:
+                        packed = {"compression": self.compression, "chunks": array.shape}
+                    dataset = group.create_dataset(key, data=array, **packed)
                     dataset.attrs.update(attrs.get(key, {}))
 
     def _merge(self) -> None:
@@ -176,12 +178,18 @@ class GroupWriter:
             with h5py.File(temporary, "a", libver="latest") as merged:
                 merged.attrs.update({"conf": self.conf, "id": self.id})
                 for piece in pieces:
-                    names = list_h5_names(piece)
                     with open_h5(piece) as file:
-                        for name in names:
-                            if name not in merged:  # killed between moving and clearing
-                                file.copy(name, merged, name)
+                        _copy_missing(file, merged)
         shutil.rmtree(self.pieces, ignore_errors=True)
+
+
+def _copy_missing(source: h5py.Group, target: h5py.Group) -> None:
+    """Copy what a group has and another has not, whole groups at once."""
+    for name in source:
+        if name not in target:
+            source.copy(name, target)
+        elif isinstance(source[name], h5py.Group):
+            _copy_missing(source[name], target[name])
 
 
 def get_dataset(file: h5py.File, name: str, key: str) -> h5py.Dataset:
