@@ -14,6 +14,7 @@ from hloc_reduce.cli import InputError, choose
 from hloc_reduce.descriptors import COLMAP, DESCRIPTORS
 from hloc_reduce.storage import STORAGES
 
+RECOMMENDED = "colmap_sift_sv64"  # the fastest, and the best measured (docs/performance.md)
 DIMS = (64, 32, 24, 16)
 SCHEMES = dict.fromkeys(DESCRIPTORS, ("pca", "us", "ss", "sv")) | {COLMAP: ("pca", "sv")}
 

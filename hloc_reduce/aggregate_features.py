@@ -95,7 +95,7 @@ def _main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: python -m hloc_reduce.aggregate_features "
-        "--features outputs/feats-dog-sift_sv64.h5 --model outputs/sfm",
+        "--features outputs/feats-dog-colmap_sift_sv64.h5 --model outputs/sfm",
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument("--features", type=Path, required=True, help="feature file")

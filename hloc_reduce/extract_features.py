@@ -263,7 +263,7 @@ def extract(
 def _main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__,
-        epilog="example: python -m hloc_reduce.extract_features --conf sift_sv64 "
+        epilog="example: python -m hloc_reduce.extract_features --conf colmap_sift_sv64 "
         "--image_dir photos --export_dir outputs",
         formatter_class=cli.HelpFormatter,
     )
@@ -272,7 +272,7 @@ def _main() -> None:
     parser.add_argument("--feature_path", type=Path, help="the feature file itself")
     parser.add_argument(
         "--conf",
-        default="sift_sv64",
+        default=features_confs.RECOMMENDED,
         help="feature, see pipelines.aachen --list_features, or a YAML file of one",
     )
     parser.add_argument("--image_list", type=Path, help="text file of names, one a line")

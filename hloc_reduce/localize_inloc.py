@@ -196,7 +196,7 @@ def _main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: python -m hloc_reduce.localize_inloc --dataset_dir datasets/inloc "
-        "--retrieval pairs-query-netvlad40.txt --features outputs/feats-dog-sift_sv64.h5 "
+        "--retrieval pairs-query-netvlad40.txt --features outputs/feats-dog-colmap_sift_sv64.h5 "
         "--matches outputs/matches.h5 --results outputs/poses.txt",
         formatter_class=cli.HelpFormatter,
     )

@@ -163,8 +163,8 @@ def _main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: python -m hloc_reduce.localize_sfm --reference_sfm outputs/sfm "
-        "--queries queries.txt --retrieval pairs.txt --features outputs/feats-dog-sift_sv64.h5 "
-        "--matches outputs/matches.h5 --results outputs/poses.txt",
+        "--queries queries.txt --retrieval pairs.txt --matches outputs/matches.h5 "
+        "--features outputs/feats-dog-colmap_sift_sv64.h5 --results outputs/poses.txt",
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument("--reference_sfm", type=Path, required=True, help="folder of the map")

@@ -133,7 +133,7 @@ def main(
     map_dir: Path,
     image_dir: Path,
     model: Path | None = None,
-    feature: str = "sift_sv64",
+    feature: str = features_confs.RECOMMENDED,
     projection: Path | None = None,
     matcher: str = "NN-ratio",
     num_covis: int = 20,

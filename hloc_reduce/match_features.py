@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from confs import features as features_confs
 from confs import matchers as matchers_confs
 
 from . import cli, io, logger, matchers, parallel
@@ -173,12 +174,14 @@ def _main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: python -m hloc_reduce.match_features --pairs pairs.txt "
-        "--features feats-dog-sift_sv64 --export_dir outputs",
+        "--features feats-dog-colmap_sift_sv64 --export_dir outputs",
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
     parser.add_argument(
-        "--features", default="feats-dog-sift_sv64", help="name of the features, without .h5"
+        "--features",
+        default=features_confs.confs[features_confs.RECOMMENDED]["output"],
+        help="name of the features, without .h5",
     )
     parser.add_argument("--export_dir", type=Path, required=True, help="folder of the features")
     parser.add_argument("--matches", type=Path, help="the match file itself")

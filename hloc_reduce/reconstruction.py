@@ -107,7 +107,7 @@ def _main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: python -m hloc_reduce.reconstruction --sfm_dir outputs/sfm "
-        "--image_dir photos --pairs pairs.txt --features outputs/feats-dog-sift_sv64.h5 "
+        "--image_dir photos --pairs pairs.txt --features outputs/feats-dog-colmap_sift_sv64.h5 "
         "--matches outputs/matches.h5",
         formatter_class=cli.HelpFormatter,
     )

@@ -246,7 +246,7 @@ def _main() -> None:
         description=__doc__,
         epilog="example: python -m hloc_reduce.triangulation --sfm_dir outputs/sfm "
         "--reference_model 3D-models/aachen_v_1_1 --image_dir images --pairs pairs.txt "
-        "--features outputs/feats-dog-sift_sv64.h5 --matches outputs/matches.h5",
+        "--features outputs/feats-dog-colmap_sift_sv64.h5 --matches outputs/matches.h5",
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument("--sfm_dir", type=Path, required=True, help="folder of the new model")

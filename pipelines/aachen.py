@@ -28,7 +28,7 @@ from . import common
 def main(
     dataset: Path,
     outputs: Path,
-    feature: str = "sift_sv64",
+    feature: str = features_confs.RECOMMENDED,
     matcher: str = "NN-ratio",
     retrieval: str = "vlad",
     num_covis: int = 20,
@@ -93,7 +93,7 @@ def main(
 def _main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__,
-        epilog="example: python -m pipelines.aachen --feature sift_sv64 --demo",
+        epilog="example: python -m pipelines.aachen --feature colmap_sift_sv64 --demo",
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument(

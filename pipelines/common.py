@@ -56,7 +56,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of features and their matching."""
     parser.add_argument(
         "--feature",
-        default="sift_sv64",
+        default=features_confs.RECOMMENDED,
         help="local feature, see --list_features, or a YAML file with its configuration",
     )
     parser.add_argument(

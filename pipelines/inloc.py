@@ -25,7 +25,7 @@ from . import common
 def main(
     dataset: Path,
     outputs: Path,
-    feature: str = "sift_sv64",
+    feature: str = features_confs.RECOMMENDED,
     matcher: str = "NN-ratio",
     retrieval: str = "vlad",
     num_loc: int = 40,
@@ -88,7 +88,7 @@ def main(
 def _main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__,
-        epilog="example: python -m pipelines.inloc --feature sift_sv64 "
+        epilog="example: python -m pipelines.inloc --feature colmap_sift_sv64 "
         "--retrieval pairs-query-netvlad40.txt",
         formatter_class=cli.HelpFormatter,
     )

@@ -1,8 +1,8 @@
 """Localize photos in a map of one's own.
 
 Builds the map from photos and a COLMAP model of them, or from photos alone, once; later runs
-localize other photos in it. Without --query_images only the map is built. The feature is sift_sv64
-and the matcher NN-ratio, if no other is given or the map is not of another.
+localize other photos in it. Without --query_images only the map is built. The feature is
+colmap_sift_sv64 and the matcher NN-ratio, if no other is given or the map is not of another.
 """
 
 import argparse
@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from pathlib import Path
 
+from confs import features as features_confs
 from confs import matchers as matchers_confs
 from hloc_reduce import (
     aggregate_features,
@@ -33,7 +34,7 @@ from hloc_reduce.storage import STORAGES
 
 from . import common
 
-FEATURE, MATCHER = "sift_sv64", "NN-ratio"
+FEATURE, MATCHER = features_confs.RECOMMENDED, "NN-ratio"
 MADE_FROM = "made_from.json"  # the map and the photos of queries
 NOT_IN_NAMES = r"[^\w.-]+"  # of a glob
 
@@ -55,7 +56,8 @@ def open_map(
         outputs: its folder map is that of a new map.
         map_images: folder of the photos of the map; None to open a map that was built.
         model_or_map: COLMAP model of the photos, or that map.
-        feature: default: sift_sv64 for a new map; any other than that of an old one is refused.
+        feature: default: colmap_sift_sv64 for a new map; any other than that of an old one is
+            refused.
         projection: of one's own.
         matcher: likewise, NN-ratio.
         num_covis: pairs of each map image.

@@ -183,7 +183,7 @@ def test_retrieval_by_hlocs_pairs(inloc_layout, tmp_path, monkeypatch):
         *("--num_loc", 30),
     )
     summary, rows = outcome(outputs)
-    assert summary["poses"] == "InLoc_hloc_sift_sv64+NN-ratio_netvlad30.txt"
+    assert summary["poses"] == "InLoc_hloc_colmap_sift_sv64+NN-ratio_netvlad30.txt"
     assert summary["map_images"] == 2 and list(summary["lists"]) == ["PLA1"]
     assert rows["a.JPG"]["status"] == "localized" and rows["a.JPG"]["retrieved"] == cutouts[0]
     assert rows["b.JPG"]["status"] == "failed" and rows["b.JPG"]["retrieved"] == ""
@@ -211,7 +211,7 @@ def test_queries_without_matches_do_not_stop_the_others(inloc_layout, tmp_path, 
     records = localize_inloc.main(
         inloc_layout,
         tmp_path / "o/pairs-query-vlad40.txt",
-        tmp_path / "o/feats-dog-sift_sv64.h5",
+        tmp_path / "o/feats-dog-colmap_sift_sv64.h5",
         matches,
         tmp_path / "poses.txt",
     )
@@ -221,7 +221,7 @@ def test_queries_without_matches_do_not_stop_the_others(inloc_layout, tmp_path, 
     strict = localize_inloc.main(
         inloc_layout,
         tmp_path / "o/pairs-query-vlad40.txt",
-        tmp_path / "o/feats-dog-sift_sv64.h5",
+        tmp_path / "o/feats-dog-colmap_sift_sv64.h5",
         matches,
         tmp_path / "poses.txt",
         skip_matches=10_000,
