@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from hloc_reduce.matchers import nearest_neighbor
 from hloc_reduce.matchers.nearest_neighbor import (
     NearestNeighbor,
     _batches,
@@ -47,6 +48,18 @@ def test_matches_by_definition(sizes, ratio_threshold):
     assert (scores[matches < 0] == 0).all()
     cosines = (descriptors0[matches >= 0] * descriptors1[matches[matches >= 0]]).sum(1)
     torch.testing.assert_close(scores[matches >= 0], (cosines + 1) / 2)
+
+
+@pytest.mark.parametrize("ratio_threshold", [None, 0.8, 0.95])
+@pytest.mark.parametrize(("part", "tile"), [(1, 1), (7, 70), (200, 1000)])
+def test_tiles_of_any_size_give_the_same(part, tile, ratio_threshold, monkeypatch):
+    monkeypatch.setattr(nearest_neighbor, "PART_BYTES", 4 * 16 * part)
+    monkeypatch.setattr(nearest_neighbor, "TILE", tile)
+    descriptors0, descriptors1 = unit(60, 16, 0), unit(50, 16, 1)
+    descriptors1[:30] = torch.nn.functional.normalize(descriptors0[:30] + 0.1 * descriptors1[:30])
+    matches, _ = match(descriptors0, descriptors1, ratio_threshold)
+    assert matches.tolist() == by_definition(descriptors0, descriptors1, ratio_threshold)
+    assert (matches >= 0).sum() >= 30
 
 
 @pytest.mark.parametrize("sizes", [(0, 5), (5, 0), (0, 0)])

@@ -7,7 +7,8 @@ from torch.nn.utils.rnn import pad_sequence
 
 from ..base_model import BaseModel
 
-BLOCK = 128  # rows of the similarity matrix at once, which stay in the cache of a CPU
+PART_BYTES = 2**19  # of descriptors1 at once, which stay in the cache of a core
+TILE = 2**20  # similarities at once
 GPU_BYTES = 2**30  # similarities in the memory of a GPU at once
 
 
@@ -25,24 +26,38 @@ def nearest(
     Returns:
         Its index (N,) int64, -1 where it does not pass, and its cosine (N,).
     """
-    indices, cosines = [], []
-    block = BLOCK if descriptors0.is_cpu else max(1, GPU_BYTES // 4 // len(descriptors1))
-    buffer = descriptors0.new_empty(min(block, len(descriptors0)), len(descriptors1))
-    for rows in descriptors0.split(block):
-        # new memory for every block would cost as much as the product
-        similarity = torch.mm(rows, descriptors1.T, out=buffer[: len(rows)])
-        index = _argmax(similarity)
-        best = similarity.gather(1, index[:, None])[:, 0]
-        if ratio_threshold is not None:
-            # hiding the best and searching again is faster than topk
-            similarity.scatter_(1, index[:, None], -torch.inf)
-            second = similarity.amax(dim=1)
-            # squared distances of unit vectors are 2 - 2 * cosine
-            accepted = 1 - best <= ratio_threshold**2 * (1 - second)
-            index = torch.where(accepted, index, -1)
-        indices.append(index)
-        cosines.append(best)
-    return torch.cat(indices), torch.cat(cosines)
+    number, dim = descriptors0.shape
+    on_cpu = descriptors0.is_cpu
+    parts = descriptors1.split(max(1, PART_BYTES // (4 * dim)) if on_cpu else len(descriptors1))
+    rows = max(1, (TILE if on_cpu else GPU_BYTES // 4) // len(parts[0]))
+    best, second = descriptors0.new_empty(2, len(parts), number)
+    index = best.new_empty(best.shape, dtype=torch.int64)
+    buffer = best.new_empty(min(rows, number) * len(parts[0]))
+    for i, part in enumerate(parts):
+        for start in range(0, number, rows):
+            chosen = slice(start, start + rows)
+            block = descriptors0[chosen]
+            # new memory for every tile would cost as much as the product
+            tile = buffer[: len(block) * len(part)].view(len(block), len(part))
+            torch.mm(block, part.T, out=tile)
+            index[i, chosen] = _argmax(tile)
+            nearest_one = index[i, chosen, None]
+            torch.gather(tile, 1, nearest_one, out=best[i, chosen, None])
+            if ratio_threshold is not None:
+                # hiding the best and searching again is faster than topk
+                tile.scatter_(1, nearest_one, -torch.inf)
+                torch.amax(tile, 1, out=second[i, chosen])
+        index[i] += i * len(parts[0])
+    cosine, winner = best.max(dim=0, keepdim=True)
+    found = index.gather(0, winner)[0]
+    if ratio_threshold is None:
+        return found, cosine[0]
+    runner_up = torch.maximum(
+        second.gather(0, winner), best.scatter(0, winner, -torch.inf).amax(0, keepdim=True)
+    )
+    # squared distances of unit vectors are 2 - 2 * cosine
+    accepted = 1 - cosine <= ratio_threshold**2 * (1 - runner_up)
+    return torch.where(accepted[0], found, -1), cosine[0]
 
 
 def _argmax(similarity: torch.Tensor) -> torch.Tensor:
