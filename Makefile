@@ -13,7 +13,7 @@ OLD := $(VENV)/pycolmap-$(OLDEST)
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed
-	$(BIN)/python -m pipelines.aachen --feature sift_sv64 --demo
+	$(BIN)/python -m pipelines.aachen --feature colmap_sift_sv64 --demo
 
 test: $(VENV)/installed $(OLD)/installed
 	$(BIN)/ruff check .

@@ -7,8 +7,8 @@ what the first image retrieved for it sees. The other keypoints are clutter. For
 process writes the features, counts covisible landmarks, makes the pairs (40 of each map image, of
 which every other is another's reverse, so that 20 are left; 50 of each query, others standing in
 for map images that are left out), matches them and checks the matches. The cache of descriptors is
-scaled with the share, so that it misses as often as at full size. Prints a Markdown table, and the
-line through the first and the last share continued to the whole data set.
+scaled with the share, so that it misses as often as at full size. Prints a Markdown table, last the
+lines through the first and the last share, along images and pairs, continued to the whole data set.
 """
 
 import argparse
@@ -33,9 +33,14 @@ from hloc_reduce.storage import STORAGES, store
 NUM_COVIS, NUM_LOC = 40, 50
 SEEN = 0.15  # of the keypoints show landmarks
 STEP = 0.04  # of these are left behind from one image of the row to the next
-NOISE = 0.35  # length of what one look adds to the descriptor of a landmark
+NOISE = 0.2  # length of what one look adds to the descriptor of a landmark
 CHECKED = 200  # pairs whose matches are checked
-SUMMED = ("images", "pairs", "features_s", "pairs_s", "matching_s", "feature_MB", "match_MB")
+WHOLE = {"images": 6697 + 1015, "pairs": 20 * 6697 + 50 * 1015}
+# what grows with the images, and with the pairs
+GROWING = {
+    "images": ("pairs_s", "features_s", "feature_MB"),
+    "pairs": ("matching_s", "match_MB"),
+}
 
 
 def ids_of(place: int, number: int) -> np.ndarray:
@@ -158,10 +163,13 @@ def run(data: Path, share: float, dim: int, number: int, storage: str) -> dict:
 
 
 def line(rows: list[dict]) -> dict:
-    """Continue the line through the first and the last row to a share of 1."""
+    """Continue the lines through the first and the last row to the whole data set."""
     first, last = rows[0], rows[-1]
-    further = (1 - first["share"]) / (last["share"] - first["share"])
-    return {"share": 1} | {key: first[key] + further * (last[key] - first[key]) for key in SUMMED}
+    continued = {"share": 1, **WHOLE}
+    for number, columns in GROWING.items():
+        further = (WHOLE[number] - last[number]) / (last[number] - first[number])
+        continued |= {key: last[key] + further * (last[key] - first[key]) for key in columns}
+    return continued
 
 
 def print_row(row: dict, columns: list[str]) -> None:

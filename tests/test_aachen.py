@@ -254,8 +254,8 @@ def test_herz_jesus(herz_jesus, tmp_path, monkeypatch):
 def test_demo(tmp_path, monkeypatch):
     """The built-in town: rendered, localized, easy by day and hard by night."""
     monkeypatch.chdir(tmp_path)
-    run(monkeypatch, "--demo", "--feature", "sift_sv64")
-    summary, rows = outcome(tmp_path / "outputs/demo_town/sift_sv64")
+    run(monkeypatch, "--demo", "--feature", "colmap_sift_sv64")
+    summary, rows = outcome(tmp_path / "outputs/demo_town/colmap_sift_sv64")
     assert len(rows) == 20
     day = summary["lists"]["day_time_queries_with_intrinsics"]
     night = summary["lists"]["night_time_queries_with_intrinsics"]
