@@ -38,7 +38,7 @@ CHECKED = 200  # pairs whose matches are checked
 WHOLE = {"images": 6697 + 1015, "pairs": 20 * 6697 + 50 * 1015}
 # what grows with the images, and with the pairs
 GROWING = {
-    "images": ("pairs_s", "features_s", "feature_MB"),
+    "images": ("features_s", "feature_MB"),
     "pairs": ("matching_s", "match_MB"),
 }
 
