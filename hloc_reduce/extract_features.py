@@ -18,7 +18,7 @@ from .descriptors import DESCRIPTORS, check_weights
 from .extractors.dog import DoG
 from .io import GroupWriter, read_image
 from .parsers import image_names
-from .storage import store
+from .storage import STORAGES, store
 from .trace import span
 
 confs = features_confs.confs
@@ -49,11 +49,12 @@ def main(
         The feature file; images it holds already are skipped.
 
     Raises:
-        InputError: for an image that is not there or cannot be read.
+        InputError: for an image that is not there or cannot be read, or an unknown storage.
     """
     if feature_path is None:
         feature_path = Path(export_dir) / f"{conf['output']}.h5"
-    storage = conf.get("storage", "float16" if as_half else "float32")
+    default = "float16" if as_half else "float32"
+    storage = cli.choose("storage", conf.get("storage", default), STORAGES)
     names = list_images(image_dir, image_list)
     if overwrite:
         extractors.load(conf["model"])  # is wrong before anything is deleted, if it is

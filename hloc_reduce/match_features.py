@@ -47,7 +47,7 @@ def main(
         matches: the match file itself; needed where `features` is a path.
         features_ref: feature file of the second images; default: `features`.
         overwrite: match anew what is there.
-        gpu_bytes: how much memory of a GPU the similarities of descriptors may take.
+        gpu_bytes: what similarities of descriptors may take of the memory of a GPU at once.
 
     Returns:
         The match file; pairs it holds already are skipped.
@@ -187,9 +187,18 @@ def _main() -> None:
     parser.add_argument("--matches", type=Path, help="the match file itself")
     parser.add_argument("--conf", default="NN-ratio", help=f"one of {', '.join(confs)}")
     parser.add_argument("--overwrite", action="store_true", help="match anew what is there")
+    parser.add_argument(
+        "--gpu_bytes",
+        type=int,
+        default=GPU_BYTES,
+        help="of a GPU's memory for similarities of descriptors, which decides how many pairs are "
+        "matched at once there",
+    )
     args = parser.parse_args()
-    conf = confs[cli.choose("matcher", args.conf, confs)]
-    main(conf, args.pairs, args.features, args.export_dir, args.matches, overwrite=args.overwrite)
+    if args.gpu_bytes < 1:
+        raise InputError("--gpu_bytes has to be positive.")
+    args.conf = confs[cli.choose("matcher", args.conf, confs)]
+    main(**vars(args))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""How descriptors are kept in feature files: as floats, or in one byte a number.
+"""Convert how a feature file keeps descriptors: as floats, or in one byte a number.
 
 hloc reads float16 and float32. uint8 takes half the space of float16: the range of the numbers of
 each image is divided into 255 steps. Its data set is called `descriptors_uint8`, so that hloc,
-which would take the steps for numbers, misses it and says so. The command converts a file.
+which would take the steps for numbers, misses it and says so.
 """
 
 import argparse
@@ -111,8 +111,9 @@ def main(features: Path, output: Path, storage: str = "float16", overwrite: bool
         The new file.
 
     Raises:
-        InputError: when an input is missing or broken, or the two files are one.
+        InputError: when an input is missing or broken, the storage unknown, or the files the same.
     """
+    cli.choose("storage", storage, STORAGES)
     if output.resolve() == features.resolve():
         raise InputError(f"{output} cannot be made of itself: choose another --output.")
     names = list_h5_names(features)
@@ -146,9 +147,7 @@ def _main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="the new feature file")
     parser.add_argument("--storage", default="float16", help=f"one of {', '.join(STORAGES)}")
     parser.add_argument("--overwrite", action="store_true", help="convert anew what is there")
-    args = parser.parse_args()
-    cli.choose("storage", args.storage, STORAGES)
-    main(**vars(args))
+    main(**vars(parser.parse_args()))
 
 
 if __name__ == "__main__":

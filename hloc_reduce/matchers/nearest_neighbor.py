@@ -9,11 +9,14 @@ from ..base_model import BaseModel
 
 PART_BYTES = 2**19  # of descriptors1 at once, which stay in the cache of a core
 TILE = 2**20  # similarities at once
-GPU_BYTES = 2**30  # similarities in the memory of a GPU at once
+GPU_BYTES = 2**30  # of the memory of a GPU for similarities
 
 
 def nearest(
-    descriptors0: torch.Tensor, descriptors1: torch.Tensor, ratio_threshold: float | None
+    descriptors0: torch.Tensor,
+    descriptors1: torch.Tensor,
+    ratio_threshold: float | None,
+    gpu_bytes: int = GPU_BYTES,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Find the nearest descriptor1 of every descriptor0 that passes the ratio test.
 
@@ -22,6 +25,7 @@ def nearest(
         descriptors1: (M, D) of unit norm, M > 0, and M > 1 for a ratio test.
         ratio_threshold: accept if the distance to the nearest is at most this times the distance
             to the second nearest; None accepts all.
+        gpu_bytes: what similarities may take of the memory of a GPU at once.
 
     Returns:
         Its index (N,) int64, -1 where it does not pass, and its cosine (N,).
@@ -29,7 +33,7 @@ def nearest(
     number, dim = descriptors0.shape
     on_cpu = descriptors0.is_cpu
     parts = descriptors1.split(max(1, PART_BYTES // (4 * dim)) if on_cpu else len(descriptors1))
-    rows = max(1, (TILE if on_cpu else GPU_BYTES // 4) // len(parts[0]))
+    rows = max(1, (TILE if on_cpu else gpu_bytes // 4) // len(parts[0]))
     best, second = descriptors0.new_empty(2, len(parts), number)
     index = best.new_empty(best.shape, dtype=torch.int64)
     buffer = best.new_empty(min(rows, number) * len(parts[0]))
@@ -72,6 +76,7 @@ def mutual_nearest(
     descriptors1: torch.Tensor,
     ratio_threshold: float | None,
     rows: torch.Tensor | None = None,
+    gpu_bytes: int = GPU_BYTES,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Match descriptors that are each other's nearest, both ways through the ratio test.
 
@@ -80,6 +85,7 @@ def mutual_nearest(
         descriptors1: (M, D) of unit norm.
         ratio_threshold: as of `nearest`.
         rows: (K,) of descriptors0, to find the matches of these only; default: all.
+        gpu_bytes: as of `nearest`.
 
     Returns:
         For each of the rows the index of its match (K,) int64, or -1, and its cosine (K,).
@@ -91,12 +97,13 @@ def mutual_nearest(
     # as in hloc, a lone descriptor on either side, which has no second best, skips the test
     if min(len(descriptors0), len(descriptors1)) == 1:
         ratio_threshold = None
-    forward, cosine = nearest(chosen, descriptors1, ratio_threshold)
+    forward, cosine = nearest(chosen, descriptors1, ratio_threshold, gpu_bytes)
     # the way back only for those that somebody wants
     wanted = forward[forward >= 0].unique()
     backward = torch.full((len(descriptors1),), -1, device=forward.device)
     if len(wanted):
-        backward[wanted], _ = nearest(descriptors1[wanted], descriptors0, ratio_threshold)
+        returned, _ = nearest(descriptors1[wanted], descriptors0, ratio_threshold, gpu_bytes)
+        backward[wanted] = returned
     own = torch.arange(len(descriptors0), device=forward.device) if rows is None else rows
     matched = (backward[forward] == own) & (forward >= 0)
     return torch.where(matched, forward, -1), cosine
@@ -118,27 +125,25 @@ def mutual_nearest_padded(
         Of each pair the index of the match of each descriptor0 (N,) int64, or -1, and its cosine
         (N,).
     """
-    sizes = [
-        torch.tensor([len(part) for part in descriptors], device=descriptors[0].device)
-        for descriptors in (descriptors0, descriptors1)
-    ]
-    padded0, padded1 = (
-        pad_sequence(part, batch_first=True) for part in (descriptors0, descriptors1)
+    sizes0, sizes1 = (
+        torch.tensor([len(part) for part in parts], device=parts[0].device)
+        for parts in (descriptors0, descriptors1)
     )
-    similarity = padded0 @ padded1.mT
-    real0, real1 = (
-        torch.arange(padded.shape[1], device=padded.device) < size[:, None]
-        for padded, size in zip((padded0, padded1), sizes, strict=True)
-    )
-    if len(sizes[0]) > 1:
-        similarity.masked_fill_(~(real0[:, :, None] & real1[:, None]), -torch.inf)
-    lone = torch.minimum(*sizes) == 1
+    similarity = _pad(descriptors0) @ _pad(descriptors1).mT
+    for dim, sizes in ((1, sizes0), (2, sizes1)):
+        padding = torch.arange(similarity.shape[dim], device=sizes.device) >= sizes[:, None]
+        similarity.masked_fill_(padding.unsqueeze(3 - dim), -torch.inf)
+    lone = torch.minimum(sizes0, sizes1) == 1
     forward, cosine = _nearest_padded(similarity, 2, ratio_threshold, lone)
     backward, _ = _nearest_padded(similarity, 1, ratio_threshold, lone)
-    own = torch.arange(padded0.shape[1], device=padded0.device)
+    own = torch.arange(similarity.shape[1], device=forward.device)
     matched = (forward >= 0) & (backward.gather(1, forward.clamp(min=0)) == own)
-    matches = torch.where(matched & real0, forward, -1)
-    return [(matches[i, :n], cosine[i, :n]) for i, n in enumerate(sizes[0].tolist())]
+    matches = torch.where(matched, forward, -1)
+    return [(matches[i, :n], cosine[i, :n]) for i, n in enumerate(sizes0.tolist())]
+
+
+def _pad(descriptors: list[torch.Tensor]) -> torch.Tensor:
+    return pad_sequence(descriptors, batch_first=True)
 
 
 def _nearest_padded(
@@ -171,8 +176,8 @@ class NearestNeighbor(BaseModel):
 
         Args:
             pairs: of descriptors (N, D) and (M, D).
-            gpu_bytes: what similarities may take of the memory of a GPU. A pair that needs more is
-                matched in blocks.
+            gpu_bytes: what similarities may take of the memory of a GPU at once. A pair that needs
+                more is matched in blocks.
 
         Returns:
             Of each pair matches0 (N,) int64, the index in 1 or -1, and matching_scores0 (N,) in
@@ -187,7 +192,7 @@ class NearestNeighbor(BaseModel):
         for batch in batches:
             parts = [pairs[i] for i in batch]
             if len(batch) == 1:
-                matched = [mutual_nearest(*parts[0], ratio_threshold)]
+                matched = [mutual_nearest(*parts[0], ratio_threshold, gpu_bytes=gpu_bytes)]
             else:
                 matched = mutual_nearest_padded(*zip(*parts, strict=True), ratio_threshold)
             found.update(zip(batch, matched, strict=True))
