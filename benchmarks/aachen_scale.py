@@ -19,15 +19,30 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from hloc_reduce import cli, match_features, pairs_from_retrieval
 from hloc_reduce.cli import InputError
-from hloc_reduce.io import GroupWriter, find_pair, get_dataset, get_matches, open_h5
+from hloc_reduce.io import (
+    GroupWriter,
+    find_pair,
+    get_dataset,
+    get_matches,
+    list_h5_names,
+    open_h5,
+)
 from hloc_reduce.pairs_from_covisibility import covisibility, most_covisible
-from hloc_reduce.parsers import image_names, parse_query_list, parse_retrieval, write_pairs
+from hloc_reduce.parsers import (
+    image_names,
+    parse_pairs,
+    parse_query_list,
+    parse_retrieval,
+    write_pairs,
+)
 from hloc_reduce.storage import STORAGES, store
 
 NUM_COVIS, NUM_LOC = 40, 50
@@ -103,9 +118,7 @@ def make_pairs(data: Path, folder: Path, share: float, number: int) -> tuple[dic
     pairs_from_retrieval.select(
         folder / "listed.txt", folder / "loc.txt", NUM_LOC, queries, database
     )
-    pairs += [
-        (q, name) for q, names in parse_retrieval(folder / "loc.txt").items() for name in names
-    ]
+    pairs += parse_pairs(folder / "loc.txt")
     write_pairs(pairs, folder / "pairs.txt")
     return places, folder / "pairs.txt"
 
@@ -115,7 +128,7 @@ def hash_of(name: str) -> int:
     return int.from_bytes(name.encode()[-8:], "big")
 
 
-def check(features: Path, matches: Path, pairs: list[tuple[str, str]]) -> tuple[float, float]:
+def check(features: Path, matches: Path, pairs: Iterable[tuple[str, str]]) -> tuple[float, float]:
     """Return which share of common landmarks is matched, and of the matches is right."""
     common = found = right = 0
     with open_h5(features) as file, open_h5(matches) as match_file:
@@ -144,13 +157,14 @@ def run(data: Path, share: float, dim: int, number: int, storage: str) -> dict:
         conf = match_features.confs["NN-ratio"]
         matches = match_features.main(conf, pairs_file, features, matches=folder / "matches.h5")
         matched = time.perf_counter()
-        pairs = [(q, name) for q, names in parse_retrieval(pairs_file).items() for name in names]
-        unordered = {frozenset(pair) for pair in pairs}
-        found, right = check(features, matches, pairs[:: -(-len(pairs) // CHECKED)])
+        matched_pairs = len(list_h5_names(matches))
+        number = sum(1 for _ in parse_pairs(pairs_file))
+        checked = islice(parse_pairs(pairs_file), 0, None, -(-number // CHECKED))
+        found, right = check(features, matches, checked)
         return {
             "share": share,
             "images": len(places),
-            "pairs": len(unordered),
+            "pairs": matched_pairs,
             "pairs_s": paired - start,
             "features_s": written - paired,
             "matching_s": matched - written,

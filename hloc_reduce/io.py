@@ -114,6 +114,10 @@ class GroupWriter:
     def __contains__(self, name: str) -> bool:
         return name in self.names
 
+    def begin(self, name: str) -> None:
+        """Have a group that will be added count as one that is there."""
+        self.names.add(name)
+
     def __enter__(self) -> "GroupWriter":
         return self
 

@@ -2,6 +2,8 @@
 
 import argparse
 from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 
 import h5py
@@ -17,7 +19,7 @@ from .base_model import dynamic_load
 from .cli import InputError
 from .io import GroupWriter, names_to_pair, open_h5
 from .matchers.nearest_neighbor import GPU_BYTES
-from .parsers import parse_retrieval
+from .parsers import parse_pairs
 from .storage import get_descriptors
 
 confs = matchers_confs.confs
@@ -55,7 +57,8 @@ def main(
     Raises:
         InputError: for an image without features, or no path for the matches.
     """
-    if not parse_retrieval(pairs):
+    number = sum(1 for _ in parse_pairs(pairs))
+    if not number:
         raise InputError(f"{pairs} has no pair.")
     if isinstance(features, Path) or Path(features).exists():
         feature_path = Path(features)
@@ -73,9 +76,10 @@ def main(
             matches, provenance(conf, file0, file1), overwrite, compression="gzip"
         ) as writer,
     ):
-        todo = unmatched_pairs(pairs, writer, ordered=features_ref not in (None, feature_path))
-        if todo:
-            _match(conf, todo, file0, file1, writer, gpu_bytes)
+        listed = tqdm(parse_pairs(pairs), desc="Matching", unit="pair", total=number, smoothing=0.1)
+        ordered = features_ref not in (None, feature_path)
+        todo = unmatched_pairs(listed, writer, ordered)
+        _match(conf, todo, file0, file1, writer, gpu_bytes)
     logger.info("Matches of the pairs %s are in %s.", pairs.name, matches)
     return matches
 
@@ -89,29 +93,24 @@ def provenance(conf: dict, *feature_files: h5py.File) -> dict:
 
 
 def unmatched_pairs(
-    pairs: Path, matched: GroupWriter, ordered: bool = False
-) -> list[tuple[str, str]]:
-    """List the pairs of a file that are not matched yet, in the file's order.
+    pairs: Iterable[tuple[str, str]], matched: GroupWriter, ordered: bool = False
+) -> Iterator[tuple[str, str]]:
+    """Yield the pairs that are not matched yet, each once.
 
     Unless `ordered`, a pair is the same as its reverse.
     """
-    todo: dict[tuple[str, str], None] = {}
-    for name0, names1 in parse_retrieval(pairs).items():
-        for name1 in names1:
-            same = [(name0, name1)] if ordered else [(name0, name1), (name1, name0)]
-            seen = any(
-                names in todo or names_to_pair(*names, separator) in matched
-                for names in same
-                for separator in "/_"
-            )
-            if not seen:
-                todo[name0, name1] = None
-    return list(todo)
+    for name0, name1 in pairs:
+        same = [(name0, name1)] if ordered else [(name0, name1), (name1, name0)]
+        # the second separator is of hloc's old format
+        if any(names_to_pair(*names, mark) in matched for names in same for mark in "/_"):
+            continue
+        matched.begin(names_to_pair(name0, name1))
+        yield name0, name1
 
 
 def _match(
     conf: dict,
-    pairs: list[tuple[str, str]],
+    pairs: Iterator[tuple[str, str]],
     file0: h5py.File,
     file1: h5py.File,
     writer: GroupWriter,
@@ -122,27 +121,29 @@ def _match(
     matcher = dynamic_load(matchers, conf["model"]["name"])(conf["model"]).eval()
     read = DescriptorCache(CACHE_BYTES)
     size, workers = (1, parallel.cores()) if device == "cpu" else (PAIRS_ON_GPU, 1)
-    batches = [pairs[i : i + size] for i in range(0, len(pairs), size)]
 
-    def match(batch: list[tuple[torch.Tensor, torch.Tensor]]) -> list[dict[str, np.ndarray]]:
-        on_device = [(part0.to(device), part1.to(device)) for part0, part1 in batch]
-        return [
+    def draw() -> Iterator[tuple[list[str], list[tuple[torch.Tensor, torch.Tensor]]]]:
+        while batch := list(islice(pairs, size)):
+            groups = [names_to_pair(*names) for names in batch]
+            yield groups, [(read(file0, name0), read(file1, name1)) for name0, name1 in batch]
+
+    def match(
+        batch: tuple[list[str], list[tuple[torch.Tensor, torch.Tensor]]],
+    ) -> list[tuple[str, dict[str, np.ndarray]]]:
+        groups, descriptors = batch
+        on_device = [(part0.to(device), part1.to(device)) for part0, part1 in descriptors]
+        matched = [
             {
                 "matches0": matches.cpu().numpy().astype(np.int32),
                 "matching_scores0": scores.cpu().numpy().astype(np.float16),
             }
             for matches, scores in matcher.match(on_device, gpu_bytes)
         ]
+        return list(zip(groups, matched, strict=True))
 
-    descriptors = (
-        [(read(file0, name0), read(file1, name1)) for name0, name1 in batch] for batch in batches
-    )
-    results = parallel.ordered("match", match, descriptors, workers)
-    with tqdm(total=len(pairs), desc="Matching", unit="pair", smoothing=0.1) as progress:
-        for batch, matched in zip(batches, results, strict=True):
-            for names, arrays in zip(batch, matched, strict=True):
-                writer.add(names_to_pair(*names), arrays)
-            progress.update(len(batch))
+    for batch in parallel.ordered("match", match, draw(), workers):
+        for group, arrays in batch:
+            writer.add(group, arrays)
 
 
 class DescriptorCache:

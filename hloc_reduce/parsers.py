@@ -16,13 +16,13 @@ CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield ("file:number", words) of every line that is neither empty nor a comment."""
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open(encoding="utf-8") as file:
+            for number, line in enumerate(file, 1):
+                words = line.split()
+                if words and not words[0].startswith("#"):
+                    yield f"{path}:{number}", words
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"Cannot read {path}: {error}.") from None
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.split()
-        if words and not words[0].startswith("#"):
-            yield f"{path}:{number}", words
 
 
 def parse_image_list(path: Path) -> list[str]:
@@ -100,13 +100,19 @@ def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]
     return lists
 
 
-def parse_retrieval(path: Path) -> dict[str, list[str]]:
-    """Read pairs, one `name0 name1` a line, as name0 -> [name1, ...] in the order of the file."""
-    retrieval: dict[str, list[str]] = {}
+def parse_pairs(path: Path) -> Iterator[tuple[str, str]]:
+    """Read pairs, one `name0 name1` a line, as they are drawn: a list may be of any length."""
     for place, words in _lines(path):
         if len(words) != 2:
             raise InputError(f"{place}: not a pair `name0 name1`.")
-        retrieval.setdefault(words[0], []).append(words[1])
+        yield words[0], words[1]
+
+
+def parse_retrieval(path: Path) -> dict[str, list[str]]:
+    """Read pairs, one `name0 name1` a line, as name0 -> [name1, ...] in the order of the file."""
+    retrieval: dict[str, list[str]] = {}
+    for name0, name1 in parse_pairs(path):
+        retrieval.setdefault(name0, []).append(name1)
     return retrieval
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from command import refused
 
 from hloc_reduce import (
     colmap,
@@ -21,7 +22,7 @@ from hloc_reduce import (
 from hloc_reduce.cli import InputError
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.io import GroupWriter, get_matches, list_h5_names
-from hloc_reduce.parsers import parse_poses, parse_retrieval, write_pairs
+from hloc_reduce.parsers import parse_pairs, parse_poses, parse_retrieval, write_pairs
 
 MATCHER = match_features.confs["NN-ratio"]
 
@@ -57,6 +58,24 @@ def built(scene):
         }
     )
     return scene
+
+
+def test_a_pair_that_is_listed_again_and_reversed_is_matched_once(built, tmp_path):
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("db/0.jpg db/1.jpg\ndb/1.jpg db/2.jpg\n" * 50 + "db/1.jpg db/0.jpg\n" * 50)
+    drawn = []
+    with GroupWriter(tmp_path / "matches.h5", {}) as writer:
+        for names in match_features.unmatched_pairs(parse_pairs(pairs), writer):
+            drawn.append(names)  # and not written before the next is drawn
+    assert drawn == [("db/0.jpg", "db/1.jpg"), ("db/1.jpg", "db/2.jpg")]
+    conf = match_features.confs["NN-ratio"]
+    matches = match_features.main(conf, pairs, built.features, matches=tmp_path / "m.h5")
+    assert len(list_h5_names(matches)) == 2
+
+
+def test_a_wrong_gpu_memory_is_refused(tmp_path, monkeypatch, caplog):
+    command = ["--pairs", tmp_path / "p.txt", "--export_dir", tmp_path, "--gpu_bytes", "0"]
+    assert "positive" in refused(monkeypatch, caplog, match_features, *command)
 
 
 def test_matches_are_those_of_the_scene(built):

@@ -5,7 +5,7 @@ from command import refused, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hloc_reduce import match_features, storage
+from hloc_reduce import extract_features, match_features, storage
 from hloc_reduce.cli import InputError
 from hloc_reduce.io import GroupWriter
 
@@ -106,6 +106,9 @@ def test_wrong_input(tmp_path, monkeypatch, caplog):
     path = write(tmp_path / "feats.h5", "uint8", "a.jpg")
     with pytest.raises(InputError, match="made of itself"):
         storage.main(path, path)
+    conf = {**extract_features.confs["sift"], "storage": "uint4"}
+    with pytest.raises(InputError, match="Unknown storage 'uint4'"):
+        extract_features.main(conf, tmp_path, tmp_path)
     with h5py.File(path, "a") as file:
         del file["a.jpg"][storage.QUANTIZED].attrs["scale"]
     with pytest.raises(InputError, match="no scale and offset"):

@@ -5,6 +5,7 @@ import kornia
 import numpy as np
 import pytest
 import torch
+from command import refused
 
 from hloc_reduce import projections
 from hloc_reduce.cli import InputError
@@ -91,6 +92,14 @@ def test_hardnet_is_trained_with_the_distance_loss(sequence, tmp_path, monkeypat
     assert (
         training.complete_recipe("us", "paper", "hardnet", "hardnet_us64")["distance_weight"] == 0.1
     )
+
+
+def test_descriptors_of_photos_are_refused(sequence, monkeypatch, caplog):
+    for option in ("--phototour", "--validate"):
+        message = refused(
+            monkeypatch, caplog, training, "--descriptor", "colmap_sift", option, sequence[0]
+        )
+        assert message == "colmap_sift describes photos, not the patches of PhotoTour."
 
 
 def test_broken_sequences_are_refused(sequence, tmp_path):
