@@ -78,6 +78,23 @@ def get(name: str, projection: Path | None = None, storage: str = STORAGES[0]) -
     return name, {**conf, "output": feature(name, model)["output"], "model": model}
 
 
+def of_patches(name: str) -> tuple[str, str | None]:
+    """Return the base descriptor and the projection, if any, of a feature that describes patches.
+
+    Args:
+        name: as of `get`.
+
+    Raises:
+        InputError: for an unknown one, or one that describes photos only.
+    """
+    name, conf = get(name)
+    model = conf["model"]
+    base = model.get("base", model)
+    if base["name"] != "dog" or base.get("descriptor", "sift") not in DESCRIPTORS:
+        raise InputError(f"{name} describes photos, not patches.")
+    return base.get("descriptor", "sift"), model.get("projection")
+
+
 def add_storage_option(parser: ArgumentParser) -> None:
     """Add --storage."""
     parser.add_argument(

@@ -54,11 +54,10 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
     """
     import torch
 
-    from confs.features import confs
+    from confs.features import of_patches
 
     from . import projections
-    from .cli import InputError, choose
-    from .descriptors import DESCRIPTORS, Descriptor
+    from .descriptors import Descriptor
 
     if not isinstance(patches, torch.Tensor):
         raise ValueError(f"Patches are a torch.Tensor, not {type(patches).__name__}.")
@@ -67,13 +66,10 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
             f"Patches are (N, 1, 32, 32) float in [0, 1], not {tuple(patches.shape)} "
             f"{patches.dtype}."
         )
-    model = confs[choose("feature", feature, confs)]["model"]
-    base = model.get("base", model)["descriptor"]
-    if base not in DESCRIPTORS:
-        raise InputError(f"{feature} is of photos, not of patches.")
+    base, projection = of_patches(feature)
     descriptors = Descriptor(base).to(patches.device)(patches.float())
-    if "projection" in model:
-        descriptors = projections.load(model["projection"]).to(patches.device)(descriptors)
+    if projection is not None:
+        descriptors = projections.load(projection).to(patches.device)(descriptors)
     return descriptors
 
 

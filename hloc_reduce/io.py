@@ -1,5 +1,6 @@
 """Images and h5 files, and how files are written so that a killed run loses little."""
 
+import csv
 import json
 import os
 import shutil
@@ -27,6 +28,14 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_csv(rows: list[dict], path: Path) -> None:
+    """Write rows, one at least, that have the same keys; None is empty."""
+    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def read_image(path: Path, grayscale: bool = False) -> np.ndarray:

@@ -1,6 +1,5 @@
 """What a localization run leaves behind: queries.csv, summary.json and the recall table."""
 
-import csv
 import json
 import shutil
 import time
@@ -13,7 +12,7 @@ import pycolmap
 
 from . import stamps, trace
 from .cli import InputError
-from .evaluation.poses import pose_error, recall
+from .evaluation.poses import FAILED, pose_error, summarize_errors
 from .io import list_h5_names, open_h5, replacing
 from .localization import pose
 from .storage import stored_descriptors
@@ -37,7 +36,6 @@ PRODUCTS = ("map.json", "*feats-*", ".*.tmp", "sfm*", "*_hloc_*", "queries.csv",
 STAGES = "stages.json"
 BOOKKEEPING = {"conf.json", STAGES, "summary.json", "queries.csv", "trace.json"}
 DELETING = {"is": "being deleted"}
-FAILED = (float("inf"), float("inf"))
 NAMED = 3  # differences that a message names
 
 
@@ -201,14 +199,6 @@ def query_table(
     return rows
 
 
-def write_csv(rows: list[dict], path: Path) -> None:
-    """Write the rows of `query_table`."""
-    with replacing(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def summarize_list(rows: list[dict], thresholds: tuple[tuple[float, float], ...]) -> dict:
     """Summarize the rows of one list.
 
@@ -229,15 +219,7 @@ def summarize_list(rows: list[dict], thresholds: tuple[tuple[float, float], ...]
             error if row["status"] == "localized" else FAILED
             for row, error in zip(known, errors, strict=True)
         ]
-        medians = np.median(errors, axis=0)
-        position, rotation = (float(x) if np.isfinite(x) else None for x in medians)
-        summary |= {
-            "with_ground_truth": len(known),
-            "thresholds_m_deg": [list(limits) for limits in thresholds],
-            "recall_percent": [round(value, 2) for value in recall(counted, thresholds)],
-            "median_position_error_m": position,
-            "median_rotation_error_deg": rotation,
-        }
+        summary |= summarize_errors(errors, counted, thresholds)
     return summary
 
 

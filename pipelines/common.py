@@ -13,12 +13,12 @@ from hloc_reduce import (
     cli,
     extract_features,
     extractors,
+    io,
     logger,
     pairs_from_retrieval,
     results,
 )
 from hloc_reduce.cli import InputError
-from hloc_reduce.io import list_h5_names
 from hloc_reduce.parsers import parse_retrieval
 from hloc_reduce.versions import versions
 
@@ -124,7 +124,7 @@ def check_retrieval(
     if Path(retrieval).resolve() == output.resolve():
         raise InputError(f"--retrieval {retrieval} would be overwritten: move it elsewhere.")
     if Path(retrieval).suffix in PAIRS_FROM:
-        list_h5_names(Path(retrieval))
+        io.list_h5_names(Path(retrieval))
         return map_names
     pairs, names = parse_retrieval(Path(retrieval)), set(map_names)
     found = [[other for other in pairs.get(name, ()) if other in names] for name in query_names]
@@ -212,7 +212,7 @@ def finish(
         The summary.
     """
     rows = results.query_table(lists, records, truth)
-    results.write_csv(rows, folder.path / "queries.csv")
+    io.write_csv(rows, folder.path / "queries.csv")
     summary = {
         **summary,
         "queries": len(rows),

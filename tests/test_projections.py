@@ -334,7 +334,7 @@ def test_no_patches_and_unknown_features():
     for name in ("sift_sv63", "SIFT_sv64"):
         with pytest.raises(InputError, match=f"feature '{name}'. The nearest of 93: sift_sv64"):
             hloc_reduce.describe_patches(torch.zeros(0, 1, 32, 32), name)
-    with pytest.raises(InputError, match="colmap_sift_sv16 is of photos, not of patches"):
+    with pytest.raises(InputError, match="colmap_sift_sv16 describes photos, not patches"):
         hloc_reduce.describe_patches(torch.zeros(0, 1, 32, 32), "colmap_sift_sv16")
 
 

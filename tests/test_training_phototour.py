@@ -7,6 +7,7 @@ import pytest
 import torch
 from command import refused
 
+from hloc_reduce import phototour as layout
 from hloc_reduce import projections
 from hloc_reduce.cli import InputError
 from hloc_reduce.descriptors import DESCRIPTORS, Base, Descriptor
@@ -38,13 +39,13 @@ def sequence(tmp_path):
         same = np.flatnonzero(points == points[i])
         for j in (same[same != i][0], (i + 1) % 300):
             lines.append(f"{i} {10 * points[i]} 0 {j} {10 * points[j]} 0 0")
-    (folder / phototour.PAIRS).write_text("\n".join(lines))
+    (folder / layout.PAIRS).write_text("\n".join(lines))
     return folder, patches, points
 
 
 def test_patches_are_read_row_by_row(sequence):
     folder, patches, _ = sequence
-    read = phototour.read_sheet(folder / "patches0001.bmp")
+    read = layout.read_sheet(folder / "patches0001.bmp")
     expected = cv2.resize(patches[256 + 17], (32, 32), interpolation=cv2.INTER_AREA) / 255
     np.testing.assert_allclose(read[17], expected, atol=1e-6)
 
@@ -54,7 +55,7 @@ def test_patches_of_a_point_are_a_track(sequence, tmp_path):
     data = tracks.load(phototour.main(folder, tmp_path / "cache"))
     assert data.num_tracks == 100 and len(data.track) == 300
     assert (points[data.image] == data.track).all()  # an image of its own each, by its number
-    first = torch.from_numpy(phototour.read_sheet(folder / "patches0000.bmp")[:1, None])
+    first = torch.from_numpy(layout.read_sheet(folder / "patches0000.bmp")[:1, None])
     row = data.descriptors[np.flatnonzero(data.image == 0)[0], 0, 0]
     assert Descriptor("sift")(first)[0].numpy() @ row.astype(np.float32) > 0.999
 
@@ -64,7 +65,7 @@ def test_training_and_validation(sequence, tmp_path, monkeypatch, capsys):
     small = {**training.sv.RECIPES["best"], "steps": 20, "batch_size": 64}
     monkeypatch.setitem(training.sv.RECIPES, "best", small)
     paths = training.main({}, [folder], "sift", "sv", [16], tmp_path / "w", tmp_path / "cache")
-    training.validate(folder, tmp_path / "cache", "sift", paths, seed=0)
+    training.validate(folder, tmp_path / "cache", "sift", paths)
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(" on ")[0] for line in lines] == ["FPR95 of sift", "FPR95 of sift_sv16"]
     assert lines[0].endswith("on town: 0.00 %")  # noise of 3 % is nothing to sift
@@ -112,12 +113,12 @@ def test_broken_sequences_are_refused(sequence, tmp_path):
     (folder / "info.txt").write_text("1 0\nx 0\n")
     with pytest.raises(InputError, match="info.txt, line 2"):
         phototour.main(folder, tmp_path / "cache")
-    (folder / phototour.PAIRS).write_text("1 2 3\n")
+    (folder / layout.PAIRS).write_text("1 2 3\n")
     with pytest.raises(InputError, match="line 1: not a pair"):
-        phototour.read_pairs(folder)
-    (folder / phototour.PAIRS).write_text("0 5 0 1 5 0\n")
+        layout.read_pairs(folder)
+    (folder / layout.PAIRS).write_text("0 5 0 1 5 0\n")
     with pytest.raises(InputError, match="both matching pairs and others"):
-        phototour.read_pairs(folder)
+        layout.read_pairs(folder)
     cv2.imwrite(str(folder / "patches0000.bmp"), np.zeros((64, 64), np.uint8))
     (folder / "info.txt").write_text("1 0\n2 0\n")
     with pytest.raises(InputError, match="no two patches"):

@@ -1,9 +1,15 @@
 """Errors of estimated poses and recall at thresholds."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import numpy as np
 import pycolmap
+
+from ..cli import InputError
+from ..parsers import parse_poses
+
+FAILED = (float("inf"), float("inf"))
 
 
 def pose_error(estimated: pycolmap.Rigid3d, true: pycolmap.Rigid3d) -> tuple[float, float]:
@@ -42,3 +48,98 @@ def recall(
         float(100 * (errors <= limits).all(axis=1).mean()) if len(errors) else 0.0
         for limits in map(np.array, thresholds)
     ]
+
+
+def summarize_errors(
+    errors: list[tuple[float, float]],
+    counted: list[tuple[float, float]],
+    thresholds: Iterable[tuple[float, float]],
+) -> dict:
+    """Summarize the errors of queries, metres and degrees.
+
+    Args:
+        errors: of the poses, of which medians are taken; infinite without one.
+        counted: those that count for recall, infinite for a failure.
+        thresholds: pairs of metres and degrees.
+
+    Returns:
+        The number of queries, recall in percent at each of the thresholds, and median errors, None
+        if half of the queries have none.
+    """
+    medians = np.median(errors, axis=0)
+    position, rotation = (float(value) if np.isfinite(value) else None for value in medians)
+    return {
+        "with_ground_truth": len(errors),
+        "thresholds_m_deg": [list(limits) for limits in thresholds],
+        "recall_percent": [round(value, 2) for value in recall(counted, thresholds)],
+        "median_position_error_m": position,
+        "median_rotation_error_deg": rotation,
+    }
+
+
+def read_truth(paths: Iterable[Path]) -> dict[str, pycolmap.Rigid3d]:
+    """Read true poses of several files, by full name.
+
+    Raises:
+        InputError: for a broken or empty file, or a name that two files have.
+    """
+    truth = {}
+    for path in paths:
+        poses = parse_poses(path)
+        if not poses:
+            raise InputError(f"{path} has no pose.")
+        if twice := truth.keys() & poses.keys():
+            raise InputError(f"{path}: {min(twice)} is in another file of true poses, too.")
+        truth |= poses
+    return truth
+
+
+def find_estimates(
+    estimates: Mapping[str, pycolmap.Rigid3d], names: Iterable[str]
+) -> dict[str, pycolmap.Rigid3d]:
+    """Find the estimates of queries by their full names, or else by what full names end with.
+
+    Benchmarks want base names, or the last folder and the base name.
+
+    Args:
+        estimates: by name.
+        names: full names of queries.
+
+    Returns:
+        By full name, of those that have one.
+
+    Raises:
+        InputError: when an estimate could be of several queries.
+    """
+    found, owner = {}, {}
+    for name in names:
+        parts = name.split("/")
+        endings = ("/".join(parts[i:]) for i in range(len(parts)))
+        written = next((ending for ending in endings if ending in estimates), None)
+        if written is None:
+            continue
+        if written in owner:
+            raise InputError(
+                f"The estimate {written} could be of {owner[written]} and of {name}: "
+                "write whole names, or evaluate one list of queries at a time."
+            )
+        found[name], owner[written] = estimates[written], name
+    return found
+
+
+def errors_of(
+    estimates: Mapping[str, pycolmap.Rigid3d], truth: Mapping[str, pycolmap.Rigid3d]
+) -> dict[str, tuple[float, float]]:
+    """Return the errors, metres and degrees, of all queries with true poses; infinite without."""
+    return {
+        name: pose_error(estimates[name], pose) if name in estimates else FAILED
+        for name, pose in truth.items()
+    }
+
+
+def cumulative(errors: Iterable[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cumulative curve of errors: sorted finite ones, and the percentage within each."""
+    errors = np.sort(np.array(list(errors), float))
+    share = 100 * np.arange(1, len(errors) + 1) / max(len(errors), 1)
+    finite = np.isfinite(errors)
+    return errors[finite], share[finite]

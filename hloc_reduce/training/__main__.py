@@ -13,9 +13,10 @@ import torch
 from confs import features as features_confs
 
 from .. import cli, extractors, logger, projections, stamps
+from .. import phototour as layout
 from ..cli import InputError
 from ..descriptors import COLMAP, DESCRIPTORS, DIM, check_weights
-from ..evaluation.phototour import fpr95
+from ..evaluation import phototour as verification
 from ..maps import Map, is_map
 from ..versions import versions
 from . import nested, pca, phototour, ss, sv, tracks, us
@@ -284,8 +285,8 @@ def _main() -> None:
     if args.seed < 0:
         raise InputError(f"--seed {args.seed}: choose 0 or more.")
     if args.validate:
-        phototour.read_pairs(args.validate)
-        phototour.read_points(args.validate)
+        layout.read_pairs(args.validate)
+        layout.read_points(args.validate)
     for dim in args.dim:
         if dim < 1 or (dim > DIM and conf is None):
             raise InputError(f"--dim {dim}: choose 1 to {DIM}.")
@@ -313,23 +314,15 @@ def _main() -> None:
         ]
         if args.validate:
             folder = args.cache / args.validate.resolve().name
-            validate(args.validate, folder, descriptor, paths, args.seed)
+            validate(args.validate, folder, descriptor, paths)
 
 
-def validate(folder: Path, cache: Path, descriptor: str, paths: list[Path], seed: int) -> None:
+def validate(folder: Path, outputs: Path, descriptor: str, paths: list[Path]) -> None:
     """Print the FPR95 of a base descriptor and projections of it on a PhotoTour sequence."""
-    pairs, matches = phototour.read_pairs(folder)
-    data = tracks.load(phototour.main(folder, cache, descriptor, seed))
-    if pairs.max() >= len(data.image):
-        raise InputError(f"{folder}: the pairs name more patches than info.txt.")
-    descriptors = torch.empty(len(data.image), DIM)
-    descriptors[torch.from_numpy(data.image)] = torch.from_numpy(data.descriptors[:, 0, 0]).float()
     projects = {descriptor: torch.nn.Identity()}
     projects |= {path.stem: projections.load(path) for path in paths}
-    for name, project in projects.items():
-        projected = torch.cat([project(rows) for rows in descriptors.split(65536)])
-        first, second = projected[pairs.T]
-        value = fpr95((first - second).norm(dim=1).numpy(), matches)
+    found = verification.main(folder, outputs, descriptor, projects)
+    for name, value in found.items():
         print(f"FPR95 of {name} on {folder.resolve().name}: {100 * value:.2f} %")
 
 

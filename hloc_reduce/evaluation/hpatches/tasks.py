@@ -1,0 +1,147 @@
+"""The three tasks of HPatches (Balntas et al., CVPR 2017), as its Python benchmark defines them."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.distance import cdist
+from tqdm import tqdm
+
+from ... import parallel
+from ..ranking import average_precision, roc_area
+from .data import IMAGES, NOISE, TYPES, Descriptors
+
+POOLS = (100, 500, 1000, 5000, 10000, 15000, 20000)
+IMBALANCE = 0.2  # of the right pairs are left in the imbalanced protocol
+OWN = len(IMAGES)  # right items of a query in the retrieval task
+PAIRS, QUERIES = 2**16, 2**8  # computed at once
+
+
+def matching_ap(reference: np.ndarray, target: np.ndarray) -> float:
+    """Match all rows of two images and rank the matches by distance.
+
+    Args:
+        reference: descriptors (N, D).
+        target: (N, D), row i showing what row i of the reference does.
+
+    Returns:
+        The average precision of "the nearest, of equal ones the first, is the same row", with N
+        right items.
+    """
+    # summed in one order, unlike a matrix product, so that equal descriptors are equally far
+    apart = cdist(reference, target)
+    nearest = apart.argmin(axis=1)
+    order = np.argsort(apart.min(axis=1), kind="stable")
+    right = nearest[order] == order
+    return float(average_precision(np.flatnonzero(right) + 1, len(reference)))
+
+
+def matching(descriptors: Descriptors) -> Iterator[tuple[str, str, float]]:
+    """Match the reference image of each sequence with the others.
+
+    Yields:
+        Noise, the sequence and image, and the average precision.
+    """
+    images = [(s, noise, i) for s in descriptors.sizes for noise in NOISE for i in IMAGES]
+
+    def match(task: tuple[str, str, int]) -> float:
+        sequence, noise, image = task
+        target = descriptors.of(sequence, f"{noise}{image}")
+        return matching_ap(descriptors.of(sequence, "ref"), target)
+
+    scores = tqdm(
+        parallel.ordered("match", match, images), desc="Matching", unit="image", total=len(images)
+    )
+    for (sequence, noise, image), score in zip(images, scores, strict=True):
+        yield noise, f"{sequence} {image}", score
+
+
+def verification(
+    descriptors: Descriptors, pairs: dict[str, np.ndarray]
+) -> Iterator[tuple[str, str, float]]:
+    """Tell pairs of the same patch from others.
+
+    Args:
+        descriptors: of the split.
+        pairs: as of `lists.pairs`.
+
+    Yields:
+        Noise; which negatives and which protocol; and the area under the ROC curve (balanced) or
+        the average precision of all negatives and the first fifth of the positives (imbalanced).
+    """
+    for noise in tqdm(NOISE, desc="Verification", unit="noise"):
+        right = pair_distances(descriptors, pairs["pos"], noise)
+        few = np.sort(right[: int(IMBALANCE * len(right))])
+        for kind in ("inter", "intra"):
+            wrong = pair_distances(descriptors, pairs[f"neg_{kind}"], noise)
+            yield noise, f"{kind} balanced", roc_area(right, wrong)
+            # of equal ones the wrong are first
+            nearer = np.searchsorted(np.sort(wrong), few, side="right")
+            ranks = np.arange(1, len(few) + 1) + nearer
+            yield noise, f"{kind} imbalanced", float(average_precision(ranks, len(few)))
+
+
+def pair_distances(descriptors: Descriptors, pairs: np.ndarray, noise: str) -> np.ndarray:
+    """Return the L2 distances (P,) of pairs (P, 2, 2) of images and patches, with a noise."""
+    apart = []
+    for part in np.array_split(pairs, -(-len(pairs) // PAIRS)):
+        first, second = (
+            descriptors.rows_of_images(part[:, side, 1], part[:, side, 0], noise) for side in (0, 1)
+        )
+        apart.append(np.linalg.norm(first.astype(np.float64) - second, axis=1))
+    return np.concatenate(apart)
+
+
+def retrieval(
+    descriptors: Descriptors, queries: np.ndarray, distractors: np.ndarray
+) -> Iterator[tuple[str, str, float]]:
+    """Find the five noisy patches of each query among distractors of other sequences.
+
+    Args:
+        descriptors: of the split.
+        queries: (Q,) reference patches.
+        distractors: (N,) reference patches; those of a query's own sequence are left out.
+
+    Yields:
+        Noise, the size of the pool and the mean average precision.
+    """
+    pool, sequence = descriptors.rows(distractors, "ref"), descriptors.sequence
+
+    def rank(block: np.ndarray) -> np.ndarray:
+        described = descriptors.rows(block, "ref")
+        own = np.stack([descriptors.rows(block, kind) for kind in TYPES[1:]], axis=1)
+        right = np.linalg.norm(own - described[:, None].astype(np.float64), axis=2)
+        right = np.sort(right.reshape(len(block), len(NOISE), OWN))
+        apart = cdist(described, pool)
+        return np.stack(
+            [
+                ranks_in_pools(right[i], apart[i, sequence[distractors] != sequence[query]])
+                for i, query in enumerate(block)
+            ]
+        )
+
+    blocks = np.array_split(queries, -(-len(queries) // QUERIES))
+    ranks = tqdm(
+        parallel.ordered("rank", rank, blocks), desc="Retrieval", unit="block", total=len(blocks)
+    )
+    precision = average_precision(np.concatenate(list(ranks)), OWN).mean(axis=0)
+    for noise, row in zip(NOISE, precision, strict=True):
+        for size, value in zip(POOLS, row, strict=True):
+            yield noise, str(size), float(value)
+
+
+def ranks_in_pools(right: np.ndarray, wrong: np.ndarray) -> np.ndarray:
+    """Rank a query's own patches in pools of these and the first distractors.
+
+    Args:
+        right: (3, 5) ascending distances of its own, which come before equal distractors.
+        wrong: (N,) distances of distractors.
+
+    Returns:
+        (3, P, 5) places, from 1 on, in each of `POOLS`.
+    """
+    # how many of the first 0, 1, 2, ... distractors are nearer
+    nearer = np.zeros((len(wrong) + 1, right.size), np.int64)
+    np.cumsum(wrong[:, None] < right.reshape(-1), axis=0, out=nearer[1:])
+    number = np.minimum(np.array(POOLS) - OWN, len(wrong))
+    before = nearer[number].reshape(len(POOLS), len(NOISE), OWN)
+    return before.swapaxes(0, 1) + np.arange(1, OWN + 1)
