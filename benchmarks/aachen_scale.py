@@ -50,6 +50,7 @@ SEEN = 0.15  # of the keypoints show landmarks
 STEP = 0.04  # of these are left behind from one image of the row to the next
 NOISE = 0.2  # length of what one look adds to the descriptor of a landmark
 CHECKED = 200  # pairs whose matches are checked
+MIN_KEYPOINTS = 10  # of which one shows a landmark
 WHOLE = {"images": 6697 + 1015, "pairs": 20 * 6697 + 50 * 1015}
 # what grows with the images, and with the pairs
 GROWING = {
@@ -71,8 +72,9 @@ def unit(generator: np.random.Generator, number: int, dim: int) -> np.ndarray:
 
 
 def synthesize(places: dict[str, int], path: Path, dim: int, number: int, storage: str) -> None:
-    """Write the features of images, given their places in the row."""
-    with GroupWriter(path, {"synthesized": [dim, number, storage]}) as writer:
+    """Write the features of images, given their places in the row, and beside them landmarks."""
+    made_by = {"synthesized": [dim, number, storage]}
+    with GroupWriter(path, made_by) as writer, GroupWriter(shown(path), made_by) as known:
         for name, place in places.items():
             ids = ids_of(place, number)
             blocks = [  # of 1,000 landmarks, which are the same in all images
@@ -85,11 +87,17 @@ def synthesize(places: dict[str, int], path: Path, dim: int, number: int, storag
             looks /= np.linalg.norm(looks, axis=1, keepdims=True)
             clutter = unit(generator, number - len(ids), dim)
             order = generator.permutation(number)
-            arrays, attrs = store(
-                {"descriptors": np.concatenate([looks, clutter])[order].T}, storage
-            )
-            arrays["ids"] = np.concatenate([ids, np.full(number - len(ids), -1)])[order]
-            writer.add(name, arrays, attrs)
+            features = {key: np.zeros(number, np.float32) for key in ("scales", "oris", "scores")}
+            features["keypoints"] = np.zeros((number, 2), np.float32)
+            features["descriptors"] = np.concatenate([looks, clutter])[order].T
+            writer.add(name, *store(features, storage))
+            ids = np.concatenate([ids, np.full(number - len(ids), -1)])[order]
+            known.add(name, {"ids": ids})
+
+
+def shown(features: Path) -> Path:
+    """Return the file of the landmarks that the features of images show."""
+    return features.with_name(f"{features.stem}_ids.h5")
 
 
 def make_pairs(data: Path, folder: Path, share: float, number: int) -> tuple[dict[str, int], Path]:
@@ -98,7 +106,8 @@ def make_pairs(data: Path, folder: Path, share: float, number: int) -> tuple[dic
     database = database[: max(NUM_LOC, round(share * len(database)))]
     lists = sorted(data.glob("*_time_queries_with_intrinsics.txt"))
     queries = [name for path in lists for name, _ in parse_query_list(path)]
-    queries = queries[:: round(1 / share)]
+    spread = np.linspace(0, len(queries) - 1, max(1, round(share * len(queries))))
+    queries = [queries[int(i)] for i in spread]
     places = {name: i for i, name in enumerate(database)}
     counts = covisibility([ids_of(i, number) for i in range(len(database))])
     pairs = [
@@ -131,7 +140,7 @@ def hash_of(name: str) -> int:
 def check(features: Path, matches: Path, pairs: Iterable[tuple[str, str]]) -> tuple[float, float]:
     """Return which share of common landmarks is matched, and of the matches is right."""
     common = found = right = 0
-    with open_h5(features) as file, open_h5(matches) as match_file:
+    with open_h5(shown(features)) as file, open_h5(matches) as match_file:
         for names in pairs:
             ids = [get_dataset(file, name, "ids")[()] for name in names]
             common += len(np.intersect1d(*(part[part >= 0] for part in ids)))
@@ -162,7 +171,7 @@ def run(data: Path, share: float, dim: int, number: int, storage: str) -> dict:
         checked = islice(parse_pairs(pairs_file), 0, None, -(-number // CHECKED))
         found, right = check(features, matches, checked)
         return {
-            "share": share,
+            "share": matched_pairs / WHOLE["pairs"],
             "images": len(places),
             "pairs": matched_pairs,
             "pairs_s": paired - start,
@@ -208,8 +217,11 @@ def _main() -> None:
     parser.add_argument("--once", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     cli.choose("storage", args.storage, STORAGES)
-    if not all(0 < share <= 1 for share in args.share):
-        raise InputError("--share: above 0 and at most 1.")
+    if not all(0 < share <= 1 for share in args.share) or len(set(args.share)) < len(args.share):
+        raise InputError("--share: different numbers above 0 and at most 1.")
+    cli.check_positive(args, "dim")
+    if args.keypoints < MIN_KEYPOINTS:
+        raise InputError(f"--keypoints: at least {MIN_KEYPOINTS}.")
     if args.once:
         measured = run(args.data, args.share[0], args.dim, args.keypoints, args.storage)
         print(json.dumps(measured))

@@ -115,6 +115,7 @@ def _main() -> None:
         with tempfile.TemporaryDirectory() as temporary:
             print("\n" + json.dumps(run(args.once, args.dataset, Path(temporary))))
         return
+    cli.check_positive(args, "rounds")
     names = [HLOC, *args.feature]
     best: dict[str, dict] = {}
     for _ in range(args.rounds):

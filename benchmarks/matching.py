@@ -11,6 +11,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -59,8 +60,9 @@ def plain(pair: Pair) -> torch.Tensor:
     similarity = pair[0] @ pair[1].T
     nearest = []
     for view in (similarity, similarity.T):
-        (best, second), index = view.topk(2, dim=1)[0].T, view.topk(2, dim=1)[1][:, 0]
-        nearest.append(torch.where(1 - best <= RATIO**2 * (1 - second), index, -1))
+        cosines, indices = view.topk(2, dim=1)
+        accepted = 1 - cosines[:, 0] <= RATIO**2 * (1 - cosines[:, 1])
+        nearest.append(torch.where(accepted, indices[:, 0], -1))
     forward, backward = nearest
     own = torch.arange(len(forward), device=forward.device)
     return torch.where((forward >= 0) & (backward[forward] == own), forward, -1)
@@ -100,7 +102,7 @@ def methods(number: int, device: str) -> dict[str, Callable[[list[Pair]], list]]
         "faiss": lambda pairs: [faiss_both_ways(pair) for pair in pairs],
         "product": lambda pairs: [torch.mm(pair[0], pair[1].T, out=memory) for pair in pairs][:0],
     }
-    if device != "cpu":
+    if device != "cpu" or find_spec("faiss") is None:
         del compared["faiss"]
     return compared
 

@@ -41,6 +41,13 @@ def choose(kind: str, name: str, names: Iterable[str]) -> str:
     return name
 
 
+def check_positive(args: argparse.Namespace, *names: str) -> None:
+    """Raise an InputError if an option is not above 0."""
+    for name in names:
+        if not getattr(args, name) > 0:
+            raise InputError(f"--{name} {getattr(args, name)}: at least 1.")
+
+
 def some(names: Iterable[str], number: int = 5) -> str:
     """Name the first few of many."""
     names = list(names)

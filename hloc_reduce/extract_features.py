@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -63,14 +64,15 @@ def main(
         if not todo:
             logger.info("All %d images are in %s.", len(names), feature_path)
             return feature_path
-        extracted = extract_all(conf, [image_dir / name for name in todo])
-        progress = tqdm(extracted, desc="Extracting features", unit="image", total=len(todo))
-        for name, features in zip(todo, progress, strict=True):
-            uncertainty = features.pop("uncertainty")
-            if len(features["keypoints"]) == 0:
-                logger.warning("Image %s has no keypoints.", name)
-            arrays, attrs = store(features, storage)
-            writer.add(name, arrays, attrs | {"keypoints": {"uncertainty": uncertainty}})
+        # closed at once if writing fails: it has processes
+        with closing(extract_all(conf, [image_dir / name for name in todo])) as extracted:
+            progress = tqdm(extracted, desc="Extracting features", unit="image", total=len(todo))
+            for name, features in zip(todo, progress, strict=True):
+                uncertainty = features.pop("uncertainty")
+                if len(features["keypoints"]) == 0:
+                    logger.warning("Image %s has no keypoints.", name)
+                arrays, attrs = store(features, storage)
+                writer.add(name, arrays, attrs | {"keypoints": {"uncertainty": uncertainty}})
     logger.info("Features of %d images are in %s.", len(names), feature_path)
     return feature_path
 
@@ -102,7 +104,7 @@ def extract_all(conf: dict, images: list[Path]) -> Iterator[dict[str, np.ndarray
             except BrokenExecutor:
                 raise InputError(
                     "A process that detects keypoints was killed, perhaps for want of memory: "
-                    "try fewer cores, for example OMP_NUM_THREADS=1. Nothing finished is lost."
+                    "try fewer cores, for example OMP_NUM_THREADS=1. What is written is kept."
                 ) from None
 
         yield from parallel.ordered(

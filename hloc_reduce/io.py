@@ -107,8 +107,8 @@ class GroupWriter:
         self.pieces = path.with_name(path.name + ".pieces")
         path.parent.mkdir(parents=True, exist_ok=True)
         if overwrite:
+            self._drop_pieces()
             path.unlink(missing_ok=True)
-            shutil.rmtree(self.pieces, ignore_errors=True)
         self.names: set[str] = set()
         self.id = uuid.uuid4().hex
         for part in [path] * path.exists() + self._finished():
@@ -146,7 +146,14 @@ class GroupWriter:
             self._flush()
 
     def _finished(self) -> list[Path]:
-        return sorted(self.pieces.glob("*.h5"))
+        return sorted(self.pieces.glob("[0-9]*.h5"))
+
+    def _drop_pieces(self) -> None:
+        """Delete all pieces or, if killed meanwhile, leave none that counts."""
+        if self.pieces.exists():
+            dropped = self.pieces.with_name(f".{self.pieces.name}.{uuid.uuid4().hex}.tmp")
+            self.pieces.rename(dropped)
+            shutil.rmtree(dropped, ignore_errors=True)
 
     def _check(self, file: h5py.File, path: Path) -> None:
         before = file.attrs.get("conf", self.conf)  # hloc's own files say nothing
@@ -161,7 +168,7 @@ class GroupWriter:
 
     def _flush(self) -> None:
         if self.buffer:
-            number = len(self._finished())
+            number = max((int(piece.stem) for piece in self._finished()), default=-1) + 1
             piece = self.pieces / f"{number:06d}.h5"
             with trace.span("write"), replacing(piece) as temporary:
                 self._write(temporary)
@@ -193,7 +200,7 @@ class GroupWriter:
                 for piece in pieces:
                     with open_h5(piece) as file:
                         _copy_missing(file, merged)
-        shutil.rmtree(self.pieces, ignore_errors=True)
+        self._drop_pieces()
 
 
 def _copy_missing(source: h5py.Group, target: h5py.Group) -> None:

@@ -3,6 +3,7 @@
 import copy
 import json
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Protocol
 
@@ -165,10 +166,10 @@ def main(
                 (name, camera, *_read(feature_file, match_file, name, retrieved, reference))
                 for name, camera in todo
             )
-            solved = parallel.ordered("localize", solve, tasks)
-            progress = tqdm(solved, desc="Localizing", unit="query", total=len(todo))
-            for (name, _), record in zip(todo, progress, strict=True):
-                log.add(name, record)
+            with closing(parallel.ordered("localize", solve, tasks)) as solved:
+                progress = tqdm(solved, desc="Localizing", unit="query", total=len(todo))
+                for (name, _), record in zip(todo, progress, strict=True):
+                    log.add(name, record)
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose(record) for name, record in records.items()}
     submitted = {name: known for name, known in poses.items() if known is not None}

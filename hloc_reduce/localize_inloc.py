@@ -170,7 +170,7 @@ class ScanMap:
 
     def num_keypoints(self, name: str) -> int:
         """Return how many keypoints a cutout has."""
-        return len(self.points(name))
+        return get_dataset(self.file, name, "points3D").shape[0]
 
     def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the ids and coordinates of the points that keypoints of a cutout show.

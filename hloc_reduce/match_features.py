@@ -3,6 +3,7 @@
 import argparse
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from itertools import islice
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from .storage import get_descriptors
 
 confs = matchers_confs.confs
 CACHE_BYTES = 2**30  # descriptors that stay in memory: of 500 images at 8,000 x 64
-PAIRS_ON_GPU = 64  # handed to a GPU at once, which matches as many together as its memory allows
+PAIRS_ON_GPU = 16  # handed to a GPU at once, which matches as many together as its memory allows
 
 
 def main(
@@ -131,7 +132,8 @@ def _match(
         batch: tuple[list[str], list[tuple[torch.Tensor, torch.Tensor]]],
     ) -> list[tuple[str, dict[str, np.ndarray]]]:
         groups, descriptors = batch
-        on_device = [(part0.to(device), part1.to(device)) for part0, part1 in descriptors]
+        moved = {id(part): part.to(device) for pair in descriptors for part in pair}
+        on_device = [(moved[id(part0)], moved[id(part1)]) for part0, part1 in descriptors]
         matched = [
             {
                 "matches0": matches.cpu().numpy().astype(np.int32),
@@ -141,9 +143,10 @@ def _match(
         ]
         return list(zip(groups, matched, strict=True))
 
-    for batch in parallel.ordered("match", match, draw(), workers):
-        for group, arrays in batch:
-            writer.add(group, arrays)
+    with closing(parallel.ordered("match", match, draw(), workers)) as results:
+        for batch in results:
+            for group, arrays in batch:
+                writer.add(group, arrays)
 
 
 class DescriptorCache:
@@ -196,8 +199,7 @@ def _main() -> None:
         "matched at once there",
     )
     args = parser.parse_args()
-    if args.gpu_bytes < 1:
-        raise InputError("--gpu_bytes has to be positive.")
+    cli.check_positive(args, "gpu_bytes")
     args.conf = confs[cli.choose("matcher", args.conf, confs)]
     main(**vars(args))
 

@@ -3,6 +3,8 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from threading import Lock
 
 import torch
 
@@ -11,9 +13,32 @@ from .trace import span
 BACKLOG = 4  # results for each worker that may wait to be taken
 
 
+_lock = Lock()
+_running = 0  # blocks of `_one_thread_each`, of whatever threads
+_threads = 1  # of torch before the first of them
+
+
 def cores() -> int:
     """Return how many cores to use: OMP_NUM_THREADS if it is set, else all."""
-    return torch.get_num_threads()
+    with _lock:
+        return _threads if _running else torch.get_num_threads()
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Have torch compute in the thread that asks it to; several such blocks may overlap."""
+    global _running, _threads
+    with _lock:
+        if not _running:
+            _threads = torch.get_num_threads()
+        _running += 1
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        with _lock:
+            _running -= 1
+            torch.set_num_threads(1 if _running else _threads)
 
 
 def ordered(name: str, function: Callable, items: Iterable, workers: int | None = None) -> Iterator:
@@ -21,7 +46,8 @@ def ordered(name: str, function: Callable, items: Iterable, workers: int | None 
 
     While one worker is at work the others and the caller go on: the caller draws the items, so that
     what reads them runs here too. Few items and results are held at once. Torch computes in one
-    thread of each worker, so that results do not depend on their number.
+    thread of each worker, so that results do not depend on their number. If drawing an item fails,
+    the results of those before it are yielded first.
 
     Args:
         name: of the work, in a trace.
@@ -29,8 +55,7 @@ def ordered(name: str, function: Callable, items: Iterable, workers: int | None 
         items: drawn as workers get free.
         workers: how many; default: `cores()`.
     """
-    threads = torch.get_num_threads()
-    workers = workers or threads
+    workers = workers or cores()
     pending = deque()
 
     def work(item: object) -> object:
@@ -46,15 +71,24 @@ def ordered(name: str, function: Callable, items: Iterable, workers: int | None 
                 return
             yield item
 
-    pool = ThreadPoolExecutor(workers)
-    torch.set_num_threads(1)
-    try:
-        for item in draw():
-            pending.append(pool.submit(work, item))
-            while pending and (pending[0].done() or len(pending) > BACKLOG * workers):
+    with _one_thread_each():
+        pool = ThreadPoolExecutor(workers)
+        try:
+            drawn, failure = draw(), None
+            while failure is None:
+                try:
+                    item = next(drawn)
+                except StopIteration:
+                    break
+                except Exception as error:
+                    failure = error
+                    break
+                pending.append(pool.submit(work, item))
+                while pending and (pending[0].done() or len(pending) > BACKLOG * workers):
+                    yield pending.popleft().result()
+            while pending:
                 yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-        torch.set_num_threads(threads)
+            if failure is not None:
+                raise failure
+        finally:
+            pool.shutdown(cancel_futures=True)

@@ -99,7 +99,7 @@ def get_descriptors(file: h5py.File, name: str) -> np.ndarray:
 
 
 def main(features: Path, output: Path, storage: str = "float16", overwrite: bool = False) -> Path:
-    """Write a feature file with descriptors kept in another way; all else is copied.
+    """Write a feature file with descriptors kept in another way; other data sets are copied.
 
     Args:
         features: feature file.
@@ -129,9 +129,9 @@ def main(features: Path, output: Path, storage: str = "float16", overwrite: bool
                 }
                 arrays = {key: dataset[()] for key, dataset in datasets.items()}
                 attrs = {key: dict(dataset.attrs) for key, dataset in datasets.items()}
-                arrays["descriptors"] = get_descriptors(file, name).T
-                stored, own = store(arrays, storage)
-                writer.add(name, stored, attrs | own)
+                stored, own = store({"descriptors": get_descriptors(file, name).T}, storage)
+                arrays.pop("descriptors", None)
+                writer.add(name, arrays | stored, attrs | own)
     logger.info("%d images, descriptors as %s: %s", len(names), storage, output)
     return output
 

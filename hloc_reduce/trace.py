@@ -14,7 +14,10 @@ _events: list[tuple] | None = None  # None while nothing is recorded
 
 @contextmanager
 def recording(path: Path | None) -> Iterator[None]:
-    """Record the spans of a block into a file of Chrome's trace format; with None do nothing."""
+    """Record the spans of a block, if any, into a file of Chrome's trace format.
+
+    With None do nothing.
+    """
     global _events
     if path is None:
         yield
@@ -24,13 +27,18 @@ def recording(path: Path | None) -> Iterator[None]:
         yield
     finally:
         events, _events = _events, None
-        spans = [
-            {"name": name, "ph": "X", "pid": 0, "tid": thread, "ts": start / 1e3, "dur": took / 1e3}
-            for name, thread, start, took in events
-        ]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({"traceEvents": spans}))
-        logger.info("The trace %s opens in https://ui.perfetto.dev.", path)
+        if events:  # else nothing ran, and an earlier trace stays
+            _write(events, path)
+
+
+def _write(events: list[tuple], path: Path) -> None:
+    spans = [
+        {"name": name, "ph": "X", "pid": 0, "tid": thread, "ts": start / 1e3, "dur": took / 1e3}
+        for name, thread, start, took in events
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"traceEvents": spans}))
+    logger.info("The trace %s opens in https://ui.perfetto.dev.", path)
 
 
 @contextmanager

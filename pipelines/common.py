@@ -100,9 +100,7 @@ def check_options(args: argparse.Namespace) -> None:
     retrieval = vars(args).get("retrieval", "vlad")
     if retrieval != "vlad" and not Path(retrieval).is_file():
         raise InputError(f"--retrieval {retrieval}: neither vlad nor a file that is there.")
-    for option, value in vars(args).items():
-        if option.startswith("num_") and value < 1:
-            raise InputError(f"--{option} {value}: at least 1.")
+    cli.check_positive(args, *(option for option in vars(args) if option.startswith("num_")))
 
 
 def retrieval_name(retrieval: str, num_loc: int) -> str:

@@ -119,3 +119,18 @@ def test_unreadable_images_are_named(tmp_path):
             io.read_image(tmp_path / "a.jpg")
     with pytest.raises(InputError, match="b.jpg"):
         io.read_image(tmp_path / "b.jpg")
+
+
+def test_a_gap_in_the_pieces_loses_none(tmp_path, monkeypatch):
+    monkeypatch.setattr(GroupWriter, "piece_bytes", 0)  # each group is a piece
+    path = tmp_path / "f.h5"
+    with pytest.raises(KeyboardInterrupt), GroupWriter(path, {}) as writer:
+        for name in "abc":
+            writer.add(name, {"a": np.arange(3)})
+        raise KeyboardInterrupt
+    (tmp_path / "f.h5.pieces/000000.h5").unlink()
+    with GroupWriter(path, {}) as writer:
+        assert writer.names == {"b", "c"}
+        for name in "de":
+            writer.add(name, {"a": np.arange(3)})
+    assert io.list_h5_names(path) == ["b", "c", "d", "e"]

@@ -55,11 +55,40 @@ def test_an_error_ends_it():
     assert len(done) < 30
 
 
+def test_what_was_drawn_before_drawing_fails_is_done(monkeypatch):
+    def items():
+        yield from range(8)
+        time.sleep(0.1)
+        raise ValueError("broken")
+
+    done = []
+    with pytest.raises(ValueError, match="broken"):
+        for result in parallel.ordered("work", lambda item: item, items(), 2):
+            done.append(result)
+    assert done == list(range(8))
+
+
+def test_overlapping_work_leaves_as_many_threads_as_before():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        first = parallel.ordered("one", lambda item: item, range(3), 1)
+        next(first)
+        second = parallel.ordered("two", lambda item: item, range(3), 1)
+        next(second)
+        assert parallel.cores() == 3 and torch.get_num_threads() == 1
+        first.close()
+        assert parallel.cores() == 3 and torch.get_num_threads() == 1
+        second.close()
+        assert parallel.cores() == torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_trace_shows_what_ran_where(tmp_path):
     with trace.recording(tmp_path / "new/trace.json"), trace.span("stage"):
         list(parallel.ordered("work", time.sleep, [0.01] * 3, 2))
-    with trace.span("later"):
-        pass
+    assert trace._events is None
     events = json.loads((tmp_path / "new/trace.json").read_text())["traceEvents"]
     assert sorted({event["name"] for event in events}) == ["read to work", "stage", "work"]
     (stage,) = [event for event in events if event["name"] == "stage"]
@@ -71,6 +100,11 @@ def test_trace_shows_what_ran_where(tmp_path):
 
 def test_nothing_is_recorded_unasked(tmp_path):
     with trace.recording(None), trace.span("stage"):
+        assert trace._events is None
+
+
+def test_a_run_that_was_refused_leaves_an_earlier_trace(tmp_path):
+    with trace.recording(tmp_path / "trace.json"):
         pass
     assert list(tmp_path.iterdir()) == []
 

@@ -75,7 +75,7 @@ def test_a_pair_that_is_listed_again_and_reversed_is_matched_once(built, tmp_pat
 
 def test_a_wrong_gpu_memory_is_refused(tmp_path, monkeypatch, caplog):
     command = ["--pairs", tmp_path / "p.txt", "--export_dir", tmp_path, "--gpu_bytes", "0"]
-    assert "positive" in refused(monkeypatch, caplog, match_features, *command)
+    assert "--gpu_bytes 0: at least 1" in refused(monkeypatch, caplog, match_features, *command)
 
 
 def test_matches_are_those_of_the_scene(built):

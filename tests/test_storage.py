@@ -82,6 +82,16 @@ def test_command_converts_to_hlocs_format(tmp_path, monkeypatch):
     assert np.abs(levels[0] - levels[1]).max() <= 1
 
 
+def test_conversion_copies_other_data_sets_as_they_are(tmp_path):
+    scores = np.array([1e5, 1.00001, 2], np.float32)
+    with GroupWriter(tmp_path / "a.h5", {}) as writer:
+        writer.add("a.jpg", {"descriptors": unit(3, 16, 0).T, "scores": scores})
+    storage.main(tmp_path / "a.h5", tmp_path / "b.h5", "uint8")
+    with h5py.File(tmp_path / "b.h5") as file:
+        assert sorted(file["a.jpg"]) == [storage.QUANTIZED, "scores"]
+        np.testing.assert_array_equal(file["a.jpg/scores"], scores)
+
+
 def test_quantized_match_like_floats(tmp_path):
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("a.jpg b.jpg\n")
