@@ -20,7 +20,7 @@ from .parsers import write_poses
 # Three points fit a pose always, and among hundreds of wrong matches a few more agree by chance.
 MIN_INLIERS = 8
 SEED = 0
-RECORDS = 2  # the version of what a record holds
+RECORDS = 3  # the version of what a record holds
 
 
 class Reference(Protocol):
@@ -143,10 +143,11 @@ def main(
     Returns:
         A record for each query: `localized` (from MIN_INLIERS inliers on), the pose that is
         written as `qvec` (w, x, y, z) and `tvec`, the fallback where it is not localized, None
-        where there is none; `camera`, the model, width, height and parameters in a list; and the
-        numbers and `db` of `localize`.
+        where there is none; `camera`, the model, width, height and parameters in a list;
+        `max_error`, the pixels within which inliers reproject, None for pycolmap's default; and
+        the numbers and `db` of `localize`.
     """
-    log = _Log(Path(f"{results}_logs.jsonl"), {"records": RECORDS, **made_from}, overwrite)
+    log = _Log(log_file(results), {"records": RECORDS, **made_from}, overwrite)
     todo = [query for query in queries if query[0] not in log.records]
     if todo:
         reference = load_reference()
@@ -157,9 +158,9 @@ def main(
             def solve(task: tuple) -> dict:
                 name, camera, keypoints, found = task
                 used = {n: m for n, m in found.items() if len(m) >= (skip_matches or 0)}
-                cam_from_world, info = localize(
-                    reference, keypoints, camera, used, config(name, camera)
-                )
+                options = config(name, camera)
+                cam_from_world, info = localize(reference, keypoints, camera, used, options)
+                info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
                 return _record(reference, list(found), cam_from_world, info)
 
             tasks = (
@@ -187,6 +188,30 @@ def pose(record: dict) -> pycolmap.Rigid3d | None:
         return None
     w, x, y, z = record["qvec"]
     return pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(record["tvec"]))
+
+
+def camera(record: dict) -> pycolmap.Camera:
+    """Return the intrinsics of a query's record, as they were refined."""
+    model, width, height, *params = record["camera"]
+    return pycolmap.Camera(model=model, width=width, height=height, params=params)
+
+
+def read_records(results: Path) -> dict[str, dict]:
+    """Read the records that `main` left beside a file of poses.
+
+    Raises:
+        InputError: when they are not there or broken.
+    """
+    path = log_file(results)
+    try:
+        return dict(json.loads(line) for line in path.read_text().splitlines()[1:])
+    except (OSError, ValueError, TypeError):
+        raise InputError(f"{path} is not there or broken: run the localization again.") from None
+
+
+def log_file(results: Path) -> Path:
+    """Return the file of the records of queries, beside that of poses."""
+    return Path(f"{results}_logs.jsonl")
 
 
 def _check_some_matched(
@@ -253,13 +278,14 @@ def _record(
         x, y, z, w = cam_from_world.rotation.quat
         qvec = [float(value) for value in (w, x, y, z)]
         tvec = [float(value) for value in cam_from_world.translation]
-    camera = info["camera"]
+    refined = info["camera"]
     numbers = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
     return {
         "localized": localized,
         "qvec": qvec,
         "tvec": tvec,
-        "camera": [camera.model.name, camera.width, camera.height, *camera.params.tolist()],
+        "camera": [refined.model.name, refined.width, refined.height, *refined.params.tolist()],
+        "max_error": info["max_error"],
         **{key: info[key] for key in numbers},
         "db": info["db"] if localized else next(iter(names), None),
     }

@@ -68,7 +68,7 @@ def main(
     wanted = [cutout for name, _ in queries for cutout in retrieved.get(name, [])]
     if not wanted:
         raise InputError(f"{retrieval} has no pair of a query and a cutout.")
-    points = features.with_name(f"{features.stem}-points3D.h5")
+    points = points_file(features)
     lift_keypoints(dataset_dir, features, sorted(set(wanted)), points, overwrite)
 
     def config(_: str, camera: pycolmap.Camera) -> dict:
@@ -95,6 +95,11 @@ def main(
             overwrite,
             skip_matches=skip_matches,
         )
+
+
+def points_file(features: Path) -> Path:
+    """Return the file of the points that the keypoints of a feature file show."""
+    return features.with_name(f"{features.stem}-points3D.h5")
 
 
 def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap.Camera]]:

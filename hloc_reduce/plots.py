@@ -1,8 +1,10 @@
 """Plots of results, by matplotlib, which the extra `report` installs."""
 
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from importlib.util import find_spec
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,8 +18,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    Panel = Callable[[Axes], None]  # draws into axes
+
 INSTALL = "pip install 'hloc-reduce[report]'"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#a6761d")
+LINES = (("-", "o"), ("--", "s"), (":", "^"))  # of lists, with their markers
 NOISE_COLOURS = {"easy": "#009e73", "hard": "#e69f00", "tough": "#d55e00"}
 STYLE = {
     "axes.grid": True,
@@ -38,14 +43,21 @@ def available(what: str | Path) -> bool:
     return True
 
 
-def _subplots(rows: int, columns: int, width: float, height: float) -> "tuple[Figure, np.ndarray]":
-    """Make a figure of panels (rows, columns), of so many inches each."""
+def figure(
+    panels: "list[Panel]", columns: int = 1, width: float = 3.8, height: float = 2.7
+) -> "Figure":
+    """Draw panels into a figure, row by row, of so many inches each."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
-        figure = Figure((columns * width, rows * height), layout="constrained")
-        return figure, figure.subplots(rows, columns, squeeze=False)
+        rows = -(-len(panels) // columns)
+        drawn = Figure((columns * width, rows * height), layout="constrained")
+        for axis, panel in zip(
+            drawn.subplots(rows, columns, squeeze=False).flat, panels, strict=True
+        ):
+            panel(axis)
+        return drawn
 
 
 def svg(figure: "Figure") -> str:
@@ -68,68 +80,84 @@ def save(figure: "Figure", path: Path) -> None:
         figure.savefig(temporary, format=path.suffix[1:], metadata=metadata, dpi=120)
 
 
-def error_curves(curves: Mapping[str, Mapping[str, list[tuple[float, float]]]]) -> "Figure":
-    """Plot cumulative errors of poses.
+def error_curves(curves: Mapping[str, Mapping[str, list[tuple[float, float]]]]) -> "list[Panel]":
+    """Plot cumulative errors of poses, of position and of rotation for each list.
 
     Args:
         curves: from list of queries and run to the errors, metres and degrees, of its queries.
     """
-    figure, axes = _subplots(2, len(curves), 3.6, 2.5)
-    for column, (name, runs) in enumerate(curves.items()):
-        for row, unit in enumerate(("position error [m]", "rotation error [°]")):
-            axis = axes[row, column]
-            for colour, (run, errors) in zip(_colours(), runs.items(), strict=False):
-                values, percent = cumulative(error[row] for error in errors)
-                axis.step(values, percent, where="post", color=colour, label=run, linewidth=1.4)
-            axis.set(xscale="log", xlabel=unit, ylim=(0, 102))
-            if column == 0:
-                axis.set_ylabel("queries within [%]")
-        axes[0, column].set_title(name)
-    axes[0, 0].legend(fontsize=8, loc="best", frameon=False)
-    return figure
+    units = ("position error [m]", "rotation error [°]")
+    return [
+        partial(_curves, name=name, runs=runs, place=place, unit=unit)
+        for name, runs in curves.items()
+        for place, unit in enumerate(units)
+    ]
 
 
-def size_and_time(points: Mapping[str, Mapping[str, list[dict]]]) -> "Figure":
-    """Plot accuracy against the size of descriptors and against time.
+def _curves(axis: "Axes", name: str, runs: Mapping, place: int, unit: str) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for colour, (run, errors) in zip(cycle(COLOURS), runs.items(), strict=False):
+        values, percent = cumulative(error[place] for error in errors)
+        axis.step(values, percent, where="post", color=colour, label=run, linewidth=1.4)
+    axis.set(xscale="log", xlabel=unit, ylabel="queries within [%]", ylim=(0, 102), title=name)
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+    axis.legend(fontsize=8, loc="best", frameon=False)
+
+
+def size_and_time(points: Mapping[str, Mapping[str, list[dict]]]) -> "list[Panel]":
+    """Plot accuracy against the size of descriptors and against time, for each measure.
 
     Args:
-        points: from measure of accuracy and list of queries to a dict for each run: `label`,
-            `bytes` of a descriptor, `seconds`, `value`.
+        points: from measure of accuracy and list of queries to a dict for each run: `family`, of
+            which the runs are joined by a line, `bytes` of a descriptor, `seconds`, `value`.
     """
-    figure, axes = _subplots(len(points), 2, 3.6, 2.5)
-    for row, (measure, lists) in zip(axes, points.items(), strict=True):
-        for axis, key, label in zip(
-            row, ("bytes", "seconds"), ("bytes a descriptor", "seconds, whole run"), strict=True
-        ):
-            for colour, (name, runs) in zip(_colours(), lists.items(), strict=False):
-                runs = sorted(runs, key=lambda run: run[key])
-                x, y = [run[key] for run in runs], [run["value"] for run in runs]
-                line = "-" if key == "bytes" else ""
-                axis.plot(x, y, marker="o", markersize=4, linestyle=line, color=colour, label=name)
-                for run in runs:
-                    axis.annotate(
-                        run["label"],
-                        (run[key], run["value"]),
-                        xytext=(0, 5),
-                        textcoords="offset points",
-                        ha="center",
-                        fontsize=6.5,
-                        color=colour,
-                    )
-            if key == "bytes":
-                _powers_of_two(axis, [run[key] for runs in lists.values() for run in runs])
-            axis.margins(0.12, 0.18)
-            axis.set(xlabel=label, ylabel=measure if key == "bytes" else None)
-    axes[0, 0].legend(fontsize=8, frameon=False)
-    return figure
+    labels = {"bytes": "bytes a descriptor", "seconds": "seconds, whole run"}
+    return [
+        partial(_against, measure=measure, lists=lists, key=key, label=label)
+        for measure, lists in points.items()
+        for key, label in labels.items()
+    ]
 
 
-def _powers_of_two(axis: "Axes", values: Iterable[float]) -> None:
-    """Scale an axis by powers of two, with a tick at each value."""
-    ticks = sorted(set(values))
-    axis.set_xscale("log", base=2)
-    axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks], minor=False)
-    axis.minorticks_off()
+def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -> None:
+    families = dict.fromkeys(run["family"] for runs in lists.values() for run in runs)
+    for colour, family in zip(cycle(COLOURS), families, strict=False):
+        for (line, marker), (name, runs) in zip(cycle(LINES), lists.items(), strict=False):
+            own = sorted((r for r in runs if r["family"] == family), key=lambda run: run["bytes"])
+            axis.plot(
+                [run[key] for run in own],
+                [run["value"] for run in own],
+                marker=marker,
+                markersize=5,
+                linestyle=line,
+                linewidth=1.2,
+                color=colour,
+                label=f"{family}, {name}",
+            )
+            for run in own if key == "seconds" else ():
+                axis.annotate(
+                    f"{run['bytes']} B",
+                    (run[key], run["value"]),
+                    xytext=(0, 5),
+                    textcoords="offset points",
+                    ha="center",
+                    fontsize=7,
+                    color=colour,
+                )
+    values = [run["value"] for runs in lists.values() for run in runs]
+    axis.set(xlabel=label, ylabel=measure)
+    axis.margins(0.12, 0.2)
+    if measure.endswith("[%]"):
+        axis.set_ylim(min(values) - 5 - 0.1 * (100 - min(values)), 102)
+    if key == "bytes":
+        ticks = sorted({run["bytes"] for runs in lists.values() for run in runs})
+        axis.set_xscale("log", base=2)
+        axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.minorticks_off()
+        axis.legend(fontsize=7, frameon=False)
 
 
 def hpatches_bars(rows: list[dict]) -> "Figure":
@@ -139,44 +167,24 @@ def hpatches_bars(rows: list[dict]) -> "Figure":
         rows: as of `evaluation.hpatches.main`.
     """
     tasks = [key.removesuffix("_easy") for key in rows[0] if key.endswith("_easy")]
-    figure, axes = _subplots(1, len(tasks), 3.2, 0.7 + 0.28 * len(rows))
-    names = [row["feature"] for row in rows]
+    panels = [partial(_bars, rows=rows, task=task) for task in tasks]
+    return figure(panels, len(panels), 4.2, 1 + 0.28 * len(rows))
+
+
+def _bars(axis: "Axes", rows: list[dict], task: str) -> None:
     places = np.arange(len(rows))[::-1]
-    for axis, task in zip(axes[0], tasks, strict=True):
-        values = [row[task] for row in rows]
-        axis.barh(places, values, color="#d7dde4", height=0.7)
-        for place, value in zip(places, values, strict=True):
-            axis.annotate(
-                f"{value:.2f}", (0, place), (3, 0), textcoords="offset points", va="center"
-            )
-        for noise, colour in NOISE_COLOURS.items():
-            axis.plot(
-                [row[f"{task}_{noise}"] for row in rows],
-                places,
-                linestyle="",
-                marker="o",
-                markersize=4,
-                color=colour,
-                label=noise,
-            )
-        paper = [row[f"{task}_paper"] for row in rows]
-        known = [(p, place) for p, place in zip(paper, places, strict=True) if p is not None]
-        if known:
-            axis.plot(
-                *zip(*known, strict=True),
-                linestyle="",
-                marker="|",
-                markersize=11,
-                color="black",
-                label="mean in the paper",
-            )
-        axis.set(title=f"{task} mAP [%]", xlim=(0, 100))
-        axis.set_yticks(places, names if axis is axes[0, 0] else [])
-        axis.grid(axis="y", visible=False)
-    axes[0, -1].legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
-    return figure
-
-
-def _colours() -> Iterable[str]:
-    while True:
-        yield from COLOURS
+    axis.barh(places, [row[task] for row in rows], color="#d7dde4", height=0.7)
+    for place, row in zip(places, rows, strict=True):
+        axis.annotate(
+            f"{row[task]:.2f}", (0, place), (3, 0), textcoords="offset points", va="center"
+        )
+    for noise, colour in NOISE_COLOURS.items():
+        values = [row[f"{task}_{noise}"] for row in rows]
+        axis.plot(values, places, "o", markersize=4, color=colour, label=noise)
+    paper = [np.nan if row[f"{task}_paper"] is None else row[f"{task}_paper"] for row in rows]
+    if not np.isnan(paper).all():
+        axis.plot(paper, places, "|", markersize=11, color="black", label="mean in the paper")
+    axis.set(title=f"{task} mAP [%]", xlim=(0, 100))
+    axis.set_yticks(places, [row["feature"] for row in rows])
+    axis.grid(axis="y", visible=False)
+    axis.legend(fontsize=7, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.12), frameon=False)

@@ -46,7 +46,8 @@ def main(
     lists = {name: [query for query, _ in part] for name, part in place.query_lists().items()}
     query_names = [name for part in lists.values() for name in part]
     place.check_images([*map_names, *query_names])
-    truth = true_poses(query_names, ground_truth or place.ground_truth, bool(ground_truth))
+    truth_file = ground_truth or place.ground_truth
+    truth = true_poses(query_names, truth_file, bool(ground_truth))
     retrieved = common.retrieval_name(retrieval, num_loc)
     loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
     common.check_retrieval(retrieval, loc_pairs, num_loc, query_names, map_names)
@@ -87,7 +88,16 @@ def main(
         "map_points3D": reconstruction.num_points3D(),
     }
     limits = {name: thresholds(name) for name in lists}
-    return common.finish(folder, summary, lists, records, truth, limits, features, poses)
+    files = {
+        "query_images": place.images,
+        "map_images": place.images,
+        "map_features": features,
+        "map": sfm,
+        "pairs": loc_pairs,
+        "matches": loc_matches,
+        "ground_truth": truth_file if truth else None,
+    }
+    return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
 
 
 def _main() -> None:

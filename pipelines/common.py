@@ -193,6 +193,7 @@ def finish(
     thresholds: Mapping[str, tuple[tuple[float, float], ...]],
     features: Path,
     poses: Path,
+    files: Mapping[str, Path | None],
 ) -> dict:
     """Write queries.csv and summary.json.
 
@@ -205,6 +206,9 @@ def finish(
         thresholds: of each list, metres and degrees.
         features: the feature file.
         poses: the file of poses.
+        files: what else the run read and wrote, for whoever shows it: `query_images` and
+            `map_images`, folders; `pairs` and `matches` of the queries; `map_features`; `map`, a
+            COLMAP model or the h5 file of `localize_inloc.lift_keypoints`; and `ground_truth`.
 
     Returns:
         The summary.
@@ -226,9 +230,19 @@ def finish(
         "bytes": folder.bytes(),
         "versions": versions(),
         "poses": poses.name,
+        "files": {
+            key: None if path is None else _placed(path, folder.path)
+            for key, path in {"features": features, **files}.items()
+        },
     }
     results.write_summary(summary, folder.path / "summary.json")
     return summary
+
+
+def _placed(path: Path, outputs: Path) -> str:
+    """Return the place of a file: in the outputs folder, which may be moved, or on the machine."""
+    path, outputs = path.resolve(), outputs.resolve()
+    return str(path.relative_to(outputs) if path.is_relative_to(outputs) else path)
 
 
 def print_result(summary: dict, outputs: Path, unknown: str) -> None:

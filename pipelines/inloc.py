@@ -45,7 +45,8 @@ def main(
     used = common.check_retrieval(retrieval, loc_pairs, num_loc, query_names, map_names)
     extract_features.list_images(dataset, [*used, *query_names])
     place.check_scans(used)
-    truth = true_poses(query_names, ground_truth or place.ground_truth, bool(ground_truth))
+    truth_file = ground_truth or place.ground_truth
+    truth = true_poses(query_names, truth_file, bool(ground_truth))
     lists = place.buildings(query_names, truth, used)
 
     numbers = {"num_loc": num_loc}
@@ -82,7 +83,16 @@ def main(
         "map_images": len(used),
     }
     limits = dict.fromkeys(lists, INLOC_THRESHOLDS)
-    return common.finish(folder, summary, lists, records, truth, limits, features, poses)
+    files = {
+        "query_images": dataset,
+        "map_images": dataset,
+        "map_features": features,
+        "map": localize_inloc.points_file(features),
+        "pairs": loc_pairs,
+        "matches": matches,
+        "ground_truth": truth_file if truth else None,
+    }
+    return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
 
 
 def _main() -> None:

@@ -201,7 +201,16 @@ def main(
         "intrinsics": Counter(sources.values()),
     }
     limits = dict.fromkeys(lists, DAY_THRESHOLDS)
-    return common.finish(folder, summary, lists, records, truth, limits, features, poses)
+    files = {
+        "query_images": query_images,
+        "map_images": built.images,
+        "map_features": built.features,
+        "map": built.sfm,
+        "pairs": loc_pairs,
+        "matches": matches,
+        "ground_truth": ground_truth,
+    }
+    return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
 
 
 def _main() -> None:

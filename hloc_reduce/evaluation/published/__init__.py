@@ -4,6 +4,13 @@ import csv
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
+# how lists of queries and the columns of the table begin
+PREFIXES = {
+    "day": "aachen_day_",
+    "night": "aachen_night_",
+    "DUC1": "inloc_duc1_",
+    "DUC2": "inloc_duc2_",
+}
 
 
 def feature_name(descriptor: str, scheme: str, dim: str) -> str:
@@ -31,3 +38,16 @@ def hpatches() -> dict[str, dict[str, float]]:
 def localization() -> dict[str, dict[str, float]]:
     """Return the recall [%] of each feature, a column for each list of queries and threshold."""
     return _read("localization_recall.csv")
+
+
+def recall(feature: str, query_list: str) -> list[float] | None:
+    """Return the recall [%] at three thresholds of a feature on a list of Aachen or InLoc.
+
+    Args:
+        feature: a name.
+        query_list: a list's name, such as day_time_queries_with_intrinsics or DUC1.
+    """
+    prefix = next((PREFIXES[key] for key in PREFIXES if query_list.startswith(key)), None)
+    row = localization().get(feature, {})
+    values = [value for column, value in row.items() if prefix and column.startswith(prefix)]
+    return values or None

@@ -1,0 +1,134 @@
+"""One page about one run or several side by side, without any other file or network."""
+
+import base64
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+from tqdm import tqdm
+
+from .. import __version__, cli, logger, plots
+from ..cli import InputError
+from ..io import replacing
+from . import pictures, runs, scene
+from .runs import ERRORS, Run
+
+FOLDER = Path(__file__).parent
+NUM_QUERIES = 6
+
+
+def main(
+    folders: list[Path],
+    output: Path,
+    queries: list[str] | None = None,
+    num_queries: int = NUM_QUERIES,
+) -> Path:
+    """Write the report of runs.
+
+    Args:
+        folders: outputs folders of pipelines.
+        output: the HTML file.
+        queries: those whose matches are shown; default: `num_queries`, evenly from the worst to
+            the best.
+        num_queries: as above.
+
+    Returns:
+        `output`.
+
+    Raises:
+        InputError: for a folder that is no finished run's, an unknown query, or when what draws
+            is not installed.
+    """
+    for package in ("jinja2", "matplotlib"):
+        if find_spec(package) is None:
+            raise InputError(f"A report needs {package}: {plots.INSTALL}.")
+    compared = runs.load(folders)
+    ranked = runs.ranked(compared)
+    chosen = [cli.choose("query", name, ranked) for name in queries or ()]
+    chosen = chosen or runs.spread(ranked, num_queries)
+    content = {
+        "runs": compared,
+        "lists": runs.lists(compared),
+        "recall": {run.label: runs.recall_rows(run) for run in compared},
+        "charts": _charts(compared),
+        "rows": [(run.label, row) for run in compared for row in run.rows.values()],
+        "errors": any(row[ERRORS[0]] is not None for run in compared for row in run.rows.values()),
+        "shown": _shown(compared, chosen),
+        "scenes": {run.label: scene.scene(run) for run in tqdm(compared, desc="Reading maps")},
+        "version": __version__,
+    }
+    with replacing(output) as temporary:
+        temporary.write_text(_page(content), encoding="utf-8")
+    logger.info("The report is %s.", output)
+    return output
+
+
+def _charts(compared: list[Run]) -> dict[str, list[str]]:
+    """Return SVG elements: of accuracy, and of errors where they are known."""
+    curves, recall, inliers = {}, {}, {}
+    for name in runs.lists(compared):
+        errors = {run.label: found for run in compared if (found := run.errors(name))}
+        short = runs.short(name)
+        if errors:
+            curves[short] = errors
+        for run in compared:
+            summary = run.summary["lists"].get(name)
+            if summary is None:
+                continue
+            point = {"family": run.family, "bytes": run.bytes, "seconds": run.seconds}
+            if "recall_percent" in summary:
+                value = summary["recall_percent"][0]
+                recall.setdefault(short, []).append({**point, "value": value})
+            inliers.setdefault(short, []).append({**point, "value": summary["mean_inliers"]})
+    measures = {"recall, finest threshold [%]": recall, "mean inliers": inliers}
+    known = {measure: lists for measure, lists in measures.items() if lists}
+    panels = {"accuracy": plots.size_and_time(known), "errors": plots.error_curves(curves)}
+    return {key: [plots.svg(plots.figure([one])) for one in drawn] for key, drawn in panels.items()}
+
+
+def _shown(compared: list[Run], chosen: list[str]) -> list[dict]:
+    """Return of each chosen query the pictures of the runs."""
+    shown = []
+    for name in tqdm(chosen, desc="Drawing matches", unit="query"):
+        drawn = []
+        for run in compared:
+            if name not in run.rows:
+                continue
+            found = pictures.matched(run, name)
+            picture = found and pictures.jpeg(pictures.draw(run, name, found))
+            drawn.append(
+                {
+                    "label": run.label,
+                    "row": run.rows[name],
+                    "name": found and found["name"],
+                    "matches": len(found["inliers"]) if found else 0,
+                    "inliers": int(found["inliers"].sum()) if found else 0,
+                    "jpeg": found and base64.b64encode(picture).decode(),
+                }
+            )
+        shown.append({"query": name, "drawn": drawn})
+    return shown
+
+
+def _page(content: dict) -> str:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(FOLDER),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"figure": _figure, "short": runs.short}
+    # within a script element nothing may end it
+    scenes = json.dumps(content["scenes"]).replace("<", "\\u003c")
+    return environment.get_template("page.html").render(
+        **{**content, "scenes": scenes},
+        style=(FOLDER / "page.css").read_text(encoding="utf-8"),
+        script=(FOLDER / "page.js").read_text(encoding="utf-8"),
+    )
+
+
+def _figure(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}" if abs(value) != float("inf") else "none"

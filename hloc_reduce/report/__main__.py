@@ -1,0 +1,33 @@
+"""Write a page about one run of a pipeline, or several side by side, to open in a browser."""
+
+import argparse
+from pathlib import Path
+
+from .. import cli
+from . import NUM_QUERIES, main
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.report outputs/herz-jesus/sift* -o report.html",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("folders", type=Path, nargs="+", metavar="OUTPUTS", help="of pipelines")
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("report.html"), help="the HTML file"
+    )
+    parser.add_argument("--queries", nargs="+", help="whose matches are shown")
+    parser.add_argument(
+        "--num_queries",
+        type=int,
+        default=NUM_QUERIES,
+        help="without --queries: so many, evenly from the worst to the best",
+    )
+    args = parser.parse_args()
+    cli.check_positive(args, "num_queries")
+    main(**vars(args))
+
+
+if __name__ == "__main__":
+    cli.run(_main)

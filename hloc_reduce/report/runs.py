@@ -1,0 +1,185 @@
+"""What a report reads of a run: its summary, its queries and the files that it left."""
+
+import csv
+import json
+import re
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from .. import colmap, localization, localize_inloc, scans
+from ..cli import InputError
+from ..evaluation import published
+from ..evaluation.poses import FAILED
+from ..io import list_h5_names, open_h5
+from ..localize_sfm import SfmMap
+from ..parsers import parse_poses
+
+NUMBERS = ("num_matches", "num_correspondences", "num_inliers")
+ERRORS = ("position_error_m", "rotation_error_deg")
+
+
+@dataclass
+class Run:
+    """The outputs folder of a pipeline.
+
+    Args:
+        folder: that has summary.json.
+
+    Attributes:
+        label: how the run is called in a report; its feature, unless another run has the same.
+        summary: of summary.json.
+        rows: of queries.csv by query, with numbers as numbers and None for an unknown error.
+
+    Raises:
+        InputError: when the folder is none of a finished run, or of an older version.
+    """
+
+    folder: Path
+    label: str = ""
+    summary: dict = field(init=False)
+    rows: dict[str, dict] = field(init=False)
+
+    def __post_init__(self) -> None:
+        try:
+            self.summary = dict(json.loads((self.folder / "summary.json").read_text()))
+            self.files = {key: value and self.folder / value for key, value in self._listed()}
+            self.poses = self.folder / self.summary["poses"]
+            self.rows = self._read_rows()
+            self.label = str(self.summary["feature"])
+            self.bytes = int(self.summary["bytes_per_keypoint"]["descriptor"])
+            self.seconds = float(sum(self.summary["seconds"].values()))
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            why = f"{error}" if isinstance(error, OSError) else f"summary.json lacks {error}"
+            raise InputError(
+                f"{self.folder} is not the outputs folder of a finished run of this version "
+                f"({why}): run its pipeline again, which computes only what is missing."
+            ) from None
+
+    def _listed(self) -> list[tuple[str, str | None]]:
+        return list(self.summary["files"].items())
+
+    def _read_rows(self) -> dict[str, dict]:
+        with (self.folder / "queries.csv").open(newline="", encoding="utf-8") as file:
+            rows = {row["query"]: row for row in csv.DictReader(file)}
+        for row in rows.values():
+            row |= {key: int(row[key]) for key in NUMBERS}
+            row |= {key: float(row[key]) if row[key] else None for key in ERRORS}
+        return rows
+
+    @property
+    def place(self) -> Path:
+        """The data set, or the map that was localized in."""
+        return Path(self.summary.get("dataset") or self.summary["map"])
+
+    @property
+    def family(self) -> str:
+        """What features of several sizes have in common: `sift_sv` of sift_sv64."""
+        return self.summary["feature"].rstrip("0123456789")
+
+    def errors(self, name: str) -> list[tuple[float, float]]:
+        """Return the errors of the queries of a list with known truth; of failures infinite."""
+        rows = [row for row in self.rows.values() if row["list"] == name]
+        return [
+            (row[ERRORS[0]], row[ERRORS[1]]) if row["status"] == "localized" else FAILED
+            for row in rows
+            if row[ERRORS[0]] is not None
+        ]
+
+    @cached_property
+    def records(self) -> dict[str, dict]:
+        """The records of the queries, as of `localization.main`."""
+        return localization.read_records(self.poses)
+
+    @cached_property
+    def reconstruction(self) -> pycolmap.Reconstruction | None:
+        """The COLMAP model of the map; None where scans are the map."""
+        return colmap.read_model(self.files["map"]) if self.files["map"].is_dir() else None
+
+    @cached_property
+    def reference(self) -> localization.Reference:
+        """The map, which knows what point each keypoint of its images shows."""
+        if self.reconstruction is not None:
+            return SfmMap(self.reconstruction)
+        file = self.files["map"]
+        names = list_h5_names(file)
+        poses = {name: scans.read_pose(self.files["map_images"], name) for name in names}
+        return localize_inloc.ScanMap(self._open(file), poses)
+
+    def _open(self, file: Path):
+        """Open a file for as long as the report is made."""
+        opened = open_h5(file)
+        self._opened = opened
+        return opened.__enter__()
+
+    @cached_property
+    def truth(self) -> dict[str, pycolmap.Rigid3d]:
+        """The true poses of queries, camera from world, as far as they are known."""
+        path = self.files["ground_truth"]
+        if path is None:
+            return {}
+        return {name: pose for name, pose in parse_poses(path).items() if name in self.rows}
+
+
+def load(folders: list[Path]) -> list[Run]:
+    """Load runs, each with a label of its own.
+
+    Raises:
+        InputError: for a folder that is no run's.
+    """
+    runs = [Run(folder) for folder in folders]
+    labels = [run.label for run in runs]
+    for run in runs:
+        if labels.count(run.label) > 1:
+            run.label = f"{run.label} ({run.folder.resolve().name})"
+    return runs
+
+
+def short(query_list: str) -> str:
+    """Return the name of a list without what all lists of queries have: `day`, for example."""
+    return re.sub(r"(_time)?(_queries)?(_with_intrinsics)$", "", query_list) or query_list
+
+
+def lists(runs: list[Run]) -> list[str]:
+    """Return the lists of queries of all runs, in their order."""
+    return list(dict.fromkeys(name for run in runs for name in run.summary["lists"]))
+
+
+def ranked(runs: list[Run]) -> list[str]:
+    """Return the queries of all runs, the worst first.
+
+    Worse is what fewer runs localize, then the larger position error in any run or, where it is
+    not known, the fewer inliers.
+    """
+
+    def badness(name: str) -> tuple[int, float, float]:
+        rows = [run.rows[name] for run in runs if name in run.rows]
+        localized = sum(row["status"] == "localized" for row in rows)
+        known = [row[ERRORS[0]] for row in rows if row[ERRORS[0]] is not None]
+        return localized, -max(known, default=0.0), min(row["num_inliers"] for row in rows)
+
+    return sorted(dict.fromkeys(name for run in runs for name in run.rows), key=badness)
+
+
+def recall_rows(run: Run) -> list[dict]:
+    """Return of each list the recall of a run and, of the same feature, the paper's."""
+    rows = []
+    for name, summary in run.summary["lists"].items():
+        rows.append(
+            {
+                "list": name,
+                "summary": summary,
+                "recall": summary.get("recall_percent"),
+                "paper": published.recall(run.summary["feature"], name),
+            }
+        )
+    return rows
+
+
+def spread(names: list[str], number: int) -> list[str]:
+    """Choose so many of ranked names, evenly, with the first and the last."""
+    places = np.linspace(0, len(names) - 1, min(number, len(names))).round().astype(int)
+    return [names[i] for i in places]
