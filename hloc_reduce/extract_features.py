@@ -93,7 +93,9 @@ def extract_all(conf: dict, images: list[Path]) -> Iterator[dict[str, np.ndarray
     workers = min(parallel.cores(), len(images))
     if workers == 1 or not isinstance(base, DoG):
         for image in images:
-            yield extract(model, image, conf["preprocessing"], device)
+            with span("extract"):
+                features = extract(model, image, conf["preprocessing"], device)
+            yield features
         return
     with processes.pool(workers) as pool:
 

@@ -17,6 +17,8 @@ import numpy as np
 from . import trace
 from .cli import InputError
 
+QUOTED = 200  # characters of a configuration in a message
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -160,7 +162,9 @@ class GroupWriter:
         if before != self.conf:
             old, new = json.loads(before), json.loads(self.conf)
             keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-            changes = "; ".join(f"{key}: {old.get(key)} before, {new.get(key)} now" for key in keys)
+            changes = "; ".join(
+                f"{key}: {_quoted(old, key)} before, {_quoted(new, key)} now" for key in keys
+            )
             raise InputError(
                 f"{path} was made with another configuration ({changes}). "
                 "Choose another output or overwrite it."
@@ -201,6 +205,11 @@ class GroupWriter:
                     with open_h5(piece) as file:
                         _copy_missing(file, merged)
         self._drop_pieces()
+
+
+def _quoted(conf: dict, key: str) -> str:
+    text = str(conf.get(key, "not given"))
+    return text if len(text) <= QUOTED else f"{text[:QUOTED]}..."
 
 
 def _copy_missing(source: h5py.Group, target: h5py.Group) -> None:

@@ -58,18 +58,23 @@ def main(
     Raises:
         InputError: for an image without features, or no path for the matches.
     """
+    if gpu_bytes < 1:
+        raise InputError(f"--gpu_bytes {gpu_bytes}: at least 1.")
     number = sum(1 for _ in parse_pairs(pairs))
     if not number:
         raise InputError(f"{pairs} has no pair.")
     if isinstance(features, Path) or Path(features).exists():
         feature_path = Path(features)
         if matches is None:
-            raise InputError("Give the path of the matches when the features are given as a path.")
+            raise InputError("Give the path of the matches, --matches, as the features have one.")
     elif export_dir is None:
         raise InputError(f"There is no feature file {features}, and no export_dir to look in.")
     else:
-        feature_path = Path(export_dir, f"{features}.h5")
-        matches = matches or Path(export_dir, f"{features}_{conf['output']}_{pairs.stem}.h5")
+        name = str(features).removesuffix(".h5")
+        feature_path = Path(export_dir, f"{name}.h5")
+        matches = matches or Path(export_dir, f"{name}_{conf['output']}_{pairs.stem}.h5")
+    if matches.resolve() in {path.resolve() for path in (feature_path, features_ref or pairs)}:
+        raise InputError(f"{matches} is what the matches are made of: choose other --matches.")
     with (
         open_h5(feature_path) as file0,
         open_h5(features_ref or feature_path) as file1,
@@ -195,11 +200,10 @@ def _main() -> None:
         "--gpu_bytes",
         type=int,
         default=GPU_BYTES,
-        help="of a GPU's memory for similarities of descriptors, which decides how many pairs are "
-        "matched at once there",
+        help="bytes of a GPU's memory that similarities of descriptors may take at once; without a "
+        "GPU it means nothing",
     )
     args = parser.parse_args()
-    cli.check_positive(args, "gpu_bytes")
     args.conf = confs[cli.choose("matcher", args.conf, confs)]
     main(**vars(args))
 

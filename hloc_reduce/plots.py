@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 INSTALL = "pip install 'hloc-reduce[report]'"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#a6761d")
+NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 LINES = (("-", "o"), ("--", "s"), (":", "^"))  # of lists, with their markers
 NOISE_COLOURS = {"easy": "#009e73", "hard": "#e69f00", "tough": "#d55e00"}
 STYLE = {
@@ -66,7 +67,7 @@ def svg(figure: "Figure") -> str:
 
     buffer = io.StringIO()
     with rc_context(STYLE):
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
+        figure.savefig(buffer, format="svg", metadata=NO_METADATA)
     text = buffer.getvalue()
     return text[text.index("<svg") :]
 
@@ -76,7 +77,7 @@ def save(figure: "Figure", path: Path) -> None:
     from matplotlib import rc_context
 
     with replacing(path) as temporary, rc_context(STYLE):
-        metadata = {"Date": None} if path.suffix == ".svg" else None
+        metadata = NO_METADATA if path.suffix == ".svg" else None
         figure.savefig(temporary, format=path.suffix[1:], metadata=metadata, dpi=120)
 
 
@@ -137,11 +138,11 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
                 color=colour,
                 label=f"{family}, {name}",
             )
-            for run in own if key == "seconds" else ():
+            for i, run in enumerate(own if key == "seconds" else ()):
                 axis.annotate(
                     f"{run['bytes']} B",
                     (run[key], run["value"]),
-                    xytext=(0, 5),
+                    xytext=(0, 5 if i % 2 else -12),
                     textcoords="offset points",
                     ha="center",
                     fontsize=7,
@@ -152,6 +153,7 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
     axis.margins(0.12, 0.2)
     if measure.endswith("[%]"):
         axis.set_ylim(min(values) - 5 - 0.1 * (100 - min(values)), 102)
+        axis.set_yticks([tick for tick in axis.get_yticks() if min(values) - 5 <= tick <= 100])
     if key == "bytes":
         ticks = sorted({run["bytes"] for runs in lists.values() for run in runs})
         axis.set_xscale("log", base=2)

@@ -37,6 +37,7 @@ STAGES = "stages.json"
 BOOKKEEPING = {"conf.json", STAGES, "summary.json", "queries.csv", "trace.json"}
 DELETING = {"is": "being deleted"}
 NAMED = 3  # differences that a message names
+SHORT = 40  # characters of values that it quotes
 
 
 class RunFolder:
@@ -116,16 +117,17 @@ class RunFolder:
                 yield
         finally:
             stages = stamps.read(self._stages_file)
-            before = stages.get(name, {"seconds": 0.0, "wrote": []})
-            spent = before["seconds"] + time.perf_counter() - start
             changed = {
                 written
                 for written, state in self._contents().items()
                 if contents.get(written) != state
             }
-            wrote = sorted(changed.union(before["wrote"]))
-            stages[name] = {"seconds": round(spent, 3), "wrote": wrote}
-            stamps.write(self._stages_file, stages)
+            if changed or name not in stages:  # a look at what is there does not count
+                before = stages.get(name, {"seconds": 0.0, "wrote": []})
+                spent = before["seconds"] + time.perf_counter() - start
+                wrote = sorted(changed.union(before["wrote"]))
+                stages[name] = {"seconds": round(spent, 3), "wrote": wrote}
+                stamps.write(self._stages_file, stages)
 
     def _contents(self) -> dict[str, tuple[int, int]]:
         """Return the size and the time of the last change of all that stages wrote, by name."""
@@ -143,7 +145,7 @@ class RunFolder:
 
 
 def _changes(before: dict, after: dict) -> dict[str, str]:
-    """Return the keys whose values differ, each with the entries that differ where it is long."""
+    """Return the keys whose values differ, each with the entries that differ where it has some."""
     changes = {}
     for key in {**before, **after}:
         old, new = before.get(key), after.get(key)
@@ -153,7 +155,13 @@ def _changes(before: dict, after: dict) -> dict[str, str]:
         if isinstance(old, dict) and isinstance(new, dict):
             names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
             more = ", ..." if len(names) > NAMED else ""
-            changes[key] = f" ({', '.join(names[:NAMED])}{more})"
+            said = [
+                f"{name} {old.get(name, 'not given')} before, {new.get(name, 'not given')} now"
+                if len(f"{old.get(name)}{new.get(name)}") < SHORT
+                else name
+                for name in names[:NAMED]
+            ]
+            changes[key] = f" ({', '.join(said)}{more})"
     return changes
 
 
@@ -223,8 +231,11 @@ def summarize_list(rows: list[dict], thresholds: tuple[tuple[float, float], ...]
     return summary
 
 
-def bytes_per_keypoint(features: Path) -> dict[str, float]:
-    """Measure the size of a feature file: bytes of one descriptor, and of all per keypoint."""
+def bytes_per_keypoint(features: Path) -> dict:
+    """Measure the size of a feature file: bytes of one descriptor, and of all per keypoint.
+
+    `storage` is the type of the numbers of a descriptor.
+    """
     names = list_h5_names(features)
     with open_h5(features) as file:
         descriptors = [stored_descriptors(file, name) for name in names]
@@ -232,6 +243,7 @@ def bytes_per_keypoint(features: Path) -> dict[str, float]:
         size = descriptors[0].shape[0] * descriptors[0].dtype.itemsize
     return {
         "descriptor": size,
+        "storage": descriptors[0].dtype.name,
         "feature_file": round(features.stat().st_size / total, 1) if total else 0.0,
         "keypoints": total,
     }

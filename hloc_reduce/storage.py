@@ -129,7 +129,11 @@ def main(features: Path, output: Path, storage: str = "float16", overwrite: bool
                 }
                 arrays = {key: dataset[()] for key, dataset in datasets.items()}
                 attrs = {key: dict(dataset.attrs) for key, dataset in datasets.items()}
-                stored, own = store({"descriptors": get_descriptors(file, name).T}, storage)
+                if storage == "uint8" and QUANTIZED in file[name]:
+                    file_attrs = dict(file[name][QUANTIZED].attrs)
+                    stored, own = {QUANTIZED: file[name][QUANTIZED][()]}, {QUANTIZED: file_attrs}
+                else:
+                    stored, own = store({"descriptors": get_descriptors(file, name).T}, storage)
                 arrays.pop("descriptors", None)
                 writer.add(name, arrays | stored, attrs | own)
     logger.info("%d images, descriptors as %s: %s", len(names), storage, output)

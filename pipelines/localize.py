@@ -247,6 +247,8 @@ def _main() -> None:
     parser.set_defaults(feature=None, matcher=None, storage=None)  # those of a map that was built
     args = parser.parse_args()
     common.check_options(args)
+    if args.storage is not None:
+        cli.choose("storage", args.storage, STORAGES)
     if args.outputs is None:
         raise InputError("Give --outputs, a folder.")
     if args.queries is not None and args.query_images is None:

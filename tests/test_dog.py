@@ -1,3 +1,6 @@
+from concurrent.futures import BrokenExecutor
+from contextlib import nullcontext
+
 import cv2
 import numpy as np
 import pytest
@@ -156,3 +159,18 @@ def test_extraction_in_original_pixels(tmp_path, textured):
     assert large["image_size"].tolist() == [640, 480] and large["uncertainty"] == 2
     np.testing.assert_allclose(large["keypoints"], small["keypoints"] * 2 + 0.5, atol=1e-3)
     np.testing.assert_allclose(large["scales"], small["scales"] * 2, rtol=1e-5)
+
+
+def test_a_killed_detector_is_said(tmp_path, textured, monkeypatch):
+    """What the kernel does where memory is short."""
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), textured)
+
+    class Broken:
+        def submit(self, *_):
+            raise BrokenExecutor
+
+    monkeypatch.setattr(extract_features.processes, "pool", lambda _: nullcontext(Broken()))
+    monkeypatch.setattr(extract_features.parallel, "cores", lambda: 2)
+    with pytest.raises(InputError, match="want of memory"):
+        extract_features.main(extract_features.confs["sift"], tmp_path, tmp_path / "o")

@@ -73,6 +73,19 @@ def test_a_pair_that_is_listed_again_and_reversed_is_matched_once(built, tmp_pat
     assert len(list_h5_names(matches)) == 2
 
 
+def test_matches_do_not_overwrite_features(built, tmp_path, monkeypatch, caplog):
+    before = built.features.read_bytes()
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("db/0.jpg db/1.jpg\n")
+    name = built.features.stem
+    command = ["--pairs", pairs, "--export_dir", built.features.parent, "--features", name]
+    command += ["--matches", built.features, "--overwrite"]
+    assert "is what the matches are made of" in refused(
+        monkeypatch, caplog, match_features, *command
+    )
+    assert built.features.read_bytes() == before
+
+
 def test_a_wrong_gpu_memory_is_refused(tmp_path, monkeypatch, caplog):
     command = ["--pairs", tmp_path / "p.txt", "--export_dir", tmp_path, "--gpu_bytes", "0"]
     assert "--gpu_bytes 0: at least 1" in refused(monkeypatch, caplog, match_features, *command)

@@ -76,6 +76,11 @@ def test_command_converts_to_hlocs_format(tmp_path, monkeypatch):
                 atol=1e-3,
             )
     run(monkeypatch, storage, "--features", quantized, "--output", output)  # all is there
+    same = storage.main(quantized, tmp_path / "same.h5", "uint8")
+    with h5py.File(quantized) as before, h5py.File(same) as after:
+        levels = [file["b.jpg"][storage.QUANTIZED] for file in (before, after)]
+        assert (levels[0][()] == levels[1][()]).all()
+        assert dict(levels[0].attrs) == dict(levels[1].attrs)
     back = storage.main(output, tmp_path / "back.h5", "uint8")
     with h5py.File(quantized) as before, h5py.File(back) as after:
         levels = [file["b.jpg"][storage.QUANTIZED][()].astype(int) for file in (before, after)]

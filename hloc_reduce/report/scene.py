@@ -40,9 +40,10 @@ def scene(run: Run) -> dict:
         [_axes(pose) for pose in poses]
         + [query["truth"] or query["pose"] for query in queries if query["truth"] or query["pose"]]
     ).reshape(-1, 12)
-    near = np.concatenate([points, shown[:, :3]])
-    centre = np.median(near, axis=0) if len(near) else np.zeros(3)
-    radius = np.quantile(np.linalg.norm(near - centre, axis=1), 0.9) if len(near) else 1.0
+    # points and cameras alike, without what is far from all others
+    groups = [part for part in (points, shown[:, :3]) if len(part)]
+    centre = np.mean([np.median(part, axis=0) for part in groups], axis=0)
+    radius = max(np.quantile(np.linalg.norm(part - centre, axis=1), 0.9) for part in groups)
     up = -shown[:, 6:9].mean(axis=0) if len(shown) else np.array([0.0, -1, 0])
     return {
         "points": _packed(points, np.float32),

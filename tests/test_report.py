@@ -1,0 +1,222 @@
+"""The report, read as text and opened in a real browser."""
+
+import json
+import re
+import shutil
+
+import command
+import pytest
+
+from hloc_reduce import cli
+from hloc_reduce.report import __main__ as report
+from hloc_reduce.report import runs
+from pipelines import aachen, inloc, localize
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@pytest.fixture(autouse=True)
+def propagated(monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
+
+
+@pytest.fixture
+def compared(aachen_layout, tmp_path, monkeypatch):
+    """Two runs in the plane: of three queries, one is grey and cannot be localized."""
+    folders = []
+    for feature in ("colmap_sift", "colmap_sift_sv32"):
+        folders.append(tmp_path / feature)
+        given = ("--dataset", aachen_layout, "--outputs", folders[-1], "--feature", feature)
+        command.run(monkeypatch, aachen, *given)
+    return folders
+
+
+def text_of(page):
+    """The text of each cell of a page's tables, row by row."""
+    rows = re.findall(r"<tr[^>]*>(.*?)</tr>", page, re.S)
+    cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row, re.S) for row in rows]
+    return [[re.sub(r"<[^>]*>", "", cell).strip() for cell in row] for row in cells]
+
+
+def test_numbers_are_those_of_the_runs(compared, tmp_path, monkeypatch):
+    output = tmp_path / "report.html"
+    command.run(monkeypatch, report, *compared, "-o", output)
+    page = output.read_text()
+    rows = text_of(page)
+    for folder in compared:
+        summary, queries = command.outcome(folder)
+        size = summary["bytes_per_keypoint"]["descriptor"]
+        (row,) = [row for row in rows if row[:1] == [folder.name] and row[1] == "dataset"]
+        assert row[2:4] == ["2 of 3", str(size)]
+        recall = [row for row in rows if row[:1] == [folder.name] and len(row) == 7]
+        for row, result in zip(recall, summary["lists"].values(), strict=True):
+            assert row[1:4] == [f"{value:.1f}" for value in result["recall_percent"]]
+            assert row[5:] == [
+                f"{result['localized']} of {result['queries']}",
+                f"{result['mean_inliers']:.1f}",
+            ]
+            assert row[4].startswith(f"{result['median_position_error_m']:.3f} m")
+        for name, query in queries.items():
+            (row,) = [row for row in rows if row[:2] == [name, folder.name]]
+            assert row[2:5] == [query[k] for k in ("status", "num_inliers", "num_correspondences")]
+            assert float(row[5]) == pytest.approx(float(query["position_error_m"]), abs=1e-4)
+    assert page.count("data:image/jpeg;base64,") == 2 * 3
+    assert "http:" not in page.replace("http://www.w3.org", "") and "https:" not in page
+    command.run(monkeypatch, report, *compared, "-o", tmp_path / "again.html")
+    assert (tmp_path / "again.html").read_text() == page
+
+
+def test_inliers_of_pictures(compared):
+    """What one map image sees of a query agrees with what PnP found."""
+    from hloc_reduce.report import pictures
+
+    run = runs.Run(compared[0])
+    found = pictures.matched(run, "query/day/a.png")
+    assert 0.7 < found["inliers"].mean() <= 1
+    assert found["inliers"].sum() <= run.rows["query/day/a.png"]["num_inliers"]
+    picture = pictures.draw(run, "query/day/a.png", found)
+    assert tuple(picture[0, 0]) == pictures.GREEN
+    found = pictures.matched(run, "query/day/grey.png")
+    assert len(found["inliers"]) == 0
+    assert tuple(pictures.draw(run, "query/day/grey.png", found)[0, 0]) == pictures.RED
+
+
+def test_queries_are_ranked_from_worst_to_best(compared):
+    ranked = runs.ranked(runs.load(compared))
+    assert ranked[0] == "query/day/grey.png" and len(ranked) == 3
+    assert runs.spread(list("abcdefg"), 3) == ["a", "d", "g"]
+    assert runs.spread(["a"], 3) == ["a"]
+
+
+def test_runs_of_scans_and_of_a_map_of_ones_own(
+    inloc_layout, plane, tmp_path, monkeypatch, aachen_layout
+):
+    given = ("--outputs", tmp_path / "i", "--feature", "colmap_sift_sv32")
+    command.run(monkeypatch, inloc, "--dataset", inloc_layout, *given)
+    model = aachen_layout / "3D-models/aachen_v_1_1"
+    photos = aachen_layout / "images_upright"
+    command.run(
+        monkeypatch,
+        *(localize, "--map", model, "--map_images", photos, "--outputs", tmp_path / "l"),
+        *("--query_images", photos / "query/day", "--feature", "colmap_sift_sv32"),
+    )
+    output = tmp_path / "report.html"
+    folders = [tmp_path / "i", tmp_path / "l/queries-day"]
+    command.run(monkeypatch, report, *folders, "-o", output, "--num_queries", 9)
+    page = output.read_text()
+    # one feature, twice
+    assert "colmap_sift_sv32 (i)" in page and "colmap_sift_sv32 (queries-day)" in page
+    by_run = runs.load(folders)
+    scenes = json.loads(re.search(r'type="application/json">(.*?)</script>', page, re.S)[1])
+    for run in by_run:
+        assert len(scenes[run.label]["points"]) > 1000
+    (good,) = [name for name in by_run[0].rows if name.endswith("a.JPG")]
+    command.run(monkeypatch, report, folders[0], "-o", output, "--queries", good)
+    assert output.read_text().count("data:image/jpeg;base64,") == 1
+
+
+def test_nothing_in_a_name_is_taken_for_html(compared, tmp_path, monkeypatch):
+    odd = tmp_path / "<script>alert(1)</script>".replace("/", "_")
+    shutil.copytree(compared[0], odd)
+    output = tmp_path / "report.html"
+    command.run(monkeypatch, report, compared[0], odd, "-o", output)
+    page = output.read_text()
+    assert "<script>alert" not in page and "&lt;script&gt;alert" in page
+
+
+def test_wrong_input(compared, tmp_path, monkeypatch, caplog):
+    def message(*arguments):
+        return command.refused(monkeypatch, caplog, report, *arguments, "-o", tmp_path / "r.html")
+
+    assert "not the outputs folder" in message(tmp_path / "nowhere")
+    assert "Unknown query 'b.png'" in message(compared[0], "--queries", "b.png")
+    assert "--num_queries 0: at least 1" in message(compared[0], "--num_queries", "0")
+    file = compared[1] / "summary.json"
+    summary = json.loads(file.read_text())
+    del summary["files"]
+    for broken in ("{", "[]", json.dumps(summary)):
+        file.write_text(broken)
+        assert "run its pipeline again" in message(*compared)
+    logs = next(compared[0].glob("*_logs.jsonl"))
+    logs.write_text(logs.read_text()[:-20])
+    assert "run the localization again" in message(compared[0])
+    assert not (tmp_path / "r.html").exists()
+    monkeypatch.setattr("hloc_reduce.report.find_spec", lambda name: None)
+    assert "pip install" in message(compared[0])
+
+
+@pytest.fixture
+def browser():
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium (Debian: apt-get install chromium)")
+    with sync_api.sync_playwright() as playwright:
+        yield playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+
+
+@pytest.mark.parametrize("width", [1200, 390])
+def test_in_a_browser(compared, tmp_path, monkeypatch, browser, width):
+    output = tmp_path / "report.html"
+    command.run(monkeypatch, report, *compared, "-o", output)
+    page = browser.new_page(viewport={"width": width, "height": 800})
+    errors, requests = [], []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda said: said.type == "error" and errors.append(said.text))
+    page.on("request", lambda request: requests.append(request.url))
+    page.goto(output.as_uri())
+
+    # nothing is wider than the screen, and all pictures are there
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.evaluate("document.querySelectorAll('img').forEach(i => i.loading = 'eager')")
+    page.wait_for_function("[...document.images].every(i => i.complete && i.naturalWidth > 300)")
+    assert page.locator("img").count() == 6 and page.locator(".charts svg").count() == 8
+
+    # a click on the head sorts, another one the other way round
+    def column(number):
+        cells = page.locator(f"#table tbody tr:not([hidden]) td:nth-child({number})")
+        return cells.all_inner_texts()
+
+    head = page.get_by_role("button", name="inliers", exact=True)
+    head.click()
+    up = [int(text) for text in column(4)]
+    head.click()
+    down = [int(text) for text in column(4)]
+    assert len(up) == 6 and up == sorted(up) and down == sorted(up, reverse=True)
+    page.select_option("#only", "colmap_sift")
+    page.fill("#name", "GREY")
+    assert column(1) == ["query/day/grey.png"] and page.inner_text("#count") == "1 of 6"
+    page.fill("#name", "")
+
+    # the map is drawn, and turns with the mouse
+    view = page.locator("#view")
+    view.scroll_into_view_if_needed()
+    page.wait_for_function("document.getElementById('view').dataset.azimuth !== undefined")
+    before, azimuth = view.screenshot(), view.get_attribute("data-azimuth")
+    box = view.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2 + 80, box["y"] + box["height"] / 2 + 30, steps=4)
+    page.mouse.up()
+    page.wait_for_function(f"document.getElementById('view').dataset.azimuth !== '{azimuth}'")
+    turned = view.screenshot()
+    assert turned != before
+    colours = page.evaluate(
+        "(c => new Set(new Uint32Array(c.getContext('2d').getImageData(0, 0, c.width, c.height)"
+        ".data.buffer)).size)(document.getElementById('view'))"
+    )
+    assert colours > 20
+    page.mouse.wheel(0, -300)
+    page.wait_for_timeout(200)
+    assert view.screenshot() != turned
+    page.click("#reset")
+    page.wait_for_timeout(200)
+    reset = view.screenshot()
+    page.locator("#table tbody tr:not([hidden])", has_text="query/day/a.png").click()
+    page.wait_for_timeout(200)
+    assert page.locator("#table tr.chosen").count() == 2 and view.screenshot() != reset
+    page.select_option("#scene", "colmap_sift_sv32")
+
+    assert errors == []
+    assert requests == [output.as_uri()] or all(
+        url.startswith("data:") for url in requests if url != output.as_uri()
+    )
