@@ -81,18 +81,20 @@ def save(figure: "Figure", path: Path) -> None:
         figure.savefig(temporary, format=path.suffix[1:], metadata=metadata, dpi=120)
 
 
-def error_curves(curves: Mapping[str, Mapping[str, list[tuple[float, float]]]]) -> "list[Panel]":
+def error_curves(
+    curves: Mapping[str, Mapping[str, list[tuple[float, float]]]],
+) -> "dict[str, Panel]":
     """Plot cumulative errors of poses, of position and of rotation for each list.
 
     Args:
         curves: from list of queries and run to the errors, metres and degrees, of its queries.
     """
     units = ("position error [m]", "rotation error [°]")
-    return [
-        partial(_curves, name=name, runs=runs, place=place, unit=unit)
+    return {
+        f"{unit.split()[0]}_{name}": partial(_curves, name=name, runs=runs, place=place, unit=unit)
         for name, runs in curves.items()
         for place, unit in enumerate(units)
-    ]
+    }
 
 
 def _curves(axis: "Axes", name: str, runs: Mapping, place: int, unit: str) -> None:
@@ -108,7 +110,7 @@ def _curves(axis: "Axes", name: str, runs: Mapping, place: int, unit: str) -> No
     axis.legend(fontsize=8, loc="best", frameon=False)
 
 
-def size_and_time(points: Mapping[str, Mapping[str, list[dict]]]) -> "list[Panel]":
+def size_and_time(points: Mapping[str, Mapping[str, list[dict]]]) -> "dict[str, Panel]":
     """Plot accuracy against the size of descriptors and against time, for each measure.
 
     Args:
@@ -116,11 +118,13 @@ def size_and_time(points: Mapping[str, Mapping[str, list[dict]]]) -> "list[Panel
             which the runs are joined by a line, `bytes` of a descriptor, `seconds`, `value`.
     """
     labels = {"bytes": "bytes a descriptor", "seconds": "seconds, whole run"}
-    return [
-        partial(_against, measure=measure, lists=lists, key=key, label=label)
+    return {
+        f"{measure.split(',')[0].replace(' ', '_')}_{key}": partial(
+            _against, measure=measure, lists=lists, key=key, label=label
+        )
         for measure, lists in points.items()
         for key, label in labels.items()
-    ]
+    }
 
 
 def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -> None:

@@ -1,5 +1,6 @@
 """The report, read as text and opened in a real browser."""
 
+import csv
 import json
 import re
 import shutil
@@ -7,7 +8,7 @@ import shutil
 import command
 import pytest
 
-from hloc_reduce import cli
+from hloc_reduce import cli, compare
 from hloc_reduce.report import __main__ as report
 from hloc_reduce.report import runs
 from pipelines import aachen, inloc, localize
@@ -122,6 +123,68 @@ def test_nothing_in_a_name_is_taken_for_html(compared, tmp_path, monkeypatch):
     command.run(monkeypatch, report, compared[0], odd, "-o", output)
     page = output.read_text()
     assert "<script>alert" not in page and "&lt;script&gt;alert" in page
+
+
+def test_pictures_as_files(compared, tmp_path, monkeypatch):
+    folder = tmp_path / "pictures"
+    given = (*compared, "-o", tmp_path / "r.html", "--pictures_dir", folder)
+    command.run(monkeypatch, report, *given, "--queries", "query/day/a.png")
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == [
+        "mean_inliers_bytes.svg",
+        "mean_inliers_seconds.svg",
+        "position_day.svg",
+        "position_night.svg",
+        "query_day_a.png_colmap_sift.jpg",
+        "query_day_a.png_colmap_sift_sv32.jpg",
+        "recall_bytes.svg",
+        "recall_seconds.svg",
+        "rotation_day.svg",
+        "rotation_night.svg",
+    ]
+    assert ">bytes a descriptor</text>" in (folder / "recall_bytes.svg").read_text()
+
+
+def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_layout):
+    outputs = tmp_path / "outputs"
+    (tmp_path / "broken.yaml").write_text("model: {name: dog, options: {peak_treshold: 1}}")
+    given = ("--dataset", aachen_layout, "--outputs", outputs, "--features")
+    features = ("sift_sv16", "colmap_sift_sv16", tmp_path / "broken.yaml")
+    with pytest.raises(SystemExit) as exit:
+        command.run(monkeypatch, compare, *given, *features)
+    # one failed, which the others do not suffer from
+    assert exit.value.code == 2 and "These failed, see above: broken" in caplog.text
+    lines = [
+        [cell.strip() for cell in line.split("|")] for line in capsys.readouterr().out.splitlines()
+    ]
+    assert lines == [
+        ["", "bytes", "day", "night"],
+        ["distance [m]", "", "0.25 / 0.5 / 5", "0.5 / 1 / 5"],
+        ["orient. [deg]", "", "2 / 5 / 10", "2 / 5 / 10"],
+        ["sift_sv16", "32", "50.0 / 50.0 / 50.0", "100.0 / 100.0 / 100.0"],
+        ["in the paper", "", "85.9 / 91.5 / 96.2", "34.6 / 46.1 / 58.6"],
+        ["colmap_sift_sv16", "32", "50.0 / 50.0 / 50.0", "100.0 / 100.0 / 100.0"],
+    ]
+    assert "colmap_sift_sv16" in (outputs / "report.html").read_text()
+    with (outputs / "compare.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 2 * 3
+    assert (rows[0]["recall_percent"], rows[0]["paper_percent"]) == ("50.0", "85.9")
+
+    # what is there is not run again
+    times = {path: path.stat().st_mtime_ns for path in outputs.rglob("*.h5")}
+    page = tmp_path / "p.html"
+    command.run(monkeypatch, compare, *given, "sift_sv16", "-o", page)
+    assert page.exists() and {path: path.stat().st_mtime_ns for path in times} == times
+
+    def message(dataset, *features):
+        command_line = ("--dataset", dataset, "--outputs", tmp_path / "o", "--features", *features)
+        return command.refused(monkeypatch, caplog, compare, *command_line)
+
+    assert "neither of the folders 3D-models and database" in message(tmp_path, "sift")
+    assert "Unknown feature 'sift_sv65'" in message(aachen_layout, "sift", "sift_sv65")
+    assert not (tmp_path / "o").exists()
+    assert compare.pipeline_of(inloc_layout) is inloc.main
 
 
 def test_wrong_input(compared, tmp_path, monkeypatch, caplog):

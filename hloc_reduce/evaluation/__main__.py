@@ -44,7 +44,9 @@ def evaluate_poses(args: argparse.Namespace) -> None:
     write_curves(curves, outputs / "curves.csv")
     if plots.available(outputs / "curves.svg"):
         by_list = {group: {args.estimates.stem: listed} for group, listed in curves.items()}
-        plots.save(plots.figure(plots.error_curves(by_list), 2), outputs / "curves.svg")
+        plots.save(
+            plots.figure(list(plots.error_curves(by_list).values()), 2), outputs / "curves.svg"
+        )
     print(results.recall_table(args.estimates.stem, summaries))
     for group, summary in summaries.items():
         medians = [summary[f"median_{key}"] for key in ("position_error_m", "rotation_error_deg")]

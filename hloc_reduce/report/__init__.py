@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from .runs import ERRORS, Run
 
 FOLDER = Path(__file__).parent
 NUM_QUERIES = 6
+RECALL, INLIERS = "recall, finest threshold [%]", "mean inliers"
 
 
 def main(
@@ -22,6 +24,7 @@ def main(
     output: Path,
     queries: list[str] | None = None,
     num_queries: int = NUM_QUERIES,
+    pictures_dir: Path | None = None,
 ) -> Path:
     """Write the report of runs.
 
@@ -31,6 +34,7 @@ def main(
         queries: those whose matches are shown; default: `num_queries`, evenly from the worst to
             the best.
         num_queries: as above.
+        pictures_dir: a folder for the plots, SVG, and the pictures of matches, JPEG, too.
 
     Returns:
         `output`.
@@ -46,11 +50,15 @@ def main(
     ranked = runs.ranked(compared)
     chosen = [cli.choose("query", name, ranked) for name in queries or ()]
     chosen = chosen or runs.spread(ranked, num_queries)
+    plotted = _plotted(compared)
     content = {
         "runs": compared,
         "lists": runs.lists(compared),
         "recall": {run.label: runs.recall_rows(run) for run in compared},
-        "charts": _charts(compared),
+        "charts": {
+            key: [plots.svg(plots.figure([panel])) for panel in panels.values()]
+            for key, panels in plotted.items()
+        },
         "rows": [(run.label, row) for run in compared for row in run.rows.values()],
         "errors": any(row[ERRORS[0]] is not None for run in compared for row in run.rows.values()),
         "shown": _shown(compared, chosen),
@@ -60,11 +68,26 @@ def main(
     with replacing(output) as temporary:
         temporary.write_text(_page(content), encoding="utf-8")
     logger.info("The report is %s.", output)
+    if pictures_dir is not None:
+        _write_pictures(pictures_dir, plotted, content["shown"])
     return output
 
 
-def _charts(compared: list[Run]) -> dict[str, list[str]]:
-    """Return SVG elements: of accuracy, and of errors where they are known."""
+def _write_pictures(folder: Path, plotted: dict, shown: list[dict]) -> None:
+    for panels in plotted.values():
+        for name, panel in panels.items():
+            plots.save(plots.figure([panel]), folder / f"{name}.svg")
+    for item in shown:
+        for one in item["drawn"]:
+            if one["jpeg"]:
+                name = re.sub(r"[^\w.-]+", "_", f"{item['query']}_{one['label']}.jpg")
+                with replacing(folder / name) as temporary:
+                    temporary.write_bytes(base64.b64decode(one["jpeg"]))
+    logger.info("Its pictures are in %s.", folder)
+
+
+def _plotted(compared: list[Run]) -> "dict[str, dict[str, plots.Panel]]":
+    """Return the panels of accuracy, and of errors where they are known, by name."""
     curves, recall, inliers = {}, {}, {}
     for name in runs.lists(compared):
         errors = {run.label: found for run in compared if (found := run.errors(name))}
@@ -80,10 +103,9 @@ def _charts(compared: list[Run]) -> dict[str, list[str]]:
                 value = summary["recall_percent"][0]
                 recall.setdefault(short, []).append({**point, "value": value})
             inliers.setdefault(short, []).append({**point, "value": summary["mean_inliers"]})
-    measures = {"recall, finest threshold [%]": recall, "mean inliers": inliers}
+    measures = {RECALL: recall, INLIERS: inliers}
     known = {measure: lists for measure, lists in measures.items() if lists}
-    panels = {"accuracy": plots.size_and_time(known), "errors": plots.error_curves(curves)}
-    return {key: [plots.svg(plots.figure([one])) for one in drawn] for key, drawn in panels.items()}
+    return {"accuracy": plots.size_and_time(known), "errors": plots.error_curves(curves)}
 
 
 def _shown(compared: list[Run], chosen: list[str]) -> list[dict]:

@@ -24,6 +24,9 @@ def _main() -> None:
         default=NUM_QUERIES,
         help="without --queries: so many, evenly from the worst to the best",
     )
+    parser.add_argument(
+        "--pictures_dir", type=Path, help="write plots and pictures of matches there as files, too"
+    )
     args = parser.parse_args()
     cli.check_positive(args, "num_queries")
     main(**vars(args))
