@@ -4,7 +4,7 @@ import io
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.util import find_spec
-from itertools import cycle
+from itertools import cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 INSTALL = "pip install 'hloc-reduce[report]'"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#a6761d")
+INCHES = 1.6  # of an entry of a legend
 NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 LINES = (("-", "o"), ("--", "s"), (":", "^"))  # of lists, with their markers
 NOISE_COLOURS = {"easy": "#009e73", "hard": "#e69f00", "tough": "#d55e00"}
@@ -58,6 +59,12 @@ def figure(
             drawn.subplots(rows, columns, squeeze=False).flat, panels, strict=True
         ):
             panel(axis)
+        handles, labels = drawn.axes[0].get_legend_handles_labels()
+        beside = min(len(labels), max(1, round(columns * width / INCHES)))
+        drawn.set_figheight(drawn.get_figheight() + 0.17 * -(-len(labels) // beside))
+        drawn.legend(
+            handles, labels, loc="outside lower center", ncols=beside, fontsize=7.5, frameon=False
+        )
         return drawn
 
 
@@ -100,14 +107,16 @@ def error_curves(
 def _curves(axis: "Axes", name: str, runs: Mapping, place: int, unit: str) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    for colour, (run, errors) in zip(cycle(COLOURS), runs.items(), strict=False):
+    styles = product([line for line, _ in LINES], COLOURS)
+    for (line, colour), (run, errors) in zip(cycle(styles), runs.items(), strict=False):
         values, percent = cumulative(error[place] for error in errors)
-        axis.step(values, percent, where="post", color=colour, label=run, linewidth=1.4)
+        axis.step(
+            values, percent, where="post", color=colour, linestyle=line, label=run, linewidth=1.4
+        )
     axis.set(xscale="log", xlabel=unit, ylabel="queries within [%]", ylim=(0, 102), title=name)
     axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
-    axis.legend(fontsize=8, loc="best", frameon=False)
 
 
 def size_and_time(points: Mapping[str, Mapping[str, list[dict]]]) -> "dict[str, Panel]":
@@ -137,7 +146,7 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
                 [run["value"] for run in own],
                 marker=marker,
                 markersize=5,
-                linestyle=line,
+                linestyle=line if key == "bytes" else "",
                 linewidth=1.2,
                 color=colour,
                 label=f"{family}, {name}",
@@ -163,7 +172,6 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
         axis.set_xscale("log", base=2)
         axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.minorticks_off()
-        axis.legend(fontsize=7, frameon=False)
 
 
 def hpatches_bars(rows: list[dict]) -> "Figure":
@@ -193,4 +201,3 @@ def _bars(axis: "Axes", rows: list[dict], task: str) -> None:
     axis.set(title=f"{task} mAP [%]", xlim=(0, 100))
     axis.set_yticks(places, [row["feature"] for row in rows])
     axis.grid(axis="y", visible=False)
-    axis.legend(fontsize=7, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.12), frameon=False)

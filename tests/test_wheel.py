@@ -32,3 +32,5 @@ def test_wheel_is_complete(tmp_path):
     }
     assert weights and weights <= names
     assert "hloc_reduce/extractors/vlad_sift_sv64.safetensors" in names
+    assert {f"hloc_reduce/report/page.{kind}" for kind in ("html", "css", "js")} <= names
+    assert "hloc_reduce/evaluation/published/localization_recall.csv" in names
