@@ -73,15 +73,18 @@ def run(name: str, dataset: Path, outputs: Path) -> dict:
         for pairs in (sfm_pairs, loc_pairs)
     )
     lap("matching")
-    sfm, poses = outputs / "sfm", outputs / "poses.txt"
+    sfm = outputs / "sfm"
     used["triangulate"](sfm, place.reference_model, place.images, sfm_pairs, features, matches)
     lap("triangulation")
-    used["localize"](sfm, place.queries, loc_pairs, features, loc_matches, poses)
+    # one list after the other: base names may be the same by day and by night
+    for key in lists:
+        given = place.queries.with_name(f"{key}.txt")
+        used["localize"](sfm, given, loc_pairs, features, loc_matches, outputs / f"{key}.txt")
     lap("localization")
     truth = true_poses(queries, place.ground_truth, True)
-    estimates = parse_poses(poses)
     finest = []
     for key, part in lists.items():
+        estimates = parse_poses(outputs / f"{key}.txt")
         errors = [
             pose_error(estimates[Path(query).name], truth[query])
             if Path(query).name in estimates

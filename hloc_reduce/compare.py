@@ -11,10 +11,9 @@ from pathlib import Path
 from confs import features as features_confs
 from pipelines import aachen, inloc
 
-from . import cli, io, logger, report
+from . import cli, io, logger, report, stamps
 from .cli import InputError
 from .report import runs
-from .report.runs import Run
 
 # a folder that a layout has -> the pipeline for it
 PIPELINES = {"3D-models": aachen.main, "database": inloc.main}
@@ -26,8 +25,9 @@ def main(
     outputs: Path,
     page: Path | None = None,
     retrieval: str = "vlad",
-) -> tuple[list[Run], dict[str, str]]:
-    """Localize the queries of a data set with several features.
+    ground_truth: Path | None = None,
+) -> dict[str, str]:
+    """Localize the queries of a data set with several features, print their table and report.
 
     Args:
         dataset: its folder.
@@ -35,31 +35,37 @@ def main(
         outputs: folder of the outputs folders, and of compare.csv.
         page: the report; default: `<outputs>/report.html`.
         retrieval: as of the pipelines.
+        ground_truth: as of the pipelines; default: what a folder was made with, or theirs.
 
     Returns:
-        The runs, and from each feature that failed to what was wrong.
+        From each feature that failed to what was wrong.
 
     Raises:
         InputError: for another layout, an unknown feature, or when all failed.
     """
     pipeline = pipeline_of(dataset)
+    report.check()
     given = {features_confs.get(feature)[0]: feature for feature in features}
     finished, failed = [], {}
     for name, feature in given.items():
         logger.info("%s:", name)
+        folder = outputs / name
+        before = stamps.read(folder / "summary.json").get("files", {}).get("ground_truth")
+        truth = ground_truth or (before and folder / before)
         try:
-            pipeline(dataset, outputs / name, feature, retrieval=retrieval)
+            pipeline(dataset, folder, feature, retrieval=retrieval, ground_truth=truth)
         except InputError as error:
             logger.error("%s failed: %s", name, error)
             failed[name] = str(error)
         else:
-            finished.append(outputs / name)
+            finished.append(folder)
     if not finished:
         raise InputError(f"None of {len(failed)} features could be run.")
-    compared = runs.load(finished)
-    io.write_csv(rows(compared), outputs / "compare.csv")
+    tables = runs.recall_tables(runs.load(finished))
+    io.write_csv(rows(tables), outputs / "compare.csv")
+    print(table(tables))
     report.main(finished, page or outputs / "report.html")
-    return compared, failed
+    return failed
 
 
 def pipeline_of(dataset: Path) -> Callable[..., dict]:
@@ -74,50 +80,52 @@ def pipeline_of(dataset: Path) -> Callable[..., dict]:
     raise InputError(f"{dataset} has neither of the folders {' and '.join(PIPELINES)}.")
 
 
-def rows(compared: list[Run]) -> list[dict]:
-    """Return a row for each run and list: recall at its thresholds, next to the paper's."""
-    found = []
-    for run in compared:
-        for row in runs.recall_rows(run):
-            recall = row["recall"] or [None] * 3
-            paper = row["paper"] or [None] * 3
-            limits = row["summary"].get("thresholds_m_deg", [(None, None)] * 3)
-            for (metres, degrees), ours, theirs in zip(limits, recall, paper, strict=True):
-                found.append(
-                    {
-                        "feature": run.label,
-                        "bytes": run.bytes,
-                        "seconds": round(run.seconds, 1),
-                        "list": row["list"],
-                        "threshold_m": metres,
-                        "threshold_deg": degrees,
-                        "recall_percent": ours,
-                        "paper_percent": theirs,
-                        "mean_inliers": row["summary"]["mean_inliers"],
-                    }
-                )
-    return found
+def rows(tables: list[dict]) -> list[dict]:
+    """Return a row for each run, list and threshold: recall next to the paper's.
 
-
-def table(compared: list[Run]) -> str:
-    """Format recall as in the paper's tables, a row for each feature and below it the paper's."""
-    names = runs.lists(compared)
-    lines = [["", "bytes", *map(runs.short, names)]]
-    limits = {
-        row["list"]: row["summary"].get("thresholds_m_deg", [])
-        for run in compared
-        for row in runs.recall_rows(run)
-    }
-    for unit, place in (("distance [m]", 0), ("orient. [deg]", 1)):
-        lines.append([unit, "", *(_joined([p[place] for p in limits[n]], "g") for n in names)])
-    for run in compared:
-        found = {row["list"]: row for row in runs.recall_rows(run)}
-        of_lists = [found.get(name, {}) for name in names]
-        lines.append(
-            [run.label, str(run.bytes), *(_joined(row.get("recall"), ".1f") for row in of_lists)]
+    Args:
+        tables: as of `runs.recall_tables`.
+    """
+    return [
+        {
+            "feature": row["run"].label,
+            "bytes": row["run"].bytes,
+            "seconds": round(row["run"].seconds, 1),
+            "list": found["list"],
+            "threshold_m": metres,
+            "threshold_deg": degrees,
+            "recall_percent": recall,
+            "paper_percent": paper,
+            "mean_inliers": row["summary"]["mean_inliers"],
+        }
+        for found in tables
+        for row in found["rows"]
+        for (metres, degrees), recall, paper in zip(
+            found["thresholds"] or [(None, None)],
+            row["recall"] or [None],
+            row["paper"] or [None] * max(1, len(found["thresholds"])),
+            strict=True,
         )
-        if any(row.get("paper") for row in of_lists):
-            paper = (_joined(row.get("paper"), ".1f") for row in of_lists)
+    ]
+
+
+def table(tables: list[dict]) -> str:
+    """Format recall as in the paper's tables, a row for each feature and below it the paper's."""
+    lines = [["", "bytes", *(found["list"] for found in tables)]]
+    for unit, place in (("distance [m]", 0), ("orient. [deg]", 1)):
+        limits = [[limit[place] for limit in found["thresholds"]] for found in tables]
+        lines.append([unit, "", *(_joined(values, "g") for values in limits)])
+    compared = dict.fromkeys(row["run"].label for found in tables for row in found["rows"])
+    for label in compared:
+        of_lists = [
+            next((row for row in found["rows"] if row["run"].label == label), None)
+            for found in tables
+        ]
+        (size,) = {row["run"].bytes for row in of_lists if row}
+        recall = (_joined(row and row["recall"], ".1f") for row in of_lists)
+        lines.append([label, str(size), *recall])
+        paper = [_joined(row and row["paper"], ".1f") for row in of_lists]
+        if set(paper) != {"-"}:
             lines.append(["  in the paper", "", *paper])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
@@ -130,7 +138,8 @@ def table(compared: list[Run]) -> str:
 
 
 def _joined(values: list[float] | None, kind: str) -> str:
-    return " / ".join(format(value, kind) for value in values) if values else "-"
+    known = [value for value in values or () if value is not None]
+    return " / ".join(format(value, kind) for value in known) or "-"
 
 
 def _main() -> None:
@@ -158,10 +167,16 @@ def _main() -> None:
     parser.add_argument(
         "--retrieval", default="vlad", metavar="vlad|FILE", help="as of the pipelines"
     )
+    parser.add_argument(
+        "--ground_truth",
+        type=Path,
+        help="true poses of the queries (default: what was given before, or that of the data set)",
+    )
     args = parser.parse_args()
     outputs = args.outputs or Path("outputs") / args.dataset.resolve().name
-    compared, failed = main(args.dataset, args.features, outputs, args.output, args.retrieval)
-    print(table(compared))
+    failed = main(
+        args.dataset, args.features, outputs, args.output, args.retrieval, args.ground_truth
+    )
     if failed:
         raise InputError(f"These failed, see above: {', '.join(failed)}. The others are reported.")
 

@@ -196,17 +196,19 @@ def camera(record: dict) -> pycolmap.Camera:
     return pycolmap.Camera(model=model, width=width, height=height, params=params)
 
 
-def read_records(results: Path) -> dict[str, dict]:
-    """Read the records that `main` left beside a file of poses.
+def read_records(path: Path) -> dict[str, dict]:
+    """Read the records of queries that `main` left in `log_file`.
 
     Raises:
-        InputError: when they are not there or broken.
+        InputError: when they are not there, broken, or of another version.
     """
-    path = log_file(results)
     try:
-        return dict(json.loads(line) for line in path.read_text().splitlines()[1:])
-    except (OSError, ValueError, TypeError):
-        raise InputError(f"{path} is not there or broken: run the localization again.") from None
+        header, *lines = path.read_text().splitlines()
+        if json.loads(header)["records"] == RECORDS:
+            return dict(json.loads(line) for line in lines)
+    except (OSError, ValueError, TypeError, KeyError):
+        pass
+    raise InputError(f"{path} is not there or broken: run the localization again.")
 
 
 def log_file(results: Path) -> Path:

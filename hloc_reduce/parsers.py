@@ -125,11 +125,19 @@ def write_pairs(pairs: list[tuple[str, str]], path: Path) -> None:
 
 
 def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
-    """Read poses, one `name qw qx qy qz tx ty tz` (camera from world, metres) a line."""
+    """Read poses, one `name qw qx qy qz tx ty tz` (camera from world, metres) a line.
+
+    Raises:
+        InputError: for a broken line, or a name that is listed twice.
+    """
     poses = {}
     for place, (name, *values) in _lines(path):
+        if name in poses:
+            raise InputError(f"{place}: {name} is listed twice.")
         try:
             qw, qx, qy, qz, *translation = map(float, values)
+            if not np.isfinite(translation).all():
+                raise ValueError
             rotation = pycolmap.Rotation3d(Rotation.from_quat([qx, qy, qz, qw]).as_matrix())
             poses[name] = pycolmap.Rigid3d(rotation, np.array(translation).reshape(3))
         except ValueError:

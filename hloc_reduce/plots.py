@@ -104,6 +104,11 @@ def error_curves(
     }
 
 
+def _shown(name: str) -> str:
+    """Return a name as a label that matplotlib neither hides nor takes for mathematics."""
+    return f" {name}".replace("$", r"\$")
+
+
 def _curves(axis: "Axes", name: str, runs: Mapping, place: int, unit: str) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -111,9 +116,17 @@ def _curves(axis: "Axes", name: str, runs: Mapping, place: int, unit: str) -> No
     for (line, colour), (run, errors) in zip(cycle(styles), runs.items(), strict=False):
         values, percent = cumulative(error[place] for error in errors)
         axis.step(
-            values, percent, where="post", color=colour, linestyle=line, label=run, linewidth=1.4
+            values,
+            percent,
+            where="post",
+            color=colour,
+            linestyle=line,
+            label=_shown(run),
+            linewidth=1.4,
         )
-    axis.set(xscale="log", xlabel=unit, ylabel="queries within [%]", ylim=(0, 102), title=name)
+    axis.set(
+        xscale="log", xlabel=unit, ylabel="queries within [%]", ylim=(0, 102), title=_shown(name)
+    )
     axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
@@ -149,7 +162,7 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
                 linestyle=line if key == "bytes" else "",
                 linewidth=1.2,
                 color=colour,
-                label=f"{family}, {name}",
+                label=_shown(f"{family}, {name}"),
             )
             for i, run in enumerate(own if key == "seconds" else ()):
                 axis.annotate(
@@ -199,5 +212,5 @@ def _bars(axis: "Axes", rows: list[dict], task: str) -> None:
     if not np.isnan(paper).all():
         axis.plot(paper, places, "|", markersize=11, color="black", label="mean in the paper")
     axis.set(title=f"{task} mAP [%]", xlim=(0, 100))
-    axis.set_yticks(places, [row["feature"] for row in rows])
+    axis.set_yticks(places, [_shown(row["feature"]) for row in rows])
     axis.grid(axis="y", visible=False)

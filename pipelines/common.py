@@ -1,6 +1,7 @@
 """What the pipelines share: options, retrieval, and what a run leaves behind."""
 
 import argparse
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -240,9 +241,9 @@ def finish(
 
 
 def _placed(path: Path, outputs: Path) -> str:
-    """Return the place of a file: in the outputs folder, which may be moved, or on the machine."""
+    """Return the place of a file: relative where it is in or beside the outputs folder."""
     path, outputs = path.resolve(), outputs.resolve()
-    return str(path.relative_to(outputs) if path.is_relative_to(outputs) else path)
+    return os.path.relpath(path, outputs) if path.is_relative_to(outputs.parent) else str(path)
 
 
 def print_result(summary: dict, outputs: Path, unknown: str) -> None:

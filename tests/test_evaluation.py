@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from pycolmap import Rigid3d, Rotation3d
 
 from hloc_reduce.evaluation import __main__ as evaluation
-from hloc_reduce.evaluation import hpatches, published
+from hloc_reduce.evaluation import hpatches, poses, published
 from hloc_reduce.evaluation.hpatches import data, lists, tasks
 from hloc_reduce.evaluation.ranking import average_precision, roc_area
 from hloc_reduce.io import GroupWriter
 from hloc_reduce.parsers import write_poses
+from pipelines import aachen
 
 
 def curve_area(right, number):
@@ -159,6 +160,21 @@ def test_retrieval_by_hand(tmp_path):
     assert ranks[0, 0].tolist() == [2, 3, 5, 6, 7]  # its own before the equal one
     assert ranks[2, 1].tolist() == [4, 5, 7, 8, 9]
     assert tasks.ranks_in_pools(right, np.array([]))[0, 3].tolist() == [1, 2, 3, 4, 5]
+
+    # its own patches are as far as a distractor, which counts as farther
+    generator = np.random.default_rng(0)
+    for i in range(10):
+        rows = torch.nn.functional.normalize(torch.from_numpy(generator.normal(size=(3, 128))))
+        reference, noisy, other = rows.float().numpy()
+
+        def tied(number, kind, reference=reference, noisy=noisy, other=other):
+            first = reference if kind == "ref" else noisy
+            return np.stack([first, other, other, other] if number == 0 else [noisy] * 3)
+
+        (tmp_path / str(i)).mkdir()
+        descriptors = described(tmp_path / str(i), tied)
+        scores = tasks.retrieval(descriptors, np.array([0]), np.array([4, 5, 6]))
+        assert {score for _, _, score in scores} == {1}
 
     def line(number, kind):
         return np.arange(4 - number)[:, None].astype(np.float32) + 4 * number
@@ -385,6 +401,27 @@ def test_poses(two_lists, monkeypatch, capsys):
     assert "33.3 / 66.7 / 66.7" in capsys.readouterr().out
 
 
+def test_whole_names_of_estimates_come_first():
+    truth = {name: rigid(0) for name in ("sub/x.jpg", "x.jpg")}
+    assert poses.find_estimates({"x.jpg": rigid(1)}, truth).keys() == {"x.jpg"}
+    assert poses.find_estimates({"sub/x.jpg": rigid(1)}, truth).keys() == {"sub/x.jpg"}
+
+
+def test_poses_of_a_pipeline_have_whole_names_and_no_fallbacks(
+    aachen_layout, tmp_path, monkeypatch, capsys
+):
+    given = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--feature", "colmap_sift")
+    run(monkeypatch, aachen, *given)
+    capsys.readouterr()
+    (logs,) = (tmp_path / "o").glob("*_logs.jsonl")
+    truth = aachen_layout / "queries/ground_truth_poses.txt"
+    files = ("--estimates", logs, "--ground_truth", truth, "--outputs", tmp_path / "e")
+    run(monkeypatch, evaluation, "poses", *files)
+    printed = capsys.readouterr().out
+    assert "50.0 / 50.0 / 50.0" in printed and "100.0 / 100.0 / 100.0" in printed
+    assert printed.endswith("query/day/grey.png\n")
+
+
 def test_poses_wrong_input(two_lists, monkeypatch, caplog):
     def message(*arguments, estimates="poses.txt"):
         files = ["--estimates", two_lists / estimates, "--ground_truth", two_lists / "truth.txt"]
@@ -398,6 +435,14 @@ def test_poses_wrong_input(two_lists, monkeypatch, caplog):
     assert "no pose of a query" in message(estimates="other.txt")
     write_poses({"a/day/0.jpg": rigid(0), "b/0.jpg": rigid(0)}, two_lists / "more.txt", None)
     assert "could be of" in message("--ground_truth", two_lists / "more.txt")
+    # base names of two lists in one file: the second one is not taken for the first
+    lines = (two_lists / "poses.txt").read_text()
+    (two_lists / "twice.txt").write_text(lines + lines)
+    assert "twice.txt:6: 0.jpg is listed twice" in message(estimates="twice.txt")
+    (two_lists / "nan.txt").write_text("0.jpg 1 0 0 0 nan 0 0\n")
+    assert "nan.txt:1: not a pose" in message(estimates="nan.txt")
+    (two_lists / "logs.jsonl").write_text("{}\n")
+    assert "run the localization again" in message(estimates="logs.jsonl")
     (two_lists / "empty.txt").touch()
     assert "has no pose" in message("--ground_truth", two_lists / "empty.txt")
 

@@ -109,8 +109,11 @@ def test_runs_of_scans_and_of_a_map_of_ones_own(
     assert "colmap_sift_sv32 (i)" in page and "colmap_sift_sv32 (queries-day)" in page
     by_run = runs.load(folders)
     scenes = json.loads(re.search(r'type="application/json">(.*?)</script>', page, re.S)[1])
-    for run in by_run:
-        assert len(scenes[run.label]["points"]) > 1000
+    # of scans one for each floor, with the scans in place of cameras
+    assert len(scenes) == 3
+    for label, scene in scenes.items():
+        assert len(scene["points"]) > 1000 and len(scene["map"]) > 0
+        assert len(scene["map"][0]) == 12 and label.startswith(by_run[0].summary["feature"])
     (good,) = [name for name in by_run[0].rows if name.endswith("a.JPG")]
     command.run(monkeypatch, report, folders[0], "-o", output, "--queries", good)
     assert output.read_text().count("data:image/jpeg;base64,") == 1
@@ -123,6 +126,57 @@ def test_nothing_in_a_name_is_taken_for_html(compared, tmp_path, monkeypatch):
     command.run(monkeypatch, report, compared[0], odd, "-o", output)
     page = output.read_text()
     assert "<script>alert" not in page and "&lt;script&gt;alert" in page
+
+
+def test_runs_of_one_feature_are_told_apart(compared, tmp_path, monkeypatch):
+    other = tmp_path / "other" / compared[0].name
+    shutil.copytree(compared[0], other)
+    file = other / "summary.json"
+    summary = json.loads(file.read_text())
+    day = summary["lists"]["day_time_queries_with_intrinsics"]
+    day["recall_percent"] = [11, 22, 33]
+    file.write_text(json.dumps(summary))
+    found = runs.load([compared[0], other, compared[0]])
+    labels = [run.label for run in found]
+    assert labels == [
+        f"colmap_sift ({folder.parent.name}/colmap_sift)" for folder in (compared[0], other)
+    ]
+    command.run(monkeypatch, report, compared[0], other, "-o", tmp_path / "r.html")
+    rows = text_of((tmp_path / "r.html").read_text())
+    for label, recall in zip(labels, (["50.0"] * 3, ["11.0", "22.0", "33.0"]), strict=True):
+        assert recall in [row[1:4] for row in rows if row[0] == label and len(row) == 7]
+
+
+def test_without_true_poses_columns_stay_in_place(compared, tmp_path, monkeypatch, aachen_layout):
+    (aachen_layout / "queries/ground_truth_poses.txt").rename(tmp_path / "truth.txt")
+    unknown = tmp_path / "sift_sv16"
+    given = ("--dataset", aachen_layout, "--outputs", unknown, "--feature", "sift_sv16")
+    command.run(monkeypatch, aachen, *given)
+    for folders in ([unknown], [unknown, compared[0]], [compared[0], unknown]):
+        command.run(monkeypatch, report, *folders, "-o", tmp_path / "r.html")
+        rows = [row for row in text_of((tmp_path / "r.html").read_text()) if len(row) == 7]
+        assert ["", "0.25 m, 2°", "0.5 m, 5°", "5 m, 10°"] in [row[:4] for row in rows]
+        (row, _) = [row for row in rows if row[0] == "sift_sv16"]
+        assert row[:6] == ["sift_sv16", "", "", "", "", "1 of 2"]
+        assert ["in the paper", "85.9", "91.5", "96.2", "", "", ""] in rows
+    # a comparison keeps what a folder was made with
+    for truth in (["--ground_truth", tmp_path / "truth.txt"], []):
+        outputs = ("--outputs", tmp_path, "-o", tmp_path / "r.html")
+        given = ("--dataset", aachen_layout, "--features", "sift_sv16", *outputs, *truth)
+        command.run(monkeypatch, compare, *given)
+        day = command.outcome(unknown)[0]["lists"]["day_time_queries_with_intrinsics"]
+        assert day["recall_percent"] == [50, 50, 50]
+
+
+def test_without_photos_there_is_a_report_all_the_same(
+    compared, tmp_path, monkeypatch, caplog, aachen_layout
+):
+    (aachen_layout / "images_upright").rename(tmp_path / "moved")
+    command.run(monkeypatch, report, *compared, "-o", tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert page.count("There is no picture: Cannot read image") == 6
+    assert "There is no picture of query/day/a.png" in caplog.text
+    assert len(json.loads(re.search(r'application/json">(.*?)</script>', page, re.S)[1])) == 2
 
 
 def test_pictures_as_files(compared, tmp_path, monkeypatch):
@@ -201,7 +255,10 @@ def test_wrong_input(compared, tmp_path, monkeypatch, caplog):
         file.write_text(broken)
         assert "run its pipeline again" in message(*compared)
     logs = next(compared[0].glob("*_logs.jsonl"))
-    logs.write_text(logs.read_text()[:-20])
+    lines = logs.read_text().splitlines()
+    logs.write_text("\n".join(lines[:-1]))  # a run that goes on, or was killed
+    assert "did not finish" in message(compared[0])
+    logs.write_text("\n".join(lines)[:-20])
     assert "run the localization again" in message(compared[0])
     assert not (tmp_path / "r.html").exists()
     monkeypatch.setattr("hloc_reduce.report.find_spec", lambda name: None)

@@ -11,7 +11,6 @@ from .. import cli, logger, plots, projections, results
 from ..cli import InputError
 from ..datasets import INLOC_THRESHOLDS, thresholds
 from ..io import write_csv
-from ..parsers import parse_poses
 from . import hpatches, phototour, poses
 from .hpatches import data
 
@@ -24,7 +23,7 @@ def evaluate_poses(args: argparse.Namespace) -> None:
     given = args.thresholds or ["aachen"]
     limits = parse_thresholds(given)
     truth = poses.read_truth(args.ground_truth)
-    estimates = parse_poses(args.estimates)
+    estimates = poses.read_estimates(args.estimates)
     found = poses.find_estimates(estimates, truth)
     if not found:
         raise InputError(f"{args.estimates} has no pose of a query of the true poses.")
@@ -169,7 +168,12 @@ def _main() -> None:
         "--ground_truth ground_truth_poses.txt",
         formatter_class=cli.HelpFormatter,
     )
-    command.add_argument("--estimates", type=Path, required=True, help="text file of poses")
+    command.add_argument(
+        "--estimates",
+        type=Path,
+        required=True,
+        help="text file of poses, or the *_logs.jsonl of a pipeline, where fallbacks are failures",
+    )
     command.add_argument(
         "--ground_truth",
         type=Path,

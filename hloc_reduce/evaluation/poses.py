@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from .. import localization
 from ..cli import InputError
 from ..parsers import parse_poses
 
@@ -111,20 +112,36 @@ def find_estimates(
     Raises:
         InputError: when an estimate could be of several queries.
     """
-    found, owner = {}, {}
+    names = list(names)
+    found = {name: estimates[name] for name in names if name in estimates}
+    owner = {name: name for name in found}
     for name in names:
         parts = name.split("/")
-        endings = ("/".join(parts[i:]) for i in range(len(parts)))
+        endings = ["/".join(parts[i:]) for i in range(1, len(parts))]
         written = next((ending for ending in endings if ending in estimates), None)
-        if written is None:
+        if name in found or written is None or written in found:
             continue
         if written in owner:
             raise InputError(
                 f"The estimate {written} could be of {owner[written]} and of {name}: "
-                "write whole names, or evaluate one list of queries at a time."
+                "whole names are needed, which the *_logs.jsonl of a pipeline has."
             )
         found[name], owner[written] = estimates[written], name
     return found
+
+
+def read_estimates(path: Path) -> dict[str, pycolmap.Rigid3d]:
+    """Read estimated poses, from a text file or from the `*_logs.jsonl` of a pipeline.
+
+    The latter has whole names, and of it only the poses of localized queries are taken.
+
+    Raises:
+        InputError: for a broken file.
+    """
+    if path.suffix != ".jsonl":
+        return parse_poses(path)
+    records = localization.read_records(path)
+    return {name: localization.pose(r) for name, r in records.items() if r["localized"]}
 
 
 def errors_of(

@@ -43,9 +43,7 @@ def main(
         InputError: for a folder that is no finished run's, an unknown query, or when what draws
             is not installed.
     """
-    for package in ("jinja2", "matplotlib"):
-        if find_spec(package) is None:
-            raise InputError(f"A report needs {package}: {plots.INSTALL}.")
+    check()
     compared = runs.load(folders)
     ranked = runs.ranked(compared)
     chosen = [cli.choose("query", name, ranked) for name in queries or ()]
@@ -53,8 +51,7 @@ def main(
     plotted = _plotted(compared)
     content = {
         "runs": compared,
-        "lists": runs.lists(compared),
-        "recall": {run.label: runs.recall_rows(run) for run in compared},
+        "recall": runs.recall_tables(compared),
         "charts": {
             key: [plots.svg(plots.figure([panel])) for panel in panels.values()]
             for key, panels in plotted.items()
@@ -62,7 +59,7 @@ def main(
         "rows": [(run.label, row) for run in compared for row in run.rows.values()],
         "errors": any(row[ERRORS[0]] is not None for run in compared for row in run.rows.values()),
         "shown": _shown(compared, chosen),
-        "scenes": {run.label: scene.scene(run) for run in tqdm(compared, desc="Reading maps")},
+        "scenes": _scenes(compared),
         "version": __version__,
     }
     with replacing(output) as temporary:
@@ -71,6 +68,23 @@ def main(
     if pictures_dir is not None:
         _write_pictures(pictures_dir, plotted, content["shown"])
     return output
+
+
+def check() -> None:
+    """Raise an InputError if what a report needs is not installed."""
+    for package in ("jinja2", "matplotlib"):
+        if find_spec(package) is None:
+            raise InputError(f"A report needs {package}: {plots.INSTALL}.")
+
+
+def _scenes(compared: list[Run]) -> dict[str, dict]:
+    scenes = {}
+    for run in tqdm(compared, desc="Reading maps", unit="run"):
+        try:
+            scenes |= scene.scenes(run)
+        except InputError as error:
+            logger.warning("There is no map of %s in the report: %s", run.label, error)
+    return scenes
 
 
 def _write_pictures(folder: Path, plotted: dict, shown: list[dict]) -> None:
@@ -89,15 +103,11 @@ def _write_pictures(folder: Path, plotted: dict, shown: list[dict]) -> None:
 def _plotted(compared: list[Run]) -> "dict[str, dict[str, plots.Panel]]":
     """Return the panels of accuracy, and of errors where they are known, by name."""
     curves, recall, inliers = {}, {}, {}
-    for name in runs.lists(compared):
-        errors = {run.label: found for run in compared if (found := run.errors(name))}
-        short = runs.short(name)
-        if errors:
-            curves[short] = errors
-        for run in compared:
-            summary = run.summary["lists"].get(name)
-            if summary is None:
-                continue
+    for run in compared:
+        for name, summary in run.summary["lists"].items():
+            short = runs.short(name)
+            if errors := run.errors(name):
+                curves.setdefault(short, {})[run.label] = errors
             point = {"family": run.family, "bytes": run.bytes, "seconds": run.seconds}
             if "recall_percent" in summary:
                 value = summary["recall_percent"][0]
@@ -116,8 +126,14 @@ def _shown(compared: list[Run], chosen: list[str]) -> list[dict]:
         for run in compared:
             if name not in run.rows:
                 continue
-            found = pictures.matched(run, name)
-            picture = found and pictures.jpeg(pictures.draw(run, name, found))
+            found = picture = None
+            try:
+                missing = "Nothing was retrieved."
+                if found := pictures.matched(run, name):
+                    picture = pictures.jpeg(pictures.draw(run, name, found))
+            except InputError as error:  # a photo that was moved, for example
+                missing = f"There is no picture: {error}"
+                logger.warning("There is no picture of %s, %s: %s", name, run.label, error)
             drawn.append(
                 {
                     "label": run.label,
@@ -125,7 +141,8 @@ def _shown(compared: list[Run], chosen: list[str]) -> list[dict]:
                     "name": found and found["name"],
                     "matches": len(found["inliers"]) if found else 0,
                     "inliers": int(found["inliers"].sum()) if found else 0,
-                    "jpeg": found and base64.b64encode(picture).decode(),
+                    "jpeg": picture and base64.b64encode(picture).decode(),
+                    "missing": missing,
                 }
             )
         shown.append({"query": name, "drawn": drawn})
@@ -144,9 +161,10 @@ def _page(content: dict) -> str:
     )
     environment.filters |= {"figure": _figure, "short": runs.short}
     # within a script element nothing may end it
-    scenes = json.dumps(content["scenes"]).replace("<", "\\u003c")
+    packed = json.dumps(content["scenes"]).replace("<", "\\u003c")
     return environment.get_template("page.html").render(
-        **{**content, "scenes": scenes},
+        **content,
+        packed=packed,
         style=(FOLDER / "page.css").read_text(encoding="utf-8"),
         script=(FOLDER / "page.js").read_text(encoding="utf-8"),
     )

@@ -66,12 +66,13 @@
   }
 
   function reset() {
+    if (!scene) return;
     // from behind the cameras, a little above
     const [east, north] = ground();
     const poses = scene.queries.map((query) => query.pose).filter(Boolean).concat(scene.map);
     const back = poses.reduce((sum, pose) => add(sum, pose.slice(9, 12), -1), [0, 0, 0]);
     const azimuth = Math.atan2(dot(back, north), dot(back, east)) + 0.35;
-    Object.assign(view, { azimuth, elevation: 0.4, distance: 2.4 * scene.radius, target: scene.centre });
+    Object.assign(view, { azimuth, elevation: 0.4, distance: 2 * scene.radius, target: scene.centre });
     redraw();
   }
 
@@ -93,7 +94,7 @@
   }
 
   function redraw() {
-    if (!pending) {
+    if (scene && !pending) {
       pending = true;
       requestAnimationFrame(draw);
     }
@@ -171,7 +172,7 @@
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
-    if (before === undefined) return;
+    if (before === undefined || !scene) return;
     const [x, y] = [event.clientX - before.clientX, event.clientY - before.clientY];
     if (pointers.size === 2) {
       const [other] = [...pointers.values()].filter((p) => p.pointerId !== event.pointerId);
@@ -189,6 +190,7 @@
     redraw();
   });
   function zoom(factor) {
+    if (!scene) return;
     view.distance = Math.max(0.01, Math.min(50, (view.distance * factor) / scene.radius)) * scene.radius;
     redraw();
   }
@@ -207,5 +209,5 @@
   byId("scene").addEventListener("change", (event) => load(event.target.value));
   byId("reset").addEventListener("click", reset);
   window.addEventListener("resize", redraw);
-  load(byId("scene").value);
+  if (byId("scene").value) load(byId("scene").value);
 })();

@@ -31,25 +31,31 @@ class Run:
 
     Attributes:
         label: how the run is called in a report; its feature, unless another run has the same.
+        family: what features of several sizes have in common, `sift_sv` of sift_sv64.
         summary: of summary.json.
         rows: of queries.csv by query, with numbers as numbers and None for an unknown error.
+        records: of the queries, as of `localization.main`.
 
     Raises:
         InputError: when the folder is none of a finished run, or of an older version.
     """
 
     folder: Path
-    label: str = ""
+    label: str = field(init=False)
+    family: str = field(init=False)
     summary: dict = field(init=False)
     rows: dict[str, dict] = field(init=False)
+    records: dict[str, dict] = field(init=False)
 
     def __post_init__(self) -> None:
         try:
             self.summary = dict(json.loads((self.folder / "summary.json").read_text()))
-            self.files = {key: value and self.folder / value for key, value in self._listed()}
+            files = self.summary["files"].items()
+            self.files = {key: value and self.folder / value for key, value in files}
             self.poses = self.folder / self.summary["poses"]
             self.rows = self._read_rows()
             self.label = str(self.summary["feature"])
+            self.family = self.label.rstrip("0123456789")
             self.bytes = int(self.summary["bytes_per_keypoint"]["descriptor"])
             self.seconds = float(sum(self.summary["seconds"].values()))
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
@@ -58,9 +64,7 @@ class Run:
                 f"{self.folder} is not the outputs folder of a finished run of this version "
                 f"({why}): run its pipeline again, which computes only what is missing."
             ) from None
-
-    def _listed(self) -> list[tuple[str, str | None]]:
-        return list(self.summary["files"].items())
+        self.records = self._read_records()
 
     def _read_rows(self) -> dict[str, dict]:
         with (self.folder / "queries.csv").open(newline="", encoding="utf-8") as file:
@@ -75,11 +79,6 @@ class Run:
         """The data set, or the map that was localized in."""
         return Path(self.summary.get("dataset") or self.summary["map"])
 
-    @property
-    def family(self) -> str:
-        """What features of several sizes have in common: `sift_sv` of sift_sv64."""
-        return self.summary["feature"].rstrip("0123456789")
-
     def errors(self, name: str) -> list[tuple[float, float]]:
         """Return the errors of the queries of a list with known truth; of failures infinite."""
         rows = [row for row in self.rows.values() if row["list"] == name]
@@ -89,10 +88,11 @@ class Run:
             if row[ERRORS[0]] is not None
         ]
 
-    @cached_property
-    def records(self) -> dict[str, dict]:
-        """The records of the queries, as of `localization.main`."""
-        return localization.read_records(self.poses)
+    def _read_records(self) -> dict[str, dict]:
+        records = localization.read_records(localization.log_file(self.poses))
+        if records.keys() != self.rows.keys():
+            raise InputError(f"{self.folder} is of a run that did not finish: run it again.")
+        return records
 
     @cached_property
     def reconstruction(self) -> pycolmap.Reconstruction | None:
@@ -117,9 +117,9 @@ class Run:
 
     @cached_property
     def truth(self) -> dict[str, pycolmap.Rigid3d]:
-        """The true poses of queries, camera from world, as far as they are known."""
+        """The true poses of queries, camera from world, as far as their file is there."""
         path = self.files["ground_truth"]
-        if path is None:
+        if path is None or not path.is_file():
             return {}
         return {name: pose for name, pose in parse_poses(path).items() if name in self.rows}
 
@@ -130,11 +130,15 @@ def load(folders: list[Path]) -> list[Run]:
     Raises:
         InputError: for a folder that is no run's.
     """
-    runs = [Run(folder) for folder in folders]
-    labels = [run.label for run in runs]
-    for run in runs:
-        if labels.count(run.label) > 1:
-            run.label = f"{run.label} ({run.folder.resolve().name})"
+    runs = [Run(folder) for folder in dict.fromkeys(path.resolve() for path in folders)]
+    for alike in [[r for r in runs if r.label == label] for label in {run.label for run in runs}]:
+        ends = [run.folder.parts for run in alike]
+        depth = next(n for n in range(1, 999) if len({parts[-n:] for parts in ends}) == len(ends))
+        for run in alike if len(alike) > 1 else ():
+            run.label = f"{run.label} ({'/'.join(run.folder.parts[-depth:])})"
+    if len({run.place.resolve() for run in runs}) > 1:  # what is joined by a line is of one place
+        for run in runs:
+            run.family = f"{run.family}, {run.place.name}"
     return runs
 
 
@@ -164,19 +168,30 @@ def ranked(runs: list[Run]) -> list[str]:
     return sorted(dict.fromkeys(name for run in runs for name in run.rows), key=badness)
 
 
-def recall_rows(run: Run) -> list[dict]:
-    """Return of each list the recall of a run and, of the same feature, the paper's."""
-    rows = []
-    for name, summary in run.summary["lists"].items():
-        rows.append(
-            {
-                "list": name,
-                "summary": summary,
-                "recall": summary.get("recall_percent"),
-                "paper": published.recall(run.summary["feature"], name),
-            }
-        )
-    return rows
+def recall_tables(runs: list[Run]) -> list[dict]:
+    """Return the recall of each list of queries, by its short name.
+
+    Returns:
+        A dict for each list: `list`; `thresholds`, pairs of metres and degrees, those of the paper
+        where no true pose is known but the paper has numbers, or none; and `rows`, a dict for each
+        run that has the list: `run`, `summary` of it, and as many numbers in percent or None of
+        `recall` and, if the paper has the feature, of `paper`.
+    """
+    tables: dict[str, dict] = {}
+    for run in runs:
+        for name, summary in run.summary["lists"].items():
+            table = tables.setdefault(
+                short(name), {"list": short(name), "thresholds": [], "rows": []}
+            )
+            paper = published.recall(run.summary["feature"], name)
+            limits = summary.get("thresholds_m_deg") or (paper and published.thresholds(name))
+            table["thresholds"] = table["thresholds"] or limits or []
+            row = {"run": run, "summary": summary, "paper": paper}
+            table["rows"].append({**row, "recall": summary.get("recall_percent")})
+    for table in tables.values():
+        for row in table["rows"]:
+            row["recall"] = row["recall"] or [None] * len(table["thresholds"])
+    return list(tables.values())
 
 
 def spread(names: list[str], number: int) -> list[str]:

@@ -5,28 +5,51 @@ import base64
 import numpy as np
 import pycolmap
 
-from .. import localization
+from .. import localization, scans
+from ..cli import InputError
 from ..io import get_keypoints, open_h5, read_image
 from .runs import Run
 
 POINTS = 6000  # shown, at most
 IMAGES = 24  # map images that give points their colours
 CAMERAS = 1000  # map cameras shown, at most
+GREY = 120
 
 
-def scene(run: Run) -> dict:
-    """Return what the page shows of a run: see `_packed` for arrays.
+def scenes(run: Run) -> dict[str, dict]:
+    """Return what the page shows of a run, by label: of scans each floor, which has its own frame.
 
-    `points` (N, 3) float32 in metres, `colours` (N, 3) uint8; cameras as (centre, right, down,
-    forward) float32 in `map`, (C, 12); `queries`, each with its name, status, camera `pose` and,
-    where it is known, `truth`; `up` and the `centre` and `radius` of what is worth seeing.
+    Of each: `points` (N, 3) float32 in metres and `colours` (N, 3) uint8, as of `_packed`; cameras
+    or scans as (centre, right, down, forward) in `map`; `queries`, each with its name, status,
+    camera `pose` and, where it is known, `truth`; `up` and the `centre` and `radius` of what is
+    worth seeing.
+
+    Raises:
+        InputError: when the map is not there.
     """
-    points, colours = _points(run)
-    model = run.reconstruction
-    poses = [] if model is None else [i.cam_from_world() for i in model.images.values()]
-    poses = poses[:: -(-len(poses) // CAMERAS) or 1]
+    if run.reconstruction is not None:
+        images = run.reconstruction.images.values()
+        cameras = {image.name: _axes(image.cam_from_world()) for image in images}
+        return {run.label: _scene(run, cameras, run.records)}
+    floors: dict[str, dict] = {}
+    for name, pose in run.reference.poses.items():
+        floors.setdefault(scans.floor_of(name), {})[name] = [*pose[:3, 3], *pose[:3, :3].T.ravel()]
+    found = {}
+    for floor, cameras in floors.items():
+        records = {
+            name: record
+            for name, record in run.records.items()
+            if record["db"] is not None and scans.floor_of(record["db"]) == floor
+        }
+        label = run.label if len(floors) == 1 else f"{run.label}, {floor}"
+        found[label] = _scene(run, cameras, records)
+    return found
+
+
+def _scene(run: Run, cameras: dict[str, list[float]], records: dict[str, dict]) -> dict:
+    points, colours = _points(run, sorted(cameras))
     queries = []
-    for name, record in run.records.items():
+    for name, record in records.items():
         pose = localization.pose(record)
         queries.append(
             {
@@ -36,19 +59,17 @@ def scene(run: Run) -> dict:
                 "truth": _axes(run.truth[name]) if name in run.truth else None,
             }
         )
-    shown = np.array(
-        [_axes(pose) for pose in poses]
-        + [query["truth"] or query["pose"] for query in queries if query["truth"] or query["pose"]]
-    ).reshape(-1, 12)
+    shown = list(cameras.values())[:: -(-len(cameras) // CAMERAS)]
+    looks = np.array([*shown, *(q["truth"] or q["pose"] for q in queries if q["pose"])])
     # points and cameras alike, without what is far from all others
-    groups = [part for part in (points, shown[:, :3]) if len(part)]
+    groups = [part for part in (points, looks[:, :3]) if len(part)]
     centre = np.mean([np.median(part, axis=0) for part in groups], axis=0)
     radius = max(np.quantile(np.linalg.norm(part - centre, axis=1), 0.9) for part in groups)
-    up = -shown[:, 6:9].mean(axis=0) if len(shown) else np.array([0.0, -1, 0])
+    up = -looks[:, 6:9].mean(axis=0)
     return {
         "points": _packed(points, np.float32),
         "colours": _packed(colours, np.uint8),
-        "map": [_axes(pose) for pose in poses],
+        "map": np.round(shown, 5).tolist(),
         "queries": queries,
         "up": (up / (np.linalg.norm(up) or 1)).tolist(),
         "centre": centre.tolist(),
@@ -68,22 +89,23 @@ def _axes(pose: pycolmap.Rigid3d) -> list[float]:
     return [round(float(value), 5) for value in values]
 
 
-def _points(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """Return points of the map (N, 3) and their colours, from images spread over the map."""
+def _points(run: Run, names: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (N, 3) that some of the map images see, spread, and their colours (N, 3)."""
+    chosen = [names[i] for i in np.linspace(0, len(names) - 1, IMAGES).astype(int)]
+    points, colours, seen = [], [], set()
     with open_h5(run.files["map_features"]) as file:
-        used = {record["db"] for record in run.records.values()} - {None}
-        model = run.reconstruction
-        names = sorted(used if model is None else {i.name for i in model.images.values()})
-        chosen = [names[i] for i in np.linspace(0, len(names) - 1, IMAGES).astype(int)]
-        points, colours, seen = [], [], set()
         for name in dict.fromkeys(chosen):
             keypoints, _ = get_keypoints(file, name)
             ids, xyz = run.reference.lift(name, np.arange(len(keypoints)))
             rows = [row for row in np.flatnonzero(ids >= 0) if ids[row] not in seen]
-            rows = np.array(rows[:: -(-len(rows) // (POINTS // IMAGES)) or 1], int)
+            rows = np.array(rows[:: max(1, -(-len(rows) // (POINTS // IMAGES)))], int)
             seen.update(ids[rows].tolist())
-            image = read_image(run.files["map_images"] / name)
-            x, y = keypoints[rows].round().astype(int).T
             points.append(xyz[rows])
+            try:
+                image = read_image(run.files["map_images"] / name)
+            except InputError:  # the photos are elsewhere
+                colours.append(np.full((len(rows), 3), GREY))
+                continue
+            x, y = keypoints[rows].round().astype(int).T
             colours.append(image[y.clip(0, len(image) - 1), x.clip(0, image.shape[1] - 1)])
     return np.concatenate(points), np.concatenate(colours)

@@ -1,5 +1,6 @@
 """HPatches: matching, verification and retrieval of patches (Balntas et al., CVPR 2017)."""
 
+import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -71,7 +72,7 @@ def main(
                 "descriptors": io.provenance(described),
                 "projection": checksum,
                 "sequences": sequences,
-                "lists": str(task_lists.resolve()),
+                "lists": stamps.stamp({}, sorted(task_lists.glob(f"*_split-{split}.csv"))),
             }
         scores[name] = _score(
             outputs / split / f"{name}.json",
@@ -108,7 +109,9 @@ def _evaluations(
             project = torch.nn.Identity() if projection is None else projections.load(projection)
             read["descriptors"] = Descriptors(file, sequences, project)
         descriptors = read["descriptors"]
-        where = task_lists, outputs / "tasks", split, descriptors.sizes
+        sizes = descriptors.sizes
+        made_of = hashlib.sha256(json.dumps(list(sizes.items())).encode()).hexdigest()[:8]
+        where = task_lists, outputs / "tasks" / made_of, split, sizes
         if task == "matching":
             return tasks.matching(descriptors)
         if task == "verification":

@@ -3,6 +3,9 @@
 import csv
 from pathlib import Path
 
+from ... import datasets
+from ...datasets import INLOC_THRESHOLDS
+
 FOLDER = Path(__file__).parent
 # how lists of queries and the columns of the table begin
 PREFIXES = {
@@ -51,3 +54,8 @@ def recall(feature: str, query_list: str) -> list[float] | None:
     row = localization().get(feature, {})
     values = [value for column, value in row.items() if prefix and column.startswith(prefix)]
     return values or None
+
+
+def thresholds(query_list: str) -> tuple[tuple[float, float], ...]:
+    """Return the thresholds, metres and degrees, of the paper's recall on a list."""
+    return INLOC_THRESHOLDS if query_list.startswith("DUC") else datasets.thresholds(query_list)
