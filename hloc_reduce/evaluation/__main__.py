@@ -37,16 +37,17 @@ def evaluate_poses(args: argparse.Namespace) -> None:
     for group, names in groups.items():
         listed = [errors[name] for name in names]
         summaries[group] = poses.summarize_errors(listed, listed, limits or thresholds(group))
-    outputs = args.outputs or Path("outputs/evaluation") / args.estimates.stem
+    called = args.estimates.name.removesuffix("_logs.jsonl").removesuffix(".txt")
+    outputs = args.outputs or Path("outputs/evaluation") / called
     write_errors(errors, groups, outputs / "errors.csv")
     curves = {group: [errors[name] for name in names] for group, names in groups.items()}
     write_curves(curves, outputs / "curves.csv")
     if plots.available(outputs / "curves.svg"):
-        by_list = {group: {args.estimates.stem: listed} for group, listed in curves.items()}
+        by_list = {group: {called: listed} for group, listed in curves.items()}
         plots.save(
             plots.figure(list(plots.error_curves(by_list).values()), 2), outputs / "curves.svg"
         )
-    print(results.recall_table(args.estimates.stem, summaries))
+    print(results.recall_table(called, summaries))
     for group, summary in summaries.items():
         medians = [summary[f"median_{key}"] for key in ("position_error_m", "rotation_error_deg")]
         known = None not in medians

@@ -72,7 +72,7 @@
     const poses = scene.queries.map((query) => query.pose).filter(Boolean).concat(scene.map);
     const back = poses.reduce((sum, pose) => add(sum, pose.slice(9, 12), -1), [0, 0, 0]);
     const azimuth = Math.atan2(dot(back, north), dot(back, east)) + 0.35;
-    Object.assign(view, { azimuth, elevation: 0.4, distance: 2 * scene.radius, target: scene.centre });
+    Object.assign(view, { azimuth, elevation: 0.4, distance: 1.5 * scene.radius, target: scene.centre });
     redraw();
   }
 
@@ -117,7 +117,7 @@
       return [width / 2 + scale * dot(offset, eye.right), height / 2 - scale * dot(offset, eye.up)];
     };
     context.clearRect(0, 0, width, height);
-    const size = 1.6 * ratio;
+    const size = 2 * ratio;
     for (let i = 0; i < points.length; i += 3) {
       const place = project(points[i], points[i + 1], points[i + 2]);
       if (place === null) continue;
