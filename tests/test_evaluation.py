@@ -480,5 +480,7 @@ def test_phototour(tmp_path, monkeypatch, capsys, caplog):
     pairs.write_text("0 0 0 24 0 0\n0 0 0 2 1 0\n")
     message = refused(monkeypatch, caplog, evaluation, *command, "--feature", "sift")
     assert "patches that info.txt does not have" in message
+    outside = [*command, "--name", "../town", "--feature", "sift"]
+    assert "a folder in --root" in refused(monkeypatch, caplog, evaluation, *outside)
     message = refused(monkeypatch, caplog, evaluation, *command, "--feature", "colmap_sift")
     assert "describes photos" in message

@@ -139,6 +139,8 @@ def evaluate_hpatches(args: argparse.Namespace) -> None:
 
 def evaluate_phototour(args: argparse.Namespace) -> None:
     """Evaluate features on PhotoTour."""
+    if Path(args.name).name != args.name:
+        raise InputError(f"--name {args.name} is a folder in --root, without any /.")
     by_base: dict[str, dict[str, torch.nn.Module]] = {}
     for feature in args.feature:
         base, projection = features_confs.of_patches(feature)
