@@ -133,7 +133,7 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
     poses = {}
     for place, (name, *values) in _lines(path):
         if name in poses:
-            raise InputError(f"{place}: {name} is listed twice.")
+            raise InputError(f"{place}: {name} is listed twice: whole names are needed.")
         try:
             qw, qx, qy, qz, *translation = map(float, values)
             if not np.isfinite(translation).all():

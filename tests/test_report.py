@@ -252,10 +252,11 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_lay
 
 def test_wrong_input(compared, tmp_path, monkeypatch, caplog):
     def message(*arguments):
-        return command.refused(monkeypatch, caplog, report, *arguments, "-o", tmp_path / "r.html")
+        return command.refused(monkeypatch, caplog, report, "-o", tmp_path / "r.html", *arguments)
 
     assert "not the outputs folder" in message(tmp_path / "nowhere")
     assert "Unknown query 'b.png'" in message(compared[0], "--queries", "b.png")
+    assert "is a folder" in message(compared[0], "-o", tmp_path)
     assert "--num_queries 0: at least 1" in message(compared[0], "--num_queries", "0")
     file = compared[1] / "summary.json"
     summary = json.loads(file.read_text())

@@ -44,6 +44,8 @@ def main(
             is not installed.
     """
     check()
+    if output.is_dir():
+        raise InputError(f"{output} is a folder: name the HTML file in it.")
     compared = runs.load(folders)
     ranked = runs.ranked(compared)
     chosen = [cli.choose("query", name, ranked) for name in queries or ()]
