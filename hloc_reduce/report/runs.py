@@ -147,11 +147,6 @@ def short(query_list: str) -> str:
     return re.sub(r"(_time)?(_queries)?(_with_intrinsics)$", "", query_list) or query_list
 
 
-def lists(runs: list[Run]) -> list[str]:
-    """Return the lists of queries of all runs, in their order."""
-    return list(dict.fromkeys(name for run in runs for name in run.summary["lists"]))
-
-
 def ranked(runs: list[Run]) -> list[str]:
     """Return the queries of all runs, the worst first.
 
