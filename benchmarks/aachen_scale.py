@@ -12,6 +12,7 @@ lines through the first and the last share, along images and pairs, continued to
 """
 
 import argparse
+import itertools
 import json
 import os
 import resource
@@ -20,7 +21,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -32,10 +32,9 @@ from hloc_reduce.io import (
     find_pair,
     get_dataset,
     get_matches,
-    list_h5_names,
     open_h5,
 )
-from hloc_reduce.pairs_from_covisibility import covisibility, most_covisible
+from hloc_reduce.pairs_from_covisibility import most_covisible
 from hloc_reduce.parsers import (
     image_names,
     parse_pairs,
@@ -109,12 +108,8 @@ def make_pairs(data: Path, folder: Path, share: float, number: int) -> tuple[dic
     spread = np.linspace(0, len(queries) - 1, max(1, round(share * len(queries))))
     queries = [queries[int(i)] for i in spread]
     places = {name: i for i, name in enumerate(database)}
-    counts = covisibility([ids_of(i, number) for i in range(len(database))])
-    pairs = [
-        (database[i], database[j])
-        for i in range(len(database))
-        for j in most_covisible(counts, i, NUM_COVIS)
-    ]
+    ranking = most_covisible((ids_of(i, number) for i in range(len(database))), NUM_COVIS)
+    covisible = ((database[i], database[j]) for i, row in enumerate(ranking) for j in row)
     retrieved = parse_retrieval(data / "pairs-query-netvlad50.txt")
     listed = []
     for query in queries:
@@ -127,8 +122,7 @@ def make_pairs(data: Path, folder: Path, share: float, number: int) -> tuple[dic
     pairs_from_retrieval.select(
         folder / "listed.txt", folder / "loc.txt", NUM_LOC, queries, database
     )
-    pairs += parse_pairs(folder / "loc.txt")
-    write_pairs(pairs, folder / "pairs.txt")
+    write_pairs(itertools.chain(covisible, parse_pairs(folder / "loc.txt")), folder / "pairs.txt")
     return places, folder / "pairs.txt"
 
 
@@ -166,9 +160,10 @@ def run(data: Path, share: float, dim: int, number: int, storage: str) -> dict:
         conf = match_features.confs["NN-ratio"]
         matches = match_features.main(conf, pairs_file, features, matches=folder / "matches.h5")
         matched = time.perf_counter()
-        matched_pairs = len(list_h5_names(matches))
+        with open_h5(matches) as file:
+            matched_pairs = sum(len(group) for group in file.values())
         number = sum(1 for _ in parse_pairs(pairs_file))
-        checked = islice(parse_pairs(pairs_file), 0, None, -(-number // CHECKED))
+        checked = itertools.islice(parse_pairs(pairs_file), 0, None, -(-number // CHECKED))
         found, right = check(features, matches, checked)
         return {
             "share": matched_pairs / WHOLE["pairs"],

@@ -56,11 +56,12 @@ def main(
         else:
             made_by["vocabulary"] = stamps.sha256(vocabulary)
         with GroupWriter(output, made_by, overwrite) as writer:
-            todo = [name for name in list_h5_names(features) if name not in writer]
+            names = list_h5_names(features)
+            todo = [name for name in names if name not in writer]
             if not todo:
                 return output
             if learn and (overwrite or not vocabulary.exists()):
-                if writer.names:
+                if len(todo) < len(names):
                     raise InputError(f"The vocabulary {vocabulary} of {output} is gone: overwrite.")
                 model.fit(_sample(file, vocabulary_images, conf["model"]["max_samples"]))
                 with replacing(vocabulary) as temporary:

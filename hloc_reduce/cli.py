@@ -4,6 +4,7 @@ import argparse
 import difflib
 import sys
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 from . import logger
 
@@ -46,6 +47,20 @@ def check_positive(args: argparse.Namespace, *names: str) -> None:
     for name in names:
         if not getattr(args, name) > 0:
             raise InputError(f"--{name} {getattr(args, name)}: at least 1.")
+
+
+def check_folder(path: Path) -> None:
+    """Raise an InputError if a folder for results cannot be made, as a file has its name."""
+    for part in (path, *path.parents):
+        if part.exists() and not part.is_dir():
+            raise InputError(f"{part} is a file: choose a folder for the results.")
+
+
+def check_file(path: Path, what: str) -> None:
+    """Raise an InputError if a file cannot be written, as a folder has its name."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder: name {what} in it.")
+    check_folder(path.parent)
 
 
 def some(names: Iterable[str], number: int = 5) -> str:

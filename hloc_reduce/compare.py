@@ -45,6 +45,9 @@ def main(
     """
     pipeline = pipeline_of(dataset)
     report.check()
+    page = page or outputs / "report.html"
+    cli.check_folder(outputs)
+    cli.check_file(page, "the HTML file")
     given = {features_confs.get(feature)[0]: feature for feature in features}
     finished, failed = [], {}
     for name, feature in given.items():
@@ -64,7 +67,7 @@ def main(
     tables = runs.recall_tables(runs.load(finished))
     io.write_csv(rows(tables), outputs / "compare.csv")
     print(table(tables))
-    report.main(finished, page or outputs / "report.html")
+    report.main(finished, page)
     return failed
 
 

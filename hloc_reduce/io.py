@@ -1,12 +1,14 @@
 """Images and h5 files, and how files are written so that a killed run loses little."""
 
 import csv
+import filecmp
 import json
 import os
 import shutil
+import sqlite3
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -22,11 +24,17 @@ QUOTED = 200  # characters of a configuration in a message
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path` and move it into place when the block succeeds."""
+    """Give a temporary path beside `path` and move it into place when the block succeeds.
+
+    A file that is replaced by an equal one keeps its time, so that nothing is made anew of it.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         yield temporary
+        filecmp.clear_cache()  # which goes by sizes and times
+        if path.exists() and filecmp.cmp(temporary, path, shallow=False):
+            shutil.copystat(path, temporary)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -69,14 +77,19 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
 def list_h5_names(path: Path) -> list[str]:
     """List the groups of an h5 file that hold data sets, in the order of their names."""
     names: dict[str, None] = {}
+    _visit_h5_names(path, lambda name: names.setdefault(name), h5py.h5.ITER_INC)
+    return list(names)
+
+
+def _visit_h5_names(path: Path, found: Callable[[str], object], order: int) -> None:
+    """Call a function with the group of each data set of an h5 file."""
 
     def visit(name: bytes, info: h5py.h5o.ObjInfo) -> None:
         if info.type == h5py.h5o.TYPE_DATASET:
-            names[name.decode().rpartition("/")[0]] = None
+            found(name.decode().rpartition("/")[0])
 
     with open_h5(path) as file:  # visititems would make an object of each
-        h5py.h5o.visit(file.id, visit, info=True)
-    return list(names)
+        h5py.h5o.visit(file.id, visit, order=order, info=True)
 
 
 class GroupWriter:
@@ -85,7 +98,8 @@ class GroupWriter:
     Groups gather in memory and go into pieces beside the file, each moved into place when it is
     whole. Leaving the context merges the pieces into the file. What a piece holds is never
     computed again, and the file itself is whole at any instant. A file keeps the `id` that it got
-    when it was begun, so that what is derived from it can tell it from one made anew.
+    when it was begun, so that what is derived from it can tell it from one made anew. The names of
+    its groups, which may be more than memory can hold, are in a temporary data base on disk.
 
     Args:
         path: the h5 file, new or to be extended.
@@ -111,13 +125,14 @@ class GroupWriter:
         if overwrite:
             self._drop_pieces()
             path.unlink(missing_ok=True)
-        self.names: set[str] = set()
+        self.names = _Names()
         self.id = uuid.uuid4().hex
         for part in [path] * path.exists() + self._finished():
             with open_h5(part) as file:
                 self._check(file, part)
                 self.id = file.attrs.get("id", self.id)
-            self.names.update(list_h5_names(part))
+            _visit_h5_names(part, self.names.add, h5py.h5.ITER_NATIVE)
+        self.next_piece = 1 + max((int(piece.stem) for piece in self._finished()), default=-1)
         self.buffer: dict[str, tuple[dict, dict]] = {}
         self.buffer_bytes = 0
         self.flushed = time.monotonic()
@@ -172,8 +187,8 @@ class GroupWriter:
 
     def _flush(self) -> None:
         if self.buffer:
-            number = max((int(piece.stem) for piece in self._finished()), default=-1) + 1
-            piece = self.pieces / f"{number:06d}.h5"
+            piece = self.pieces / f"{self.next_piece:06d}.h5"
+            self.next_piece += 1
             with trace.span("write"), replacing(piece) as temporary:
                 self._write(temporary)
         self.buffer.clear()
@@ -205,6 +220,22 @@ class GroupWriter:
                     with open_h5(piece) as file:
                         _copy_missing(file, merged)
         self._drop_pieces()
+
+
+class _Names:
+    """A set of names on disk, in a file without a name in the system's temporary folder."""
+
+    def __init__(self):
+        self.database = sqlite3.connect("", isolation_level=None)
+        self.database.execute("PRAGMA journal_mode = OFF")
+        self.database.execute("CREATE TABLE names (name TEXT PRIMARY KEY) WITHOUT ROWID")
+
+    def add(self, name: str) -> None:
+        self.database.execute("INSERT OR IGNORE INTO names VALUES (?)", (name,))
+
+    def __contains__(self, name: str) -> bool:
+        found = self.database.execute("SELECT 1 FROM names WHERE name = ?", (name,))
+        return found.fetchone() is not None
 
 
 def _quoted(conf: dict, key: str) -> str:

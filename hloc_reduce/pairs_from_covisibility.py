@@ -1,6 +1,8 @@
 """Pair each image of a COLMAP model with those that see most of the same points."""
 
 import argparse
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,8 @@ from scipy.sparse import coo_array
 
 from . import cli, colmap, logger
 from .parsers import write_pairs
+
+BLOCK = 256  # images whose counts with all others are in memory at once
 
 
 def main(model: Path, output: Path, num_matched: int) -> Path:
@@ -30,45 +34,44 @@ def main(model: Path, output: Path, num_matched: int) -> Path:
     if not reconstruction.images:
         raise cli.InputError(f"The model {model} has no images.")
     images = [reconstruction.images[i] for i in sorted(reconstruction.images)]
-    counts = covisibility([colmap.point3D_ids(image) for image in images])
-    pairs = []
-    for i, image in enumerate(images):
-        others = most_covisible(counts, i, num_matched)
-        if not len(others):
-            logger.warning("Image %s has no covisible image.", image.name)
-        pairs += [(image.name, images[j].name) for j in others]
-    if not pairs:
-        raise cli.InputError(f"The model {model} has no covisible images: has it 3D points?")
-    write_pairs(pairs, output)
-    logger.info("Found %d covisible pairs.", len(pairs))
+    ranking = most_covisible((colmap.point3D_ids(image) for image in images), num_matched)
+
+    def pairs() -> Iterator[tuple[str, str]]:
+        alone = 0
+        for image, others in zip(images, ranking, strict=True):
+            if not len(others):
+                logger.warning("Image %s has no covisible image.", image.name)
+                alone += 1
+            yield from ((image.name, images[j].name) for j in others)
+        if alone == len(images):
+            raise cli.InputError(f"The model {model} has no covisible images: has it 3D points?")
+
+    number = write_pairs(pairs(), output)
+    logger.info("Found %d covisible pairs.", number)
     return output
 
 
-def covisibility(point3D_ids: list[np.ndarray]) -> "coo_array":
-    """Count the points that images share.
+def most_covisible(point3D_ids: Iterable[np.ndarray], number: int) -> Iterator[np.ndarray]:
+    """Yield for each image those that share most points with it, best first, at most `number`.
+
+    Of images that share equally many the first come first.
 
     Args:
         point3D_ids: for each image the point of each keypoint, -1 where it has none.
-
-    Returns:
-        Sparse (images, images) counts with an empty diagonal, in CSR form.
+        number: how many to find.
     """
     points = [ids[ids >= 0] for ids in point3D_ids]
     rows = np.repeat(np.arange(len(points)), [len(ids) for ids in points])
     _, columns = np.unique(np.concatenate(points), return_inverse=True)
     shape = (len(points), columns.max(initial=-1) + 1)
-    observed = coo_array((np.ones(len(rows), np.int64), (rows, columns)), shape).tocsr()
-    counts = (observed @ observed.T).tolil()
-    counts.setdiag(0)
-    counts = counts.tocsr()
-    counts.eliminate_zeros()
-    return counts
-
-
-def most_covisible(counts: "coo_array", i: int, number: int) -> np.ndarray:
-    """Return the images that share most points with image `i`, best first, at most `number`."""
-    row = counts[[i]].tocoo()
-    return row.coords[1][np.lexsort((row.coords[1], -row.data))[:number]]
+    observed = coo_array((np.ones(len(rows), np.int32), (rows, columns)), shape).tocsr()
+    seen_by = observed.T.tocsr()
+    for start in range(0, len(points), BLOCK):
+        counts = (observed[start : start + BLOCK] @ seen_by).tocsr()
+        for i, (begin, end) in enumerate(pairwise(counts.indptr), start):
+            others, shared = counts.indices[begin:end], counts.data[begin:end]
+            best = np.lexsort((others, -shared))
+            yield others[best[others[best] != i][:number]]
 
 
 def _main() -> None:

@@ -1,17 +1,18 @@
 """Pair each query with the database images of the most similar global descriptors."""
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from . import cli, colmap, logger
 from .cli import InputError
 from .io import get_dataset, list_h5_names, open_h5
 from .parsers import image_names, parse_retrieval, write_pairs
 
-QUERY_BLOCK = 1024  # rows of the similarity matrix in memory at once
+BLOCK = 2048  # queries, and database images, whose descriptors are in memory at once
 
 
 def main(
@@ -52,21 +53,20 @@ def main(
         db_list = [image.name for image in colmap.read_model(db_model).images.values()]
     query_names = _select(descriptors, query_prefix, query_list)
     db_names = _select(db_descriptors, db_prefix, db_list)
-    queries = read_global(descriptors, query_names)
-    database = read_global(db_descriptors, db_names)
-    if queries.shape[1] != database.shape[1]:
-        raise InputError(
-            f"Global descriptors of {queries.shape[1]} numbers in {descriptors} and of "
-            f"{database.shape[1]} in {db_descriptors} cannot be compared."
-        )
-    pairs = []
-    for start in range(0, len(queries), QUERY_BLOCK):
-        ranking = rank(queries[start : start + QUERY_BLOCK], database, num_matched + 1)
-        for name, row in zip(query_names[start:], ranking, strict=False):
-            others = [db_names[j] for j in row if not same_file or db_names[j] != name]
-            pairs += [(name, other) for other in others[:num_matched]]
-    write_pairs(pairs, output)
-    logger.info("Retrieved %d pairs for %d images.", len(pairs), len(query_names))
+
+    def retrieve() -> Iterator[tuple[str, str]]:
+        with tqdm(total=len(query_names), desc="Retrieving", unit="image") as progress:
+            for start in range(0, len(query_names), BLOCK):
+                names = query_names[start : start + BLOCK]
+                queries = read_global(descriptors, names)
+                ranking = _rank_file(queries, db_descriptors, db_names, num_matched + 1)
+                for name, row in zip(names, ranking, strict=True):
+                    others = [db_names[j] for j in row if not same_file or db_names[j] != name]
+                    yield from ((name, other) for other in others[:num_matched])
+                progress.update(len(names))
+
+    number = write_pairs(retrieve(), output)
+    logger.info("Retrieved %d pairs for %d images.", number, len(query_names))
     return output
 
 
@@ -81,9 +81,37 @@ def rank(queries: np.ndarray, database: np.ndarray, num_matched: int) -> np.ndar
     Returns:
         (Q, num_matched) rows of the database, best first.
     """
+    return _best(_similarity(queries, database), num_matched)
+
+
+def _rank_file(queries: np.ndarray, path: Path, names: list[str], num_matched: int) -> np.ndarray:
+    """Rank as `rank` does, with a database that is read from a file block by block."""
+    rows = np.empty((len(queries), 0), np.int64)
+    similarity = np.empty((len(queries), 0), np.float32)
+    for start in range(0, len(names), BLOCK):
+        database = read_global(path, names[start : start + BLOCK])
+        if queries.shape[1] != database.shape[1]:
+            raise InputError(
+                f"Global descriptors of {queries.shape[1]} numbers and, in {path}, of "
+                f"{database.shape[1]} cannot be compared."
+            )
+        more = np.broadcast_to(np.arange(len(database)) + start, (len(queries), len(database)))
+        rows = np.concatenate([rows, more], axis=1)
+        similarity = np.concatenate([similarity, _similarity(queries, database)], axis=1)
+        best = _best(similarity, num_matched)
+        rows, similarity = (np.take_along_axis(part, best, 1) for part in (rows, similarity))
+    return rows
+
+
+def _similarity(queries: np.ndarray, database: np.ndarray) -> np.ndarray:
     similarity = queries @ database.T
     similarity[:, ~database.any(axis=1)] = -np.inf  # images without features come last
-    return np.argsort(-similarity, axis=1, kind="stable")[:, :num_matched]
+    return similarity
+
+
+def _best(similarity: np.ndarray, number: int) -> np.ndarray:
+    """Return the columns of the largest numbers of each row, of equal ones the first."""
+    return np.argsort(-similarity, axis=1, kind="stable")[:, :number]
 
 
 def select(

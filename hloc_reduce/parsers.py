@@ -1,5 +1,6 @@
 """The text files of hloc: image lists, query lists with intrinsics, pairs, poses."""
 
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
@@ -112,16 +113,18 @@ def parse_retrieval(path: Path) -> dict[str, list[str]]:
     """Read pairs, one `name0 name1` a line, as name0 -> [name1, ...] in the order of the file."""
     retrieval: dict[str, list[str]] = {}
     for name0, name1 in parse_pairs(path):
-        retrieval.setdefault(name0, []).append(name1)
+        retrieval.setdefault(name0, []).append(sys.intern(name1))
     return retrieval
 
 
-def write_pairs(pairs: list[tuple[str, str]], path: Path) -> None:
-    """Write pairs, one `name0 name1` a line; a file that has them already is not touched."""
-    text = "".join(f"{name0} {name1}\n" for name0, name1 in pairs)
-    if not path.exists() or path.read_bytes() != text.encode():
-        with replacing(path) as temporary:
-            temporary.write_text(text)
+def write_pairs(pairs: Iterable[tuple[str, str]], path: Path) -> int:
+    """Write pairs, one `name0 name1` a line, as they are drawn, and return how many they are."""
+    number = 0
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        for name0, name1 in pairs:
+            file.write(f"{name0} {name1}\n")
+            number += 1
+    return number
 
 
 def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
@@ -133,7 +136,10 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
     poses = {}
     for place, (name, *values) in _lines(path):
         if name in poses:
-            raise InputError(f"{place}: {name} is listed twice: whole names are needed.")
+            raise InputError(
+                f"{place}: {name} is listed twice: whole names are needed, which the "
+                "*_logs.jsonl of a pipeline has."
+            )
         try:
             qw, qx, qy, qz, *translation = map(float, values)
             if not np.isfinite(translation).all():

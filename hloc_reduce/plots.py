@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     Panel = Callable[[Axes], None]  # draws into axes
 
 INSTALL = "pip install 'hloc-reduce[report]'"
+FINEST = 1e-4  # metres, degrees: the least error on a logarithmic axis
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#a6761d")
 INCHES = 1.6  # of an entry of a legend
+AXES = np.array([220, 140])  # of a panel, in points, about
 NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 LINES = (("-", "o"), ("--", "s"), (":", "^"))  # of lists, with their markers
 NOISE_COLOURS = {"easy": "#009e73", "hard": "#e69f00", "tough": "#d55e00"}
@@ -113,21 +115,26 @@ def _curves(axis: "Axes", name: str, runs: Mapping, place: int, unit: str) -> No
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     styles = product([line for line, _ in LINES], COLOURS)
-    for (line, colour), (run, errors) in zip(cycle(styles), runs.items(), strict=False):
+    widths = np.linspace(1.3 + 0.5 * min(len(runs) - 1, 5), 1.3, len(runs))  # none hides another
+    for (line, colour), width, (run, errors) in zip(
+        cycle(styles), widths, runs.items(), strict=False
+    ):
         values, percent = cumulative(error[place] for error in errors)
         axis.step(
-            values,
+            values.clip(FINEST),
             percent,
             where="post",
             color=colour,
             linestyle=line,
             label=_shown(run),
-            linewidth=1.4,
+            linewidth=width,
         )
     axis.set(
         xscale="log", xlabel=unit, ylabel="queries within [%]", ylim=(0, 102), title=_shown(name)
     )
-    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    low, high = axis.get_xlim()
+    steps = (1, 2, 5) if high < 50 * low else (1, 3) if high < 1000 * low else (1,)
+    axis.xaxis.set_major_locator(LogLocator(subs=steps))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
 
@@ -150,6 +157,7 @@ def size_and_time(points: Mapping[str, Mapping[str, list[dict]]]) -> "dict[str, 
 
 
 def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -> None:
+    marked = []
     families = dict.fromkeys(run["family"] for runs in lists.values() for run in runs)
     for colour, family in zip(cycle(COLOURS), families, strict=False):
         for (line, marker), (name, runs) in zip(cycle(LINES), lists.items(), strict=False):
@@ -164,27 +172,48 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
                 color=colour,
                 label=_shown(f"{family}, {name}"),
             )
-            for i, run in enumerate(own if key == "seconds" else ()):
-                axis.annotate(
-                    f"{run['bytes']} B",
-                    (run[key], run["value"]),
-                    xytext=(0, 5 if i % 2 else -12),
-                    textcoords="offset points",
-                    ha="center",
-                    fontsize=7,
-                    color=colour,
-                )
+            marked += [(run[key], run["value"], f"{run['bytes']} B", colour) for run in own]
     values = [run["value"] for runs in lists.values() for run in runs]
     axis.set(xlabel=label, ylabel=measure)
     axis.margins(0.12, 0.2)
     if measure.endswith("[%]"):
         axis.set_ylim(min(values) - 5 - 0.1 * (100 - min(values)), 102)
         axis.set_yticks([tick for tick in axis.get_yticks() if min(values) - 5 <= tick <= 100])
-    if key == "bytes":
+    else:
+        axis.set_ylim(max(0, axis.get_ylim()[0]))
+    if key == "seconds":
+        _mark(axis, marked)
+    else:
         ticks = sorted({run["bytes"] for runs in lists.values() for run in runs})
         axis.set_xscale("log", base=2)
         axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.minorticks_off()
+
+
+def _mark(axis: "Axes", marked: list[tuple[float, float, str, str]]) -> None:
+    """Write the text beside each point (x, y, text, colour), if there is a place that is free."""
+    to_points = axis.transScale + axis.transLimits
+    places = to_points.transform([mark[:2] for mark in marked]) * AXES
+    taken = [(place, (4, 4)) for place in places]
+    for place, (*point, text, colour) in zip(places, marked, strict=True):
+        half = np.array([2.2 * len(text), 4])
+        for side in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)):
+            offset = side * (half + 4)
+            centre = place + offset
+            apart = all((abs(centre - other) > half + size).any() for other, size in taken)
+            if apart and (centre > half).all() and (centre < AXES - half).all():
+                taken.append((centre, half))
+                axis.annotate(
+                    text,
+                    point,
+                    xytext=offset,
+                    textcoords="offset points",
+                    ha="center",
+                    va="center",
+                    fontsize=7,
+                    color=colour,
+                )
+                break
 
 
 def hpatches_bars(rows: list[dict]) -> "Figure":

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pycolmap import Rigid3d, Rotation3d
 
+from hloc_reduce import cli
 from hloc_reduce.evaluation import __main__ as evaluation
 from hloc_reduce.evaluation import hpatches, poses, published
 from hloc_reduce.evaluation.hpatches import data, lists, tasks
@@ -362,11 +363,12 @@ def test_poses(two_lists, monkeypatch, capsys):
     # of 0.1, 0.4, 0.1, inf m and 1, 1, 3, inf deg
     assert "day: 4 queries, median errors 0.250 m, 2.000 deg" in printed
     assert printed.splitlines()[-2:] == [
-        "1 queries have no pose and count as failures:",
+        "Failures without a pose: 1",
         "query/day/3.jpg",
     ]
     rows = rows_of(two_lists / "o/errors.csv")
     assert len(rows) == 6 and rows[3]["position_error_m"] == ""
+    assert [row["status"] for row in rows] == [*["localized"] * 3, "failed", *["localized"] * 2]
     assert float(rows[1]["position_error_m"]) == pytest.approx(0.4)
     curve = [
         (float(row["value"]), float(row["percent"]))
@@ -407,19 +409,42 @@ def test_whole_names_of_estimates_come_first():
     assert poses.find_estimates({"sub/x.jpg": rigid(1)}, truth).keys() == {"sub/x.jpg"}
 
 
-def test_poses_of_a_pipeline_have_whole_names_and_no_fallbacks(
+def test_poses_of_a_pipeline_are_evaluated_as_in_its_summary(
     aachen_layout, tmp_path, monkeypatch, capsys
 ):
     given = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--feature", "colmap_sift")
     run(monkeypatch, aachen, *given)
     capsys.readouterr()
+    lists = json.loads((tmp_path / "o/summary.json").read_text())["lists"]
     (logs,) = (tmp_path / "o").glob("*_logs.jsonl")
     truth = aachen_layout / "queries/ground_truth_poses.txt"
     files = ("--estimates", logs, "--ground_truth", truth, "--outputs", tmp_path / "e")
     run(monkeypatch, evaluation, "poses", *files)
     printed = capsys.readouterr().out
     assert "50.0 / 50.0 / 50.0" in printed and "100.0 / 100.0 / 100.0" in printed
-    assert printed.endswith("query/day/grey.png\n")
+    for name, summary in lists.items():
+        medians = [summary[f"median_{key}"] for key in ("position_error_m", "rotation_error_deg")]
+        number = summary["queries"]
+        said = "{}: {} queries, median errors {:.3f} m, {:.3f} deg"
+        assert said.format(name.split("_")[0], number, *medians) in printed
+    assert printed.endswith("Failures with a fallback pose: 1\nquery/day/grey.png\n")
+    with (next((tmp_path / "o").glob("queries.csv"))).open() as file:
+        expected = {row["query"]: row for row in csv.DictReader(file)}
+    for row in rows_of(tmp_path / "e/errors.csv"):
+        for key in ("status", "position_error_m", "rotation_error_deg"):
+            assert row[key] == expected[row["query"]][key]
+
+
+def test_exact_poses_and_unknown_names(two_lists, monkeypatch, capsys, caplog, recwarn):
+    """On a logarithmic axis there is no 0."""
+    lines = (two_lists / "truth.txt").read_text()
+    (two_lists / "exact.txt").write_text(lines + lines.splitlines()[0].replace("day/0", "day/O"))
+    files = ("--estimates", two_lists / "exact.txt", "--ground_truth", two_lists / "truth.txt")
+    monkeypatch.setattr(cli.logger, "propagate", True)
+    run(monkeypatch, evaluation, "poses", *files, "--outputs", two_lists / "o")
+    assert "1 estimates are of no such query: query/day/O.jpg." in caplog.text
+    assert "day: 4 queries, median errors 0.000 m, 0.000 deg" in capsys.readouterr().out
+    assert not list(recwarn)
 
 
 def test_poses_wrong_input(two_lists, monkeypatch, caplog):
@@ -431,6 +456,7 @@ def test_poses_wrong_input(two_lists, monkeypatch, caplog):
     assert "aachen, inloc or pairs" in message("--thresholds", "aachen", "0,1")
     assert "in another file" in message("--ground_truth", two_lists / "truth.txt")
     assert "Cannot read" in message(estimates="absent.txt")
+    assert "poses.txt is a file" in message("--outputs", two_lists / "poses.txt/o")
     write_poses({"x.jpg": rigid(0)}, two_lists / "other.txt")
     assert "no pose of a query" in message(estimates="other.txt")
     write_poses({"a/day/0.jpg": rigid(0), "b/0.jpg": rigid(0)}, two_lists / "more.txt", None)

@@ -86,6 +86,15 @@ def test_inliers_of_pictures(compared):
     assert found["inliers"].sum() <= run.rows["query/day/a.png"]["num_inliers"]
     picture = pictures.draw(run, "query/day/a.png", found)
     assert tuple(picture[0, 0]) == pictures.GREEN
+    # of those retrieved it is the one with most inliers, wherever it is in the list
+    names, record = run.retrieved["query/day/a.png"], run.records["query/day/a.png"]
+    numbers = {}
+    for record["db"] in names:
+        run.retrieved["query/day/a.png"] = [record["db"]]
+        numbers[record["db"]] = pictures.matched(run, "query/day/a.png")["inliers"].sum()
+    run.retrieved["query/day/a.png"] = sorted(names, key=numbers.get)
+    assert pictures.matched(run, "query/day/a.png")["name"] == found["name"]
+    assert numbers[found["name"]] == max(numbers.values()) > min(numbers.values())
     found = pictures.matched(run, "query/day/grey.png")
     assert len(found["inliers"]) == 0
     assert tuple(pictures.draw(run, "query/day/grey.png", found)[0, 0]) == pictures.RED
@@ -235,10 +244,14 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_lay
     assert (rows[0]["recall_percent"], rows[0]["paper_percent"]) == ("50.0", "85.9")
 
     # what is there is not run again
-    times = {path: path.stat().st_mtime_ns for path in outputs.rglob("*.h5")}
+    times = {path: path.stat().st_mtime_ns for path in (outputs / "sift_sv16").rglob("*")}
     page = tmp_path / "p.html"
     command.run(monkeypatch, compare, *given, "sift_sv16", "-o", page)
-    assert page.exists() and {path: path.stat().st_mtime_ns for path in times} == times
+    assert page.exists() and len(times) > 10
+    files = [path for path in times if path.is_file()]
+    assert {path.name: path.stat().st_mtime_ns for path in files} == {
+        path.name: times[path] for path in files
+    }
 
     def message(dataset, *features):
         command_line = ("--dataset", dataset, "--outputs", tmp_path / "o", "--features", *features)
@@ -246,6 +259,7 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_lay
 
     assert "neither of the folders 3D-models and database" in message(tmp_path, "sift")
     assert "Unknown feature 'sift_sv65'" in message(aachen_layout, "sift", "sift_sv65")
+    assert "is a folder: name the HTML file" in message(aachen_layout, "sift", "-o", tmp_path)
     assert not (tmp_path / "o").exists()
     assert compare.pipeline_of(inloc_layout) is inloc.main
 
@@ -254,16 +268,18 @@ def test_wrong_input(compared, tmp_path, monkeypatch, caplog):
     def message(*arguments):
         return command.refused(monkeypatch, caplog, report, "-o", tmp_path / "r.html", *arguments)
 
-    assert "not the outputs folder" in message(tmp_path / "nowhere")
+    assert "There is no folder" in message(tmp_path / "nowhere")
+    assert "not the outputs folder" in message(tmp_path)
     assert "Unknown query 'b.png'" in message(compared[0], "--queries", "b.png")
     assert "is a folder" in message(compared[0], "-o", tmp_path)
     assert "--num_queries 0: at least 1" in message(compared[0], "--num_queries", "0")
     file = compared[1] / "summary.json"
     summary = json.loads(file.read_text())
     del summary["files"]
-    for broken in ("{", "[]", json.dumps(summary)):
+    for broken, why in (("{", "broken"), ("[]", "no 'files'"), (json.dumps(summary), "no 'files'")):
         file.write_text(broken)
-        assert "run its pipeline again" in message(*compared)
+        said = message(*compared)
+        assert why in said and "run its pipeline again" in said
     logs = next(compared[0].glob("*_logs.jsonl"))
     lines = logs.read_text().splitlines()
     logs.write_text("\n".join(lines[:-1]))  # a run that goes on, or was killed

@@ -437,12 +437,15 @@ def test_files_of_another_kind_are_refused(built):
         match_features.main(MATCHER, built.pairs, built.matches, matches=built.root / "m.h5")
 
 
-def test_covisibility_by_hand():
-    counts = pairs_from_covisibility.covisibility(
-        [np.array([7, -1, 9, 9]), np.array([9, -1]), np.array([7, 9, 4]), np.array([-1])]
-    ).toarray()
-    # image 0 sees point 9 twice
-    assert counts.tolist() == [[0, 2, 3, 0], [2, 0, 1, 0], [3, 1, 0, 0], [0, 0, 0, 0]]
+@pytest.mark.parametrize("block", [1, 256])
+def test_covisibility_by_hand(monkeypatch, block):
+    monkeypatch.setattr(pairs_from_covisibility, "BLOCK", block)
+    # image 0 sees point 9 twice, so that it shares 2 with 1, 3 with 2, which share 1; 4 is as 1
+    ids = [[7, -1, 9, 9], [9, -1], [7, 9, 4], [-1], [9, -1]]
+    ranking = pairs_from_covisibility.most_covisible(map(np.array, ids), 10)
+    assert [row.tolist() for row in ranking] == [[2, 1, 4], [0, 2, 4], [0, 1, 4], [], [0, 1, 2]]
+    ranking = pairs_from_covisibility.most_covisible(map(np.array, ids), 1)
+    assert [row.tolist() for row in ranking] == [[2], [0], [0], [], [0]]
 
 
 def test_covisible_pairs_of_the_map(built, tmp_path):
@@ -454,7 +457,9 @@ def test_covisible_pairs_of_the_map(built, tmp_path):
     }
 
 
-def test_retrieval_ranks_by_similarity(tmp_path):
+@pytest.mark.parametrize("block", [2, 2048])
+def test_retrieval_ranks_by_similarity(tmp_path, monkeypatch, block):
+    monkeypatch.setattr(pairs_from_retrieval, "BLOCK", block)
     path = tmp_path / "global.h5"
     vectors = {
         "q/0": [1, 0, 0],

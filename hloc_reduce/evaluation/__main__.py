@@ -22,32 +22,47 @@ def evaluate_poses(args: argparse.Namespace) -> None:
     """Compare estimated with true poses."""
     given = args.thresholds or ["aachen"]
     limits = parse_thresholds(given)
+    called = args.estimates.name.removesuffix("_logs.jsonl").removesuffix(".txt")
+    outputs = args.outputs or Path("outputs/evaluation") / called
+    cli.check_folder(outputs)
     truth = poses.read_truth(args.ground_truth)
-    estimates = poses.read_estimates(args.estimates)
+    estimates, fallbacks = poses.read_estimates(args.estimates)
     found = poses.find_estimates(estimates, truth)
     if not found:
         raise InputError(f"{args.estimates} has no pose of a query of the true poses.")
-    if len(estimates) > len(found):
-        logger.warning("%d estimates are of no such query.", len(estimates) - len(found))
-    errors = poses.errors_of(found, truth)
+    if others := estimates.keys() - set(found.values()):
+        logger.warning(
+            "%d estimates are of no such query: %s.", len(others), cli.some(sorted(others))
+        )
+    errors = poses.errors_of({name: estimates[key] for name, key in found.items()}, truth)
+    status = {
+        name: "failed" if key is None else "fallback" if key in fallbacks else "localized"
+        for name, key in ((name, found.get(name)) for name in truth)
+    }
+    counted = {
+        name: error if status[name] == "localized" else poses.FAILED
+        for name, error in errors.items()
+    }
     groups: dict[str, list[str]] = {}
     for name in truth:
         groups.setdefault(group_of(name, given), []).append(name)
-    summaries = {}
-    for group, names in groups.items():
-        listed = [errors[name] for name in names]
-        summaries[group] = poses.summarize_errors(listed, listed, limits or thresholds(group))
-    called = args.estimates.name.removesuffix("_logs.jsonl").removesuffix(".txt")
-    outputs = args.outputs or Path("outputs/evaluation") / called
-    write_errors(errors, groups, outputs / "errors.csv")
-    curves = {group: [errors[name] for name in names] for group, names in groups.items()}
+    summaries = {
+        group: poses.summarize_errors(
+            [errors[name] for name in names],
+            [counted[name] for name in names],
+            limits or thresholds(group),
+        )
+        for group, names in groups.items()
+    }
+    write_errors(errors, status, groups, outputs / "errors.csv")
+    curves = {group: [counted[name] for name in names] for group, names in groups.items()}
     write_curves(curves, outputs / "curves.csv")
     if plots.available(outputs / "curves.svg"):
         by_list = {group: {called: listed} for group, listed in curves.items()}
         plots.save(
             plots.figure(list(plots.error_curves(by_list).values()), 2), outputs / "curves.svg"
         )
-    print(results.recall_table(called, summaries))
+    print(f"{called}:\n{results.recall_table('', summaries)}")
     for group, summary in summaries.items():
         medians = [summary[f"median_{key}"] for key in ("position_error_m", "rotation_error_deg")]
         known = None not in medians
@@ -55,10 +70,11 @@ def evaluate_poses(args: argparse.Namespace) -> None:
             f"{group}: {summary['with_ground_truth']} queries, median errors "
             + ("{:.3f} m, {:.3f} deg".format(*medians) if known else "none: half have no pose")
         )
-    missing = [name for name in truth if name not in found]
-    if missing:
-        print(f"{len(missing)} queries have no pose and count as failures:")
-        print("\n".join(missing[:SHOWN]) + ("\n..." if len(missing) > SHOWN else ""))
+    for kind, said in (("failed", "without a pose"), ("fallback", "with a fallback pose")):
+        names = [name for name in truth if status[name] == kind]
+        if names:
+            print(f"Failures {said}: {len(names)}")
+            print("\n".join(names[:SHOWN]) + ("\n..." if len(names) > SHOWN else ""))
     logger.info("Errors and their curves are in %s.", outputs)
 
 
@@ -85,14 +101,17 @@ def parse_thresholds(given: list[str]) -> list[tuple[float, float]] | None:
 def group_of(name: str, given: list[str]) -> str:
     """Return the group of a query: with Aachen's thresholds those of night are apart."""
     if given != ["aachen"]:
-        return "queries"
+        return "all"
     return "night" if any(part.startswith("night") for part in name.split("/")[:-1]) else "day"
 
 
 def write_errors(
-    errors: dict[str, tuple[float, float]], groups: dict[str, list[str]], path: Path
+    errors: dict[str, tuple[float, float]],
+    status: dict[str, str],
+    groups: dict[str, list[str]],
+    path: Path,
 ) -> None:
-    """Write the errors of all queries, empty for those without a pose."""
+    """Write the status and the errors of all queries, empty for those without a pose."""
     rows = []
     for group, names in groups.items():
         for name in names:
@@ -101,6 +120,7 @@ def write_errors(
                 {
                     "query": name,
                     "list": group,
+                    "status": status[name],
                     "position_error_m": metres,
                     "rotation_error_deg": degrees,
                 }
@@ -121,6 +141,7 @@ def write_curves(curves: dict[str, list[tuple[float, float]]], path: Path) -> No
 
 def evaluate_hpatches(args: argparse.Namespace) -> None:
     """Evaluate features on HPatches."""
+    cli.check_folder(args.outputs)
     rows = hpatches.main(
         args.root,
         args.feature,
@@ -139,6 +160,7 @@ def evaluate_hpatches(args: argparse.Namespace) -> None:
 
 def evaluate_phototour(args: argparse.Namespace) -> None:
     """Evaluate features on PhotoTour."""
+    cli.check_folder(args.outputs)
     if Path(args.name).name != args.name:
         raise InputError(f"--name {args.name} is a folder in --root, without any /.")
     by_base: dict[str, dict[str, torch.nn.Module]] = {}
@@ -175,7 +197,8 @@ def _main() -> None:
         "--estimates",
         type=Path,
         required=True,
-        help="text file of poses, or the *_logs.jsonl of a pipeline, where fallbacks are failures",
+        help="text file of poses, or the *_logs.jsonl of a pipeline, of which fallbacks count as "
+        "failures in recall and curves",
     )
     command.add_argument(
         "--ground_truth",

@@ -95,26 +95,24 @@ def read_truth(paths: Iterable[Path]) -> dict[str, pycolmap.Rigid3d]:
     return truth
 
 
-def find_estimates(
-    estimates: Mapping[str, pycolmap.Rigid3d], names: Iterable[str]
-) -> dict[str, pycolmap.Rigid3d]:
+def find_estimates(estimates: Iterable[str], names: Iterable[str]) -> dict[str, str]:
     """Find the estimates of queries by their full names, or else by what full names end with.
 
     Benchmarks want base names, or the last folder and the base name.
 
     Args:
-        estimates: by name.
+        estimates: their names.
         names: full names of queries.
 
     Returns:
-        By full name, of those that have one.
+        From full name to the name of the estimate, for those that have one.
 
     Raises:
         InputError: when an estimate could be of several queries.
     """
-    names = list(names)
-    found = {name: estimates[name] for name in names if name in estimates}
-    owner = {name: name for name in found}
+    estimates, names = set(estimates), list(names)
+    found = {name: name for name in names if name in estimates}
+    owner = dict(found)
     for name in names:
         parts = name.split("/")
         endings = ["/".join(parts[i:]) for i in range(1, len(parts))]
@@ -126,22 +124,26 @@ def find_estimates(
                 f"The estimate {written} could be of {owner[written]} and of {name}: "
                 "whole names are needed, which the *_logs.jsonl of a pipeline has."
             )
-        found[name], owner[written] = estimates[written], name
+        found[name], owner[written] = written, name
     return found
 
 
-def read_estimates(path: Path) -> dict[str, pycolmap.Rigid3d]:
+def read_estimates(path: Path) -> tuple[dict[str, pycolmap.Rigid3d], set[str]]:
     """Read estimated poses, from a text file or from the `*_logs.jsonl` of a pipeline.
 
-    The latter has whole names, and of it only the poses of localized queries are taken.
+    Returns:
+        The poses by name, in the latter whole names, and the names of those that are fallbacks,
+        which only the latter tells.
 
     Raises:
         InputError: for a broken file.
     """
     if path.suffix != ".jsonl":
-        return parse_poses(path)
+        return parse_poses(path), set()
     records = localization.read_records(path)
-    return {name: localization.pose(r) for name, r in records.items() if r["localized"]}
+    poses = {name: localization.pose(record) for name, record in records.items()}
+    known = {name: pose for name, pose in poses.items() if pose is not None}
+    return known, {name for name in known if not records[name]["localized"]}
 
 
 def errors_of(

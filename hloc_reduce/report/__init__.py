@@ -44,8 +44,7 @@ def main(
             is not installed.
     """
     check()
-    if output.is_dir():
-        raise InputError(f"{output} is a folder: name the HTML file in it.")
+    cli.check_file(output, "the HTML file")
     compared = runs.load(folders)
     ranked = runs.ranked(compared)
     chosen = [cli.choose("query", name, ranked) for name in queries or ()]

@@ -1,4 +1,4 @@
-"""The picture of a query beside the map image that was retrieved for it, with their matches."""
+"""The picture of a query beside its best retrieved map image, with their matches."""
 
 import cv2
 import numpy as np
@@ -16,7 +16,9 @@ QUALITY = 80  # of JPEG
 
 
 def matched(run: Run, query: str) -> dict | None:
-    """Find the matches of a query with the map image that its record names.
+    """Find the matches of a query with the retrieved map image that has most inliers.
+
+    Where the query was not localized it is the first retrieved one.
 
     Returns:
         `name` of the map image; keypoints `first` and `second` (M, 2) of the matches, pixel
@@ -24,25 +26,43 @@ def matched(run: Run, query: str) -> dict | None:
         threshold of the query's pose, none if it was not localized. None if nothing was retrieved.
     """
     record = run.records[query]
-    name = record["db"]
-    if name is None:
+    if record["db"] is None:
         return None
-    with open_h5(run.files["features"]) as features, open_h5(run.files["map_features"]) as others:
-        keypoints, _ = get_keypoints(features, query)
-        map_keypoints, _ = get_keypoints(others, name)
-    with open_h5(run.files["matches"]) as file:
-        matches, _ = get_matches(file, query, name)
-    first, second = keypoints[matches[:, 0]], map_keypoints[matches[:, 1]]
-    inliers = np.zeros(len(matches), bool)
-    pose = localization.pose(record)
+    names = [record["db"]]
     if record["localized"]:
-        ids, points = run.reference.lift(name, matches[:, 1])
+        present = [name for name in run.retrieved[query] if name in run.reference]
+        clusters = run.reference.clusters(present)
+        (names,) = [names for names in clusters if record["db"] in names]
+    with open_h5(run.files["features"]) as file:
+        keypoints, _ = get_keypoints(file, query)
+    best = None
+    with open_h5(run.files["matches"]) as file:
+        for name in names:
+            matches, _ = get_matches(file, query, name)
+            inliers = _inliers(run, record, name, keypoints[matches[:, 0]], matches[:, 1])
+            if best is None or inliers.sum() > best[2].sum():
+                best = name, matches, inliers
+    name, matches, inliers = best
+    with open_h5(run.files["map_features"]) as file:
+        map_keypoints, _ = get_keypoints(file, name)
+    first, second = keypoints[matches[:, 0]], map_keypoints[matches[:, 1]]
+    return {"name": name, "first": first, "second": second, "inliers": inliers}
+
+
+def _inliers(
+    run: Run, record: dict, name: str, matched_to: np.ndarray, keypoints: np.ndarray
+) -> np.ndarray:
+    """Tell which points that keypoints (M,) of a map image show reproject to those (M, 2)."""
+    inliers = np.zeros(len(keypoints), bool)
+    if record["localized"]:
+        pose = localization.pose(record)
+        ids, points = run.reference.lift(name, keypoints)
         known = np.flatnonzero(ids >= 0)
         in_camera = points[known] @ pose.rotation.matrix().T + pose.translation
         projected = localization.camera(record).img_from_cam(in_camera)
-        apart = np.linalg.norm(projected - (first[known] + 0.5), axis=1)
+        apart = np.linalg.norm(projected - (matched_to[known] + 0.5), axis=1)
         inliers[known] = (apart <= record["max_error"]) & (in_camera[:, 2] > 0)
-    return {"name": name, "first": first, "second": second, "inliers": inliers}
+    return inliers
 
 
 def draw(run: Run, query: str, found: dict) -> np.ndarray:

@@ -7,16 +7,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pycolmap
 
-from .. import colmap, localization, localize_inloc, scans
+from .. import colmap, localization, localize_inloc, logger, scans
 from ..cli import InputError
 from ..evaluation import published
 from ..evaluation.poses import FAILED
-from ..io import list_h5_names, open_h5
+from ..io import list_h5_names
 from ..localize_sfm import SfmMap
-from ..parsers import parse_poses
+from ..parsers import parse_poses, parse_retrieval
 
 NUMBERS = ("num_matches", "num_correspondences", "num_inliers")
 ERRORS = ("position_error_m", "rotation_error_deg")
@@ -59,10 +60,16 @@ class Run:
             self.bytes = int(self.summary["bytes_per_keypoint"]["descriptor"])
             self.seconds = float(sum(self.summary["seconds"].values()))
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-            why = f"{error}" if isinstance(error, OSError) else f"summary.json lacks {error}"
+            if not self.folder.is_dir():
+                raise InputError(f"There is no folder {self.folder}.") from None
+            why = "a broken file"
+            if isinstance(error, FileNotFoundError):
+                why = f"no {Path(error.filename).name}"
+            elif isinstance(error, KeyError):
+                why = f"no {error} in its summary.json or queries.csv"
             raise InputError(
-                f"{self.folder} is not the outputs folder of a finished run of this version "
-                f"({why}): run its pipeline again, which computes only what is missing."
+                f"{self.folder} is not the outputs folder of a finished run of this version, it "
+                f"has {why}: run its pipeline again, which computes only what is missing."
             ) from None
         self.records = self._read_records()
 
@@ -107,13 +114,12 @@ class Run:
         file = self.files["map"]
         names = list_h5_names(file)
         poses = {name: scans.read_pose(self.files["map_images"], name) for name in names}
-        return localize_inloc.ScanMap(self._open(file), poses)
+        return localize_inloc.ScanMap(h5py.File(file), poses)
 
-    def _open(self, file: Path):
-        """Open a file for as long as the report is made."""
-        opened = open_h5(file)
-        self._opened = opened
-        return opened.__enter__()
+    @cached_property
+    def retrieved(self) -> dict[str, list[str]]:
+        """The map images that were retrieved for each query, best first."""
+        return parse_retrieval(self.files["pairs"])
 
     @cached_property
     def truth(self) -> dict[str, pycolmap.Rigid3d]:
@@ -130,7 +136,10 @@ def load(folders: list[Path]) -> list[Run]:
     Raises:
         InputError: for a folder that is no run's.
     """
-    runs = [Run(folder) for folder in dict.fromkeys(path.resolve() for path in folders)]
+    different = dict.fromkeys(path.resolve() for path in folders)
+    if len(different) < len(folders):
+        logger.warning("A folder that is given twice is shown once.")
+    runs = [Run(folder) for folder in different]
     for alike in [[r for r in runs if r.label == label] for label in {run.label for run in runs}]:
         ends = [run.folder.parts for run in alike]
         depth = next(n for n in range(1, 999) if len({parts[-n:] for parts in ends}) == len(ends))
