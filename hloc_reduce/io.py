@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -76,20 +76,37 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
 
 def list_h5_names(path: Path) -> list[str]:
     """List the groups of an h5 file that hold data sets, in the order of their names."""
-    names: dict[str, None] = {}
-    _visit_h5_names(path, lambda name: names.setdefault(name), h5py.h5.ITER_INC)
-    return list(names)
+    with open_h5(path) as file:
+        return list(iterate_h5_names(file.id))
 
 
-def _visit_h5_names(path: Path, found: Callable[[str], object], order: int) -> None:
-    """Call a function with the group of each data set of an h5 file."""
+def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]:
+    """Yield the groups below a group that hold data sets, in the order of their names.
 
-    def visit(name: bytes, info: h5py.h5o.ObjInfo) -> None:
-        if info.type == h5py.h5o.TYPE_DATASET:
-            found(name.decode().rpartition("/")[0])
+    Reads one group at a time: HDF5's own visit of all groups keeps all in memory. Only what the
+    file itself holds counts, not links to elsewhere.
 
-    with open_h5(path) as file:  # visititems would make an object of each
-        h5py.h5o.visit(file.id, visit, order=order, info=True)
+    Raises:
+        InputError: when a group has several names, and so could be in itself.
+    """
+    names = []
+
+    def gather(name: bytes, link: h5py.h5l.LinkInfo) -> None:
+        if link.type == h5py.h5l.TYPE_HARD:
+            names.append(name)
+
+    group.links.iterate(gather, info=True)
+    holds_data = False
+    for name in names:
+        child = h5py.h5o.get_info(group, name)
+        if child.type == h5py.h5o.TYPE_GROUP:
+            path = f"{prefix}{name.decode()}"
+            if child.rc > 1:
+                raise InputError(f"The group {path} of an h5 file has another name, too.")
+            yield from iterate_h5_names(h5py.h5g.open(group, name), f"{path}/")
+        elif not holds_data:
+            holds_data = True
+            yield prefix[:-1]
 
 
 class GroupWriter:
@@ -131,7 +148,8 @@ class GroupWriter:
             with open_h5(part) as file:
                 self._check(file, part)
                 self.id = file.attrs.get("id", self.id)
-            _visit_h5_names(part, self.names.add, h5py.h5.ITER_NATIVE)
+                for name in iterate_h5_names(file.id):
+                    self.names.add(name)
         self.next_piece = 1 + max((int(piece.stem) for piece in self._finished()), default=-1)
         self.buffer: dict[str, tuple[dict, dict]] = {}
         self.buffer_bytes = 0

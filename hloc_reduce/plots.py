@@ -116,13 +116,14 @@ def _curves(axis: "Axes", name: str, runs: Mapping, place: int, unit: str) -> No
 
     styles = product([line for line, _ in LINES], COLOURS)
     widths = np.linspace(1.3 + 0.5 * min(len(runs) - 1, 5), 1.3, len(runs))  # none hides another
-    for (line, colour), width, (run, errors) in zip(
-        cycle(styles), widths, runs.items(), strict=False
+    curves = {run: cumulative(error[place] for error in errors) for run, errors in runs.items()}
+    end = max((values[-1] for values, _ in curves.values() if len(values)), default=1.0)
+    for (line, colour), width, (run, (values, percent)) in zip(
+        cycle(styles), widths, curves.items(), strict=False
     ):
-        values, percent = cumulative(error[place] for error in errors)
         axis.step(
-            values.clip(FINEST),
-            percent,
+            np.array([*values[:1], *values, end]).clip(FINEST),
+            [0, *percent, percent[-1]] if len(percent) else [0],
             where="post",
             color=colour,
             linestyle=line,
@@ -182,7 +183,7 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
     else:
         axis.set_ylim(max(0, axis.get_ylim()[0]))
     if key == "seconds":
-        _mark(axis, marked)
+        _mark(axis, list(dict.fromkeys(marked)))
     else:
         ticks = sorted({run["bytes"] for runs in lists.values() for run in runs})
         axis.set_xscale("log", base=2)
@@ -198,9 +199,9 @@ def _mark(axis: "Axes", marked: list[tuple[float, float, str, str]]) -> None:
     for place, (*point, text, colour) in zip(places, marked, strict=True):
         half = np.array([2.2 * len(text), 4])
         for side in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)):
-            offset = side * (half + 4)
+            offset = side * (half + 5)
             centre = place + offset
-            apart = all((abs(centre - other) > half + size).any() for other, size in taken)
+            apart = all((abs(centre - other) >= half + size).any() for other, size in taken)
             if apart and (centre > half).all() and (centre < AXES - half).all():
                 taken.append((centre, half))
                 axis.annotate(

@@ -83,6 +83,23 @@ def test_broken_h5_is_refused_and_kept(tmp_path):
         pass
 
 
+def test_only_groups_of_the_file_itself_are_listed(tmp_path):
+    path = tmp_path / "f.h5"
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x/a"] = 1
+    with h5py.File(path, "w") as file:
+        for name in ("db/2.jpg/a", "db/2.jpg/b", "db/10.jpg/a", "db/sub/3.jpg/a", "q/1/a", "top"):
+            file[name] = 1
+        file.create_group("empty")
+        file["elsewhere"] = h5py.ExternalLink("other.h5", "x")
+        file["nowhere"] = h5py.SoftLink("/absent")
+    assert io.list_h5_names(path) == ["db/10.jpg", "db/2.jpg", "db/sub/3.jpg", "q/1", ""]
+    with h5py.File(path, "a") as file:
+        file["db/sub/itself"] = file["db"]
+    with pytest.raises(InputError, match="has another name"):
+        io.list_h5_names(path)
+
+
 def test_replacing_keeps_the_old_file_on_failure(tmp_path):
     path = tmp_path / "sub" / "a.txt"
     with io.replacing(path) as temporary:
