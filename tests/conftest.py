@@ -1,6 +1,7 @@
 """What tests share: the folder of real data, and a small scene with answers known in advance."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ import pytest
 from scipy.io import savemat
 
 from hloc_reduce import colmap
+from hloc_reduce.descriptors import weights
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -25,10 +27,17 @@ def herz_jesus() -> Path:
 
 
 @pytest.fixture
-def base_weights(monkeypatch) -> None:
-    """Weights of learned base descriptors: those of the shared folder, where it is there."""
+def base_weights(monkeypatch) -> Callable[[str], None]:
+    """Skips a test for want of a base descriptor's weights, in the shared folder if it is there."""
     if (SHARED / "torch_home").is_dir():
         monkeypatch.setenv("TORCH_HOME", str(SHARED / "torch_home"))
+
+    def need(name: str) -> None:
+        path = weights(name)
+        if path and not path.is_file():
+            pytest.skip(f"the weights {path} are not on this machine")
+
+    return need
 
 
 @pytest.fixture

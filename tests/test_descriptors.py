@@ -7,21 +7,14 @@ import torch
 from confs import features
 from hloc_reduce import descriptors
 from hloc_reduce.cli import InputError
-from hloc_reduce.descriptors import DESCRIPTORS, Descriptor, weights
+from hloc_reduce.descriptors import DESCRIPTORS, Descriptor
 from hloc_reduce.extract_features import provenance
-
-
-def available(name):
-    """Make a descriptor, or skip where its weights are not on this machine."""
-    path = weights(name)
-    if path and not path.is_file():
-        pytest.skip(f"the weights {path} are not on this machine")
-    return Descriptor(name)
 
 
 @pytest.mark.parametrize("name", DESCRIPTORS)
 def test_descriptors_are_of_unit_norm_and_do_not_depend_on_the_batch(name, base_weights):
-    describe = available(name)
+    base_weights(name)
+    describe = Descriptor(name)
     patches = torch.rand(150, 1, 32, 32, generator=torch.Generator().manual_seed(0))
     described = describe(patches)
     assert described.shape == (150, 128) and described.dtype == torch.float32
@@ -39,7 +32,8 @@ def test_descriptors_are_of_unit_norm_and_do_not_depend_on_the_batch(name, base_
     ],
 )
 def test_descriptors_are_kornias(name, module, base_weights):
-    describe = available(name)
+    base_weights(name)
+    describe = Descriptor(name)
     patches = torch.rand(7, 1, 32, 32, generator=torch.Generator().manual_seed(0))
     patches[5] = 0.5  # flat
     patches[6] = torch.linspace(0, 1, 32)  # a ramp: one orientation, that of bin 0

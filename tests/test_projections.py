@@ -85,6 +85,7 @@ OF_PATCHES = [
 
 @pytest.mark.parametrize("feature", ["sift", *OF_PATCHES])
 def test_every_feature_describes_patches(feature, base_weights):
+    base_weights(features.of_patches(feature)[0])
     torch.manual_seed(0)
     patches = torch.rand(200, 1, 32, 32)
     descriptors = hloc_reduce.describe_patches(patches, feature)
@@ -353,5 +354,6 @@ def test_a_feature_is_called_after_file_and_prefix(tmp_path):
 
 
 def test_a_projection_of_another_descriptor_is_refused(base_weights):
+    base_weights("mkd")
     with pytest.raises(InputError, match="is for sift, not for mkd"):
         Reduced({"base": {"name": "dog", "descriptor": "mkd"}, "projection": "sift_sv16"})
