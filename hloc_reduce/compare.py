@@ -57,7 +57,7 @@ def main(
         truth = ground_truth or (before and folder / before)
         try:
             pipeline(dataset, folder, feature, retrieval=retrieval, ground_truth=truth)
-        except InputError as error:
+        except (InputError, OSError) as error:
             logger.error("%s failed: %s", name, error)
             failed[name] = str(error)
         else:

@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -40,10 +40,13 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_csv(rows: list[dict], path: Path) -> None:
-    """Write rows, one at least, that have the same keys; None is empty."""
+def write_csv(rows: list[dict], path: Path, columns: Iterable[str] = ()) -> None:
+    """Write rows that have the same keys, the columns; None is empty.
+
+    Where there may be no row, `columns` names them.
+    """
     with replacing(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
+        writer = csv.DictWriter(file, list(columns) or list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
 
@@ -102,7 +105,8 @@ def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]
         if child.type == h5py.h5o.TYPE_GROUP:
             path = f"{prefix}{name.decode()}"
             if child.rc > 1:
-                raise InputError(f"The group {path} of an h5 file has another name, too.")
+                file = h5py.h5f.get_name(group).decode()
+                raise InputError(f"{file}: the group {path} has another name, too; copy the file.")
             yield from iterate_h5_names(h5py.h5g.open(group, name), f"{path}/")
         elif not holds_data:
             holds_data = True
@@ -150,7 +154,7 @@ class GroupWriter:
                 self.id = file.attrs.get("id", self.id)
                 for name in iterate_h5_names(file.id):
                     self.names.add(name)
-        self.next_piece = 1 + max((int(piece.stem) for piece in self._finished()), default=-1)
+        self.next_piece = 0
         self.buffer: dict[str, tuple[dict, dict]] = {}
         self.buffer_bytes = 0
         self.flushed = time.monotonic()
@@ -205,8 +209,8 @@ class GroupWriter:
 
     def _flush(self) -> None:
         if self.buffer:
-            piece = self.pieces / f"{self.next_piece:06d}.h5"
-            self.next_piece += 1
+            while (piece := self.pieces / f"{self.next_piece:06d}.h5").exists():
+                self.next_piece += 1
             with trace.span("write"), replacing(piece) as temporary:
                 self._write(temporary)
         self.buffer.clear()
@@ -249,11 +253,19 @@ class _Names:
         self.database.execute("CREATE TABLE names (name TEXT PRIMARY KEY) WITHOUT ROWID")
 
     def add(self, name: str) -> None:
-        self.database.execute("INSERT OR IGNORE INTO names VALUES (?)", (name,))
+        self._run("INSERT OR IGNORE INTO names VALUES (?)", name)
 
     def __contains__(self, name: str) -> bool:
-        found = self.database.execute("SELECT 1 FROM names WHERE name = ?", (name,))
-        return found.fetchone() is not None
+        return self._run("SELECT 1 FROM names WHERE name = ?", name) is not None
+
+    def _run(self, command: str, name: str) -> tuple | None:
+        try:
+            return self.database.execute(command, (name,)).fetchone()
+        except sqlite3.OperationalError as error:
+            raise InputError(
+                f"The names of what is done cannot be kept in the temporary folder ({error}): set "
+                "SQLITE_TMPDIR to another one."
+            ) from None
 
 
 def _quoted(conf: dict, key: str) -> str:

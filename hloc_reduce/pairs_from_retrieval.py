@@ -12,7 +12,8 @@ from .cli import InputError
 from .io import get_dataset, list_h5_names, open_h5
 from .parsers import image_names, parse_retrieval, write_pairs
 
-BLOCK = 2048  # queries, and database images, whose descriptors are in memory at once
+BLOCK_BYTES = 2**28  # descriptors of queries, and of the database, in memory at once
+QUERIES = 1024  # rows of the similarity matrix in memory at once
 
 
 def main(
@@ -54,12 +55,14 @@ def main(
     query_names = _select(descriptors, query_prefix, query_list)
     db_names = _select(db_descriptors, db_prefix, db_list)
 
+    size = max(1, BLOCK_BYTES // read_global(descriptors, query_names[:1]).nbytes)
+
     def retrieve() -> Iterator[tuple[str, str]]:
         with tqdm(total=len(query_names), desc="Retrieving", unit="image") as progress:
-            for start in range(0, len(query_names), BLOCK):
-                names = query_names[start : start + BLOCK]
+            for start in range(0, len(query_names), size):
+                names = query_names[start : start + size]
                 queries = read_global(descriptors, names)
-                ranking = _rank_file(queries, db_descriptors, db_names, num_matched + 1)
+                ranking = _rank_file(queries, db_descriptors, db_names, num_matched + 1, size)
                 for name, row in zip(names, ranking, strict=True):
                     others = [db_names[j] for j in row if not same_file or db_names[j] != name]
                     yield from ((name, other) for other in others[:num_matched])
@@ -84,23 +87,41 @@ def rank(queries: np.ndarray, database: np.ndarray, num_matched: int) -> np.ndar
     return _best(_similarity(queries, database), num_matched)
 
 
-def _rank_file(queries: np.ndarray, path: Path, names: list[str], num_matched: int) -> np.ndarray:
-    """Rank as `rank` does, with a database that is read from a file block by block."""
+def _rank_file(
+    queries: np.ndarray, path: Path, names: list[str], num_matched: int, size: int
+) -> np.ndarray:
+    """Rank as `rank` does, with a database that is read from a file, `size` images at once."""
     rows = np.empty((len(queries), 0), np.int64)
     similarity = np.empty((len(queries), 0), np.float32)
-    for start in range(0, len(names), BLOCK):
-        database = read_global(path, names[start : start + BLOCK])
+    for start in range(0, len(names), size):
+        database = read_global(path, names[start : start + size])
         if queries.shape[1] != database.shape[1]:
             raise InputError(
                 f"Global descriptors of {queries.shape[1]} numbers and, in {path}, of "
                 f"{database.shape[1]} cannot be compared."
             )
-        more = np.broadcast_to(np.arange(len(database)) + start, (len(queries), len(database)))
-        rows = np.concatenate([rows, more], axis=1)
-        similarity = np.concatenate([similarity, _similarity(queries, database)], axis=1)
-        best = _best(similarity, num_matched)
-        rows, similarity = (np.take_along_axis(part, best, 1) for part in (rows, similarity))
+        parts = [
+            _better(rows[part], similarity[part], start, queries[part], database, num_matched)
+            for part in (slice(i, i + QUERIES) for i in range(0, len(queries), QUERIES))
+        ]
+        rows, similarity = (np.concatenate(part) for part in zip(*parts, strict=True))
     return rows
+
+
+def _better(
+    rows: np.ndarray,
+    similarity: np.ndarray,
+    start: int,
+    queries: np.ndarray,
+    database: np.ndarray,
+    number: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the best rows of those found and of the database from `start` on."""
+    more = np.broadcast_to(np.arange(len(database)) + start, (len(queries), len(database)))
+    rows = np.concatenate([rows, more], axis=1)
+    similarity = np.concatenate([similarity, _similarity(queries, database)], axis=1)
+    best = _best(similarity, number)
+    return np.take_along_axis(rows, best, 1), np.take_along_axis(similarity, best, 1)
 
 
 def _similarity(queries: np.ndarray, database: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from hloc_reduce.evaluation import hpatches, poses, published
 from hloc_reduce.evaluation.hpatches import data, lists, tasks
 from hloc_reduce.evaluation.ranking import average_precision, roc_area
 from hloc_reduce.io import GroupWriter
+from hloc_reduce.localization import RECORDS
 from hloc_reduce.parsers import write_poses
 from pipelines import aachen
 
@@ -433,6 +434,18 @@ def test_poses_of_a_pipeline_are_evaluated_as_in_its_summary(
     for row in rows_of(tmp_path / "e/errors.csv"):
         for key in ("status", "position_error_m", "rotation_error_deg"):
             assert row[key] == expected[row["query"]][key]
+
+
+def test_fallbacks_only(two_lists, monkeypatch, capsys):
+    """What a run leaves that localized nothing."""
+    record = {"localized": False, "qvec": [1, 0, 0, 0], "tvec": [0, 0, 0]}
+    lines = [{"records": RECORDS}, ["query/day/0.jpg", record]]
+    (two_lists / "p_logs.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n")
+    files = ("--estimates", two_lists / "p_logs.jsonl", "--ground_truth", two_lists / "truth.txt")
+    run(monkeypatch, evaluation, "poses", *files, "--outputs", two_lists / "o")
+    printed = capsys.readouterr().out
+    assert "0.0 / 0.0 / 0.0" in printed and "Failures with a fallback pose: 1" in printed
+    assert (two_lists / "o/curves.csv").read_text() == "list,error,value,percent\n"
 
 
 def test_exact_poses_and_unknown_names(two_lists, monkeypatch, capsys, caplog, recwarn):

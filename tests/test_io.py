@@ -149,6 +149,26 @@ def test_unreadable_images_are_named(tmp_path):
         io.read_image(tmp_path / "b.jpg")
 
 
+def test_two_writers_of_a_file_lose_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(GroupWriter, "piece_bytes", 0)
+    first, second = GroupWriter(tmp_path / "f.h5", {}), GroupWriter(tmp_path / "f.h5", {})
+    for writer, name in ((first, "a"), (second, "b"), (first, "c")):
+        writer.add(name, {"a": np.zeros(1)})
+    with second:
+        pass
+    with first:
+        pass
+    assert io.list_h5_names(tmp_path / "f.h5") == ["a", "b", "c"]
+
+
+def test_a_full_temporary_folder_is_said(tmp_path):
+    with GroupWriter(tmp_path / "f.h5", {}) as writer:
+        writer.names.database.execute("PRAGMA max_page_count = 20")
+        with pytest.raises(InputError, match="SQLITE_TMPDIR"):
+            for i in range(10000):
+                writer.begin(f"db/{i}.jpg")
+
+
 def test_a_gap_in_the_pieces_loses_none(tmp_path, monkeypatch):
     monkeypatch.setattr(GroupWriter, "piece_bytes", 0)  # each group is a piece
     path = tmp_path / "f.h5"

@@ -95,6 +95,8 @@ def test_inliers_of_pictures(compared):
     run.retrieved["query/day/a.png"] = sorted(names, key=numbers.get)
     assert pictures.matched(run, "query/day/a.png")["name"] == found["name"]
     assert numbers[found["name"]] == max(numbers.values()) > min(numbers.values())
+    del run.retrieved["query/day/a.png"]  # by a run that goes on
+    assert pictures.matched(run, "query/day/a.png")["name"] == record["db"]
     found = pictures.matched(run, "query/day/grey.png")
     assert len(found["inliers"]) == 0
     assert tuple(pictures.draw(run, "query/day/grey.png", found)[0, 0]) == pictures.RED
@@ -257,6 +259,16 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_lay
         command_line = ("--dataset", dataset, "--outputs", tmp_path / "o", "--features", *features)
         return command.refused(monkeypatch, caplog, compare, *command_line)
 
+    (tmp_path / "o/sift").mkdir(parents=True)
+    (tmp_path / "o/sift/conf.json").mkdir()
+    with pytest.raises(SystemExit):
+        command.run(
+            monkeypatch,
+            *(compare, "--dataset", aachen_layout, "--outputs", tmp_path / "o"),
+            *("--features", "sift"),
+        )
+    assert "sift failed: " in caplog.text and "None of 1 features could be run" in caplog.text
+    shutil.rmtree(tmp_path / "o")
     assert "neither of the folders 3D-models and database" in message(tmp_path, "sift")
     assert "Unknown feature 'sift_sv65'" in message(aachen_layout, "sift", "sift_sv65")
     assert "is a folder: name the HTML file" in message(aachen_layout, "sift", "-o", tmp_path)

@@ -15,15 +15,15 @@ from . import hpatches, phototour, poses
 from .hpatches import data
 
 PAPER = ("aachen", "inloc")
-SHOWN = 20  # queries without a pose that are named
+SHOWN = 20  # failures of each kind that are named
 
 
 def evaluate_poses(args: argparse.Namespace) -> None:
     """Compare estimated with true poses."""
     given = args.thresholds or ["aachen"]
     limits = parse_thresholds(given)
-    called = args.estimates.name.removesuffix("_logs.jsonl").removesuffix(".txt")
-    outputs = args.outputs or Path("outputs/evaluation") / called
+    label = args.estimates.name.removesuffix("_logs.jsonl").removesuffix(".txt")
+    outputs = args.outputs or Path("outputs/evaluation") / label
     cli.check_folder(outputs)
     truth = poses.read_truth(args.ground_truth)
     estimates, fallbacks = poses.read_estimates(args.estimates)
@@ -58,11 +58,11 @@ def evaluate_poses(args: argparse.Namespace) -> None:
     curves = {group: [counted[name] for name in names] for group, names in groups.items()}
     write_curves(curves, outputs / "curves.csv")
     if plots.available(outputs / "curves.svg"):
-        by_list = {group: {called: listed} for group, listed in curves.items()}
+        by_list = {group: {label: listed} for group, listed in curves.items()}
         plots.save(
             plots.figure(list(plots.error_curves(by_list).values()), 2), outputs / "curves.svg"
         )
-    print(f"{called}:\n{results.recall_table('', summaries)}")
+    print(f"{label}:\n{results.recall_table('', summaries)}")
     for group, summary in summaries.items():
         medians = [summary[f"median_{key}"] for key in ("position_error_m", "rotation_error_deg")]
         known = None not in medians
@@ -136,7 +136,7 @@ def write_curves(curves: dict[str, list[tuple[float, float]]], path: Path) -> No
         for kind, values in zip(("m", "deg"), zip(*errors, strict=True), strict=True)
         for value, percent in zip(*poses.cumulative(values), strict=True)
     ]
-    write_csv(rows, path)
+    write_csv(rows, path, ("list", "error", "value", "percent"))
 
 
 def evaluate_hpatches(args: argparse.Namespace) -> None:

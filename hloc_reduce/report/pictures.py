@@ -18,7 +18,8 @@ QUALITY = 80  # of JPEG
 def matched(run: Run, query: str) -> dict | None:
     """Find the matches of a query with the retrieved map image that has most inliers.
 
-    Where the query was not localized it is the first retrieved one.
+    Of scans it is of the floor that the query was localized on. Where the query was not localized
+    it is the first retrieved one.
 
     Returns:
         `name` of the map image; keypoints `first` and `second` (M, 2) of the matches, pixel
@@ -30,9 +31,9 @@ def matched(run: Run, query: str) -> dict | None:
         return None
     names = [record["db"]]
     if record["localized"]:
-        present = [name for name in run.retrieved[query] if name in run.reference]
+        present = [name for name in run.retrieved.get(query, ()) if name in run.reference]
         clusters = run.reference.clusters(present)
-        (names,) = [names for names in clusters if record["db"] in names]
+        names = next((part for part in clusters if record["db"] in part), names)
     with open_h5(run.files["features"]) as file:
         keypoints, _ = get_keypoints(file, query)
     best = None
