@@ -27,8 +27,8 @@ import numpy as np
 
 from hloc_reduce import cli, match_features, pairs_from_retrieval
 from hloc_reduce.cli import InputError
+from hloc_reduce.group_writer import GroupWriter
 from hloc_reduce.io import (
-    GroupWriter,
     find_pair,
     get_dataset,
     get_matches,

@@ -15,7 +15,8 @@ from . import cli, colmap, extractors, io, logger, stamps
 from .base_model import dynamic_load
 from .cli import InputError
 from .extractors.vlad import read_vocabulary
-from .io import GroupWriter, list_h5_names, open_h5, replacing
+from .group_writer import GroupWriter
+from .io import list_h5_names, open_h5, replacing
 from .storage import get_descriptors
 
 confs = retrieval_confs.confs

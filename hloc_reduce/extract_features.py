@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,13 +17,16 @@ from confs import features as features_confs
 from . import cli, colmap, extractors, logger, parallel, processes, projections
 from .cli import InputError
 from .descriptors import DESCRIPTORS, check_weights
+from .executors import SERIAL, Executor
 from .extractors.dog import DoG
-from .io import GroupWriter, read_image
+from .group_writer import Group, GroupWriter
+from .io import read_image
 from .parsers import image_names
 from .storage import STORAGES, store
 from .trace import span
 
 confs = features_confs.confs
+CHUNK = 8  # images
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 
@@ -34,6 +38,7 @@ def main(
     image_list: Path | str | Iterable[str] | None = None,
     feature_path: Path | None = None,
     overwrite: bool = False,
+    executor: Executor = SERIAL,
 ) -> Path:
     """Extract the features of all images of a folder, or of a list of them.
 
@@ -45,6 +50,7 @@ def main(
         image_list: names, or a text file of them; default: every image of the folder.
         feature_path: the h5 file itself, instead of `export_dir`.
         overwrite: extract anew what is there.
+        executor: does the work.
 
     Returns:
         The feature file; images it holds already are skipped.
@@ -64,17 +70,27 @@ def main(
         if not todo:
             logger.info("All %d images are in %s.", len(names), feature_path)
             return feature_path
-        # closed at once if writing fails: it has processes
-        with closing(extract_all(conf, [image_dir / name for name in todo])) as extracted:
-            progress = tqdm(extracted, desc="Extracting features", unit="image", total=len(todo))
-            for name, features in zip(todo, progress, strict=True):
-                uncertainty = features.pop("uncertainty")
-                if len(features["keypoints"]) == 0:
-                    logger.warning("Image %s has no keypoints.", name)
-                arrays, attrs = store(features, storage)
-                writer.add(name, arrays, attrs | {"keypoints": {"uncertainty": uncertainty}})
+        work = partial(_extract_groups, conf, image_dir, storage)
+        with closing(writer.fill(work, todo, executor, CHUNK)) as done:
+            for _ in tqdm(done, desc="Extracting features", unit="image", total=len(todo)):
+                pass
     logger.info("Features of %d images are in %s.", len(names), feature_path)
     return feature_path
+
+
+def _extract_groups(
+    conf: dict, image_dir: Path, storage: str, names: Iterable[str]
+) -> Iterator[Group]:
+    """Yield the features of images as a file keeps them."""
+    names = list(names)
+    # closed at once if writing fails: it has processes
+    with closing(extract_all(conf, [image_dir / name for name in names])) as extracted:
+        for name, features in zip(names, extracted, strict=True):
+            uncertainty = features.pop("uncertainty")
+            if len(features["keypoints"]) == 0:
+                logger.warning("Image %s has no keypoints.", name)
+            arrays, attrs = store(features, storage)
+            yield name, arrays, attrs | {"keypoints": {"uncertainty": uncertainty}}
 
 
 def extract_all(conf: dict, images: list[Path]) -> Iterator[dict[str, np.ndarray]]:

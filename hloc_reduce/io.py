@@ -2,12 +2,8 @@
 
 import csv
 import filecmp
-import json
 import os
 import shutil
-import sqlite3
-import time
-import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,10 +12,7 @@ import cv2
 import h5py
 import numpy as np
 
-from . import trace
 from .cli import InputError
-
-QUOTED = 200  # characters of a configuration in a message
 
 
 @contextmanager
@@ -111,175 +104,6 @@ def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]
         elif not holds_data:
             holds_data = True
             yield prefix[:-1]
-
-
-class GroupWriter:
-    """Adds groups of arrays to an h5 file; a killed run loses its last seconds of work only.
-
-    Groups gather in memory and go into pieces beside the file, each moved into place when it is
-    whole. Leaving the context merges the pieces into the file. What a piece holds is never
-    computed again, and the file itself is whole at any instant. A file keeps the `id` that it got
-    when it was begun, so that what is derived from it can tell it from one made anew. The names of
-    its groups, which may be more than memory can hold, are in a temporary data base on disk.
-
-    Args:
-        path: the h5 file, new or to be extended.
-        conf: what makes the arrays; kept in the file and refused when it differs.
-        overwrite: start anew instead of extending.
-        compression: h5py's name of a compression filter for all arrays.
-
-    Raises:
-        InputError: when the file is broken or was made with another conf.
-    """
-
-    piece_seconds = 5.0
-    piece_bytes = 64 * 2**20
-
-    def __init__(
-        self, path: Path, conf: dict, overwrite: bool = False, compression: str | None = None
-    ):
-        self.path = path
-        self.conf = json.dumps(conf, sort_keys=True)
-        self.compression = compression
-        self.pieces = path.with_name(path.name + ".pieces")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if overwrite:
-            self._drop_pieces()
-            path.unlink(missing_ok=True)
-        self.names = _Names()
-        self.id = uuid.uuid4().hex
-        for part in [path] * path.exists() + self._finished():
-            with open_h5(part) as file:
-                self._check(file, part)
-                self.id = file.attrs.get("id", self.id)
-                for name in iterate_h5_names(file.id):
-                    self.names.add(name)
-        self.next_piece = 0
-        self.buffer: dict[str, tuple[dict, dict]] = {}
-        self.buffer_bytes = 0
-        self.flushed = time.monotonic()
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.names
-
-    def begin(self, name: str) -> None:
-        """Have a group that will be added count as one that is there."""
-        self.names.add(name)
-
-    def __enter__(self) -> "GroupWriter":
-        return self
-
-    def __exit__(self, error: type | None, *_) -> None:
-        self._flush()
-        if error is None:
-            with trace.span("merge"):
-                self._merge()
-
-    def add(self, name: str, arrays: dict[str, np.ndarray], attrs: dict | None = None) -> None:
-        """Add a group of arrays; `attrs` maps the name of an array to its attributes."""
-        self.buffer[name] = arrays, attrs or {}
-        self.names.add(name)
-        self.buffer_bytes += sum(array.nbytes for array in arrays.values())
-        late = time.monotonic() - self.flushed > self.piece_seconds
-        if late or self.buffer_bytes > self.piece_bytes:
-            self._flush()
-
-    def _finished(self) -> list[Path]:
-        return sorted(self.pieces.glob("[0-9]*.h5"))
-
-    def _drop_pieces(self) -> None:
-        """Delete all pieces or, if killed meanwhile, leave none that counts."""
-        if self.pieces.exists():
-            dropped = self.pieces.with_name(f".{self.pieces.name}.{uuid.uuid4().hex}.tmp")
-            self.pieces.rename(dropped)
-            shutil.rmtree(dropped, ignore_errors=True)
-
-    def _check(self, file: h5py.File, path: Path) -> None:
-        before = file.attrs.get("conf", self.conf)  # hloc's own files say nothing
-        if before != self.conf:
-            old, new = json.loads(before), json.loads(self.conf)
-            keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-            changes = "; ".join(
-                f"{key}: {_quoted(old, key)} before, {_quoted(new, key)} now" for key in keys
-            )
-            raise InputError(
-                f"{path} was made with another configuration ({changes}). "
-                "Choose another output or overwrite it."
-            )
-
-    def _flush(self) -> None:
-        if self.buffer:
-            while (piece := self.pieces / f"{self.next_piece:06d}.h5").exists():
-                self.next_piece += 1
-            with trace.span("write"), replacing(piece) as temporary:
-                self._write(temporary)
-        self.buffer.clear()
-        self.buffer_bytes = 0
-        self.flushed = time.monotonic()
-
-    def _write(self, path: Path) -> None:
-        with h5py.File(path, "w", libver="latest") as file:
-            file.attrs.update({"conf": self.conf, "id": self.id})
-            for name, (arrays, attrs) in self.buffer.items():
-                group = file.create_group(name)
-                for key, array in arrays.items():
-                    packed = {}
-                    if self.compression and array.size:
-                        packed = {"compression": self.compression, "chunks": array.shape}
-                    dataset = group.create_dataset(key, data=array, **packed)
-                    dataset.attrs.update(attrs.get(key, {}))
-
-    def _merge(self) -> None:
-        pieces = self._finished()
-        if not pieces and self.path.exists():
-            return
-        with replacing(self.path) as temporary:
-            if self.path.exists():
-                shutil.copyfile(self.path, temporary)
-            with h5py.File(temporary, "a", libver="latest") as merged:
-                merged.attrs.update({"conf": self.conf, "id": self.id})
-                for piece in pieces:
-                    with open_h5(piece) as file:
-                        _copy_missing(file, merged)
-        self._drop_pieces()
-
-
-class _Names:
-    """A set of names on disk, in a file without a name in the system's temporary folder."""
-
-    def __init__(self):
-        self.database = sqlite3.connect("", isolation_level=None)
-        self.database.execute("PRAGMA journal_mode = OFF")
-        self.database.execute("CREATE TABLE names (name TEXT PRIMARY KEY) WITHOUT ROWID")
-
-    def add(self, name: str) -> None:
-        self._run("INSERT OR IGNORE INTO names VALUES (?)", name)
-
-    def __contains__(self, name: str) -> bool:
-        return self._run("SELECT 1 FROM names WHERE name = ?", name) is not None
-
-    def _run(self, command: str, name: str) -> tuple | None:
-        try:
-            return self.database.execute(command, (name,)).fetchone()
-        except sqlite3.OperationalError as error:
-            raise InputError(
-                f"The names of what is done cannot be kept in the temporary folder ({error}): set "
-                "SQLITE_TMPDIR to another one."
-            ) from None
-
-
-def _quoted(conf: dict, key: str) -> str:
-    text = str(conf.get(key, "not given"))
-    return text if len(text) <= QUOTED else f"{text[:QUOTED]}..."
-
-
-def _copy_missing(source: h5py.Group, target: h5py.Group) -> None:
-    """Copy what a group has and another has not, whole groups at once."""
-    for name in source:
-        if name not in target:
-            source.copy(name, target)
-        elif isinstance(source[name], h5py.Group):
-            _copy_missing(source[name], target[name])
 
 
 def get_dataset(file: h5py.File, name: str, key: str) -> h5py.Dataset:

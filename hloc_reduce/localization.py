@@ -2,8 +2,9 @@
 
 import copy
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -14,12 +15,14 @@ from tqdm import tqdm
 
 from . import cli, colmap, logger, parallel
 from .cli import InputError
+from .executors import SERIAL, Executor
 from .io import check_matches, find_pair, get_colmap_keypoints, get_matches, open_h5, replacing
 from .parsers import write_poses
 
 # Three points fit a pose always, and among hundreds of wrong matches a few more agree by chance.
 MIN_INLIERS = 8
 SEED = 0
+CHUNK = 8  # queries
 RECORDS = 3  # the version of what a record holds
 
 
@@ -123,11 +126,12 @@ def main(
     overwrite: bool = False,
     skip_matches: int | None = None,
     name_parts: int | None = 1,
+    executor: Executor = SERIAL,
 ) -> dict[str, dict]:
     """Localize queries by the files of their features and matches.
 
     Args:
-        load_reference: gives the map, if there is something to do.
+        load_reference: gives the map, in each process where there is something to do.
         queries: names and intrinsics.
         retrieved: the map images of each query, best first.
         features: feature file of the queries.
@@ -139,6 +143,7 @@ def main(
         overwrite: localize anew what is there.
         skip_matches: leave out retrieved images with fewer matches.
         name_parts: as of `parsers.write_poses`.
+        executor: does the work; unless in this process, `load_reference` and `config` are pickled.
 
     Returns:
         A record for each query: `localized` (from MIN_INLIERS inliers on), the pose that is
@@ -150,27 +155,14 @@ def main(
     log = _Log(log_file(results), {"records": RECORDS, **made_from}, overwrite)
     todo = [query for query in queries if query[0] not in log.records]
     if todo:
-        reference = load_reference()
-        with open_h5(features) as feature_file, open_h5(matches) as match_file, log:
+        with open_h5(features) as feature_file, open_h5(matches) as match_file:
             _check_some_matched(match_file, queries, retrieved)
             _check_sizes(feature_file, todo)
-
-            def solve(task: tuple) -> dict:
-                name, camera, keypoints, found = task
-                used = {n: m for n, m in found.items() if len(m) >= (skip_matches or 0)}
-                options = config(name, camera)
-                cam_from_world, info = localize(reference, keypoints, camera, used, options)
-                info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
-                return _record(reference, list(found), cam_from_world, info)
-
-            tasks = (
-                (name, camera, *_read(feature_file, match_file, name, retrieved, reference))
-                for name, camera in todo
-            )
-            with closing(parallel.ordered("localize", solve, tasks)) as solved:
-                progress = tqdm(solved, desc="Localizing", unit="query", total=len(todo))
-                for (name, _), record in zip(todo, progress, strict=True):
-                    log.add(name, record)
+        work = partial(_localize_all, load_reference, features, matches, config, skip_matches)
+        tasks = ((name, camera, retrieved.get(name, [])) for name, camera in todo)
+        with log, closing(executor.map(work, tasks, CHUNK)) as found:
+            for name, record in tqdm(found, desc="Localizing", unit="query", total=len(todo)):
+                log.add(name, record)
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose(record) for name, record in records.items()}
     submitted = {name: known for name, known in poses.items() if known is not None}
@@ -180,6 +172,34 @@ def main(
     localized = sum(record["localized"] for record in records.values())
     logger.info("Localized %d of %d queries: %s", localized, len(records), results)
     return records
+
+
+def _localize_all(
+    load_reference: Callable[[], Reference],
+    features: Path,
+    matches: Path,
+    config: Callable[[str, pycolmap.Camera], dict],
+    skip_matches: int | None,
+    queries: Iterable[tuple[str, pycolmap.Camera, list[str]]],
+) -> Iterator[tuple[str, dict]]:
+    """Yield the names and the records of queries with their intrinsics and retrieved images."""
+    reference = load_reference()
+
+    def solve(task: tuple) -> tuple[str, dict]:
+        name, camera, keypoints, found = task
+        used = {n: m for n, m in found.items() if len(m) >= (skip_matches or 0)}
+        options = config(name, camera)
+        cam_from_world, info = localize(reference, keypoints, camera, used, options)
+        info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
+        return name, _record(reference, list(found), cam_from_world, info)
+
+    with open_h5(features) as feature_file, open_h5(matches) as match_file:
+        tasks = (
+            (name, camera, *_read(feature_file, match_file, name, retrieved, reference))
+            for name, camera, retrieved in queries
+        )
+        with closing(parallel.ordered("localize", solve, tasks)) as solved:
+            yield from solved
 
 
 def pose(record: dict) -> pycolmap.Rigid3d | None:
@@ -250,12 +270,11 @@ def _read(
     feature_file: h5py.File,
     match_file: h5py.File,
     name: str,
-    retrieved: Mapping[str, list[str]],
+    names: list[str],
     reference: Reference,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Read the keypoints of a query, and its matches with the images that were retrieved for it."""
     keypoints, _ = get_colmap_keypoints(feature_file, name)
-    names = retrieved.get(name, [])
     present = [other for other in names if other in reference]
     if len(present) < len(names):
         absent = len(names) - len(present)

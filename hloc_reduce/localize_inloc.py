@@ -2,8 +2,9 @@
 
 import argparse
 import hashlib
-from collections.abc import Iterable, Mapping
-from functools import lru_cache
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
+from functools import lru_cache, partial
 from pathlib import Path
 
 import h5py
@@ -13,11 +14,14 @@ from tqdm import tqdm
 
 from . import cli, io, localization, logger, scans, stamps
 from .cli import InputError
-from .io import GroupWriter, get_dataset, get_keypoints, open_h5
+from .executors import SERIAL, Executor
+from .group_writer import Group, GroupWriter
+from .io import get_dataset, get_keypoints, open_h5
 from .parsers import parse_query_lists, parse_retrieval
 
 RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
 RANSAC_SIZE = 4032  # the longer side of such a photo
+CHUNK = 4  # cutouts
 CACHED_IMAGES = 128  # points of so many cutouts stay in memory: 25 MB at 8,000 keypoints
 
 
@@ -31,6 +35,7 @@ def main(
     queries: Path | list[tuple[str, pycolmap.Camera]] | None = None,
     ransac_thresh: float = RANSAC_THRESH,
     overwrite: bool = False,
+    executor: Executor = SERIAL,
 ) -> dict[str, dict]:
     """Localize queries in a data set of InLoc's layout.
 
@@ -49,6 +54,7 @@ def main(
         ransac_thresh: inliers reproject within so many pixels of a photo of 4032 pixels, of others
             in proportion.
         overwrite: localize anew what is there.
+        executor: does the work.
 
     Returns:
         A record for each query, as `localization.main`; a query with too few inliers has the pose
@@ -69,11 +75,7 @@ def main(
     if not wanted:
         raise InputError(f"{retrieval} has no pair of a query and a cutout.")
     points = points_file(features)
-    lift_keypoints(dataset_dir, features, sorted(set(wanted)), points, overwrite)
-
-    def config(_: str, camera: pycolmap.Camera) -> dict:
-        scale = max(camera.width, camera.height) / RANSAC_SIZE
-        return {"estimation": {"ransac": {"max_error": ransac_thresh * scale}}}
+    lift_keypoints(dataset_dir, features, sorted(set(wanted)), points, overwrite, executor)
 
     options = {"ransac_thresh": ransac_thresh, "skip_matches": skip_matches}
     options["queries"] = {
@@ -82,19 +84,28 @@ def main(
     }
     poses = {cutout: scans.read_pose(dataset_dir, cutout) for cutout in sorted(set(wanted))}
     options["scans"] = hashlib.sha256(np.array(list(poses.values())).tobytes()).hexdigest()
-    with open_h5(points) as file:
-        return localization.main(
-            lambda: ScanMap(file, poses),
-            queries,
-            retrieved,
-            features,
-            matches,
-            results,
-            config,
-            stamps.stamp(options, [retrieval, features, matches]),
-            overwrite,
-            skip_matches=skip_matches,
-        )
+    return localization.main(
+        partial(_load, points, poses),
+        queries,
+        retrieved,
+        features,
+        matches,
+        results,
+        partial(_config, ransac_thresh),
+        stamps.stamp(options, [retrieval, features, matches]),
+        overwrite,
+        skip_matches=skip_matches,
+        executor=executor,
+    )
+
+
+def _load(points: Path, poses: Mapping[str, np.ndarray]) -> "ScanMap":
+    return ScanMap(h5py.File(points), poses)
+
+
+def _config(ransac_thresh: float, _: str, camera: pycolmap.Camera) -> dict:
+    scale = max(camera.width, camera.height) / RANSAC_SIZE
+    return {"estimation": {"ransac": {"max_error": ransac_thresh * scale}}}
 
 
 def points_file(features: Path) -> Path:
@@ -117,7 +128,12 @@ def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap
 
 
 def lift_keypoints(
-    dataset_dir: Path, features: Path, cutouts: list[str], output: Path, overwrite: bool = False
+    dataset_dir: Path,
+    features: Path,
+    cutouts: list[str],
+    output: Path,
+    overwrite: bool = False,
+    executor: Executor = SERIAL,
 ) -> Path:
     """Write the 3D points that the keypoints of cutouts show, reading each scan once.
 
@@ -128,6 +144,7 @@ def lift_keypoints(
         output: h5 file, `points3D` (N, 3) float32 of each cutout: metres in the frame of its
             scan, NaN where that has no depth.
         overwrite: compute anew what is there.
+        executor: does the work.
 
     Returns:
         `output`; cutouts it holds already are skipped.
@@ -137,18 +154,27 @@ def lift_keypoints(
     """
     with open_h5(features) as file:
         made_by = {"dataset": str(dataset_dir.resolve()), "features": io.provenance(file)}
-        with GroupWriter(output, made_by, overwrite) as writer:
-            todo = [name for name in cutouts if name not in writer]
-            for name in tqdm(todo, desc="Reading scans", unit="scan"):
-                keypoints, _ = get_keypoints(file, name)
-                scan = scans.read_scan(dataset_dir / f"{name}.mat")
-                scale = scan.shape[1::-1] / get_dataset(file, name, "image_size")[()]
-                points = scans.interpolate(scan, (keypoints + 0.5) * scale - 0.5)
-                known = np.isfinite(points[:, 0]).mean() if len(points) else 1
-                if known < 0.5:
-                    logger.warning("%.0f %% of the keypoints of %s have depth.", 100 * known, name)
-                writer.add(name, {"points3D": points.astype(np.float32)})
+    with GroupWriter(output, made_by, overwrite) as writer:
+        todo = [name for name in cutouts if name not in writer]
+        work = partial(_lift, dataset_dir, features)
+        with closing(writer.fill(work, todo, executor, CHUNK)) as done:
+            for _ in tqdm(done, desc="Reading scans", unit="scan", total=len(todo)):
+                pass
     return output
+
+
+def _lift(dataset_dir: Path, features: Path, cutouts: Iterable[str]) -> Iterator[Group]:
+    """Yield the points that the keypoints of cutouts show."""
+    with open_h5(features) as file:
+        for name in cutouts:
+            keypoints, _ = get_keypoints(file, name)
+            scan = scans.read_scan(dataset_dir / f"{name}.mat")
+            scale = scan.shape[1::-1] / get_dataset(file, name, "image_size")[()]
+            points = scans.interpolate(scan, (keypoints + 0.5) * scale - 0.5)
+            known = np.isfinite(points[:, 0]).mean() if len(points) else 1
+            if known < 0.5:
+                logger.warning("%.0f %% of the keypoints of %s have depth.", 100 * known, name)
+            yield name, {"points3D": points.astype(np.float32)}, {}
 
 
 class ScanMap:

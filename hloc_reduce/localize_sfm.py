@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Mapping
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from . import cli, colmap, localization, stamps
 from .cli import InputError
+from .executors import SERIAL, Executor
 from .parsers import parse_query_lists, parse_retrieval
 
 RANSAC_THRESH = 12.0  # pixels, as in hloc
@@ -30,6 +32,7 @@ def main(
     overwrite: bool = False,
     refinements: Mapping[str, dict] | None = None,
     full_names: bool = False,
+    executor: Executor = SERIAL,
 ) -> dict[str, dict]:
     """Localize all queries of the lists that match a glob.
 
@@ -50,6 +53,7 @@ def main(
         overwrite: localize anew what is there.
         refinements: for queries whose intrinsics are inexact more options, as in `config`.
         full_names: write whole names instead of `basename`.
+        executor: does the work; for a map in memory it is this process.
 
     Returns:
         A record for each query, as `localization.main`. A query that PnP could not solve is not
@@ -65,15 +69,19 @@ def main(
     query_list = [query for queries in parse_query_lists(queries).values() for query in queries]
     retrieved = parse_retrieval(retrieval)
     in_memory = isinstance(reference_sfm, pycolmap.Reconstruction)
-    reference = reference_sfm if in_memory else colmap.read_model(reference_sfm)
-    if reference.num_points3D() == 0:
-        raise InputError("The map is empty: no query can be localized in it.")
     config = {**(config or {})}
     config.setdefault("estimation", {"ransac": {"max_error": ransac_thresh}})
 
     inputs = [retrieval, features, matches, *sorted(queries.parent.glob(queries.name))]
-    if not in_memory:
+    if in_memory:
+        load = partial(SfmMap, reference_sfm, covisibility_clustering)
+    else:
+        if not reference_sfm.is_dir():
+            raise InputError(f"There is no COLMAP model folder {reference_sfm}.")
         inputs.append(reference_sfm / "points3D.bin")
+        load = partial(
+            _load, reference_sfm, covisibility_clustering, reference_sfm.stat().st_mtime_ns
+        )
     refinements = refinements or {}
     options = {"config": config}
     if refinements:
@@ -81,17 +89,28 @@ def main(
     if covisibility_clustering:
         options["covisibility_clustering"] = True
     return localization.main(
-        lambda: SfmMap(reference, covisibility_clustering),
+        load,
         query_list,
         retrieved,
         features,
         matches,
         results,
-        lambda name, _: merged(config, refinements.get(name, {})),
+        partial(_config, config, refinements),
         stamps.stamp(options, [path for path in inputs if path.exists()]),
         overwrite or in_memory,
         name_parts=None if full_names else 2 if prepend_camera_name else 1,
+        executor=SERIAL if in_memory else executor,
     )
+
+
+@lru_cache(maxsize=1)  # a process localizes many chunks of queries
+def _load(path: Path, covisibility_clustering: bool, written: int) -> "SfmMap":
+    """Read the map that was written at a time."""
+    return SfmMap(colmap.read_model(path), covisibility_clustering)
+
+
+def _config(config: dict, refinements: Mapping[str, dict], name: str, _: pycolmap.Camera) -> dict:
+    return merged(config, refinements.get(name, {}))
 
 
 def merged(config: dict, refinement: dict) -> dict:
@@ -106,11 +125,16 @@ class SfmMap:
     Args:
         reconstruction: the model.
         covisibility_clustering: match each cluster of images that see common points by itself.
+
+    Raises:
+        InputError: when it has no point.
     """
 
     def __init__(
         self, reconstruction: pycolmap.Reconstruction, covisibility_clustering: bool = False
     ):
+        if reconstruction.num_points3D() == 0:
+            raise InputError("The map is empty: no query can be localized in it.")
         self.covisibility_clustering = covisibility_clustering
         self.images = {image.name: image for image in reconstruction.images.values()}
         ids = np.array(sorted(reconstruction.point3D_ids()), np.int64)

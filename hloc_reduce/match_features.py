@@ -3,7 +3,8 @@
 import argparse
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -18,13 +19,16 @@ from confs import matchers as matchers_confs
 from . import cli, io, logger, matchers, parallel
 from .base_model import dynamic_load
 from .cli import InputError
-from .io import GroupWriter, names_to_pair, open_h5
+from .executors import SERIAL, Executor
+from .group_writer import Group, GroupWriter
+from .io import names_to_pair, open_h5
 from .matchers.nearest_neighbor import GPU_BYTES
 from .parsers import parse_pairs
 from .storage import get_descriptors
 
 confs = matchers_confs.confs
 CACHE_BYTES = 2**30  # descriptors that stay in memory: of 500 images at 8,000 x 64
+CHUNK = 64  # pairs
 PAIRS_ON_GPU = 16  # handed to a GPU at once, which matches as many together as its memory allows
 
 
@@ -37,6 +41,7 @@ def main(
     features_ref: Path | None = None,
     overwrite: bool = False,
     gpu_bytes: int = GPU_BYTES,
+    executor: Executor = SERIAL,
 ) -> Path:
     """Match all pairs of a list, each unordered pair once.
 
@@ -51,6 +56,7 @@ def main(
         features_ref: feature file of the second images; default: `features`.
         overwrite: match anew what is there.
         gpu_bytes: what similarities of descriptors may take of the memory of a GPU at once.
+        executor: does the work.
 
     Returns:
         The match file; pairs it holds already are skipped.
@@ -75,17 +81,17 @@ def main(
         matches = matches or Path(export_dir, f"{name}_{conf['output']}_{pairs.stem}.h5")
     if matches.resolve() in {path.resolve() for path in (feature_path, features_ref or pairs)}:
         raise InputError(f"{matches} is what the matches are made of: choose other --matches.")
-    with (
-        open_h5(feature_path) as file0,
-        open_h5(features_ref or feature_path) as file1,
-        GroupWriter(
-            matches, provenance(conf, file0, file1), overwrite, compression="gzip"
-        ) as writer,
-    ):
+    feature_paths = feature_path, features_ref or feature_path
+    with ExitStack() as stack:
+        files = [stack.enter_context(open_h5(path)) for path in feature_paths]
+        made_by = provenance(conf, *files)
+    with GroupWriter(matches, made_by, overwrite, compression="gzip") as writer:
         listed = tqdm(parse_pairs(pairs), desc="Matching", unit="pair", total=number, smoothing=0.1)
-        ordered = features_ref not in (None, feature_path)
-        todo = unmatched_pairs(listed, writer, ordered)
-        _match(conf, todo, file0, file1, writer, gpu_bytes)
+        todo = unmatched_pairs(listed, writer, ordered=features_ref not in (None, feature_path))
+        work = partial(_match, conf, feature_paths, gpu_bytes)
+        with closing(writer.fill(work, todo, executor, CHUNK)) as done:
+            for _ in done:
+                pass
     logger.info("Matches of the pairs %s are in %s.", pairs.name, matches)
     return matches
 
@@ -116,13 +122,22 @@ def unmatched_pairs(
 
 def _match(
     conf: dict,
-    pairs: Iterator[tuple[str, str]],
+    feature_paths: tuple[Path, Path],
+    gpu_bytes: int,
+    pairs: Iterable[tuple[str, str]],
+) -> Iterator[Group]:
+    """Match pairs while others are read and written, which this thread does."""
+    with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
+        yield from _match_open(conf, file0, file1, gpu_bytes, iter(pairs))
+
+
+def _match_open(
+    conf: dict,
     file0: h5py.File,
     file1: h5py.File,
-    writer: GroupWriter,
     gpu_bytes: int,
-) -> None:
-    """Match pairs while others are read and written, which this thread does."""
+    pairs: Iterator[tuple[str, str]],
+) -> Iterator[Group]:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     matcher = dynamic_load(matchers, conf["model"]["name"])(conf["model"]).eval()
     read = DescriptorCache(CACHE_BYTES)
@@ -151,7 +166,7 @@ def _match(
     with closing(parallel.ordered("match", match, draw(), workers)) as results:
         for batch in results:
             for group, arrays in batch:
-                writer.add(group, arrays)
+                yield group, arrays, {}
 
 
 class DescriptorCache:

@@ -14,7 +14,8 @@ from tqdm import tqdm
 
 from . import cli, io, logger
 from .cli import InputError
-from .io import GroupWriter, get_dataset, list_h5_names, open_h5
+from .group_writer import GroupWriter
+from .io import get_dataset, list_h5_names, open_h5
 
 STORAGES = ("float16", "float32", "uint8")  # hloc's `as_half`, without it, and ours
 QUANTIZED = "descriptors_uint8"

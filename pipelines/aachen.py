@@ -20,6 +20,7 @@ from hloc_reduce import (
     triangulation,
 )
 from hloc_reduce.datasets import Aachen, thresholds, true_poses
+from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.storage import STORAGES
 
 from . import common
@@ -37,6 +38,7 @@ def main(
     overwrite: bool = False,
     projection: Path | None = None,
     storage: str = STORAGES[0],
+    executor: Executor = SERIAL,
 ) -> dict:
     """Run all stages and return the summary, as in summary.json."""
     feature, feature_conf = features_confs.get(feature, projection, storage)
@@ -62,11 +64,15 @@ def main(
 
     with folder.stage("extract_features"):
         names = [*map_names, *query_names]
-        features = extract_features.main(feature_conf, place.images, outputs, image_list=names)
+        features = extract_features.main(
+            feature_conf, place.images, outputs, image_list=names, executor=executor
+        )
     with folder.stage("pairs_from_covisibility"):
         pairs_from_covisibility.main(place.reference_model, sfm_pairs, num_covis)
     with folder.stage("match_map"):
-        sfm_matches = match_features.main(matcher_conf, sfm_pairs, features.stem, outputs)
+        sfm_matches = match_features.main(
+            matcher_conf, sfm_pairs, features.stem, outputs, executor=executor
+        )
     with folder.stage("triangulation"):
         reconstruction = triangulation.main(
             sfm, place.reference_model, place.images, sfm_pairs, features, sfm_matches
@@ -74,9 +80,13 @@ def main(
     with folder.stage("retrieval"):
         common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
     with folder.stage("match_queries"):
-        loc_matches = match_features.main(matcher_conf, loc_pairs, features.stem, outputs)
+        loc_matches = match_features.main(
+            matcher_conf, loc_pairs, features.stem, outputs, executor=executor
+        )
     with folder.stage("localization"):
-        records = localize_sfm.main(sfm, place.queries, loc_pairs, features, loc_matches, poses)
+        records = localize_sfm.main(
+            sfm, place.queries, loc_pairs, features, loc_matches, poses, executor=executor
+        )
 
     summary = {
         "feature": feature,

@@ -17,6 +17,7 @@ from hloc_reduce import (
     trace,
 )
 from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
+from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.storage import STORAGES
 
 from . import common
@@ -33,6 +34,7 @@ def main(
     overwrite: bool = False,
     projection: Path | None = None,
     storage: str = STORAGES[0],
+    executor: Executor = SERIAL,
 ) -> dict:
     """Run all stages and return the summary, as in summary.json."""
     feature, feature_conf = features_confs.get(feature, projection, storage)
@@ -57,11 +59,15 @@ def main(
 
     with folder.stage("extract_features"):
         names = [*used, *query_names]
-        features = extract_features.main(feature_conf, dataset, outputs, image_list=names)
+        features = extract_features.main(
+            feature_conf, dataset, outputs, image_list=names, executor=executor
+        )
     with folder.stage("retrieval"):
         common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
     with folder.stage("match_queries"):
-        matches = match_features.main(matcher_conf, loc_pairs, features.stem, outputs)
+        matches = match_features.main(
+            matcher_conf, loc_pairs, features.stem, outputs, executor=executor
+        )
     with folder.stage("localization"):
         records = localize_inloc.main(
             dataset,
@@ -71,6 +77,7 @@ def main(
             poses,
             queries=place.queries(features),
             ransac_thresh=place.ransac_thresh,
+            executor=executor,
         )
 
     summary = {

@@ -17,7 +17,7 @@ from hloc_reduce.evaluation import __main__ as evaluation
 from hloc_reduce.evaluation import hpatches, poses, published
 from hloc_reduce.evaluation.hpatches import data, lists, tasks
 from hloc_reduce.evaluation.ranking import average_precision, roc_area
-from hloc_reduce.io import GroupWriter
+from hloc_reduce.group_writer import GroupWriter
 from hloc_reduce.localization import RECORDS
 from hloc_reduce.parsers import write_poses
 from pipelines import aachen

@@ -4,9 +4,9 @@ import h5py
 import numpy as np
 import pytest
 
-from hloc_reduce import io
+from hloc_reduce import group_writer, io
 from hloc_reduce.cli import InputError
-from hloc_reduce.io import GroupWriter
+from hloc_reduce.group_writer import GroupWriter
 
 
 def read(path):
@@ -42,11 +42,10 @@ def test_writer_keeps_what_was_finished_before_a_failure(tmp_path):
 def test_killed_writer_loses_only_its_buffer(tmp_path):
     path = tmp_path / "f.h5"
     writer = GroupWriter(path, {})
-    writer.piece_bytes = 0
     writer.add("1", {"a": np.ones(2)})
-    writer.piece_bytes = 10**9
+    writer.added.flush()
     writer.add("2", {"a": np.ones(2)})  # and here the power fails
-    (writer.pieces / ".000001.h5.7.tmp").write_bytes(b"half a file")
+    (writer.folder / ".000001.h5.7.tmp").write_bytes(b"half a file")
     with GroupWriter(path, {}) as again:
         assert "1" in again and "2" not in again
     assert read(path) == {"1": [1, 1]}
@@ -56,11 +55,11 @@ def test_writer_finishes_a_merge_that_was_cut_before_clearing(tmp_path):
     path = tmp_path / "f.h5"
     writer = GroupWriter(path, {})
     writer.add("1", {"a": np.ones(2)})
-    writer._flush()
-    path.write_bytes((writer.pieces / "000000.h5").read_bytes())
+    writer.added.flush()
+    path.write_bytes(next(writer.folder.iterdir()).read_bytes())
     with GroupWriter(path, {}):
         pass
-    assert read(path) == {"1": [1, 1]} and not writer.pieces.exists()
+    assert read(path) == {"1": [1, 1]} and not writer.folder.exists()
 
 
 def test_writer_refuses_another_configuration(tmp_path):
@@ -150,7 +149,7 @@ def test_unreadable_images_are_named(tmp_path):
 
 
 def test_two_writers_of_a_file_lose_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(GroupWriter, "piece_bytes", 0)
+    monkeypatch.setattr(group_writer, "PIECE_BYTES", 0)
     first, second = GroupWriter(tmp_path / "f.h5", {}), GroupWriter(tmp_path / "f.h5", {})
     for writer, name in ((first, "a"), (second, "b"), (first, "c")):
         writer.add(name, {"a": np.zeros(1)})
@@ -170,13 +169,13 @@ def test_a_full_temporary_folder_is_said(tmp_path):
 
 
 def test_a_gap_in_the_pieces_loses_none(tmp_path, monkeypatch):
-    monkeypatch.setattr(GroupWriter, "piece_bytes", 0)  # each group is a piece
+    monkeypatch.setattr(group_writer, "PIECE_BYTES", 0)  # each group is a piece
     path = tmp_path / "f.h5"
     with pytest.raises(KeyboardInterrupt), GroupWriter(path, {}) as writer:
         for name in "abc":
             writer.add(name, {"a": np.arange(3)})
         raise KeyboardInterrupt
-    (tmp_path / "f.h5.pieces/000000.h5").unlink()
+    min((tmp_path / "f.h5.pieces").iterdir()).unlink()
     with GroupWriter(path, {}) as writer:
         assert [name in writer for name in "abc"] == [False, True, True]
         for name in "de":

@@ -21,7 +21,8 @@ from hloc_reduce import (
 )
 from hloc_reduce.cli import InputError
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.io import GroupWriter, get_matches, list_h5_names
+from hloc_reduce.group_writer import GroupWriter
+from hloc_reduce.io import get_matches, list_h5_names
 from hloc_reduce.parsers import parse_pairs, parse_poses, parse_retrieval, write_pairs
 
 MATCHER = match_features.confs["NN-ratio"]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hloc_reduce import extract_features, match_features, storage
 from hloc_reduce.cli import InputError
-from hloc_reduce.io import GroupWriter
+from hloc_reduce.group_writer import GroupWriter
 
 
 def unit(number, dim, seed):

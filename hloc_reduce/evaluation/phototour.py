@@ -10,7 +10,8 @@ from tqdm import tqdm
 from .. import parallel
 from ..cli import InputError
 from ..descriptors import Descriptor
-from ..io import GroupWriter, get_dataset, open_h5
+from ..group_writer import GroupWriter
+from ..io import get_dataset, open_h5
 from ..phototour import SHEET, read_pairs, read_points, read_sheet, sheets
 
 

@@ -11,7 +11,8 @@ from tqdm import tqdm
 from ... import cli, io, parallel
 from ...cli import InputError
 from ...descriptors import PATCH_SIZE, Descriptor
-from ...io import GroupWriter, get_dataset, open_h5
+from ...group_writer import GroupWriter
+from ...io import get_dataset, open_h5
 
 SIDE = 65
 NOISE = {"e": "easy", "h": "hard", "t": "tough"}

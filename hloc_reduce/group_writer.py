@@ -1,0 +1,255 @@
+"""How groups of arrays are added to h5 files, so that a run that is stopped loses little."""
+
+import json
+import shutil
+import sqlite3
+import time
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from . import trace
+from .cli import InputError
+from .executors import Executor, Item
+from .io import iterate_h5_names, open_h5, replacing
+
+PIECE_SECONDS = 5.0  # of work that a killed run may lose
+PIECE_BYTES = 64 * 2**20
+QUOTED = 200  # characters of a configuration in a message
+
+Arrays = dict[str, np.ndarray]
+# the name of a group, its arrays, and from the name of an array to its attributes
+Group = tuple[str, Arrays, dict[str, dict]]
+
+
+class GroupWriter:
+    """Adds groups of arrays to an h5 file; a killed run loses its last seconds of work only.
+
+    Groups go into pieces beside the file, each moved into place when it is whole. Leaving the
+    context merges the pieces into the file. What a piece holds is never computed again, and the
+    file itself is whole at any instant. A file keeps the `id` that it got when it was begun, so
+    that what is derived from it can tell it from one made anew. The names of its groups, which may
+    be more than memory can hold, are in a temporary data base on disk.
+
+    Args:
+        path: the h5 file, new or to be extended.
+        conf: what makes the arrays; kept in the file and refused when it differs.
+        overwrite: start anew instead of extending.
+        compression: h5py's name of a compression filter for all arrays.
+
+    Raises:
+        InputError: when the file is broken or was made with another conf.
+    """
+
+    def __init__(
+        self, path: Path, conf: dict, overwrite: bool = False, compression: str | None = None
+    ):
+        self.path = path
+        self.folder = path.with_name(path.name + ".pieces")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if overwrite:
+            self._drop_pieces()
+            path.unlink(missing_ok=True)
+        self.names = _Names()
+        header = {"conf": json.dumps(conf, sort_keys=True), "id": uuid.uuid4().hex}
+        for part in [path] * path.exists() + self._pieces():
+            with open_h5(part) as file:
+                _check(file, part, header["conf"])
+                header["id"] = file.attrs.get("id", header["id"])
+                for name in iterate_h5_names(file.id):
+                    self.names.add(name)
+        self.header = header
+        self.new_pieces = partial(Pieces, self.folder, header, compression)
+        self.added = self.new_pieces()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    def begin(self, name: str) -> None:
+        """Have a group that will be added count as one that is there."""
+        self.names.add(name)
+
+    def __enter__(self) -> "GroupWriter":
+        return self
+
+    def __exit__(self, error: type | None, *_) -> None:
+        self.added.flush()
+        if error is None:
+            with trace.span("merge"):
+                self._merge()
+
+    def add(self, name: str, arrays: Arrays, attrs: dict[str, dict] | None = None) -> None:
+        """Add a group of arrays; `attrs` maps the name of an array to its attributes."""
+        self.names.add(name)
+        self.added.add(name, arrays, attrs or {})
+
+    def fill(
+        self,
+        work: Callable[[Iterable[Item]], Iterator[Group]],
+        items: Iterable[Item],
+        executor: Executor,
+        size: int,
+    ) -> Iterator[str]:
+        """Add the groups that work makes of items, where an executor does it; yield their names.
+
+        Args:
+            work: as of `executors`, yields groups.
+            items: as of `Executor.map`.
+            executor: does the work.
+            size: as of `Executor.map`.
+        """
+        with closing(
+            executor.map(partial(_write_pieces, self.new_pieces, work), items, size)
+        ) as names:
+            for name in names:
+                self.names.add(name)
+                yield name
+
+    def _pieces(self) -> list[Path]:
+        return sorted(self.folder.glob("*.h5"))
+
+    def _drop_pieces(self) -> None:
+        """Delete all pieces or, if killed meanwhile, leave none that counts."""
+        if self.folder.exists():
+            dropped = self.folder.with_name(f".{self.folder.name}.{uuid.uuid4().hex}.tmp")
+            self.folder.rename(dropped)
+            shutil.rmtree(dropped, ignore_errors=True)
+
+    def _merge(self) -> None:
+        pieces = self._pieces()
+        if not pieces and self.path.exists():
+            return
+        with replacing(self.path) as temporary:
+            if self.path.exists():
+                shutil.copyfile(self.path, temporary)
+            with h5py.File(temporary, "a", libver="latest") as merged:
+                merged.attrs.update(self.header)
+                for piece in pieces:
+                    with open_h5(piece) as file:
+                        _copy_missing(file, merged)
+        self._drop_pieces()
+
+
+@dataclass
+class Pieces:
+    """Gathers groups in memory and writes them into pieces of an h5 file.
+
+    Args:
+        folder: of the pieces.
+        header: attributes of each.
+        compression: as of GroupWriter.
+    """
+
+    folder: Path
+    header: dict[str, str]
+    compression: str | None
+
+    def __post_init__(self) -> None:
+        self._clear()
+
+    def add(self, name: str, arrays: Arrays, attrs: dict[str, dict]) -> None:
+        """Add a group, and write a piece if it is time to."""
+        self.groups[name] = arrays, attrs
+        self.bytes += sum(array.nbytes for array in arrays.values())
+        if time.monotonic() - self.since > PIECE_SECONDS or self.bytes > PIECE_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what was gathered into a piece."""
+        if self.groups:
+            # in the order of time, and of one writer only
+            piece = self.folder / f"{time.time_ns():020d}-{uuid.uuid4().hex[:8]}.h5"
+            with trace.span("write"), replacing(piece) as temporary:
+                self._write(temporary)
+        self._clear()
+
+    def _clear(self) -> None:
+        self.groups: dict[str, tuple[Arrays, dict]] = {}
+        self.bytes, self.since = 0, time.monotonic()
+
+    def _write(self, path: Path) -> None:
+        with h5py.File(path, "w", libver="latest") as file:
+            file.attrs.update(self.header)
+            for name, (arrays, attrs) in self.groups.items():
+                group = file.create_group(name)
+                for key, array in arrays.items():
+                    packed = {}
+                    if self.compression and array.size:
+                        packed = {"compression": self.compression, "chunks": array.shape}
+                    dataset = group.create_dataset(key, data=array, **packed)
+                    dataset.attrs.update(attrs.get(key, {}))
+
+
+def _write_pieces(
+    new_pieces: Callable[[], Pieces],
+    work: Callable[[Iterable[Item]], Iterator[Group]],
+    items: Iterable[Item],
+) -> Iterator[str]:
+    """Write the groups that work makes of items into pieces, and yield their names."""
+    pieces = new_pieces()
+    try:
+        with closing(work(items)) as groups:
+            for name, arrays, attrs in groups:
+                pieces.add(name, arrays, attrs)
+                yield name
+    finally:
+        pieces.flush()
+
+
+class _Names:
+    """A set of names on disk, in a file without a name in the system's temporary folder."""
+
+    def __init__(self):
+        self.database = sqlite3.connect("", isolation_level=None)
+        self.database.execute("PRAGMA journal_mode = OFF")
+        self.database.execute("CREATE TABLE names (name TEXT PRIMARY KEY) WITHOUT ROWID")
+
+    def add(self, name: str) -> None:
+        self._run("INSERT OR IGNORE INTO names VALUES (?)", name)
+
+    def __contains__(self, name: str) -> bool:
+        return self._run("SELECT 1 FROM names WHERE name = ?", name) is not None
+
+    def _run(self, command: str, name: str) -> tuple | None:
+        try:
+            return self.database.execute(command, (name,)).fetchone()
+        except sqlite3.OperationalError as error:
+            raise InputError(
+                f"The names of what is done cannot be kept in the temporary folder ({error}): set "
+                "SQLITE_TMPDIR to another one."
+            ) from None
+
+
+def _check(file: h5py.File, path: Path, conf: str) -> None:
+    """Raise an InputError if an h5 file was made with another configuration."""
+    before = file.attrs.get("conf", conf)  # hloc's own files say nothing
+    if before != conf:
+        old, new = json.loads(before), json.loads(conf)
+        keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+        changes = "; ".join(
+            f"{key}: {_quoted(old, key)} before, {_quoted(new, key)} now" for key in keys
+        )
+        raise InputError(
+            f"{path} was made with another configuration ({changes}). "
+            "Choose another output or overwrite it."
+        )
+
+
+def _quoted(conf: dict, key: str) -> str:
+    text = str(conf.get(key, "not given"))
+    return text if len(text) <= QUOTED else f"{text[:QUOTED]}..."
+
+
+def _copy_missing(source: h5py.Group, target: h5py.Group) -> None:
+    """Copy what a group has and another has not, whole groups at once."""
+    for name in source:
+        if name not in target:
+            source.copy(name, target)
+        elif isinstance(source[name], h5py.Group):
+            _copy_missing(source[name], target[name])

@@ -1,0 +1,127 @@
+"""Work in this process, and in others: the results are the same."""
+
+import csv
+import json
+import os
+import signal
+from concurrent.futures import Future
+from functools import partial
+
+import h5py
+import numpy as np
+import pytest
+
+from hloc_reduce import executors, extract_features, io
+from hloc_reduce.cli import InputError
+from hloc_reduce.executors import SERIAL, Pool, processes_of_this_machine
+from hloc_reduce.group_writer import GroupWriter
+from pipelines import aachen, inloc
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with processes_of_this_machine(2) as pool:
+        yield pool
+
+
+def contents(path):
+    """All data sets of an h5 file with their attributes, and those of the file but its id."""
+    found = {"": {key: value for key, value in h5py.File(path).attrs.items() if key != "id"}}
+    with h5py.File(path) as file:
+        for name in io.list_h5_names(path):
+            for key, dataset in file[name].items():
+                found[f"{name}/{key}"] = dataset[()].tobytes(), dict(dataset.attrs)
+    found[""].pop("conf", None)  # has ids of other files
+    return found
+
+
+def results(folder):
+    """What a run left, but for what says when and where it ran."""
+    summary = json.loads((folder / "summary.json").read_text())
+    for key in ("seconds", "bytes"):
+        del summary[key]
+    del summary["bytes_per_keypoint"]["feature_file"]  # pieces take more or less space in a file
+    with (folder / "queries.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    poses = (folder / summary["poses"]).read_text()
+    return summary, rows, poses, {path.name: contents(path) for path in folder.glob("*.h5")}
+
+
+def squares(items):
+    for i in items:
+        yield i, i * i
+
+
+def failing(items):
+    for i in items:
+        if i == 7:
+            raise InputError("seven")
+        yield i
+
+
+def killed(items):
+    for i in items:
+        if i == 7:
+            os.kill(os.getpid(), signal.SIGKILL)
+        yield i
+
+
+def test_each_item_once(pool):
+    for executor in (SERIAL, pool):
+        assert sorted(executor.map(squares, iter(range(100)), 3)) == [
+            (i, i * i) for i in range(100)
+        ]
+        assert list(executor.map(squares, [], 3)) == []
+
+
+def test_items_are_drawn_as_workers_get_free():
+    drawn, handed = [], []
+
+    def submit(function, *arguments):
+        handed.append(arguments)
+        future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    results = Pool(submit, 2).map(squares, (drawn.append(i) or i for i in range(1000)), 5)
+    assert next(results) in [(i, i * i) for i in range(20)]
+    assert len(drawn) == 5 * 2 * executors.BACKLOG
+
+
+@pytest.mark.parametrize("work, message", [(failing, "seven"), (killed, "A process was killed")])
+def test_what_fails_is_one_clear_error(work, message):
+    with processes_of_this_machine(2) as pool, pytest.raises(InputError, match=message):
+        list(pool.map(work, range(100), 2))
+
+
+def groups(fail_at, items):
+    for i in items:
+        if i == fail_at:
+            raise InputError("an image")
+        yield f"{i % 3}/{i}", {"a": np.full(3, i)}, {"a": {"x": i}}
+
+
+def test_groups_are_the_same_and_a_failure_loses_none_that_is_done(pool, tmp_path):
+    for executor in (SERIAL, pool):
+        path = tmp_path / f"{type(executor).__name__}.h5"
+        with pytest.raises(InputError, match="an image"), GroupWriter(path, {}) as writer:
+            list(writer.fill(partial(groups, 30), range(50), executor, 4))
+        with GroupWriter(path, {}) as writer:
+            todo = [i for i in range(50) if f"{i % 3}/{i}" not in writer]
+            assert 30 in todo and len(todo) < 50 - 12
+            assert sorted(writer.fill(partial(groups, None), todo, executor, 4)) == sorted(
+                f"{i % 3}/{i}" for i in todo
+            )
+    assert contents(tmp_path / "Serial.h5") == contents(tmp_path / "Pool.h5")
+    assert len(contents(path)) == 51
+
+
+@pytest.mark.parametrize("layout, pipeline", [("aachen_layout", aachen), ("inloc_layout", inloc)])
+def test_a_pipeline_is_the_same(layout, pipeline, pool, request, tmp_path, monkeypatch):
+    place = request.getfixturevalue(layout)
+    for module in (extract_features, aachen.match_features, inloc.localize_inloc):
+        monkeypatch.setattr(module, "CHUNK", 2)
+    for name, executor in (("serial", SERIAL), ("pool", pool)):
+        outputs = tmp_path / name / "run"
+        pipeline.main(place, outputs, "sift_sv32", executor=executor)
+    assert results(tmp_path / "serial/run") == results(tmp_path / "pool/run")
