@@ -1,8 +1,10 @@
 """Images and h5 files, and how files are written so that a killed run loses little."""
 
 import csv
+import fcntl
 import filecmp
 import os
+import platform
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -12,7 +14,10 @@ import cv2
 import h5py
 import numpy as np
 
+from . import logger
 from .cli import InputError
+
+LOCK = ".lock"  # in an outputs folder
 
 
 @contextmanager
@@ -31,6 +36,43 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+class Lock:
+    """A folder that no other run may write to.
+
+    The lock is the system's, which ends with the process however that ends.
+
+    Args:
+        folder: made if need be.
+
+    Raises:
+        InputError: when another run has it.
+    """
+
+    def __init__(self, folder: Path):
+        folder.mkdir(parents=True, exist_ok=True)
+        self.file = None
+        if not os.access(folder, os.W_OK):  # then nobody writes to it
+            return
+        self.file = (folder / LOCK).open("a+")
+        try:
+            fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.file.seek(0)
+            who = self.file.read()
+            self.file.close()
+            raise InputError(f"Another run is at work in {folder} ({who}).") from None
+        except OSError as error:
+            logger.warning("%s cannot be locked (%s): start no second run in it.", folder, error)
+        self.file.truncate(0)
+        self.file.write(f"process {os.getpid()} on {platform.node()}")
+        self.file.flush()
+
+    def release(self) -> None:
+        """Let others have it."""
+        if self.file is not None:
+            self.file.close()
 
 
 def write_csv(rows: list[dict], path: Path, columns: Iterable[str] = ()) -> None:

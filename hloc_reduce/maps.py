@@ -194,54 +194,54 @@ def main(
     if before and before != made_from and not (map_dir / FINISHED).exists():
         logger.info("The map %s, which was not finished, is begun anew.", map_dir)
         overwrite = True
-    folder = RunFolder(
+    with RunFolder(
         map_dir,
         made_from,
         overwrite,
         inputs=[path for path in (image_dir, model, projection) if path is not None],
-    )
-    if (map_dir / FINISHED).exists():
-        return Map(map_dir)
-    if not (map_dir / PLACE).exists():
-        with replacing(map_dir / PLACE) as temporary:
-            temporary.write_text(uuid.uuid4().hex)
+    ) as folder:
+        if (map_dir / FINISHED).exists():
+            return Map(map_dir)
+        if not (map_dir / PLACE).exists():
+            with replacing(map_dir / PLACE) as temporary:
+                temporary.write_text(uuid.uuid4().hex)
 
-    logger.info("Building the map %s of %d images.", map_dir, len(names))
-    stamps.write(map_dir / FINGERPRINTS, fingerprints)
-    conf = _keep_projection(conf, map_dir)
-    with folder.stage("extract_features"):
-        features = extract_features.main(conf, image_dir, map_dir, image_list=names)
-    with folder.stage("retrieval"):
-        descriptors = aggregate_features.main(RETRIEVAL, features, names)
-    pairs = map_dir / f"pairs-db-{num_covis}.txt"
-    with folder.stage("pairs"):
-        if model is not None and reference.num_points3D():
-            pairs_from_covisibility.main(model, pairs, num_covis)
-        else:
-            pairs_from_retrieval.main(descriptors, pairs, num_covis)
-    with folder.stage("match_map"):
-        matches = match_features.main(matcher_conf, pairs, features.stem, map_dir)
-    with folder.stage("triangulation" if model is not None else "reconstruction"):
-        inputs = (image_dir, pairs, features, matches)
-        if model is not None:
-            sfm = triangulation.main(map_dir / "sfm", model, *inputs)
-        else:
-            sfm = reconstruction.main(map_dir / "sfm", *inputs, image_list=names)
-    summary = {
-        "id": uuid.uuid4().hex,
-        "feature": feature,
-        "matcher": matcher,
-        "image_dir": str(image_dir.resolve()),
-        "model": str(model.resolve()) if model is not None else None,
-        "conf": _with_projection(conf, lambda path: Path(path).name),
-        "images": len(names),
-        "images_with_pose": sfm.num_reg_images(),
-        "points3D": sfm.num_points3D(),
-        "seconds": folder.seconds(),
-        "bytes": folder.bytes(),
-    }
-    stamps.write(map_dir / FINISHED, summary)
-    return Map(map_dir)
+        logger.info("Building the map %s of %d images.", map_dir, len(names))
+        stamps.write(map_dir / FINGERPRINTS, fingerprints)
+        conf = _keep_projection(conf, map_dir)
+        with folder.stage("extract_features"):
+            features = extract_features.main(conf, image_dir, map_dir, image_list=names)
+        with folder.stage("retrieval"):
+            descriptors = aggregate_features.main(RETRIEVAL, features, names)
+        pairs = map_dir / f"pairs-db-{num_covis}.txt"
+        with folder.stage("pairs"):
+            if model is not None and reference.num_points3D():
+                pairs_from_covisibility.main(model, pairs, num_covis)
+            else:
+                pairs_from_retrieval.main(descriptors, pairs, num_covis)
+        with folder.stage("match_map"):
+            matches = match_features.main(matcher_conf, pairs, features.stem, map_dir)
+        with folder.stage("triangulation" if model is not None else "reconstruction"):
+            inputs = (image_dir, pairs, features, matches)
+            if model is not None:
+                sfm = triangulation.main(map_dir / "sfm", model, *inputs)
+            else:
+                sfm = reconstruction.main(map_dir / "sfm", *inputs, image_list=names)
+        summary = {
+            "id": uuid.uuid4().hex,
+            "feature": feature,
+            "matcher": matcher,
+            "image_dir": str(image_dir.resolve()),
+            "model": str(model.resolve()) if model is not None else None,
+            "conf": _with_projection(conf, lambda path: Path(path).name),
+            "images": len(names),
+            "images_with_pose": sfm.num_reg_images(),
+            "points3D": sfm.num_points3D(),
+            "seconds": folder.seconds(),
+            "bytes": folder.bytes(),
+        }
+        stamps.write(map_dir / FINISHED, summary)
+        return Map(map_dir)
 
 
 def _file_name(name: str) -> str:

@@ -13,7 +13,7 @@ import pycolmap
 from . import stamps, trace
 from .cli import InputError
 from .evaluation.poses import FAILED, pose_error, summarize_errors
-from .io import list_h5_names, open_h5, replacing
+from .io import Lock, list_h5_names, open_h5, replacing
 from .localization import pose
 from .storage import stored_descriptors
 
@@ -43,6 +43,8 @@ SHORT = 40  # characters of values that it quotes
 class RunFolder:
     """An output folder that belongs to one configuration and knows how long its stages took.
 
+    In a `with` block no other run can write to it.
+
     Args:
         path: the folder; made if need be.
         conf: what determines the results.
@@ -54,7 +56,7 @@ class RunFolder:
 
     Raises:
         InputError: when the folder holds results of another configuration, or an input that would
-            be deleted.
+            be deleted, or another run is at work in it.
     """
 
     def __init__(
@@ -65,8 +67,23 @@ class RunFolder:
         inputs: Iterable[Path] = (),
         stale: bool = False,
     ):
-        self.path = path
-        conf_file, self._stages_file = path / "conf.json", path / STAGES
+        self.path, self._stages_file = path, path / STAGES
+        self._lock = Lock(path)
+        try:
+            self._claim(conf, overwrite, inputs, stale)
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def __enter__(self) -> "RunFolder":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._lock.release()
+
+    def _claim(self, conf: dict, overwrite: bool, inputs: Iterable[Path], stale: bool) -> None:
+        """Check that the folder is of a configuration, or make it so."""
+        path, conf_file = self.path, self.path / "conf.json"
         conf = json.loads(json.dumps(conf))
         before = None
         if conf_file.exists() and not overwrite:

@@ -55,59 +55,59 @@ def main(
     common.check_retrieval(retrieval, loc_pairs, num_loc, query_names, map_names)
 
     numbers = {"num_covis": num_covis, "num_loc": num_loc}
-    folder = common.run_folder(
+    with common.run_folder(
         outputs, dataset, feature_conf, matcher_conf, retrieval, numbers, overwrite
-    )
-    sfm = outputs / f"sfm_{feature}+{matcher}"
-    sfm_pairs = outputs / f"pairs-db-covis{num_covis}.txt"
-    poses = outputs / f"Aachen-v1.1_hloc_{feature}+{matcher}_{retrieved}.txt"
+    ) as folder:
+        sfm = outputs / f"sfm_{feature}+{matcher}"
+        sfm_pairs = outputs / f"pairs-db-covis{num_covis}.txt"
+        poses = outputs / f"Aachen-v1.1_hloc_{feature}+{matcher}_{retrieved}.txt"
 
-    with folder.stage("extract_features"):
-        names = [*map_names, *query_names]
-        features = extract_features.main(
-            feature_conf, place.images, outputs, image_list=names, executor=executor
-        )
-    with folder.stage("pairs_from_covisibility"):
-        pairs_from_covisibility.main(place.reference_model, sfm_pairs, num_covis)
-    with folder.stage("match_map"):
-        sfm_matches = match_features.main(
-            matcher_conf, sfm_pairs, features.stem, outputs, executor=executor
-        )
-    with folder.stage("triangulation"):
-        reconstruction = triangulation.main(
-            sfm, place.reference_model, place.images, sfm_pairs, features, sfm_matches
-        )
-    with folder.stage("retrieval"):
-        common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
-    with folder.stage("match_queries"):
-        loc_matches = match_features.main(
-            matcher_conf, loc_pairs, features.stem, outputs, executor=executor
-        )
-    with folder.stage("localization"):
-        records = localize_sfm.main(
-            sfm, place.queries, loc_pairs, features, loc_matches, poses, executor=executor
-        )
+        with folder.stage("extract_features"):
+            names = [*map_names, *query_names]
+            features = extract_features.main(
+                feature_conf, place.images, outputs, image_list=names, executor=executor
+            )
+        with folder.stage("pairs_from_covisibility"):
+            pairs_from_covisibility.main(place.reference_model, sfm_pairs, num_covis)
+        with folder.stage("match_map"):
+            sfm_matches = match_features.main(
+                matcher_conf, sfm_pairs, features.stem, outputs, executor=executor
+            )
+        with folder.stage("triangulation"):
+            reconstruction = triangulation.main(
+                sfm, place.reference_model, place.images, sfm_pairs, features, sfm_matches
+            )
+        with folder.stage("retrieval"):
+            common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
+        with folder.stage("match_queries"):
+            loc_matches = match_features.main(
+                matcher_conf, loc_pairs, features.stem, outputs, executor=executor
+            )
+        with folder.stage("localization"):
+            records = localize_sfm.main(
+                sfm, place.queries, loc_pairs, features, loc_matches, poses, executor=executor
+            )
 
-    summary = {
-        "feature": feature,
-        "matcher": matcher,
-        "retrieval": retrieval,
-        "dataset": str(dataset),
-        **numbers,
-        "map_images": len(map_names),
-        "map_points3D": reconstruction.num_points3D(),
-    }
-    limits = {name: thresholds(name) for name in lists}
-    files = {
-        "query_images": place.images,
-        "map_images": place.images,
-        "map_features": features,
-        "map": sfm,
-        "pairs": loc_pairs,
-        "matches": loc_matches,
-        "ground_truth": truth_file if truth else None,
-    }
-    return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
+        summary = {
+            "feature": feature,
+            "matcher": matcher,
+            "retrieval": retrieval,
+            "dataset": str(dataset),
+            **numbers,
+            "map_images": len(map_names),
+            "map_points3D": reconstruction.num_points3D(),
+        }
+        limits = {name: thresholds(name) for name in lists}
+        files = {
+            "query_images": place.images,
+            "map_images": place.images,
+            "map_features": features,
+            "map": sfm,
+            "pairs": loc_pairs,
+            "matches": loc_matches,
+            "ground_truth": truth_file if truth else None,
+        }
+        return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
 
 
 def _main() -> None:

@@ -52,54 +52,54 @@ def main(
     lists = place.buildings(query_names, truth, used)
 
     numbers = {"num_loc": num_loc}
-    folder = common.run_folder(
+    with common.run_folder(
         outputs, dataset, feature_conf, matcher_conf, retrieval, numbers, overwrite
-    )
-    poses = outputs / f"InLoc_hloc_{feature}+{matcher}_{retrieved}.txt"
+    ) as folder:
+        poses = outputs / f"InLoc_hloc_{feature}+{matcher}_{retrieved}.txt"
 
-    with folder.stage("extract_features"):
-        names = [*used, *query_names]
-        features = extract_features.main(
-            feature_conf, dataset, outputs, image_list=names, executor=executor
-        )
-    with folder.stage("retrieval"):
-        common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
-    with folder.stage("match_queries"):
-        matches = match_features.main(
-            matcher_conf, loc_pairs, features.stem, outputs, executor=executor
-        )
-    with folder.stage("localization"):
-        records = localize_inloc.main(
-            dataset,
-            loc_pairs,
-            features,
-            matches,
-            poses,
-            queries=place.queries(features),
-            ransac_thresh=place.ransac_thresh,
-            executor=executor,
-        )
+        with folder.stage("extract_features"):
+            names = [*used, *query_names]
+            features = extract_features.main(
+                feature_conf, dataset, outputs, image_list=names, executor=executor
+            )
+        with folder.stage("retrieval"):
+            common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
+        with folder.stage("match_queries"):
+            matches = match_features.main(
+                matcher_conf, loc_pairs, features.stem, outputs, executor=executor
+            )
+        with folder.stage("localization"):
+            records = localize_inloc.main(
+                dataset,
+                loc_pairs,
+                features,
+                matches,
+                poses,
+                queries=place.queries(features),
+                ransac_thresh=place.ransac_thresh,
+                executor=executor,
+            )
 
-    summary = {
-        "feature": feature,
-        "matcher": matcher,
-        "retrieval": retrieval,
-        "dataset": str(dataset),
-        **numbers,
-        "intrinsics": {"list" if place.query_list.is_file() else "iphone7": len(query_names)},
-        "map_images": len(used),
-    }
-    limits = dict.fromkeys(lists, INLOC_THRESHOLDS)
-    files = {
-        "query_images": dataset,
-        "map_images": dataset,
-        "map_features": features,
-        "map": localize_inloc.points_file(features),
-        "pairs": loc_pairs,
-        "matches": matches,
-        "ground_truth": truth_file if truth else None,
-    }
-    return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
+        summary = {
+            "feature": feature,
+            "matcher": matcher,
+            "retrieval": retrieval,
+            "dataset": str(dataset),
+            **numbers,
+            "intrinsics": {"list" if place.query_list.is_file() else "iphone7": len(query_names)},
+            "map_images": len(used),
+        }
+        limits = dict.fromkeys(lists, INLOC_THRESHOLDS)
+        files = {
+            "query_images": dataset,
+            "map_images": dataset,
+            "map_features": features,
+            "map": localize_inloc.points_file(features),
+            "pairs": loc_pairs,
+            "matches": matches,
+            "ground_truth": truth_file if truth else None,
+        }
+        return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
 
 
 def _main() -> None:

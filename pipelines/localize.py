@@ -130,7 +130,7 @@ def main(
         changed.append(f"the map {built.folder}")
     if changed:
         logger.info("Localizing anew, because of changes: %s.", ", ".join(changed))
-    folder = results.RunFolder(
+    with results.RunFolder(
         outputs,
         {
             "map": built.place,
@@ -141,76 +141,79 @@ def main(
         overwrite,
         inputs=[query_images] if cameras else [query_images, queries],
         stale=bool(changed),
-    )
-    if not changed:  # photos that are not in this list may be in the next
-        now["queries"] = {**before.get("queries", {}), **now["queries"]}
-    stamps.write(made_from, now)
-    sources = dict.fromkeys(names, "list")
-    sources |= {name: source for name, (_, source) in cameras.items()}
-    if cameras:
-        intrinsics.write_queries(cameras, queries)
-    for source, said in (("EXIF", "from EXIF data"), ("guess", "guessed")):
-        if some := [name for name in names if sources[name] == source]:
-            logger.info(
-                "Intrinsics of %d queries are %s; the focal length is refined with the pose: %s",
-                *(len(some), said, cli.some(some)),
-            )
-    loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
-    poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
+    ) as folder:
+        if not changed:  # photos that are not in this list may be in the next
+            now["queries"] = {**before.get("queries", {}), **now["queries"]}
+        stamps.write(made_from, now)
+        sources = dict.fromkeys(names, "list")
+        sources |= {name: source for name, (_, source) in cameras.items()}
+        if cameras:
+            intrinsics.write_queries(cameras, queries)
+        for source, said in (("EXIF", "from EXIF data"), ("guess", "guessed")):
+            if some := [name for name in names if sources[name] == source]:
+                logger.info(
+                    "Intrinsics of %d queries are %s; the focal length is refined with the pose: "
+                    "%s",
+                    *(len(some), said, cli.some(some)),
+                )
+        loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
+        poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
 
-    with folder.stage("extract_features"):
-        features = extract_features.main(built.conf, query_images, outputs, image_list=names)
-    with folder.stage("retrieval"):
-        descriptors = aggregate_features.main(maps.RETRIEVAL, features, vocabulary=built.vocabulary)
-        pairs_from_retrieval.main(
-            descriptors,
-            loc_pairs,
-            num_loc,
-            query_list=names,
-            db_list=built.names(),
-            db_descriptors=built.descriptors,
-        )
-    with folder.stage("match_queries"):
-        matches = outputs / f"{features.stem}_{matcher_conf['output']}_{loc_pairs.stem}.h5"
-        match_features.main(
-            matcher_conf, loc_pairs, features, matches=matches, features_ref=built.features
-        )
-    with folder.stage("localization"):
-        records = localize_sfm.main(
-            built.sfm,
-            queries,
-            loc_pairs,
-            features,
-            matches,
-            poses,
-            refinements={
-                name: intrinsics.REFINEMENTS[source]
-                for name, source in sources.items()
-                if source != "list"
-            },
-            full_names=True,
-        )
-    summary = {
-        "feature": built.feature,
-        "matcher": built.matcher,
-        "retrieval": "vlad",
-        "map": str(built.folder),
-        "num_loc": num_loc,
-        "map_images": built.num_images,
-        "map_points3D": built.num_points3D,
-        "intrinsics": Counter(sources.values()),
-    }
-    limits = dict.fromkeys(lists, DAY_THRESHOLDS)
-    files = {
-        "query_images": query_images,
-        "map_images": built.images,
-        "map_features": built.features,
-        "map": built.sfm,
-        "pairs": loc_pairs,
-        "matches": matches,
-        "ground_truth": ground_truth,
-    }
-    return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
+        with folder.stage("extract_features"):
+            features = extract_features.main(built.conf, query_images, outputs, image_list=names)
+        with folder.stage("retrieval"):
+            descriptors = aggregate_features.main(
+                maps.RETRIEVAL, features, vocabulary=built.vocabulary
+            )
+            pairs_from_retrieval.main(
+                descriptors,
+                loc_pairs,
+                num_loc,
+                query_list=names,
+                db_list=built.names(),
+                db_descriptors=built.descriptors,
+            )
+        with folder.stage("match_queries"):
+            matches = outputs / f"{features.stem}_{matcher_conf['output']}_{loc_pairs.stem}.h5"
+            match_features.main(
+                matcher_conf, loc_pairs, features, matches=matches, features_ref=built.features
+            )
+        with folder.stage("localization"):
+            records = localize_sfm.main(
+                built.sfm,
+                queries,
+                loc_pairs,
+                features,
+                matches,
+                poses,
+                refinements={
+                    name: intrinsics.REFINEMENTS[source]
+                    for name, source in sources.items()
+                    if source != "list"
+                },
+                full_names=True,
+            )
+        summary = {
+            "feature": built.feature,
+            "matcher": built.matcher,
+            "retrieval": "vlad",
+            "map": str(built.folder),
+            "num_loc": num_loc,
+            "map_images": built.num_images,
+            "map_points3D": built.num_points3D,
+            "intrinsics": Counter(sources.values()),
+        }
+        limits = dict.fromkeys(lists, DAY_THRESHOLDS)
+        files = {
+            "query_images": query_images,
+            "map_images": built.images,
+            "map_features": built.features,
+            "map": built.sfm,
+            "pairs": loc_pairs,
+            "matches": matches,
+            "ground_truth": ground_truth,
+        }
+        return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
 
 
 def _main() -> None:

@@ -17,6 +17,7 @@ from hloc_reduce import (
     cli,
     colmap,
     intrinsics,
+    io,
     localization,
     maps,
     match_features,
@@ -47,7 +48,8 @@ def propagated(monkeypatch):
 
 
 def state(folder):
-    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != io.LOCK)
+    return {path: path.stat().st_mtime_ns for path in files}
 
 
 @pytest.fixture
