@@ -1,7 +1,8 @@
 """Extract local features from images into an h5 file."""
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from contextlib import closing
 from functools import partial
@@ -19,7 +20,7 @@ from .cli import InputError
 from .descriptors import DESCRIPTORS, check_weights
 from .executors import SERIAL, Executor
 from .extractors.dog import DoG
-from .group_writer import Group, GroupWriter
+from .group_writer import Group, GroupWriter, Key, fill
 from .io import read_image
 from .parsers import image_names
 from .storage import STORAGES, store
@@ -27,6 +28,7 @@ from .trace import span
 
 confs = features_confs.confs
 CHUNK = 8  # images
+Detect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # as colmap.detect_dog
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 
@@ -60,57 +62,112 @@ def main(
     """
     if feature_path is None:
         feature_path = Path(export_dir) / f"{conf['output']}.h5"
-    default = "float16" if as_half else "float32"
-    storage = cli.choose("storage", conf.get("storage", default), STORAGES)
     names = list_images(image_dir, image_list)
     if overwrite:
         extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
     with GroupWriter(feature_path, provenance(conf, as_half), overwrite) as writer:
-        todo = [name for name in names if name not in writer]
-        if not todo:
-            logger.info("All %d images are in %s.", len(names), feature_path)
-            return feature_path
-        work = partial(_extract_groups, conf, image_dir, storage)
-        with closing(writer.fill(work, todo, executor, CHUNK)) as done:
-            for _ in tqdm(done, desc="Extracting features", unit="image", total=len(todo)):
-                pass
-    logger.info("Features of %d images are in %s.", len(names), feature_path)
+        default = "float16" if as_half else "float32"
+        conf = {"storage": default, **conf}
+        extract_several({feature_path: (conf, writer)}, image_dir, names, executor)
     return feature_path
 
 
+def extract_several(
+    features: Mapping[Path, tuple[dict, GroupWriter]],
+    image_dir: Path,
+    names: list[str],
+    executor: Executor = SERIAL,
+) -> None:
+    """Extract several features of images at once.
+
+    Keypoints are detected once, and each base descriptor is computed once for all its projections.
+
+    Args:
+        features: from feature file to the configuration, with `storage`, and the writer; all of
+            one `shared_key`.
+        image_dir: the folder that names are relative to.
+        names: the images; a file's own are skipped.
+        executor: does the work.
+
+    Raises:
+        InputError: for an image that cannot be read, or an unknown storage.
+    """
+    confs = {path: conf for path, (conf, _) in features.items()}
+    writers = {path: writer for path, (_, writer) in features.items()}
+    for conf in confs.values():
+        cli.choose("storage", conf["storage"], STORAGES)
+    wanted = (
+        (name, [path for path, writer in writers.items() if name not in writer]) for name in names
+    )
+    todo = [(name, paths) for name, paths in wanted if paths]
+    if todo:
+        work = partial(_extract_groups, confs, image_dir)
+        # counts files: an image is as many as are wanted of it
+        number = sum(len(paths) for _, paths in todo)
+        with closing(fill(writers, work, todo, executor, CHUNK)) as done:
+            for _ in tqdm(done, desc="Extracting features", unit="image", total=number):
+                pass
+    for path in writers:
+        logger.info("Features of %d images are in %s.", len(names), path)
+
+
+def shared_key(conf: dict) -> str:
+    """Return what features have in common whose keypoints are the same."""
+    base = conf["model"].get("base", conf["model"])
+    if base["name"] == "dog":
+        base = {key: value for key, value in base.items() if key != "descriptor"}
+    return json.dumps([base, conf["preprocessing"]], sort_keys=True)
+
+
 def _extract_groups(
-    conf: dict, image_dir: Path, storage: str, names: Iterable[str]
-) -> Iterator[Group]:
-    """Yield the features of images as a file keeps them."""
-    names = list(names)
+    confs: Mapping[Path, dict], image_dir: Path, items: Iterable[tuple[str, list[Path]]]
+) -> Iterator[tuple[Path, Group]]:
+    """Yield the features of images, for each the wanted ones, as files keep them."""
+    items = list(items)
+    images = [(image_dir / name, paths) for name, paths in items]
     # closed at once if writing fails: it has processes
-    with closing(extract_all(conf, [image_dir / name for name in names])) as extracted:
-        for name, features in zip(names, extracted, strict=True):
-            uncertainty = features.pop("uncertainty")
-            if len(features["keypoints"]) == 0:
-                logger.warning("Image %s has no keypoints.", name)
-            arrays, attrs = store(features, storage)
-            yield name, arrays, attrs | {"keypoints": {"uncertainty": uncertainty}}
+    with closing(extract_all(confs, images)) as extracted:
+        for (name, _), several in zip(items, extracted, strict=True):
+            for path, features in several.items():
+                uncertainty = features.pop("uncertainty")
+                if len(features["keypoints"]) == 0:
+                    logger.warning("Image %s has no keypoints.", name)
+                arrays, attrs = store(features, confs[path]["storage"])
+                attrs = attrs | {"keypoints": {"uncertainty": uncertainty}}
+                yield path, (name, arrays, attrs)
 
 
-def extract_all(conf: dict, images: list[Path]) -> Iterator[dict[str, np.ndarray]]:
-    """Extract the features of images on all cores, and yield them in order.
+def extract_all(
+    confs: Mapping[Key, dict], images: list[tuple[Path, list[Key]]]
+) -> Iterator[dict[Key, dict[str, np.ndarray]]]:
+    """Extract features of images on all cores, and yield them in order.
 
     COLMAP's detector, which lets no other thread of its process run, gets processes. An extractor
     of another kind takes one image after the other, on all cores or a GPU.
 
     Args:
-        conf: an entry of `confs`.
-        images: files.
+        confs: configurations, all of one `shared_key`.
+        images: files, each with the keys of what is wanted of it.
+
+    Yields:
+        For each image the features, as of `extract`, by key.
     """
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = extractors.load(conf["model"]).eval().to(device)
+    models = {key: extractors.load(conf["model"]).eval().to(device) for key, conf in confs.items()}
+    model, conf = next(iter(models.values())), next(iter(confs.values()))
     base = getattr(model, "base", model)
     workers = min(parallel.cores(), len(images))
+
+    def work(item: tuple[Path, list[Key]], detect: Detect | None = None) -> dict:
+        image, keys = item
+        chosen = [models[key] for key in keys]
+        found = extract_each(chosen, image, conf["preprocessing"], device, detect)
+        return dict(zip(keys, found, strict=True))
+
     if workers == 1 or not isinstance(base, DoG):
-        for image in images:
+        for item in images:
             with span("extract"):
-                features = extract(model, image, conf["preprocessing"], device)
+                features = work(item)
             yield features
         return
     with processes.pool(workers) as pool:
@@ -125,12 +182,7 @@ def extract_all(conf: dict, images: list[Path]) -> Iterator[dict[str, np.ndarray
                     "try fewer cores, for example OMP_NUM_THREADS=1. What is written is kept."
                 ) from None
 
-        yield from parallel.ordered(
-            "extract",
-            lambda image: extract(model, image, conf["preprocessing"], device, detect),
-            images,
-            workers,
-        )
+        yield from parallel.ordered("extract", partial(work, detect=detect), images, workers)
 
 
 def provenance(conf: dict, as_half: bool = True) -> dict:
@@ -245,13 +297,11 @@ def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 and not grayscale else image
 
 
-@torch.no_grad()
 def extract(
     model: torch.nn.Module,
     image: Path | np.ndarray,
     preprocessing: dict,
     device: str = "cpu",
-    detect: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> dict[str, np.ndarray]:
     """Extract the features of one image.
 
@@ -260,25 +310,57 @@ def extract(
         image: as of `load_image`.
         preprocessing: as of `load_image`.
         device: of the model.
-        detect: finds DoG keypoints in place of the model, as `colmap.detect_dog`.
 
     Returns:
         keypoints (N, 2) float32 (x, y) in pixels of the original image, centres at integers;
         descriptors (D, N); scores, scales (pixels), oris (degrees) (N,), as far as the model has
         them; image_size (2,) width, height; and the uncertainty of the keypoints in pixels.
     """
+    return extract_each([model], image, preprocessing, device)[0]
+
+
+@torch.no_grad()
+def extract_each(
+    models: list[torch.nn.Module],
+    image: Path | np.ndarray,
+    preprocessing: dict,
+    device: str = "cpu",
+    detect: Detect | None = None,
+) -> list[dict[str, np.ndarray]]:
+    """Extract several features of one image, what they have in common once.
+
+    Args:
+        models: extractors, all of one `shared_key`.
+        image: as of `load_image`.
+        preprocessing: as of `load_image`.
+        device: of the models.
+        detect: finds DoG keypoints in place of the models, as `colmap.detect_dog`.
+
+    Returns:
+        Of each model what `extract` returns.
+    """
     image, size = load_image(image, preprocessing)
     data = {"image": image.to(device)}
+    bases = [getattr(model, "base", model) for model in models]
     if detect is not None:
         data["detected"] = detect(image[0, 0].numpy())
-    features = {key: value[0].cpu().numpy() for key, value in model(data).items()}
+    elif len(models) > 1 and isinstance(bases[0], DoG):
+        data["detected"] = bases[0].detect(data["image"])
     ratio = (size / np.array(image.shape[:1:-1])).astype(np.float32)
-    features["keypoints"] = (features["keypoints"] + 0.5) * ratio - 0.5
-    if "scales" in features:
-        features["scales"] = features["scales"] * ratio.mean()
-    features["image_size"] = size
-    features["uncertainty"] = model.detection_noise * ratio.mean()
-    return features
+    described, extracted = {}, []
+    for model, base in zip(models, bases, strict=True):
+        key = json.dumps(base.conf, sort_keys=True, default=str)
+        if key not in described:
+            described[key] = base(data)
+        found = described[key] if model is base else model.reduce(described[key])
+        features = {key: value[0].cpu().numpy() for key, value in found.items()}
+        features["keypoints"] = (features["keypoints"] + 0.5) * ratio - 0.5
+        if "scales" in features:
+            features["scales"] = features["scales"] * ratio.mean()
+        features["image_size"] = size
+        features["uncertainty"] = model.detection_noise * ratio.mean()
+        extracted.append(features)
+    return extracted
 
 
 def _main() -> None:

@@ -5,11 +5,12 @@ import shutil
 import sqlite3
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import h5py
 import numpy as np
@@ -26,6 +27,7 @@ QUOTED = 200  # characters of a configuration in a message
 Arrays = dict[str, np.ndarray]
 # the name of a group, its arrays, and from the name of an array to its attributes
 Group = tuple[str, Arrays, dict[str, dict]]
+Key = TypeVar("Key", bound=Hashable)
 
 
 class GroupWriter:
@@ -72,7 +74,7 @@ class GroupWriter:
         return name in self.names
 
     def begin(self, name: str) -> None:
-        """Have a group that will be added count as one that is there."""
+        """Have a group that is or will be added count as one that is there."""
         self.names.add(name)
 
     def __enter__(self) -> "GroupWriter":
@@ -88,28 +90,6 @@ class GroupWriter:
         """Add a group of arrays; `attrs` maps the name of an array to its attributes."""
         self.names.add(name)
         self.added.add(name, arrays, attrs or {})
-
-    def fill(
-        self,
-        work: Callable[[Iterable[Item]], Iterator[Group]],
-        items: Iterable[Item],
-        executor: Executor,
-        size: int,
-    ) -> Iterator[str]:
-        """Add the groups that work makes of items, where an executor does it; yield their names.
-
-        Args:
-            work: as of `executors`, yields groups.
-            items: as of `Executor.map`.
-            executor: does the work.
-            size: as of `Executor.map`.
-        """
-        with closing(
-            executor.map(partial(_write_pieces, self.new_pieces, work), items, size)
-        ) as names:
-            for name in names:
-                self.names.add(name)
-                yield name
 
     def _pieces(self) -> list[Path]:
         return sorted(self.folder.glob("*.h5"))
@@ -186,20 +166,47 @@ class Pieces:
                     dataset.attrs.update(attrs.get(key, {}))
 
 
-def _write_pieces(
-    new_pieces: Callable[[], Pieces],
-    work: Callable[[Iterable[Item]], Iterator[Group]],
+def fill(
+    writers: Mapping[Key, GroupWriter],
+    work: Callable[[Iterable[Item]], Iterator[tuple[Key, Group]]],
     items: Iterable[Item],
-) -> Iterator[str]:
-    """Write the groups that work makes of items into pieces, and yield their names."""
-    pieces = new_pieces()
+    executor: Executor,
+    size: int,
+) -> Iterator[tuple[Key, str]]:
+    """Add the groups that work makes of items to files, wherever an executor does it.
+
+    Args:
+        writers: of the files.
+        work: as of `executors`, yields groups, each with the key of its writer.
+        items: as of `Executor.map`.
+        executor: does the work.
+        size: as of `Executor.map`.
+
+    Yields:
+        For each group the key of its writer and its name.
+    """
+    new_pieces = {key: writer.new_pieces for key, writer in writers.items()}
+    with closing(executor.map(partial(_write_pieces, new_pieces, work), items, size)) as added:
+        for key, name in added:
+            writers[key].begin(name)
+            yield key, name
+
+
+def _write_pieces(
+    new_pieces: Mapping[Key, Callable[[], Pieces]],
+    work: Callable[[Iterable[Item]], Iterator[tuple[Key, Group]]],
+    items: Iterable[Item],
+) -> Iterator[tuple[Key, str]]:
+    """Write the groups that work makes of items into pieces, and yield their keys and names."""
+    pieces = {key: new() for key, new in new_pieces.items()}
     try:
         with closing(work(items)) as groups:
-            for name, arrays, attrs in groups:
-                pieces.add(name, arrays, attrs)
-                yield name
+            for key, (name, arrays, attrs) in groups:
+                pieces[key].add(name, arrays, attrs)
+                yield key, name
     finally:
-        pieces.flush()
+        for part in pieces.values():
+            part.flush()
 
 
 class _Names:

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from . import cli, io, localization, logger, scans, stamps
 from .cli import InputError
 from .executors import SERIAL, Executor
-from .group_writer import Group, GroupWriter
+from .group_writer import Group, GroupWriter, fill
 from .io import get_dataset, get_keypoints, open_h5
 from .parsers import parse_query_lists, parse_retrieval
 
@@ -157,13 +157,15 @@ def lift_keypoints(
     with GroupWriter(output, made_by, overwrite) as writer:
         todo = [name for name in cutouts if name not in writer]
         work = partial(_lift, dataset_dir, features)
-        with closing(writer.fill(work, todo, executor, CHUNK)) as done:
+        with closing(fill({None: writer}, work, todo, executor, CHUNK)) as done:
             for _ in tqdm(done, desc="Reading scans", unit="scan", total=len(todo)):
                 pass
     return output
 
 
-def _lift(dataset_dir: Path, features: Path, cutouts: Iterable[str]) -> Iterator[Group]:
+def _lift(
+    dataset_dir: Path, features: Path, cutouts: Iterable[str]
+) -> Iterator[tuple[None, Group]]:
     """Yield the points that the keypoints of cutouts show."""
     with open_h5(features) as file:
         for name in cutouts:
@@ -174,7 +176,7 @@ def _lift(dataset_dir: Path, features: Path, cutouts: Iterable[str]) -> Iterator
             known = np.isfinite(points[:, 0]).mean() if len(points) else 1
             if known < 0.5:
                 logger.warning("%.0f %% of the keypoints of %s have depth.", 100 * known, name)
-            yield name, {"points3D": points.astype(np.float32)}, {}
+            yield None, (name, {"points3D": points.astype(np.float32)}, {})
 
 
 class ScanMap:

@@ -20,7 +20,7 @@ from . import cli, io, logger, matchers, parallel
 from .base_model import dynamic_load
 from .cli import InputError
 from .executors import SERIAL, Executor
-from .group_writer import Group, GroupWriter
+from .group_writer import Group, GroupWriter, fill
 from .io import names_to_pair, open_h5
 from .matchers.nearest_neighbor import GPU_BYTES
 from .parsers import parse_pairs
@@ -89,7 +89,7 @@ def main(
         listed = tqdm(parse_pairs(pairs), desc="Matching", unit="pair", total=number, smoothing=0.1)
         todo = unmatched_pairs(listed, writer, ordered=features_ref not in (None, feature_path))
         work = partial(_match, conf, feature_paths, gpu_bytes)
-        with closing(writer.fill(work, todo, executor, CHUNK)) as done:
+        with closing(fill({None: writer}, work, todo, executor, CHUNK)) as done:
             for _ in done:
                 pass
     logger.info("Matches of the pairs %s are in %s.", pairs.name, matches)
@@ -125,7 +125,7 @@ def _match(
     feature_paths: tuple[Path, Path],
     gpu_bytes: int,
     pairs: Iterable[tuple[str, str]],
-) -> Iterator[Group]:
+) -> Iterator[tuple[None, Group]]:
     """Match pairs while others are read and written, which this thread does."""
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
         yield from _match_open(conf, file0, file1, gpu_bytes, iter(pairs))
@@ -137,7 +137,7 @@ def _match_open(
     file1: h5py.File,
     gpu_bytes: int,
     pairs: Iterator[tuple[str, str]],
-) -> Iterator[Group]:
+) -> Iterator[tuple[None, Group]]:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     matcher = dynamic_load(matchers, conf["model"]["name"])(conf["model"]).eval()
     read = DescriptorCache(CACHE_BYTES)
@@ -166,7 +166,7 @@ def _match_open(
     with closing(parallel.ordered("match", match, draw(), workers)) as results:
         for batch in results:
             for group, arrays in batch:
-                yield group, arrays, {}
+                yield None, (group, arrays, {})
 
 
 class DescriptorCache:

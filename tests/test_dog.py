@@ -1,16 +1,19 @@
 from concurrent.futures import BrokenExecutor
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import torch
 from kornia.feature.laf import extract_patches_from_pyramid, laf_from_center_scale_ori
 
 from confs import features as features_confs
-from hloc_reduce import extract_features
+from hloc_reduce import colmap, extract_features, parallel
 from hloc_reduce.cli import InputError
+from hloc_reduce.descriptors import Descriptor
 from hloc_reduce.extractors.dog import DoG, extract_patches
+from hloc_reduce.group_writer import GroupWriter
 
 
 def detect(image, **conf):
@@ -112,17 +115,53 @@ def test_all_cores_extract_the_same(tmp_path, textured):
         extracted = []
         for number in (1, 3):
             torch.set_num_threads(number)
-            extracted.append(list(extract_features.extract_all(features_confs.confs[name], images)))
+            conf = {name: features_confs.confs[name]}
+            found = extract_features.extract_all(conf, [(image, [name]) for image in images])
+            extracted.append([features[name] for features in found])
         torch.set_num_threads(threads)
         for alone, together in zip(*extracted, strict=True):
             for key in alone:
                 np.testing.assert_array_equal(alone[key], together[key])
     images[3].write_bytes(b"no image")
     torch.set_num_threads(2)
-    results = extract_features.extract_all(features_confs.confs["sift"], images)
+    conf = {"sift": features_confs.confs["sift"]}
+    results = extract_features.extract_all(conf, [(image, ["sift"]) for image in images])
     with pytest.raises(InputError, match="Cannot read image .*3.png"):
         list(results)
     torch.set_num_threads(threads)
+
+
+def test_several_features_at_once_are_those_of_each(tmp_path, textured, monkeypatch):
+    """Keypoints are detected once, and each base descriptor is computed once."""
+    names = ["sift", "sift_sv64", "colmap_sift_sv32", "sift_sv16"]
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.roll(textured, 17 * i, axis=1))
+    for name in names:
+        extract_features.main(features_confs.confs[name], tmp_path, tmp_path / "alone")
+    detected, described = [], []
+    monkeypatch.setattr(
+        colmap, "detect_dog", lambda *a, f=colmap.detect_dog: detected.append(1) or f(*a)
+    )
+    forward = Descriptor.forward
+    monkeypatch.setattr(Descriptor, "forward", lambda *a: described.append(1) or forward(*a))
+    monkeypatch.setattr(parallel, "cores", lambda: 1)
+    with ExitStack() as stack:
+        features = {}
+        for name in names:
+            conf = {**features_confs.confs[name], "storage": "float16"}
+            path = tmp_path / "together" / f"{conf['output']}.h5"
+            writer = stack.enter_context(GroupWriter(path, {}))
+            features[path] = conf, writer
+        assert len({extract_features.shared_key(conf) for conf, _ in features.values()}) == 1
+        files = [f"{i}.png" for i in range(3)]
+        extract_features.extract_several(features, tmp_path, files)
+    assert len(detected) == len(described) == 3
+    for path in features:
+        with h5py.File(path) as together, h5py.File(tmp_path / "alone" / path.name) as alone:
+            for name in files:
+                assert alone[name].keys() == together[name].keys()
+                for key, dataset in alone[name].items():
+                    np.testing.assert_array_equal(dataset[()], together[name][key][()])
 
 
 @pytest.mark.parametrize("angle", [30, 90, 200])

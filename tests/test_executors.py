@@ -14,7 +14,7 @@ import pytest
 from hloc_reduce import executors, extract_features, io
 from hloc_reduce.cli import InputError
 from hloc_reduce.executors import SERIAL, Pool, processes_of_this_machine
-from hloc_reduce.group_writer import GroupWriter
+from hloc_reduce.group_writer import GroupWriter, fill
 from pipelines import aachen, inloc
 
 
@@ -98,20 +98,19 @@ def groups(fail_at, items):
     for i in items:
         if i == fail_at:
             raise InputError("an image")
-        yield f"{i % 3}/{i}", {"a": np.full(3, i)}, {"a": {"x": i}}
+        yield 0, (f"{i % 3}/{i}", {"a": np.full(3, i)}, {"a": {"x": i}})
 
 
 def test_groups_are_the_same_and_a_failure_loses_none_that_is_done(pool, tmp_path):
     for executor in (SERIAL, pool):
         path = tmp_path / f"{type(executor).__name__}.h5"
         with pytest.raises(InputError, match="an image"), GroupWriter(path, {}) as writer:
-            list(writer.fill(partial(groups, 30), range(50), executor, 4))
+            list(fill({0: writer}, partial(groups, 30), range(50), executor, 4))
         with GroupWriter(path, {}) as writer:
             todo = [i for i in range(50) if f"{i % 3}/{i}" not in writer]
             assert 30 in todo and len(todo) < 50 - 12
-            assert sorted(writer.fill(partial(groups, None), todo, executor, 4)) == sorted(
-                f"{i % 3}/{i}" for i in todo
-            )
+            found = fill({0: writer}, partial(groups, None), todo, executor, 4)
+            assert sorted(found) == sorted((0, f"{i % 3}/{i}") for i in todo)
     assert contents(tmp_path / "Serial.h5") == contents(tmp_path / "Pool.h5")
     assert len(contents(path)) == 51
 

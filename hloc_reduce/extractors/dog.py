@@ -95,17 +95,19 @@ class DoG(BaseModel):
         """The name that a projection of these descriptors is kept under."""
         return self.conf["descriptor"]
 
+    def detect(self, image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Detect keypoints in an image (1, 1, H, W), as `colmap.detect_dog`."""
+        return colmap.detect_dog(image[0, 0].cpu().numpy(), self.conf["options"])
+
     def _forward(self, data: dict) -> dict:
         """Extract from an image (1, 1, H, W), or describe what was `detected` in it.
 
-        `data["detected"]` is what `colmap.detect_dog` returns.
+        `data["detected"]` is what `detect` returns.
         """
         image = data["image"]
         if image.shape[1] != 1:
             raise InputError("DoG needs grey images: preprocessing: {grayscale: true}.")
-        keypoints, descriptors = data.get("detected") or colmap.detect_dog(
-            image[0, 0].cpu().numpy(), self.conf["options"]
-        )
+        keypoints, descriptors = data.get("detected") or self.detect(image)
         if self.conf["max_keypoints"] >= 0:
             order = np.argsort(-keypoints[:, 2], kind="stable")[: self.conf["max_keypoints"]]
             keypoints, descriptors = keypoints[order], descriptors[order]

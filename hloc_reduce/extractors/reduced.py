@@ -35,7 +35,10 @@ class Reduced(BaseModel):
         return self.base.detection_noise
 
     def _forward(self, data: dict) -> dict:
-        features = self.base(data)
+        return self.reduce(self.base(data))
+
+    def reduce(self, features: dict) -> dict:
+        """Project the descriptors of features that `base` extracted."""
         if self.project is None:
             return features
         descriptors = features["descriptors"][0].T
