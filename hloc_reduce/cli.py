@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import signal
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -16,7 +17,11 @@ class InputError(ValueError):
 
 
 def run(main: Callable[[], None]) -> None:
-    """Run a command line: an error that a user can mend is one logged line and exit code 2."""
+    """Run a command line: an error that a user can mend is one logged line and exit code 2.
+
+    Ctrl-C, and a SIGTERM as of Slurm, end it as an error would, so that what is done is written.
+    """
+    signal.signal(signal.SIGTERM, _terminate)
     try:
         # argparse would call a module by its file
         if spec := sys.modules["__main__"].__spec__:
@@ -25,9 +30,17 @@ def run(main: Callable[[], None]) -> None:
     except (InputError, OSError) as error:
         logger.error(error)
         sys.exit(2)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         logger.error("Interrupted. The same command, but for any --overwrite, goes on from here.")
-        sys.exit(130)
+        sys.exit(128 + (signal.SIGTERM if isinstance(interrupt, _Terminated) else signal.SIGINT))
+
+
+class _Terminated(KeyboardInterrupt):
+    """A SIGTERM, which libraries in C++ would answer with a trace of their stack."""
+
+
+def _terminate(*_) -> None:
+    raise _Terminated
 
 
 def choose(kind: str, name: str, names: Iterable[str]) -> str:

@@ -62,13 +62,13 @@ def main(
     """
     if feature_path is None:
         feature_path = Path(export_dir) / f"{conf['output']}.h5"
+    stored = {"storage": "float16" if as_half else "float32", **conf}
+    cli.choose("storage", stored["storage"], STORAGES)
     names = list_images(image_dir, image_list)
     if overwrite:
         extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
     with GroupWriter(feature_path, provenance(conf, as_half), overwrite) as writer:
-        default = "float16" if as_half else "float32"
-        conf = {"storage": default, **conf}
-        extract_several({feature_path: (conf, writer)}, image_dir, names, executor)
+        extract_several({feature_path: (stored, writer)}, image_dir, names, executor)
     return feature_path
 
 
@@ -90,12 +90,10 @@ def extract_several(
         executor: does the work.
 
     Raises:
-        InputError: for an image that cannot be read, or an unknown storage.
+        InputError: for an image that cannot be read.
     """
     confs = {path: conf for path, (conf, _) in features.items()}
     writers = {path: writer for path, (_, writer) in features.items()}
-    for conf in confs.values():
-        cli.choose("storage", conf["storage"], STORAGES)
     wanted = (
         (name, [path for path, writer in writers.items() if name not in writer]) for name in names
     )

@@ -1,6 +1,7 @@
 """Runs that are killed, interrupted, started twice or out of space."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ import pytest
 
 from hloc_reduce import cli, io
 from hloc_reduce.cli import InputError
+from hloc_reduce.group_writer import GroupWriter
 from pipelines import aachen
 
 
@@ -50,3 +52,35 @@ def test_a_folder_that_cannot_be_written_needs_no_lock(tmp_path):
     tmp_path.chmod(0o500)
     io.Lock(tmp_path).release()
     tmp_path.chmod(0o700)
+
+
+@pytest.mark.parametrize("kind, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_run_writes_what_is_done(tmp_path, kind, code):
+    program = f"""
+import time
+import numpy, pycolmap
+from pathlib import Path
+from hloc_reduce import cli
+from hloc_reduce.group_writer import GroupWriter
+
+def main():
+    with GroupWriter(Path({str(tmp_path / "f.h5")!r}), {{}}) as writer:
+        writer.add("done", {{"a": numpy.arange(3)}})
+        print("ready", flush=True)
+        time.sleep(60)
+
+cli.run(main)
+"""
+    run = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=-1, stderr=-1, text=True, start_new_session=True
+    )
+    assert run.stdout.readline() == "ready\n"
+    os.killpg(run.pid, kind)
+    _, said = run.communicate(timeout=30)
+    assert run.returncode == code
+    (line,) = said.splitlines()
+    assert line.endswith(
+        "Interrupted. The same command, but for any --overwrite, goes on from here."
+    )
+    with GroupWriter(tmp_path / "f.h5", {}) as writer:
+        assert "done" in writer
