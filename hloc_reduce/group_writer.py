@@ -81,6 +81,7 @@ class GroupWriter:
         return self
 
     def __exit__(self, error: type | None, *_) -> None:
+        self.names.database.close()
         self.added.flush()
         if error is None:
             with trace.span("merge"):

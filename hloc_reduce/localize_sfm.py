@@ -88,19 +88,22 @@ def main(
         options["refinements"] = refinements
     if covisibility_clustering:
         options["covisibility_clustering"] = True
-    return localization.main(
-        load,
-        query_list,
-        retrieved,
-        features,
-        matches,
-        results,
-        partial(_config, config, refinements),
-        stamps.stamp(options, [path for path in inputs if path.exists()]),
-        overwrite or in_memory,
-        name_parts=None if full_names else 2 if prepend_camera_name else 1,
-        executor=SERIAL if in_memory else executor,
-    )
+    try:
+        return localization.main(
+            load,
+            query_list,
+            retrieved,
+            features,
+            matches,
+            results,
+            partial(_config, config, refinements),
+            stamps.stamp(options, [path for path in inputs if path.exists()]),
+            overwrite or in_memory,
+            name_parts=None if full_names else 2 if prepend_camera_name else 1,
+            executor=SERIAL if in_memory else executor,
+        )
+    finally:
+        _load.cache_clear()  # a map may be large
 
 
 @lru_cache(maxsize=1)  # a process localizes many chunks of queries

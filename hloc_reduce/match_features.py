@@ -127,26 +127,11 @@ def _match(
     pairs: Iterable[tuple[str, str]],
 ) -> Iterator[tuple[None, Group]]:
     """Match pairs while others are read and written, which this thread does."""
-    with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
-        yield from _match_open(conf, file0, file1, gpu_bytes, iter(pairs))
-
-
-def _match_open(
-    conf: dict,
-    file0: h5py.File,
-    file1: h5py.File,
-    gpu_bytes: int,
-    pairs: Iterator[tuple[str, str]],
-) -> Iterator[tuple[None, Group]]:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     matcher = dynamic_load(matchers, conf["model"]["name"])(conf["model"]).eval()
     read = DescriptorCache(CACHE_BYTES)
+    drawn = iter(pairs)
     size, workers = (1, parallel.cores()) if device == "cpu" else (PAIRS_ON_GPU, 1)
-
-    def draw() -> Iterator[tuple[list[str], list[tuple[torch.Tensor, torch.Tensor]]]]:
-        while batch := list(islice(pairs, size)):
-            groups = [names_to_pair(*names) for names in batch]
-            yield groups, [(read(file0, name0), read(file1, name1)) for name0, name1 in batch]
 
     def match(
         batch: tuple[list[str], list[tuple[torch.Tensor, torch.Tensor]]],
@@ -163,10 +148,17 @@ def _match_open(
         ]
         return list(zip(groups, matched, strict=True))
 
-    with closing(parallel.ordered("match", match, draw(), workers)) as results:
-        for batch in results:
-            for group, arrays in batch:
-                yield None, (group, arrays, {})
+    with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
+
+        def draw() -> Iterator[tuple[list[str], list[tuple[torch.Tensor, torch.Tensor]]]]:
+            while batch := list(islice(drawn, size)):
+                groups = [names_to_pair(*names) for names in batch]
+                yield groups, [(read(file0, name0), read(file1, name1)) for name0, name1 in batch]
+
+        with closing(parallel.ordered("match", match, draw(), workers)) as results:
+            for batch in results:
+                for group, arrays in batch:
+                    yield None, (group, arrays, {})
 
 
 class DescriptorCache:
