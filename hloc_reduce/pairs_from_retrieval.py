@@ -12,8 +12,9 @@ from .cli import InputError
 from .io import get_dataset, list_h5_names, open_h5
 from .parsers import image_names, parse_retrieval, write_pairs
 
-BLOCK_BYTES = 2**28  # descriptors of queries, and of the database, in memory at once
-QUERIES = 1024  # rows of the similarity matrix in memory at once
+# queries, and images of the database, whose descriptors are in memory at once
+BLOCK, BLOCK_BYTES = 2**14, 2**28
+QUERIES = 1024  # of them so many rows of the similarity matrix
 
 
 def main(
@@ -55,7 +56,7 @@ def main(
     query_names = _select(descriptors, query_prefix, query_list)
     db_names = _select(db_descriptors, db_prefix, db_list)
 
-    size = max(1, BLOCK_BYTES // read_global(descriptors, query_names[:1]).nbytes)
+    size = max(1, min(BLOCK, BLOCK_BYTES // read_global(descriptors, query_names[:1]).nbytes))
 
     def retrieve() -> Iterator[tuple[str, str]]:
         with tqdm(total=len(query_names), desc="Retrieving", unit="image") as progress:
