@@ -111,15 +111,16 @@ def read(path: Path) -> dict:
         InputError: when it is none.
     """
     try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except Exception as error:  # yaml raises whatever a broken value leads it to
         raise InputError(f"{path} cannot be read ({' '.join(str(error).split())}).") from None
     model = content.get("model") if isinstance(content, dict) else None
     for part in (model, model.get("base", model) if isinstance(model, dict) else None):
         if not isinstance(part, dict) or "name" not in part:
             raise InputError(f"{path} has no model with a name, such as: model: {{name: dog}}.")
-    if model["name"] == "reduced" and not model.get("projection"):
-        raise InputError(f"{path}: the reduced model names no projection.")
+    projection = model.get("projection", "" if model["name"] == "reduced" else None)
+    if projection is not None and not (isinstance(projection, str) and projection):
+        raise InputError(f"{path}: the {model['name']} model names no projection.")
     given = content.get("preprocessing") or {}
     if not isinstance(given, dict):
         raise InputError(f"{path}: preprocessing cannot be {given!r}.")

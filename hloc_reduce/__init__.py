@@ -23,6 +23,10 @@ if not logger.handlers:
     logger.setLevel(logging.INFO)
     logger.propagate = False
 
+from . import cli  # noqa: E402, it needs the logger
+
+cli.while_importing()
+
 
 def __getattr__(name: str) -> "type[Localizer]":
     """Import `Localizer` when it is asked for: it takes seconds."""

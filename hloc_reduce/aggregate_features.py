@@ -70,7 +70,10 @@ def main(
             model.vocabulary = read_vocabulary(vocabulary)
             for name in tqdm(todo, desc="Aggregating", unit="image"):
                 local = torch.from_numpy(get_descriptors(file, name).T)
-                descriptor = model({"descriptors": local[None]})["global_descriptor"][0]
+                try:
+                    descriptor = model({"descriptors": local[None]})["global_descriptor"][0]
+                except InputError as error:
+                    raise InputError(f"{features}, {name}: {error}") from None
                 writer.add(name, {"global_descriptor": descriptor.half().numpy()})
     logger.info("Global descriptors are in %s.", output)
     return output
@@ -87,6 +90,11 @@ def _sample(file: h5py.File, names: list[str], max_samples: int) -> np.ndarray:
     samples = []
     for name in names:
         descriptors = get_descriptors(file, name)
+        if samples and descriptors.shape[1] != samples[0].shape[1]:
+            raise InputError(
+                f"{file.filename}: the descriptors of {name} are {descriptors.shape[1]}-D, those "
+                f"of {names[0]} {samples[0].shape[1]}-D."
+            )
         samples.append(descriptors[:: -(-len(descriptors) // share) or 1])
     if not sum(map(len, samples)):
         raise InputError(f"No image for the vocabulary has features in {file.filename}.")

@@ -1,6 +1,9 @@
 """The parts of pycolmap whose interface or behaviour differs between versions."""
 
+import errno
 import json
+import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -11,8 +14,10 @@ import numpy as np
 import pycolmap
 
 from .cli import InputError
+from .parsers import check_names
 
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
+FULL = 2**16  # bytes: in less COLMAP cannot even open a database
 
 
 def detect_dog(image: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray]:
@@ -73,15 +78,18 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model, binary or text, with or without rigs and frames.
 
     Raises:
-        InputError: when it is not there or broken.
+        InputError: when it is not there or broken, or an image has a name that no list can have.
     """
     if not path.is_dir():
         raise InputError(f"There is no COLMAP model folder {path}.")
     try:
-        return pycolmap.Reconstruction(path)
+        model = pycolmap.Reconstruction(path)
+        names = [image.name for image in model.images.values()]
     except Exception as error:  # pycolmap raises RuntimeError, ValueError, IndexError, ...
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"{path} is not a COLMAP model ({reason}).") from None
+    check_names(names, path)
+    return model
 
 
 def add_image(
@@ -126,7 +134,7 @@ def cam_from_img(camera: pycolmap.Camera, points2D: np.ndarray) -> np.ndarray:
 
 def write_reference(database: Path, reference: pycolmap.Reconstruction) -> None:
     """Begin a COLMAP database with the cameras and images of a model, and their ids."""
-    with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
+    with _open(database) as opened:
         for camera in reference.cameras.values():
             opened.write_camera(camera, use_camera_id=True)
         for rig in reference.rigs.values():
@@ -135,6 +143,33 @@ def write_reference(database: Path, reference: pycolmap.Reconstruction) -> None:
             opened.write_frame(frame, use_frame_id=True)
         for image in reference.images.values():
             opened.write_image(image, use_image_id=True)
+
+
+@contextmanager
+def _open(database: Path) -> Iterator[pycolmap.Database]:
+    """Open a COLMAP database; in no transaction, whose end aborts the process on a full disk."""
+    with _full_disk(database), pycolmap.Database.open(database) as opened:
+        yield opened
+
+
+@contextmanager
+def _full_disk(path: Path) -> Iterator[None]:
+    """Raise an OSError if a disk is full in a block that writes; COLMAP says why not, or nothing.
+
+    Args:
+        path: what is written.
+    """
+
+    def check() -> None:
+        if shutil.disk_usage(path.parent).free < FULL:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
+
+    try:
+        yield
+    except RuntimeError:
+        check()
+        raise
+    check()
 
 
 def import_images(
@@ -149,7 +184,7 @@ def import_images(
     Raises:
         InputError: for an option that there is not, or an image that COLMAP skips.
     """
-    with pycolmap.Database.open(database):
+    with _open(database):
         pass
     try:
         reader = pycolmap.ImageReaderOptions(options)
@@ -157,7 +192,7 @@ def import_images(
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"The image options {options} cannot be used ({reason}).") from None
     pycolmap.import_images(database, image_dir, camera_mode, image_names=names, options=reader)
-    with pycolmap.Database.open(database) as opened:
+    with _open(database) as opened:
         imported = {image.name for image in opened.read_all_images()}
     if skipped := [name for name in names if name not in imported]:
         raise InputError(
@@ -179,7 +214,7 @@ def write_matches(
         matches: from two image names to all and to the verified matches, both (M, 2); None for
             those that `verify_matches` will verify.
     """
-    with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
+    with _open(database) as opened:
         image_ids = {image.name: image.image_id for image in opened.read_all_images()}
         for name, points in keypoints.items():
             opened.write_keypoints(image_ids[name], points.astype(np.float32))
@@ -228,10 +263,10 @@ def triangulate_points(
 
     Without any the model is empty; COLMAP 3.13 would raise a ValueError.
     """
-    with pycolmap.Database.open(database) as opened:
+    with _open(database) as opened:
         if opened.num_inlier_matches() == 0:
             return pycolmap.Reconstruction()
-    with _log(verbose):
+    with _log(verbose), _full_disk(output):
         return pycolmap.triangulate_points(
             reference,
             database,
@@ -250,7 +285,7 @@ def incremental_mapping(
 ) -> list[pycolmap.Reconstruction]:
     """Reconstruct the images of a database of verified matches, the largest model first."""
     output.mkdir()
-    with _log(verbose):
+    with _log(verbose), _full_disk(output):
         models = pycolmap.incremental_mapping(database, image_dir, output, options=options)
     return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 

@@ -48,6 +48,5 @@ def write_queries(cameras: Mapping[str, tuple[pycolmap.Camera, str]], path: Path
         lines.append(f"# {source}")
         lines.append(f"{name} {camera.model.name} {camera.width} {camera.height} {params}")
     text = "\n".join(lines) + "\n"
-    if not path.exists() or path.read_text() != text:  # what is made from it is up to date then
-        with replacing(path) as temporary:
-            temporary.write_text(text)
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -3,11 +3,14 @@
 import csv
 import fcntl
 import filecmp
+import io
 import os
 import platform
 import shutil
+import signal
+import threading
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
@@ -29,13 +32,29 @@ def replacing(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        yield temporary
+        with naming(path):
+            yield temporary
         filecmp.clear_cache()  # which goes by sizes and times
         if path.exists() and filecmp.cmp(temporary, path, shallow=False):
             shutil.copystat(path, temporary)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Have an error of the system that names no file, as that of a full disk, name this one."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+class UnreadableImage(InputError):
+    """A file that is not there, or no image that can be read."""
 
 
 class Lock:
@@ -65,9 +84,10 @@ class Lock:
             raise InputError(f"Another run is at work in {folder} ({who}).") from None
         except OSError as error:
             logger.warning("%s cannot be locked (%s): start no second run in it.", folder, error)
-        self.file.truncate(0)
-        self.file.write(f"process {os.getpid()} on {platform.node()}")
-        self.file.flush()
+        with suppress(OSError):  # of a full disk: it is locked all the same
+            self.file.truncate(0)
+            self.file.write(f"process {os.getpid()} on {platform.node()}")
+            self.file.flush()
 
     def release(self) -> None:
         """Let others have it."""
@@ -80,7 +100,7 @@ def write_csv(rows: list[dict], path: Path, columns: Iterable[str] = ()) -> None
 
     Where there may be no row, `columns` names them.
     """
-    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(columns) or list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
@@ -90,13 +110,19 @@ def read_image(path: Path, grayscale: bool = False) -> np.ndarray:
     """Read an image as uint8, (H, W) or (H, W, 3) RGB, without applying EXIF's rotation.
 
     Raises:
-        InputError: when the file is no image that OpenCV can read.
+        UnreadableImage: when the file is no image that OpenCV can read.
     """
     mode = cv2.IMREAD_GRAYSCALE if grayscale else cv2.IMREAD_COLOR
-    data = np.fromfile(path, np.uint8) if path.is_file() else np.empty(0, np.uint8)
-    image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    try:
+        data = np.fromfile(path, np.uint8)
+        image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+        reason = "it is no image, or a part of one" if data.size else "it is empty"
+    except OSError as error:
+        image, reason = None, error.strerror
+    except cv2.error as error:
+        image, reason = None, f"OpenCV says that not {error.err}"
     if image is None:
-        raise InputError(f"Cannot read image {path}.")
+        raise UnreadableImage(f"Cannot read image {path}: {reason}.")
     return image if grayscale else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -110,6 +136,96 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
         raise InputError(f"Cannot open {path}: {reason}.") from error
     with file:
         yield file
+
+
+@contextmanager
+def write_h5(path: Path) -> Iterator[h5py.File]:
+    """Open an h5 file, or a new one, to add to it; Ctrl-C waits until the block ends.
+
+    Raises:
+        OSError: after the block, when the disk is full; HDF5 itself would crash.
+    """
+    modes = ("r+b", "r+") if path.exists() else ("w+b", "w")
+    with _uninterrupted(), path.open(modes[0], buffering=0) as file:
+        disk = _Disk(file)
+        with h5py.File(disk, modes[1], libver="latest") as h5_file:
+            yield h5_file
+        if disk.error is not None:
+            raise disk.error
+
+
+class _Disk:
+    """A file for HDF5, which must not see an error: what cannot be written is kept in memory."""
+
+    def __init__(self, file: io.FileIO):
+        self.file, self.place = file, 0
+        self.error: OSError | None = None
+        self.unwritten: list[tuple[int, bytes]] = []  # where, and what
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self.place = offset if whence == os.SEEK_SET else self.file.seek(offset, whence)
+        return self.place
+
+    def tell(self) -> int:
+        return self.place
+
+    def read(self, size: int) -> bytes:
+        data = bytearray(size)
+        self.readinto(data)
+        return bytes(data)
+
+    def readinto(self, buffer: memoryview) -> int:
+        buffer = memoryview(buffer).cast("B")
+        self.file.seek(self.place)
+        number = self.file.readinto(buffer)
+        buffer[number:] = bytes(len(buffer) - number)
+        for start, kept in self.unwritten:
+            begin = max(start, self.place)
+            end = min(start + len(kept), self.place + len(buffer))
+            if begin < end:
+                buffer[begin - self.place : end - self.place] = kept[begin - start : end - start]
+        self.place += len(buffer)
+        return len(buffer)
+
+    def write(self, data: memoryview) -> int:
+        data, written = memoryview(data).cast("B"), 0
+        try:
+            self.file.seek(self.place)
+            while self.error is None and written < len(data):
+                written += self.file.write(data[written:])
+        except OSError as error:
+            self.error = error
+        if written < len(data):
+            self.unwritten.append((self.place + written, bytes(data[written:])))
+        self.place += len(data)
+        return len(data)
+
+    def truncate(self, size: int) -> None:
+        try:
+            if self.error is None:
+                self.file.truncate(size)
+        except OSError as error:
+            self.error = error
+
+    def flush(self) -> None:
+        pass
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Have SIGINT and SIGTERM wait for the end of a block."""
+    came, handlers = [], {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if callable(signal.getsignal(number)):
+                handlers[number] = signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in came[:1]:
+            signal.raise_signal(number)
 
 
 def list_h5_names(path: Path) -> list[str]:
@@ -143,18 +259,48 @@ def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]
                 file = h5py.h5f.get_name(group).decode()
                 raise InputError(f"{file}: the group {path} has another name, too; copy the file.")
             yield from iterate_h5_names(h5py.h5g.open(group, name), f"{path}/")
-        elif not holds_data:
+        elif prefix and not holds_data:
             holds_data = True
             yield prefix[:-1]
 
 
 def get_dataset(file: h5py.File, name: str, key: str) -> h5py.Dataset:
     """Return a data set of an image or a pair in an open h5 file, or raise an InputError."""
-    if name not in file:
+    group = file.get(name)
+    if group is None:
         raise InputError(f"{name} is not in the file {file.filename}.")
-    if key not in file[name]:
+    dataset = group.get(key) if isinstance(group, h5py.Group) else None
+    if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"{file.filename} is not a file of {key}: {name} has none.")
-    return file[name][key]
+    return dataset
+
+
+def get_array(file: h5py.File, name: str, key: str, least: tuple[int, ...]) -> np.ndarray:
+    """Read a data set of finite numbers of an image or a pair in an open h5 file.
+
+    Args:
+        file: the h5 file.
+        name: of the image or pair.
+        key: of the data set.
+        least: the least size of each of its dimensions.
+
+    Raises:
+        InputError: when it is not there or is none of such.
+    """
+    dataset = get_dataset(file, name, key)
+    said = f"{file.filename}: the {key} of {name}"
+    shape = dataset.shape or ()
+    if len(shape) != len(least) or any(n < m for n, m in zip(shape, least, strict=True)):
+        raise InputError(f"{said} are of the wrong shape {shape}.")
+    if dataset.dtype.kind not in "iuf":
+        raise InputError(f"{said} are no numbers, but {dataset.dtype}.")
+    try:
+        array = dataset[()]
+    except OSError as error:  # h5py names no file
+        raise InputError(f"{said} cannot be read ({error}).") from None
+    if array.dtype.kind == "f" and not np.isfinite(array.astype(np.float32)).all():
+        raise InputError(f"{said} have numbers that are not finite.")
+    return array
 
 
 def provenance(file: h5py.File) -> str:
@@ -165,8 +311,19 @@ def provenance(file: h5py.File) -> str:
 
 def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
     """Read keypoints (N, 2) float64, pixel centres at integers, and their uncertainty in pixels."""
-    dataset = get_dataset(file, name, "keypoints")
-    return dataset[:, :2].astype(np.float64), float(dataset.attrs.get("uncertainty", 1.0))
+    keypoints = get_array(file, name, "keypoints", (0, 2))[:, :2].astype(np.float64)
+    uncertainty = get_dataset(file, name, "keypoints").attrs.get("uncertainty", 1.0)
+    if not (np.isscalar(uncertainty) and np.isreal(uncertainty) and 0 < uncertainty < np.inf):
+        raise InputError(f"{file.filename}: the uncertainty of {name} is {uncertainty!r}.")
+    return keypoints, float(uncertainty)
+
+
+def get_image_size(file: h5py.File, name: str) -> tuple[int, int]:
+    """Read the width and height of an image in an open feature file."""
+    width, height = map(int, get_array(file, name, "image_size", (2,))[:2])
+    if min(width, height) < 1:
+        raise InputError(f"{file.filename}: the image_size of {name} is {width}x{height}.")
+    return width, height
 
 
 def get_colmap_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
@@ -199,35 +356,50 @@ def find_pair(file: h5py.File, name0: str, name1: str) -> tuple[str | None, bool
     return None, False
 
 
-def get_matches(file: h5py.File, name0: str, name1: str) -> tuple[np.ndarray, np.ndarray]:
+def get_matches(
+    file: h5py.File, name0: str, name1: str, sizes: tuple[int, int] | None = None
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Read the matches of a pair, stored in either order.
 
+    Args:
+        file: the match file.
+        name0: an image.
+        name1: another.
+        sizes: how many keypoints both have, if that is to be checked.
+
     Returns:
-        matches (M, 2) int64, indices of the keypoints of name0 and name1, and scores (M,).
+        matches (M, 2) int64, indices of the keypoints of name0 and name1, and scores (M,), None
+        where the file has none.
 
     Raises:
-        InputError: when the pair was not matched.
+        InputError: when the pair was not matched, or its matches are of other keypoints.
     """
     pair, reverse = find_pair(file, name0, name1)
     if pair is None:
         raise InputError(f"The pair {name0}, {name1} is not in the match file {file.filename}.")
-    matches0 = get_dataset(file, pair, "matches0")[()]
+    matches0 = get_array(file, pair, "matches0", (0,))
     matched = np.flatnonzero(matches0 != -1)
     matches = np.stack([matched, matches0[matched].astype(np.int64)], -1)
-    scores = get_dataset(file, pair, "matching_scores0")[()][matched]
-    return (matches[:, ::-1] if reverse else matches), scores
+    matches = matches[:, ::-1] if reverse else matches
+    if sizes is not None:
+        _check_matches(file, matches, (name0, name1), sizes)
+    if "matching_scores0" not in file[pair]:
+        return matches, None
+    return matches, get_array(file, pair, "matching_scores0", matches0.shape)[matched]
 
 
-def check_matches(matches: np.ndarray, names: tuple[str, str], sizes: tuple[int, int]) -> None:
+def _check_matches(
+    file: h5py.File, matches: np.ndarray, names: tuple[str, str], sizes: tuple[int, int]
+) -> None:
     """Raise an InputError if matches (M, 2) refer to keypoints that images do not have."""
+    said = f"{file.filename}: the matches of {names[0]}, {names[1]}"
     if len(matches) and matches.min() < 0:
         raise InputError(
-            f"The matches of {names[0]}, {names[1]} are negative, as hloc's are that have more "
-            "than 32,767 keypoints: match these anew."
+            f"{said} are negative, as hloc's are that have more than 32,767 keypoints: match these "
+            "anew."
         )
     for column, (name, size) in enumerate(zip(names, sizes, strict=True)):
         if len(matches) and matches[:, column].max() >= size:
             raise InputError(
-                f"The matches of {names[0]}, {names[1]} were made of other features: "
-                f"{name} has {size} keypoints only."
+                f"{said} were made of other features: {name} has {size} keypoints only."
             )

@@ -16,7 +16,15 @@ from tqdm import tqdm
 from . import cli, colmap, logger, parallel
 from .cli import InputError
 from .executors import SERIAL, Executor
-from .io import check_matches, find_pair, get_colmap_keypoints, get_matches, open_h5, replacing
+from .io import (
+    find_pair,
+    get_colmap_keypoints,
+    get_image_size,
+    get_matches,
+    naming,
+    open_h5,
+    replacing,
+)
 from .parsers import write_poses
 
 # Three points fit a pose always, and among hundreds of wrong matches a few more agree by chance.
@@ -225,8 +233,12 @@ def read_records(path: Path) -> dict[str, dict]:
     try:
         header, *lines = path.read_text().splitlines()
         if json.loads(header)["records"] == RECORDS:
-            return dict(json.loads(line) for line in lines)
-    except (OSError, ValueError, TypeError, KeyError):
+            records = dict(json.loads(line) for line in lines)
+            for record in records.values():
+                record["localized"] = bool(record["localized"])
+                pose(record)
+            return records
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         pass
     raise InputError(f"{path} is not there or broken: run the localization again.")
 
@@ -254,8 +266,8 @@ def _check_sizes(feature_file: h5py.File, queries: list[tuple[str, pycolmap.Came
     """Warn of intrinsics that are for photos of another size."""
     wrong = []
     for name, camera in queries:
-        if "image_size" in feature_file.get(name, ()):
-            width, height = map(int, feature_file[name]["image_size"][()])
+        if f"{name}/image_size" in feature_file:
+            width, height = get_image_size(feature_file, name)
             if (width, height) != (camera.width, camera.height):
                 wrong.append(f"{name} ({camera.width}x{camera.height}, not {width}x{height})")
     if wrong:
@@ -282,10 +294,10 @@ def _read(
     if present and not any(find_pair(match_file, name, other)[0] for other in present):
         logger.warning("%s was not matched: %s has none of its pairs.", name, match_file.filename)
         return keypoints, {other: np.zeros((0, 2), np.int64) for other in present}
-    matches = {other: get_matches(match_file, name, other)[0] for other in present}
-    for other, indices in matches.items():
-        check_matches(indices, (name, other), (len(keypoints), reference.num_keypoints(other)))
-    return keypoints, matches
+    sizes = {other: (len(keypoints), reference.num_keypoints(other)) for other in present}
+    return keypoints, {
+        other: get_matches(match_file, name, other, both)[0] for other, both in sizes.items()
+    }
 
 
 def _record(
@@ -330,9 +342,11 @@ class _Log:
         self.file = self.path.open("a")
 
     def __exit__(self, *_) -> None:
-        self.file.close()
+        with naming(self.path):
+            self.file.close()
 
     def add(self, name: str, record: dict) -> None:
         self.records[name] = record
-        self.file.write(json.dumps([name, record]) + "\n")
-        self.file.flush()
+        with naming(self.path):
+            self.file.write(json.dumps([name, record]) + "\n")
+            self.file.flush()

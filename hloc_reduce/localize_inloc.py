@@ -16,7 +16,7 @@ from . import cli, io, localization, logger, scans, stamps
 from .cli import InputError
 from .executors import SERIAL, Executor
 from .group_writer import Group, GroupWriter, fill
-from .io import get_dataset, get_keypoints, open_h5
+from .io import get_dataset, get_image_size, get_keypoints, open_h5
 from .parsers import parse_query_lists, parse_retrieval
 
 RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
@@ -118,7 +118,7 @@ def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap
     queries = []
     with open_h5(features) as file:
         for name in names:
-            width, height = map(int, get_dataset(file, name, "image_size")[()])
+            width, height = get_image_size(file, name)
             params = [max(width, height) * 28 / 36, width / 2, height / 2]
             camera = pycolmap.Camera(
                 model="SIMPLE_PINHOLE", width=width, height=height, params=params
@@ -171,7 +171,7 @@ def _lift(
         for name in cutouts:
             keypoints, _ = get_keypoints(file, name)
             scan = scans.read_scan(dataset_dir / f"{name}.mat")
-            scale = scan.shape[1::-1] / get_dataset(file, name, "image_size")[()]
+            scale = np.array(scan.shape[1::-1]) / get_image_size(file, name)
             points = scans.interpolate(scan, (keypoints + 0.5) * scale - 0.5)
             known = np.isfinite(points[:, 0]).mean() if len(points) else 1
             if known < 0.5:

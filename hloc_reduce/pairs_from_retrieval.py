@@ -9,8 +9,8 @@ from tqdm import tqdm
 
 from . import cli, colmap, logger
 from .cli import InputError
-from .io import get_dataset, list_h5_names, open_h5
-from .parsers import image_names, parse_retrieval, write_pairs
+from .io import get_array, list_h5_names, open_h5
+from .parsers import check_names, image_names, parse_retrieval, write_pairs
 
 # queries, and images of the database, whose descriptors are in memory at once
 BLOCK, BLOCK_BYTES = 2**14, 2**28
@@ -190,7 +190,7 @@ def _select(
         selected = list_h5_names(path)
     if not selected:
         raise InputError(f"No image is selected from the global descriptors {path}.")
-    return selected
+    return check_names(selected, path)
 
 
 def read_global(path: Path, names: list[str]) -> np.ndarray:
@@ -200,7 +200,7 @@ def read_global(path: Path, names: list[str]) -> np.ndarray:
         InputError: when an image has none, or they differ in size.
     """
     with open_h5(path) as file:
-        rows = [get_dataset(file, name, "global_descriptor")[()] for name in names]
+        rows = [get_array(file, name, "global_descriptor", (1,)) for name in names]
     if len({row.shape for row in rows}) > 1:
         raise InputError(f"The global descriptors in {path} differ in size.")
     return np.stack(rows).astype(np.float32)

@@ -1,5 +1,6 @@
 """The text files of hloc: image lists, query lists with intrinsics, pairs, poses."""
 
+import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -8,20 +9,46 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from .cli import InputError, choose
+from .cli import InputError, choose, some
 from .io import replacing
 
 CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+_PART = r"(?!\.\.?(?:/|$))[^\s/\0\ud800-\udfff]+"  # neither . nor .., and what h5 and lists hold
+_NAME = re.compile(rf"(?!#){_PART}(?:/{_PART})*")
 
 
-def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield ("file:number", words) of every line that is neither empty nor a comment."""
+def check_names(names: list[str], place: Path | str) -> list[str]:
+    """Return names of images, the paths of their files in a folder, if they are sound.
+
+    Args:
+        names: from a list, a model, a folder or an h5 file.
+        place: the one that they are from, for the message.
+
+    Raises:
+        InputError: for a name that has spaces, or is absolute, or the like.
+    """
+    wrong = [name for name in names if not _NAME.fullmatch(name)]
+    if wrong:
+        raise InputError(
+            f"{place}: {some(map(repr, wrong), 3)} cannot be names of images: these are relative "
+            "to a folder, without spaces, a # at the beginning, or . or .. as a part. Rename them."
+        )
+    return names
+
+
+def _lines(path: Path, names: int = 1) -> Iterator[tuple[str, list[str]]]:
+    """Yield ("file:number", words) of every line that is neither empty nor a comment.
+
+    The first words, so many, are names of images.
+    """
     try:
-        with path.open(encoding="utf-8") as file:
+        with path.open(encoding="utf-8-sig") as file:  # which Windows likes to mark as such
             for number, line in enumerate(file, 1):
                 words = line.split()
                 if words and not words[0].startswith("#"):
-                    yield f"{path}:{number}", words
+                    place = f"{path}:{number}"
+                    check_names(words[:names], place)
+                    yield place, words
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"Cannot read {path}: {error}.") from None
 
@@ -37,7 +64,10 @@ def image_names(images: Path | str | Iterable[str]) -> list[str]:
     Raises:
         InputError: when there is none.
     """
-    names = parse_image_list(Path(images)) if isinstance(images, (Path, str)) else list(images)
+    if isinstance(images, (Path, str)):
+        names = parse_image_list(Path(images))
+    else:
+        names = check_names(list(images), "The list of images")
     if not names:
         raise InputError(f"There is no image in the list {images}.")
     return names
@@ -63,7 +93,9 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
             )
             if not camera.verify_params():
                 raise ValueError(f"wrong number of parameters for {model}")
-            sizes = camera.width, camera.height, camera.focal_length_x, camera.focal_length_y
+            # of a panorama, which has none, COLMAP crashes when asked for the first
+            focal_lengths = camera.params[camera.focal_length_idxs()]
+            sizes = camera.width, camera.height, *focal_lengths
             if not (np.isfinite(camera.params).all() and min(sizes) > 0):
                 raise ValueError("sizes and focal lengths are positive and finite")
         except (ValueError, TypeError, AttributeError, RuntimeError) as error:
@@ -103,7 +135,7 @@ def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]
 
 def parse_pairs(path: Path) -> Iterator[tuple[str, str]]:
     """Read pairs, one `name0 name1` a line, as they are drawn: a list may be of any length."""
-    for place, words in _lines(path):
+    for place, words in _lines(path, names=2):
         if len(words) != 2:
             raise InputError(f"{place}: not a pair `name0 name1`.")
         yield words[0], words[1]
@@ -142,7 +174,9 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
             )
         try:
             qw, qx, qy, qz, *translation = map(float, values)
-            if not np.isfinite(translation).all():
+            if not (
+                np.isfinite(translation).all() and 1e-9 < np.hypot.reduce([qw, qx, qy, qz]) < 1e9
+            ):
                 raise ValueError
             rotation = pycolmap.Rotation3d(Rotation.from_quat([qx, qy, qz, qw]).as_matrix())
             poses[name] = pycolmap.Rigid3d(rotation, np.array(translation).reshape(3))
@@ -162,7 +196,7 @@ def write_poses(
         name_parts: how much of names is written: 1 for `basename`, 2 for `folder/basename`
             (RobotCar's format), None for all.
     """
-    with replacing(path) as temporary, temporary.open("w") as file:
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for name, pose in poses.items():
             written = name if name_parts is None else "/".join(name.split("/")[-name_parts:])
             x, y, z, w = pose.rotation.quat

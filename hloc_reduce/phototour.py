@@ -77,9 +77,9 @@ def read_pairs(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     pairs = []
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
         try:
-            values = [int(value) for value in line.split()]
+            values = np.array(line.split(), np.int64)
             pairs.append((values[0], values[3], values[1] == values[4]))
-        except (ValueError, IndexError):
+        except (ValueError, IndexError, OverflowError):
             raise InputError(f"{path}, line {number}: not a pair of patches and points.") from None
     pairs = np.array(pairs, np.int64).reshape(-1, 3)
     matches = pairs[:, 2] == 1

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from . import cli, io, logger
 from .cli import InputError
 from .group_writer import GroupWriter
-from .io import get_dataset, list_h5_names, open_h5
+from .io import get_array, get_dataset, list_h5_names, open_h5
 
 STORAGES = ("float16", "float32", "uint8")  # hloc's `as_half`, without it, and ours
 QUANTIZED = "descriptors_uint8"
@@ -79,23 +79,31 @@ def stored_descriptors(file: h5py.File, name: str) -> h5py.Dataset:
     """Return the data set of the descriptors (D, N) of an image, floats or quantized.
 
     Raises:
-        InputError: when the image is not there or has none.
+        InputError: when the image is not there or has none, or not as many as keypoints.
     """
-    quantized = name in file and QUANTIZED in file[name]
-    return get_dataset(file, name, QUANTIZED if quantized else "descriptors")
+    key = QUANTIZED if f"{name}/{QUANTIZED}" in file else "descriptors"
+    dataset, keypoints = get_dataset(file, name, key), file[name].get("keypoints")
+    shapes = [getattr(part, "shape", None) for part in (dataset, keypoints)]
+    if all(shapes) and shapes[0][-1] != shapes[1][0]:
+        raise InputError(
+            f"{file.filename}: the descriptors of {name} are {shapes[0]}, its keypoints "
+            f"{shapes[1]}: they are to be (D, N) and (N, 2)."
+        )
+    return dataset
 
 
 def get_descriptors(file: h5py.File, name: str) -> np.ndarray:
     """Read the descriptors (N, D) float32 of an image, one row each.
 
     Raises:
-        InputError: when the image is not there or has none.
+        InputError: when the image is not there, or has none, or broken ones.
     """
     dataset = stored_descriptors(file, name)
     key = dataset.name.rpartition("/")[2]
+    array = get_array(file, name, key, (0, 0))
     try:
-        return restore({key: dataset[()]}, {key: dict(dataset.attrs)})
-    except KeyError:
+        return restore({key: array}, {key: dict(dataset.attrs)})
+    except (KeyError, TypeError, ValueError):
         raise InputError(f"{file.filename}: {name} has no scale and offset.") from None
 
 
@@ -127,8 +135,9 @@ def main(features: Path, output: Path, storage: str = "float16", overwrite: bool
                     key: dataset
                     for key, dataset in file[name].items()
                     if isinstance(dataset, h5py.Dataset) and key != QUANTIZED
+                    if dataset.shape is not None  # as of an empty one, which holds nothing
                 }
-                arrays = {key: dataset[()] for key, dataset in datasets.items()}
+                arrays = {key: np.asarray(d[()], d.dtype) for key, d in datasets.items()}
                 attrs = {key: dict(dataset.attrs) for key, dataset in datasets.items()}
                 if storage == "uint8" and QUANTIZED in file[name]:
                     file_attrs = dict(file[name][QUANTIZED].attrs)

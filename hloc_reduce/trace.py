@@ -8,6 +8,7 @@ from pathlib import Path
 from threading import get_native_id
 
 from . import logger
+from .io import replacing
 
 _events: list[tuple] | None = None  # None while nothing is recorded
 
@@ -36,8 +37,8 @@ def _write(events: list[tuple], path: Path) -> None:
         {"name": name, "ph": "X", "pid": 0, "tid": thread, "ts": start / 1e3, "dur": took / 1e3}
         for name, thread, start, took in events
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"traceEvents": spans}))
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps({"traceEvents": spans}))
     logger.info("The trace %s opens in https://ui.perfetto.dev.", path)
 
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from . import cli, colmap, logger, stamps
 from .cli import InputError
-from .io import check_matches, get_colmap_keypoints, get_matches, open_h5
+from .io import get_colmap_keypoints, get_matches, open_h5
 from .parsers import parse_retrieval
 
 MAX_EPIPOLAR_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
@@ -128,9 +128,13 @@ def replacing_map(
     building = sfm_dir.with_name(f".{sfm_dir.name}.tmp")
     shutil.rmtree(building, ignore_errors=True)
     building.mkdir(parents=True)
-    yield building
-    stamps.write(building / STAMP, made_from)
-    replaced = sfm_dir.with_name(f".{sfm_dir.name}.old")
+    try:
+        yield building
+        stamps.write(building / STAMP, made_from)
+    except BaseException:
+        shutil.rmtree(building, ignore_errors=True)
+        raise
+    replaced = sfm_dir.with_name(f".{sfm_dir.name}.old.tmp")
     shutil.rmtree(replaced, ignore_errors=True)
     if sfm_dir.exists():
         sfm_dir.replace(replaced)
@@ -169,12 +173,13 @@ def read_matches(
                     raise InputError(f"{pairs}: image {absent} is not in the reference model.")
                 if name0 == name1 or (name0, name1) in found or (name1, name0) in found:
                     continue
-                indices, scores = get_matches(file, name0, name1)
                 sizes = len(keypoints[name0]), len(keypoints[name1])
-                check_matches(indices, (name0, name1), sizes)
-                found[name0, name1] = (
-                    indices[scores > min_match_score] if min_match_score else indices
-                )
+                indices, scores = get_matches(file, name0, name1, sizes)
+                if min_match_score:
+                    if scores is None:
+                        raise InputError(f"{matches}: the pair {name0}, {name1} has no scores.")
+                    indices = indices[scores > min_match_score]
+                found[name0, name1] = indices
     return keypoints, uncertainty, found
 
 

@@ -1,3 +1,7 @@
+import hashlib
+import io
+import pickle
+from dataclasses import replace
 from urllib.error import URLError
 
 import kornia
@@ -5,7 +9,7 @@ import pytest
 import torch
 
 from confs import features
-from hloc_reduce import descriptors
+from hloc_reduce import descriptors, downloads
 from hloc_reduce.cli import InputError
 from hloc_reduce.descriptors import DESCRIPTORS, Descriptor
 from hloc_reduce.extract_features import provenance
@@ -60,7 +64,7 @@ def test_missing_weights_are_named_at_once(tmp_path, monkeypatch):
         raise URLError("no network")
 
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(descriptors, "urlopen", unreachable)
+    monkeypatch.setattr(downloads, "urlopen", unreachable)
     with pytest.raises(InputError, match="no network"):  # before anything is computed or written
         provenance(features.confs["tfeat"], True)
     asked.clear()
@@ -70,6 +74,46 @@ def test_missing_weights_are_named_at_once(tmp_path, monkeypatch):
     assert "no network" in message and "kornia/tfeat/resolve/main/tfeat-liberty.params" in message
     assert str(tmp_path / "hub/checkpoints/tfeat-liberty.params") in message
     assert len(asked) == 2 and sum(timeout for _, timeout in asked) <= 10
+
+
+class Harm:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return type(self.path).mkdir, (self.path,)
+
+
+def test_weights_are_downloaded_once_and_checked(tmp_path, monkeypatch):
+    mirror, source = DESCRIPTORS["tfeat"].urls
+    weights, other = io.BytesIO(), pickle.dumps(Harm(tmp_path / "harmed"))
+    torch.save(kornia.feature.TFeat(pretrained=False).state_dict(), weights)
+    weights = weights.getvalue()
+    base = replace(DESCRIPTORS["tfeat"], sha256=hashlib.sha256(weights).hexdigest())
+    monkeypatch.setitem(DESCRIPTORS, "tfeat", base)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    path, sent, asked = tmp_path / "hub/checkpoints/tfeat-liberty.params", {}, []
+
+    def urlopen(url, timeout):
+        asked.append(url)
+        return io.BytesIO(sent[url])
+
+    monkeypatch.setattr(downloads, "urlopen", urlopen)
+    sent = {mirror: other, source: other[:9]}
+    with pytest.raises(InputError, match="resolve/main/tfeat.*not the sha256.*raw/master"):
+        Descriptor("tfeat")
+    assert not path.exists()
+    sent[source] = weights
+    for _ in range(2):
+        assert Descriptor("tfeat")(torch.rand(2, 1, 32, 32)).shape == (2, 128)
+    assert asked == [mirror, source] * 2 and path.read_bytes() == weights
+    for broken in (other, weights[:-1], b""):
+        path.write_bytes(broken)
+        with pytest.raises(InputError, match="tfeat-liberty.params, are broken"):
+            Descriptor("tfeat")
+    assert not (tmp_path / "harmed").exists()
 
 
 @pytest.mark.parametrize("name", ["mkd", "tfeat", "hardnet"])

@@ -15,7 +15,7 @@ from torch import nn
 import hloc_reduce
 from confs import features
 from confs.features import confs
-from hloc_reduce import extractors, projections
+from hloc_reduce import downloads, extractors, projections
 from hloc_reduce.cli import InputError
 from hloc_reduce.extractors.reduced import Reduced
 from hloc_reduce.projections import MLP, Projection, released
@@ -220,9 +220,9 @@ def test_released_networks_are_downloaded_once_and_checked(tmp_path, monkeypatch
     content, asked = buffer.getvalue(), []
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(
-        released, "urlopen", lambda url, timeout: asked.append(url) or io.BytesIO(content)
+        downloads, "urlopen", lambda url, timeout: asked.append(url) or io.BytesIO(content)
     )
-    with pytest.raises(InputError, match="not the HardNet_sv_dim24.pth that was released"):
+    with pytest.raises(InputError, match="HardNet_sv_dim24.pth: .* has not the sha256"):
         projections.load("hardnet_sv24")
     assert not list(tmp_path.rglob("*.pth"))
     known = ("HardNet_sv_dim24.pth", hashlib.sha256(content).hexdigest())
@@ -234,8 +234,8 @@ def test_released_networks_are_downloaded_once_and_checked(tmp_path, monkeypatch
     def unreachable(url, timeout):
         raise URLError("no network")
 
-    monkeypatch.setattr(released, "urlopen", unreachable)
-    with pytest.raises(InputError, match="hardnet_sv64 is not there.*no network.*checkpoints"):
+    monkeypatch.setattr(downloads, "urlopen", unreachable)
+    with pytest.raises(InputError, match="hardnet_sv64 are not there.*no network.*checkpoints"):
         projections.load("hardnet_sv64")
 
 

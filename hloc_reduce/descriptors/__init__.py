@@ -3,20 +3,18 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from pickle import UnpicklingError
-from urllib.request import urlopen
 
 import torch
 from kornia import feature
 from torch import nn
 
-from ..cli import InputError, choose
+from .. import downloads
+from ..cli import choose
 from .sift import SIFT
 
 PATCH_SIZE = 32
 DIM = 128
 COLMAP = "colmap_sift"  # COLMAP's own SIFT, a base descriptor that takes no patches
-TIMEOUT = 5  # seconds to wait for a server
 
 
 @dataclass(frozen=True)
@@ -25,14 +23,16 @@ class Base:
 
     Args:
         make: returns the module that maps (N, 1, 32, 32) in [0, 1] to (N, 128).
-        urls: of the weights that kornia downloads to torch's cache, the first that answers; none
-            for a descriptor without.
+        urls: of the weights, which kornia looks for in torch's cache; none for a descriptor
+            without.
+        sha256: of the weights.
         hidden: the sizes of the hidden layers of its projections: two for hand-crafted descriptors,
             one for learned ones (Sec. III-D).
     """
 
     make: Callable[[], nn.Module]
     urls: tuple[str, ...] = ()
+    sha256: str = ""
     hidden: tuple[int, ...] = (512, 512)
 
 
@@ -41,6 +41,7 @@ DESCRIPTORS = {
     "mkd": Base(
         feature.MKDDescriptor,
         ("https://github.com/manyids2/mkd_pytorch/raw/master/mkd_pytorch/mkd-concat-64.pth",),
+        "e31112000009e0d6e159dd7726aeea9f6a7d746cfe7d59b59bfb86c570667641",
     ),
     "tfeat": Base(
         lambda: feature.TFeat(pretrained=True),
@@ -48,6 +49,7 @@ DESCRIPTORS = {
             "https://huggingface.co/kornia/tfeat/resolve/main/tfeat-liberty.params",
             "https://github.com/vbalnt/tfeat/raw/master/pretrained-models/tfeat-liberty.params",
         ),
+        "1f2e9516b03c45876161da006ce8047e0a66ef08cc91d3fbf96a75f1a80f445a",
         hidden=(512,),
     ),
     "hardnet": Base(
@@ -57,6 +59,7 @@ DESCRIPTORS = {
             "https://github.com/DagnyT/hardnet/raw/master/pretrained/train_liberty_with_aug/"
             "checkpoint_liberty_with_aug.pth",
         ),
+        "1e9a41b19f1dc93c986e91df9aaf5696d1a777ac1d67498492856a65d6f49c16",
         hidden=(96,),
     ),
 }
@@ -69,7 +72,7 @@ class Descriptor(nn.Module):
         name: a key of `DESCRIPTORS`.
 
     Raises:
-        InputError: for an unknown name, or when its weights are neither cached nor to be had.
+        InputError: for an unknown name, or when its weights are broken or not to be had.
     """
 
     batch_size = 128  # whose intermediate results stay in the cache of a CPU
@@ -77,12 +80,8 @@ class Descriptor(nn.Module):
     def __init__(self, name: str):
         super().__init__()
         base = DESCRIPTORS[choose("descriptor", name, DESCRIPTORS)]
-        check_weights(name)
-        try:
-            self.describe = base.make().eval()
-        except (RuntimeError, EOFError, UnpicklingError) as error:
-            reason = str(error).strip().splitlines()[0]
-            raise InputError(f"The weights {weights(name)} are broken ({reason}).") from None
+        check_weights(name)  # before kornia unpickles them
+        self.describe = base.make().eval()
 
     @torch.no_grad()
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
@@ -94,28 +93,18 @@ class Descriptor(nn.Module):
 
 
 def check_weights(name: str) -> None:
-    """Make sure that kornia, which retries for minutes, finds or can download weights.
+    """Make sure that torch's cache has the weights of a descriptor, the right ones.
 
     Raises:
-        InputError: when they are not in torch's cache and their address does not answer.
+        InputError: when they are broken, or not there and not to be downloaded.
     """
-    path, urls = weights(name), DESCRIPTORS[name].urls
-    if path is None or path.is_file():
-        return
-    for url in urls:
-        try:
-            urlopen(url, timeout=TIMEOUT).close()
-            return
-        except OSError as error:
-            reason = getattr(error, "reason", error)
-    raise InputError(
-        f"The weights of {name} are not there, and cannot be downloaded ({reason}): "
-        f"put {urls[0]} to {path}, or set TORCH_HOME to the folder whose hub/checkpoints has it."
-    )
+    path, base = weights(name), DESCRIPTORS[name]
+    if path is not None:
+        otherwise = "or set TORCH_HOME to the folder whose hub/checkpoints has them"
+        downloads.fetch(path, base.urls, base.sha256, f"The weights of {name}", otherwise)
 
 
 def weights(name: str) -> Path | None:
     """Return where torch's cache has the weights of a descriptor; None for one without."""
     urls = DESCRIPTORS[name].urls
-    folder = Path(torch.hub.get_dir()) / "checkpoints"
-    return folder / urls[0].rpartition("/")[2] if urls else None
+    return downloads.cache() / urls[0].rpartition("/")[2] if urls else None

@@ -23,8 +23,11 @@ def read_vocabulary(path: Path | str | None = None) -> torch.Tensor:
     """
     path = path or VOCABULARY
     try:
-        return load_file(path)["vocabulary"].float()
-    except (OSError, SafetensorError, KeyError) as error:
+        vocabulary = load_file(path)["vocabulary"].float()
+        if vocabulary.ndim != 2 or not len(vocabulary) or not vocabulary.isfinite().all():
+            raise ValueError(f"{tuple(vocabulary.shape)} numbers, or not finite ones")
+        return vocabulary
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise InputError(f"{path} is not a vocabulary ({error}).") from None
 
 

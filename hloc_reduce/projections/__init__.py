@@ -1,13 +1,12 @@
 """Frozen projections of descriptors: load, fold, apply, save."""
 
 import json
-import pickle
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save as serialize
 from torch import nn
 
@@ -25,10 +24,6 @@ COMMAND = (
 )
 # sift_nested@24: the first 24 numbers of sift_nested; an @ in the path of a file is its own
 PREFIX = re.compile(r"(.+)@([^@/\\.]+)")
-BROKEN = (
-    *(SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError, IndexError),
-    *(AttributeError, EOFError, pickle.UnpicklingError),
-)
 
 
 class MLP(nn.Module):
@@ -193,9 +188,10 @@ def read(projection: str | Path) -> tuple[MLP, dict]:
     path = find(projection)
     try:
         mlp, metadata = READERS.get(path.suffix, read_safetensors)(path)
-        Projection(mlp)
-    except BROKEN as error:
-        reason = str(error).strip().splitlines()[0]
+        if not all(part.isfinite().all() for part in Projection(mlp).parameters()):
+            raise ValueError("its weights are not finite")
+    except Exception as error:  # torch raises whatever a broken file leads it to
+        reason = next(iter(str(error).split("\n")))
         raise InputError(f"{path} is not a projection ({reason}).") from None
     return mlp, metadata
 
@@ -205,7 +201,11 @@ def read_safetensors(path: Path) -> tuple[MLP, dict]:
     with safe_open(path, "pt") as file:
         metadata = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
         state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
-    mlp = MLP(metadata["layers"])
+    layers = metadata["layers"]
+    sizes = [len(state[f"linears.{i}.bias"]) for i in range(len(layers) - 1)]
+    if layers[1:] != sizes or layers[0] != state["linears.0.weight"].shape[1]:  # may be too many
+        raise ValueError(f"its layers are not {layers}")
+    mlp = MLP(layers)
     missing, unexpected = mlp.load_state_dict(state, strict=False)
     missing = [key for key in missing if not key.endswith("num_batches_tracked")]
     if missing or unexpected:

@@ -1,18 +1,11 @@
 """The projections that the paper's authors released, downloaded from them when they are needed."""
 
-import hashlib
-from http.client import HTTPException
 from pathlib import Path
-from urllib.request import urlopen
 
-import torch
-
-from ..cli import InputError
-from ..io import replacing
+from .. import downloads
 
 SOURCE = "https://github.com/PRBonn/descriptor-dr"
 URL = f"{SOURCE}/raw/main/models"
-TIMEOUT = 10  # seconds to wait for the server
 # feature -> file and its sha256
 FILES = {
     "hardnet_sv64": (
@@ -44,26 +37,5 @@ def fetch(name: str) -> Path:
         InputError: when it cannot be downloaded or is not the one that was released.
     """
     file, sha256 = FILES[name]
-    path = Path(torch.hub.get_dir()) / "checkpoints" / file
-    if path.is_file():
-        content = path.read_bytes()
-    else:
-        try:
-            with urlopen(f"{URL}/{file}", timeout=TIMEOUT) as response:
-                content = response.read()
-        except (OSError, HTTPException) as error:
-            raise InputError(
-                f"{name} is not there, and {URL}/{file} cannot be downloaded "
-                f"({getattr(error, 'reason', error)}): put it to {path}, or name a copy with "
-                "--projection."
-            ) from None
-    if hashlib.sha256(content).hexdigest() != sha256:
-        raise InputError(
-            f"{path if path.is_file() else URL + '/' + file} is not the {file} that "
-            f"was released: its sha256 is not {sha256}."
-        )
-    if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary:
-            temporary.write_bytes(content)
-    return path
+    what, otherwise = f"The weights of {name}", "or name a copy with --projection"
+    return downloads.fetch(downloads.cache() / file, [f"{URL}/{file}"], sha256, what, otherwise)

@@ -39,7 +39,8 @@ def matched(run: Run, query: str) -> dict | None:
     best = None
     with open_h5(run.files["matches"]) as file:
         for name in names:
-            matches, _ = get_matches(file, query, name)
+            sizes = len(keypoints), run.reference.num_keypoints(name)
+            matches, _ = get_matches(file, query, name, sizes)
             inliers = _inliers(run, record, name, keypoints[matches[:, 0]], matches[:, 1])
             if best is None or inliers.sum() > best[2].sum():
                 best = name, matches, inliers

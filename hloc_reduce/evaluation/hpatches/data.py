@@ -44,7 +44,7 @@ def test_sequences(root: Path, tasks: Path, split: str) -> list[str]:
     if file is not None:
         try:
             names = list(map(str, json.loads(file.read_text())[split]["test"]))
-        except (ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             raise InputError(f"{file} is broken or has no split {split}.") from None
     elif split in WHOLE:
         names = sorted(name for name in there if name.startswith(WHOLE[split]))

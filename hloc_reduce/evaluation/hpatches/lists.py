@@ -126,8 +126,10 @@ def _read(path: Path, columns: tuple[str, ...], sizes: Mapping[str, int]) -> lis
         reader = csv.reader(file)
         if tuple(next(reader, ())) != columns:
             raise InputError(f"{path} does not begin with {','.join(columns)}.")
-        for cells in reader:
+        while True:
             try:
+                if (cells := next(reader, None)) is None:
+                    break
                 row = tuple(
                     cell if column.startswith("s") else int(cell)
                     for column, cell in zip(columns, cells, strict=True)
@@ -140,7 +142,7 @@ def _read(path: Path, columns: tuple[str, ...], sizes: Mapping[str, int]) -> lis
                         raise ValueError(f"there is no image {row[side + 1]}")
             except KeyError as error:
                 reason = f"the sequence {error} is not of this split"
-            except ValueError as error:
+            except (ValueError, csv.Error) as error:
                 reason = error
             else:
                 rows.append(row)
