@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 OLDEST := 3.13.0
 OLD := $(VENV)/pycolmap-$(OLDEST)
 
-.PHONY: demo test lint clean
+.PHONY: demo test test-long lint clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed
@@ -23,6 +23,9 @@ test: $(VENV)/installed $(OLD)/installed
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest tests/test_dog.py tests/test_stages.py \
 		tests/test_aachen.py::test_plane tests/test_inloc.py::test_plane tests/test_localize.py \
 		-k "not test_localize or intrinsics or reconstruction or the_same_as"
+
+test-long: $(VENV)/installed
+	$(BIN)/python -m pytest -m long
 
 # torch by itself first: a pinned version is a CPU build where an index offers one
 $(VENV)/installed: pyproject.toml constraints.txt

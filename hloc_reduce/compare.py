@@ -5,18 +5,15 @@ its own, as that of pipelines.aachen or pipelines.inloc, where a run goes on tha
 """
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 from confs import features as features_confs
-from pipelines import aachen, inloc
+from pipelines.layouts import pipeline_of
 
-from . import cli, io, logger, report, stamps
+from . import cli, io, logger, report, results, stamps
 from .cli import InputError
 from .report import runs
-
-# a folder that a layout has -> the pipeline for it
-PIPELINES = {"3D-models": aachen.main, "database": inloc.main}
 
 
 def main(
@@ -43,7 +40,7 @@ def main(
     Raises:
         InputError: for another layout, an unknown feature, or when all failed.
     """
-    pipeline = pipeline_of(dataset)
+    pipeline = pipeline_of(dataset).main
     report.check()
     page = page or outputs / "report.html"
     cli.check_folder(outputs)
@@ -69,18 +66,6 @@ def main(
     print(table(tables))
     report.main(finished, page)
     return failed
-
-
-def pipeline_of(dataset: Path) -> Callable[..., dict]:
-    """Return the pipeline for the layout of a data set.
-
-    Raises:
-        InputError: when it has none that is known.
-    """
-    for folder, pipeline in PIPELINES.items():
-        if (dataset / folder).is_dir():
-            return pipeline
-    raise InputError(f"{dataset} has neither of the folders {' and '.join(PIPELINES)}.")
 
 
 def rows(tables: list[dict]) -> list[dict]:
@@ -130,14 +115,7 @@ def table(tables: list[dict]) -> str:
         paper = [_joined(row and row["paper"], ".1f") for row in of_lists]
         if set(paper) != {"-"}:
             lines.append(["  in the paper", "", *paper])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        " | ".join(
-            cell.ljust(width) if i == 0 else cell.center(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
+    return results.aligned(lines)
 
 
 def _joined(values: list[float] | None, kind: str) -> str:

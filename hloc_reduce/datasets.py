@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pycolmap
@@ -34,6 +35,7 @@ class Aachen:
     """
 
     root: Path
+    whole_map: ClassVar[bool] = True  # is needed, not only the map images that are retrieved
 
     def __post_init__(self) -> None:
         folders = (self.images, self.reference_model, self.queries.parent)
@@ -80,6 +82,10 @@ class Aachen:
         """Read the queries of each list."""
         return parse_query_lists(self.queries)
 
+    def query_names(self) -> list[str]:
+        """Read the names of the queries of all lists."""
+        return [name for part in self.query_lists().values() for name, _ in part]
+
     def map_names(self) -> list[str]:
         """Read the names of the map images."""
         images = colmap.read_model(self.reference_model).images.values()
@@ -101,10 +107,16 @@ class InLoc:
     """
 
     root: Path
+    whole_map: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         folders = (self.root / "query", self.cutouts, self.alignments)
         _refuse(self.root, [path for path in folders if not path.is_dir()], INLOC_SOURCE)
+
+    @property
+    def images(self) -> Path:
+        """The folder that image names are relative to."""
+        return self.root
 
     @property
     def cutouts(self) -> Path:

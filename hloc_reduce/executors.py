@@ -5,31 +5,45 @@ gives it all items at once, or chunks of them in processes that find the same fi
 paths.
 """
 
+import os
+import re
+import signal
+import socket
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import islice
 from typing import Protocol, TypeVar
+
+import torch
 
 from . import parallel, processes
 from .cli import InputError
 
 Item, Result = TypeVar("Item"), TypeVar("Result")
 BACKLOG = 2  # chunks for each worker that are handed out
+RETRIES = 20  # of a chunk whose machine is gone
+TIMEOUT = 10  # seconds to wait for a Ray cluster
 
 
 class Executor(Protocol):
     """Does work."""
 
     def map(
-        self, work: Callable[[Iterable[Item]], Iterator[Result]], items: Iterable[Item], size: int
+        self,
+        work: Callable[[Iterable[Item]], Iterator[Result]],
+        items: Iterable[Item],
+        size: int,
+        gpu: bool = False,
     ) -> Iterator[Result]:
         """Yield what work makes of items, in any order.
 
         Args:
-            work: as above; it is pickled where it is not done in this process.
+            work: as above; it is pickled where it is not done in this process. It may be done again
+                for the same items, when a machine is gone.
             items: drawn as they are needed.
             size: how many items make a chunk that is worth a process's while.
+            gpu: it uses a GPU where there is one.
 
         Raises:
             InputError: of the work, or when a process was killed.
@@ -40,7 +54,11 @@ class Serial:
     """Does work in this process, with threads on all of its cores."""
 
     def map(
-        self, work: Callable[[Iterable[Item]], Iterator[Result]], items: Iterable[Item], size: int
+        self,
+        work: Callable[[Iterable[Item]], Iterator[Result]],
+        items: Iterable[Item],
+        size: int,
+        gpu: bool = False,
     ) -> Iterator[Result]:
         """Yield what work makes of items, as `Executor.map`."""
         return work(items)
@@ -54,20 +72,34 @@ class Pool:
 
     Args:
         submit: hands a function and its arguments to a process.
-        workers: how many processes there are.
+        workers: tells how many processes there are.
+        gpu: does the work that uses a GPU; default: the same.
     """
 
-    def __init__(self, submit: Callable[..., Future], workers: int):
-        self.submit, self.workers = submit, workers
+    def __init__(
+        self,
+        submit: Callable[..., Future],
+        workers: Callable[[], int],
+        gpu: Executor | None = None,
+    ):
+        self.submit, self.workers, self.gpu = submit, workers, gpu
 
     def map(
-        self, work: Callable[[Iterable[Item]], Iterator[Result]], items: Iterable[Item], size: int
+        self,
+        work: Callable[[Iterable[Item]], Iterator[Result]],
+        items: Iterable[Item],
+        size: int,
+        gpu: bool = False,
     ) -> Iterator[Result]:
         """Yield what work makes of items, as `Executor.map`, chunk by chunk as they are done."""
+        if gpu and self.gpu is not None:
+            yield from self.gpu.map(work, items, size)
+            return
         drawn, pending = iter(items), set()
 
         def submit() -> None:
-            while len(pending) < BACKLOG * self.workers and (chunk := list(islice(drawn, size))):
+            backlog = BACKLOG * self.workers()
+            while len(pending) < backlog and (chunk := list(islice(drawn, size))):
                 pending.add(self.submit(_all, work, chunk))
 
         try:
@@ -75,7 +107,9 @@ class Pool:
             while pending:
                 for future in wait(pending, return_when=FIRST_COMPLETED).done:
                     pending.remove(future)
-                    yield from future.result()
+                    if isinstance(found := future.result(), InputError):
+                        raise found
+                    yield from found
                 submit()
         except BrokenExecutor:
             raise InputError(
@@ -87,17 +121,81 @@ class Pool:
                 future.cancel()
 
 
-def _all(work: Callable[[Iterable[Item]], Iterator[Result]], items: list[Item]) -> list[Result]:
-    return list(work(items))
+def _all(
+    work: Callable[[Iterable[Item]], Iterator[Result]], items: list[Item]
+) -> list[Result] | InputError:
+    """Return what work makes of items, or its error, which a cluster would wrap in its own."""
+    try:
+        return list(work(items))
+    except InputError as error:
+        return error
 
 
 @contextmanager
 def processes_of_this_machine(workers: int | None = None) -> Iterator[Pool]:
     """Start processes, of one thread each, for the time of a block.
 
+    A GPU is left to this process.
+
     Args:
         workers: how many; default: one for each core.
     """
     workers = workers or parallel.cores()
     with processes.pool(workers) as pool:
-        yield Pool(pool.submit, workers)
+        yield Pool(pool.submit, lambda: workers, SERIAL if torch.cuda.is_available() else None)
+
+
+@contextmanager
+def ray_cluster(address: str | None = None) -> Iterator[Pool]:
+    """Use a Ray cluster for the time of a block: a process of one thread on each of its cores.
+
+    Work that uses a GPU is done where there are some. What a machine that is gone had to do is done
+    by another.
+
+    Args:
+        address: as of `ray.init`; default: that of the environment variable RAY_ADDRESS, or else a
+            new cluster of this machine only.
+
+    Raises:
+        InputError: when Ray is not installed or the cluster does not answer.
+    """
+    try:
+        import ray
+    except ImportError:
+        raise InputError("Ray is not installed: pip install 'hloc-reduce[ray]'.") from None
+    handler = signal.getsignal(signal.SIGTERM)
+    address = address or os.environ.get("RAY_ADDRESS")
+    try:
+        if match := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address or ""):
+            # Ray itself would try for minutes
+            socket.create_connection((match[1], int(match[2])), timeout=TIMEOUT).close()
+        ray.init(address, include_dashboard=False, logging_level="warning")
+    except (OSError, ValueError, OverflowError, RuntimeError) as error:
+        raise InputError(f"The Ray cluster {address} does not answer ({error}).") from None
+    signal.signal(signal.SIGTERM, handler)  # Ray sets its own
+
+    def submit(function: Callable, *arguments: object, **resources: int) -> Future:
+        task = ray.remote(function).options(num_cpus=1, max_retries=RETRIES, **resources)
+        return task.remote(*arguments).future()
+
+    def number(kind: str) -> int:
+        return int(ray.cluster_resources().get(kind, 0))
+
+    gpu = None
+    if number("GPU"):
+        gpu = Pool(lambda *given: submit(*given, num_gpus=1), lambda: number("GPU") or 1)
+    try:
+        yield Pool(submit, lambda: number("CPU") or 1, gpu)
+    except ray.exceptions.RayError as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise InputError(f"Ray gave up ({reason}). What is written is kept.") from None
+    finally:
+        ray.shutdown()
+
+
+# by name; each is given the address of a cluster
+EXECUTORS: dict[str, Callable[[str | None], AbstractContextManager[Executor]]] = {
+    "serial": lambda _: nullcontext(SERIAL),
+    "processes": lambda _: processes_of_this_machine(),
+    "ray": ray_cluster,
+}

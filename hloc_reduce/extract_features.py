@@ -20,14 +20,15 @@ from .cli import InputError
 from .descriptors import DESCRIPTORS, check_weights
 from .executors import SERIAL, Executor
 from .extractors.dog import DoG
-from .group_writer import Group, GroupWriter, Key, fill
-from .io import read_image
-from .parsers import image_names
+from .group_writer import FAILURE, Group, GroupWriter, Key, fill
+from .io import UnreadableImage, read_image
+from .parsers import check_names, image_names
 from .storage import STORAGES, store
 from .trace import span
 
 confs = features_confs.confs
 CHUNK = 8  # images
+BLACK = 32  # pixels, the sides of what stands for an image that cannot be read
 Detect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # as colmap.detect_dog
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 
@@ -77,6 +78,7 @@ def extract_several(
     image_dir: Path,
     names: list[str],
     executor: Executor = SERIAL,
+    strict: bool = True,
 ) -> None:
     """Extract several features of images at once.
 
@@ -88,9 +90,11 @@ def extract_several(
         image_dir: the folder that names are relative to.
         names: the images; a file's own are skipped.
         executor: does the work.
+        strict: stop at an image that cannot be read. Else it has the features of a black one, and
+            a `group_writer.FAILURE`; a later run tries to read it again.
 
     Raises:
-        InputError: for an image that cannot be read.
+        UnreadableImage: as said.
     """
     confs = {path: conf for path, (conf, _) in features.items()}
     writers = {path: writer for path, (_, writer) in features.items()}
@@ -99,10 +103,10 @@ def extract_several(
     )
     todo = [(name, paths) for name, paths in wanted if paths]
     if todo:
-        work = partial(_extract_groups, confs, image_dir)
+        work = partial(_extract_groups, confs, image_dir, strict)
         # counts files: an image is as many as are wanted of it
         number = sum(len(paths) for _, paths in todo)
-        with closing(fill(writers, work, todo, executor, CHUNK)) as done:
+        with closing(fill(writers, work, todo, executor, CHUNK, gpu=True)) as done:
             for _ in tqdm(done, desc="Extracting features", unit="image", total=number):
                 pass
     for path in writers:
@@ -118,25 +122,30 @@ def shared_key(conf: dict) -> str:
 
 
 def _extract_groups(
-    confs: Mapping[Path, dict], image_dir: Path, items: Iterable[tuple[str, list[Path]]]
+    confs: Mapping[Path, dict],
+    image_dir: Path,
+    strict: bool,
+    items: Iterable[tuple[str, list[Path]]],
 ) -> Iterator[tuple[Path, Group]]:
     """Yield the features of images, for each the wanted ones, as files keep them."""
     items = list(items)
     images = [(image_dir / name, paths) for name, paths in items]
     # closed at once if writing fails: it has processes
-    with closing(extract_all(confs, images)) as extracted:
+    with closing(extract_all(confs, images, strict)) as extracted:
         for (name, _), several in zip(items, extracted, strict=True):
             for path, features in several.items():
-                uncertainty = features.pop("uncertainty")
-                if len(features["keypoints"]) == 0:
+                uncertainty, failure = features.pop("uncertainty"), features.pop(FAILURE, None)
+                if failure:
+                    logger.warning(failure)
+                elif len(features["keypoints"]) == 0:
                     logger.warning("Image %s has no keypoints.", name)
                 arrays, attrs = store(features, confs[path]["storage"])
-                attrs = attrs | {"keypoints": {"uncertainty": uncertainty}}
-                yield path, (name, arrays, attrs)
+                attrs |= {"keypoints": {"uncertainty": uncertainty}}
+                yield path, (name, arrays, attrs | ({"": {FAILURE: failure}} if failure else {}))
 
 
 def extract_all(
-    confs: Mapping[Key, dict], images: list[tuple[Path, list[Key]]]
+    confs: Mapping[Key, dict], images: list[tuple[Path, list[Key]]], strict: bool = True
 ) -> Iterator[dict[Key, dict[str, np.ndarray]]]:
     """Extract features of images on all cores, and yield them in order.
 
@@ -146,6 +155,8 @@ def extract_all(
     Args:
         confs: configurations, all of one `shared_key`.
         images: files, each with the keys of what is wanted of it.
+        strict: raise an UnreadableImage. Else the features are those of a black image, and
+            `FAILURE` says why.
 
     Yields:
         For each image the features, as of `extract`, by key.
@@ -158,8 +169,17 @@ def extract_all(
 
     def work(item: tuple[Path, list[Key]], detect: Detect | None = None) -> dict:
         image, keys = item
-        chosen = [models[key] for key in keys]
-        found = extract_each(chosen, image, conf["preprocessing"], device, detect)
+        extract = partial(extract_each, [models[key] for key in keys], device=device, detect=detect)
+        try:
+            found = extract(image, conf["preprocessing"])
+        except UnreadableImage as error:
+            if strict:
+                raise
+            black = np.zeros((BLACK, BLACK), np.uint8)
+            found = [
+                {**features, FAILURE: str(error)}
+                for features in extract(black, conf["preprocessing"])
+            ]
         return dict(zip(keys, found, strict=True))
 
     if workers == 1 or not isinstance(base, DoG):
@@ -226,24 +246,13 @@ def list_images(
         )
         if not names:
             raise InputError(f"There is no image in {within}.")
-        return _check_names(names)
-    names = _check_names(image_names(image_list))
+        return check_names(names, within)
+    names = image_names(image_list)
     missing = [name for name in names if not (image_dir / name).is_file()]
     if missing:
         raise InputError(
             f"{len(missing)} of {len(names)} images are not in {image_dir}: "
             f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
-        )
-    return names
-
-
-def _check_names(names: list[str]) -> list[str]:
-    """Refuse names that no list of hloc's can hold."""
-    wrong = [name for name in names if len(name.split()) != 1 or name.startswith("#")]
-    if wrong:
-        raise InputError(
-            f"{len(wrong)} names of images have spaces or begin with #, as none in a list of pairs "
-            f"can: {', '.join(map(repr, wrong[:3]))}. Rename them."
         )
     return names
 

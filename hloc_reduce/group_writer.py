@@ -18,14 +18,18 @@ import numpy as np
 from . import trace
 from .cli import InputError
 from .executors import Executor, Item
-from .io import iterate_h5_names, open_h5, replacing
+from .io import iterate_h5_names, open_h5, replacing, write_h5
 
 PIECE_SECONDS = 5.0  # of work that a killed run may lose
 PIECE_BYTES = 64 * 2**20
+SYNC_SECONDS = 120.0  # until what another machine wrote is to be seen on this one
+FAILURE = "failure"  # attribute of a group that stands for what could not be computed, and why
+FAILURES = "failures"  # attribute of a file: the names of its groups that have a FAILURE
 QUOTED = 200  # characters of a configuration in a message
 
 Arrays = dict[str, np.ndarray]
-# the name of a group, its arrays, and from the name of an array to its attributes
+# the name of a group, its arrays, and from the name of an array, "" for the group itself, to its
+# attributes
 Group = tuple[str, Arrays, dict[str, dict]]
 Key = TypeVar("Key", bound=Hashable)
 
@@ -59,13 +63,16 @@ class GroupWriter:
             self._drop_pieces()
             path.unlink(missing_ok=True)
         self.names = _Names()
+        self.expected: dict[str, str] = {}  # pieces of other processes, and a group of each
         header = {"conf": json.dumps(conf, sort_keys=True), "id": uuid.uuid4().hex}
         for part in [path] * path.exists() + self._pieces():
             with open_h5(part) as file:
                 _check(file, part, header["conf"])
                 header["id"] = file.attrs.get("id", header["id"])
+                failed = _failed(file)
                 for name in iterate_h5_names(file.id):
-                    self.names.add(name)
+                    if name not in failed:
+                        self.names.add(name)
         self.header = header
         self.new_pieces = partial(Pieces, self.folder, header, compression)
         self.added = self.new_pieces()
@@ -73,9 +80,11 @@ class GroupWriter:
     def __contains__(self, name: str) -> bool:
         return name in self.names
 
-    def begin(self, name: str) -> None:
-        """Have a group that is or will be added count as one that is there."""
+    def begin(self, name: str, piece: str | None = None) -> None:
+        """Have a group count as one that is there: it will be added, or is in a piece."""
         self.names.add(name)
+        if piece is not None:
+            self.expected[piece] = name
 
     def __enter__(self) -> "GroupWriter":
         return self
@@ -89,7 +98,7 @@ class GroupWriter:
 
     def add(self, name: str, arrays: Arrays, attrs: dict[str, dict] | None = None) -> None:
         """Add a group of arrays; `attrs` maps the name of an array to its attributes."""
-        self.names.add(name)
+        self.begin(name)
         self.added.add(name, arrays, attrs or {})
 
     def _pieces(self) -> list[Path]:
@@ -103,18 +112,43 @@ class GroupWriter:
             shutil.rmtree(dropped, ignore_errors=True)
 
     def _merge(self) -> None:
-        pieces = self._pieces()
-        if not pieces and self.path.exists():
+        pieces = self._await_pieces()
+        if self.path.exists() and not any(map(self._has_news, pieces)):
+            if pieces:
+                self._drop_pieces()
             return
         with replacing(self.path) as temporary:
             if self.path.exists():
                 shutil.copyfile(self.path, temporary)
-            with h5py.File(temporary, "a", libver="latest") as merged:
+            with write_h5(temporary) as merged:
                 merged.attrs.update(self.header)
-                for piece in pieces:
-                    with open_h5(piece) as file:
-                        _copy_missing(file, merged)
+            for piece in pieces:
+                with open_h5(piece) as file, write_h5(temporary) as merged:
+                    _merge_piece(file, merged)
         self._drop_pieces()
+
+    def _await_pieces(self) -> list[Path]:
+        """Return all pieces, when those that other machines wrote are here, too."""
+        end = time.monotonic() + SYNC_SECONDS
+        while missing := self.expected.keys() - {piece.name for piece in self._pieces()}:
+            if self.path.exists():
+                with open_h5(self.path) as file:  # into which another writer may have merged them
+                    missing = {piece for piece in missing if self.expected[piece] not in file}
+            if not missing:
+                break
+            if time.monotonic() > end:
+                raise InputError(
+                    f"{len(missing)} pieces that other machines wrote are not in {self.folder}: is "
+                    "it shared with them, or synced? The same command goes on from here."
+                )
+            time.sleep(SYNC_SECONDS / 100)
+        return self._pieces()
+
+    def _has_news(self, piece: Path) -> bool:
+        """Return whether a piece has what the file has not, or has as a failure."""
+        with open_h5(piece) as new, open_h5(self.path) as old:
+            done = _failed(old) - _failed(new)
+            return any(name in done or name not in old for name in iterate_h5_names(new.id))
 
 
 @dataclass
@@ -134,31 +168,35 @@ class Pieces:
     def __post_init__(self) -> None:
         self._clear()
 
-    def add(self, name: str, arrays: Arrays, attrs: dict[str, dict]) -> None:
-        """Add a group, and write a piece if it is time to."""
+    def add(self, name: str, arrays: Arrays, attrs: dict[str, dict]) -> str:
+        """Add a group, write a piece if it is time to, and return the name of the group's piece."""
+        piece = self.piece
         self.groups[name] = arrays, attrs
         self.bytes += sum(array.nbytes for array in arrays.values())
         if time.monotonic() - self.since > PIECE_SECONDS or self.bytes > PIECE_BYTES:
             self.flush()
+        return piece
 
     def flush(self) -> None:
         """Write what was gathered into a piece."""
         if self.groups:
-            # in the order of time, and of one writer only
-            piece = self.folder / f"{time.time_ns():020d}-{uuid.uuid4().hex[:8]}.h5"
-            with trace.span("write"), replacing(piece) as temporary:
+            with trace.span("write"), replacing(self.folder / self.piece) as temporary:
                 self._write(temporary)
         self._clear()
 
     def _clear(self) -> None:
         self.groups: dict[str, tuple[Arrays, dict]] = {}
         self.bytes, self.since = 0, time.monotonic()
+        # in the order of time, and of one writer only
+        self.piece = f"{time.time_ns():020d}-{uuid.uuid4().hex[:8]}.h5"
 
     def _write(self, path: Path) -> None:
-        with h5py.File(path, "w", libver="latest") as file:
+        with write_h5(path) as file:
             file.attrs.update(self.header)
+            _set_failed(file, {n for n, (_, a) in self.groups.items() if FAILURE in a.get("", ())})
             for name, (arrays, attrs) in self.groups.items():
                 group = file.create_group(name)
+                group.attrs.update(attrs.get("", {}))
                 for key, array in arrays.items():
                     packed = {}
                     if self.compression and array.size:
@@ -173,6 +211,7 @@ def fill(
     items: Iterable[Item],
     executor: Executor,
     size: int,
+    gpu: bool = False,
 ) -> Iterator[tuple[Key, str]]:
     """Add the groups that work makes of items to files, wherever an executor does it.
 
@@ -182,14 +221,16 @@ def fill(
         items: as of `Executor.map`.
         executor: does the work.
         size: as of `Executor.map`.
+        gpu: as of `Executor.map`.
 
     Yields:
         For each group the key of its writer and its name.
     """
     new_pieces = {key: writer.new_pieces for key, writer in writers.items()}
-    with closing(executor.map(partial(_write_pieces, new_pieces, work), items, size)) as added:
-        for key, name in added:
-            writers[key].begin(name)
+    write = partial(_write_pieces, new_pieces, work)
+    with closing(executor.map(write, items, size, gpu)) as added:
+        for key, name, piece in added:
+            writers[key].begin(name, piece)
             yield key, name
 
 
@@ -197,14 +238,13 @@ def _write_pieces(
     new_pieces: Mapping[Key, Callable[[], Pieces]],
     work: Callable[[Iterable[Item]], Iterator[tuple[Key, Group]]],
     items: Iterable[Item],
-) -> Iterator[tuple[Key, str]]:
-    """Write the groups that work makes of items into pieces, and yield their keys and names."""
+) -> Iterator[tuple[Key, str, str]]:
+    """Write the groups that work makes of items, and yield their keys, names and pieces."""
     pieces = {key: new() for key, new in new_pieces.items()}
     try:
         with closing(work(items)) as groups:
             for key, (name, arrays, attrs) in groups:
-                pieces[key].add(name, arrays, attrs)
-                yield key, name
+                yield key, name, pieces[key].add(name, arrays, attrs)
     finally:
         for part in pieces.values():
             part.flush()
@@ -238,7 +278,12 @@ def _check(file: h5py.File, path: Path, conf: str) -> None:
     """Raise an InputError if an h5 file was made with another configuration."""
     before = file.attrs.get("conf", conf)  # hloc's own files say nothing
     if before != conf:
-        old, new = json.loads(before), json.loads(conf)
+        try:
+            old, new = dict(json.loads(before)), json.loads(conf)
+        except (ValueError, TypeError):
+            raise InputError(
+                f"{path} was made by another program: choose another output."
+            ) from None
         keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
         changes = "; ".join(
             f"{key}: {_quoted(old, key)} before, {_quoted(new, key)} now" for key in keys
@@ -252,6 +297,33 @@ def _check(file: h5py.File, path: Path, conf: str) -> None:
 def _quoted(conf: dict, key: str) -> str:
     text = str(conf.get(key, "not given"))
     return text if len(text) <= QUOTED else f"{text[:QUOTED]}..."
+
+
+def failures(path: Path) -> dict[str, str]:
+    """Return the groups of an h5 file that stand for what could not be computed, and why."""
+    with open_h5(path) as file:
+        return {name: str(file[name].attrs[FAILURE]) for name in sorted(_failed(file))}
+
+
+def _failed(file: h5py.File) -> set[str]:
+    return set(json.loads(file.attrs.get(FAILURES, "[]")))
+
+
+def _set_failed(file: h5py.File, names: set[str]) -> None:
+    if names or FAILURES in file.attrs:
+        file.attrs[FAILURES] = json.dumps(sorted(names))
+
+
+def _merge_piece(piece: h5py.File, merged: h5py.File) -> None:
+    """Add what a piece has and a file has not, or has as a failure."""
+    failed = _failed(merged)
+    mended = {name for name in failed - _failed(piece) if name in piece}
+    for name in mended:
+        del merged[name]
+        merged.attrs["id"] = uuid.uuid4().hex
+    new = {name for name in _failed(piece) if name not in merged}
+    _copy_missing(piece, merged)
+    _set_failed(merged, failed - mended | new)
 
 
 def _copy_missing(source: h5py.Group, target: h5py.Group) -> None:

@@ -89,7 +89,8 @@ def main(
         listed = tqdm(parse_pairs(pairs), desc="Matching", unit="pair", total=number, smoothing=0.1)
         todo = unmatched_pairs(listed, writer, ordered=features_ref not in (None, feature_path))
         work = partial(_match, conf, feature_paths, gpu_bytes)
-        with closing(fill({None: writer}, work, todo, executor, CHUNK)) as done:
+        done = fill({None: writer}, work, todo, executor, CHUNK, gpu=True)
+        with listed, closing(done):
             for _ in done:
                 pass
     logger.info("Matches of the pairs %s are in %s.", pairs.name, matches)
@@ -150,10 +151,19 @@ def _match(
 
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
 
+        def read_pair(name0: str, name1: str) -> tuple[torch.Tensor, torch.Tensor]:
+            pair = read(file0, name0), read(file1, name1)
+            if pair[0].shape[1] != pair[1].shape[1]:
+                raise InputError(
+                    f"{file1.filename}: the descriptors of {name1} are {pair[1].shape[1]}-D, those "
+                    f"of {name0} {pair[0].shape[1]}-D."
+                )
+            return pair
+
         def draw() -> Iterator[tuple[list[str], list[tuple[torch.Tensor, torch.Tensor]]]]:
             while batch := list(islice(drawn, size)):
                 groups = [names_to_pair(*names) for names in batch]
-                yield groups, [(read(file0, name0), read(file1, name1)) for name0, name1 in batch]
+                yield groups, [read_pair(*names) for names in batch]
 
         with closing(parallel.ordered("match", match, draw(), workers)) as results:
             for batch in results:

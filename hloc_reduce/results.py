@@ -3,8 +3,8 @@
 import json
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +112,8 @@ class RunFolder:
         if overwrite or before is None:
             with replacing(conf_file) as temporary:
                 temporary.write_text(json.dumps(conf, indent=1))
+        for left in path.glob(".*.tmp"):  # by a killed run: only who has the lock makes such files
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
 
     def seconds(self) -> dict[str, float]:
         """Return how long each stage took, all runs together."""
@@ -132,19 +134,24 @@ class RunFolder:
         try:
             with trace.span(name):
                 yield
-        finally:
-            stages = stamps.read(self._stages_file)
-            changed = {
-                written
-                for written, state in self._contents().items()
-                if contents.get(written) != state
-            }
-            if changed or name not in stages:  # a look at what is there does not count
-                before = stages.get(name, {"seconds": 0.0, "wrote": []})
-                spent = before["seconds"] + time.perf_counter() - start
-                wrote = sorted(changed.union(before["wrote"]))
-                stages[name] = {"seconds": round(spent, 3), "wrote": wrote}
-                stamps.write(self._stages_file, stages)
+        except BaseException:
+            with suppress(OSError):  # of a full disk: the error in the stage says more
+                self._measure(name, contents, start)
+            raise
+        self._measure(name, contents, start)
+
+    def _measure(self, name: str, contents: dict, start: float) -> None:
+        """Write down what a stage spent and wrote since a time when there were other contents."""
+        stages = stamps.read(self._stages_file)
+        changed = {
+            written for written, state in self._contents().items() if contents.get(written) != state
+        }
+        if changed or name not in stages:  # a look at what is there does not count
+            before = stages.get(name, {"seconds": 0.0, "wrote": []})
+            spent = before["seconds"] + time.perf_counter() - start
+            wrote = sorted(changed.union(before["wrote"]))
+            stages[name] = {"seconds": round(spent, 3), "wrote": wrote}
+            stamps.write(self._stages_file, stages)
 
     def _contents(self) -> dict[str, tuple[int, int]]:
         """Return the size and the time of the last change of all that stages wrote, by name."""
@@ -152,7 +159,7 @@ class RunFolder:
         for path in self.path.iterdir():
             if path.name in BOOKKEEPING or path.name.startswith("."):
                 continue
-            files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
+            files = [path] if path.is_file() else [p for p in path.rglob("[!.]*") if p.is_file()]
             states = [file.stat() for file in files]
             contents[path.name] = (
                 sum(state.st_size for state in states),
@@ -286,9 +293,16 @@ def recall_table(feature: str, lists: Mapping[str, dict]) -> str:
                     " / ".join(f"{value:.1f}" for value in summary["recall_percent"]),
                 ]
             )
-    widths = [max(map(len, column)) for column in columns]
-    lines = [
-        " | ".join(cell.center(width) for cell, width in zip(row, widths, strict=True))
-        for row in zip(*columns, strict=True)
-    ]
-    return "\n".join(lines)
+    return aligned(list(zip(*columns, strict=True)), left=0)
+
+
+def aligned(lines: list[Sequence[str]], left: int = 1) -> str:
+    """Format lines of cells as a table, the first `left` columns to the left, others centred."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        " | ".join(
+            cell.ljust(width) if i < left else cell.center(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )

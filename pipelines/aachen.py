@@ -14,7 +14,6 @@ from hloc_reduce import (
     demo,
     extract_features,
     localize_sfm,
-    match_features,
     pairs_from_covisibility,
     trace,
     triangulation,
@@ -25,6 +24,9 @@ from hloc_reduce.storage import STORAGES
 
 from . import common
 
+NUMBERS = {"num_covis": 20, "num_loc": 50}
+Place = Aachen
+
 
 def main(
     dataset: Path,
@@ -32,15 +34,20 @@ def main(
     feature: str = features_confs.RECOMMENDED,
     matcher: str = "NN-ratio",
     retrieval: str = "vlad",
-    num_covis: int = 20,
-    num_loc: int = 50,
+    num_covis: int = NUMBERS["num_covis"],
+    num_loc: int = NUMBERS["num_loc"],
     ground_truth: Path | None = None,
     overwrite: bool = False,
     projection: Path | None = None,
     storage: str = STORAGES[0],
     executor: Executor = SERIAL,
+    features: Path | None = None,
 ) -> dict:
-    """Run all stages and return the summary, as in summary.json."""
+    """Run all stages and return the summary, as in summary.json.
+
+    Takes what the command line takes, and the executor that does the work, and `features`, a file
+    of them to use instead of extracting them.
+    """
     feature, feature_conf = features_confs.get(feature, projection, storage)
     matcher_conf = matchers_confs.confs[matcher]
     place = Aachen(dataset)
@@ -56,7 +63,7 @@ def main(
 
     numbers = {"num_covis": num_covis, "num_loc": num_loc}
     with common.run_folder(
-        outputs, dataset, feature_conf, matcher_conf, retrieval, numbers, overwrite
+        outputs, dataset, feature_conf, matcher_conf, retrieval, numbers, overwrite, features
     ) as folder:
         sfm = outputs / f"sfm_{feature}+{matcher}"
         sfm_pairs = outputs / f"pairs-db-covis{num_covis}.txt"
@@ -64,15 +71,13 @@ def main(
 
         with folder.stage("extract_features"):
             names = [*map_names, *query_names]
-            features = extract_features.main(
+            features = features or extract_features.main(
                 feature_conf, place.images, outputs, image_list=names, executor=executor
             )
         with folder.stage("pairs_from_covisibility"):
             pairs_from_covisibility.main(place.reference_model, sfm_pairs, num_covis)
         with folder.stage("match_map"):
-            sfm_matches = match_features.main(
-                matcher_conf, sfm_pairs, features.stem, outputs, executor=executor
-            )
+            sfm_matches = common.match(matcher_conf, sfm_pairs, features, outputs, executor)
         with folder.stage("triangulation"):
             reconstruction = triangulation.main(
                 sfm, place.reference_model, place.images, sfm_pairs, features, sfm_matches
@@ -80,9 +85,7 @@ def main(
         with folder.stage("retrieval"):
             common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
         with folder.stage("match_queries"):
-            loc_matches = match_features.main(
-                matcher_conf, loc_pairs, features.stem, outputs, executor=executor
-            )
+            loc_matches = common.match(matcher_conf, loc_pairs, features, outputs, executor)
         with folder.stage("localization"):
             records = localize_sfm.main(
                 sfm, place.queries, loc_pairs, features, loc_matches, poses, executor=executor
@@ -125,12 +128,14 @@ def _main() -> None:
         help="render a small town in the data set's layout and localize there "
         "(default --dataset: datasets/demo_town)",
     )
-    parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
+    parser.add_argument(
+        "--num_covis", type=int, default=NUMBERS["num_covis"], help="pairs of each map image"
+    )
     common.add_dataset_options(
         parser,
         outputs="outputs/<dataset>/<feature>",
         truth="<dataset>/queries/ground_truth_poses.txt",
-        num_loc=50,
+        num_loc=NUMBERS["num_loc"],
     )
     args = parser.parse_args()
     common.check_options(args)

@@ -16,10 +16,13 @@ from hloc_reduce import (
     extractors,
     io,
     logger,
+    match_features,
     pairs_from_retrieval,
     results,
+    stamps,
 )
 from hloc_reduce.cli import InputError
+from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.parsers import parse_retrieval
 from hloc_reduce.versions import versions
 
@@ -140,8 +143,11 @@ def run_folder(
     retrieval: str,
     numbers: dict[str, int],
     overwrite: bool,
+    features: Path | None = None,
 ) -> results.RunFolder:
     """Open the output folder of a data set's pipeline, or refuse it, before any work is done.
+
+    It is begun anew if the given features were.
 
     Args:
         outputs: the folder.
@@ -151,21 +157,34 @@ def run_folder(
         retrieval: --retrieval.
         numbers: --num_...
         overwrite: begin anew.
+        features: a feature file, where they are not extracted in the folder.
     """
-    if overwrite or not (outputs / "conf.json").exists():
+    conf = {
+        "dataset": str(dataset.resolve()),
+        "feature": extract_features.provenance(feature_conf),
+        "matcher": matcher_conf["model"],
+        "retrieval": retrieval,
+        **numbers,
+    }
+    if features is not None:
+        with io.open_h5(features) as file:
+            conf["features"] = file.attrs.get("id", str(features))
+        before = stamps.read(outputs / "conf.json")
+        made_anew = before.get("features") not in (None, conf["features"])
+        overwrite |= made_anew and {**before, "features": conf["features"]} == conf
+    elif overwrite or not (outputs / "conf.json").exists():
         extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
     return results.RunFolder(
-        outputs,
-        {
-            "dataset": str(dataset.resolve()),
-            "feature": extract_features.provenance(feature_conf),
-            "matcher": matcher_conf["model"],
-            "retrieval": retrieval,
-            **numbers,
-        },
-        overwrite,
-        inputs=[] if retrieval == "vlad" else [Path(retrieval)],
+        outputs, conf, overwrite, inputs=[] if retrieval == "vlad" else [Path(retrieval)]
     )
+
+
+def match(
+    conf: dict, pairs: Path, features: Path, outputs: Path, executor: Executor = SERIAL
+) -> Path:
+    """Match pairs into a file of the outputs folder, which is called as hloc's."""
+    matches = outputs / f"{features.stem}_{conf['output']}_{pairs.stem}.h5"
+    return match_features.main(conf, pairs, features, matches=matches, executor=executor)
 
 
 def retrieve(

@@ -13,7 +13,6 @@ from hloc_reduce import (
     cli,
     extract_features,
     localize_inloc,
-    match_features,
     trace,
 )
 from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
@@ -22,6 +21,9 @@ from hloc_reduce.storage import STORAGES
 
 from . import common
 
+NUMBERS = {"num_loc": 40}
+Place = InLoc
+
 
 def main(
     dataset: Path,
@@ -29,14 +31,19 @@ def main(
     feature: str = features_confs.RECOMMENDED,
     matcher: str = "NN-ratio",
     retrieval: str = "vlad",
-    num_loc: int = 40,
+    num_loc: int = NUMBERS["num_loc"],
     ground_truth: Path | None = None,
     overwrite: bool = False,
     projection: Path | None = None,
     storage: str = STORAGES[0],
     executor: Executor = SERIAL,
+    features: Path | None = None,
 ) -> dict:
-    """Run all stages and return the summary, as in summary.json."""
+    """Run all stages and return the summary, as in summary.json.
+
+    Takes what the command line takes, and the executor that does the work, and `features`, a file
+    of them to use instead of extracting them.
+    """
     feature, feature_conf = features_confs.get(feature, projection, storage)
     matcher_conf = matchers_confs.confs[matcher]
     place = InLoc(dataset)
@@ -45,7 +52,8 @@ def main(
     loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
     # what is not retrieved needs neither features nor a scan
     used = common.check_retrieval(retrieval, loc_pairs, num_loc, query_names, map_names)
-    extract_features.list_images(dataset, [*used, *query_names])
+    if features is None:
+        extract_features.list_images(dataset, [*used, *query_names])
     place.check_scans(used)
     truth_file = ground_truth or place.ground_truth
     truth = true_poses(query_names, truth_file, bool(ground_truth))
@@ -53,21 +61,19 @@ def main(
 
     numbers = {"num_loc": num_loc}
     with common.run_folder(
-        outputs, dataset, feature_conf, matcher_conf, retrieval, numbers, overwrite
+        outputs, dataset, feature_conf, matcher_conf, retrieval, numbers, overwrite, features
     ) as folder:
         poses = outputs / f"InLoc_hloc_{feature}+{matcher}_{retrieved}.txt"
 
         with folder.stage("extract_features"):
             names = [*used, *query_names]
-            features = extract_features.main(
+            features = features or extract_features.main(
                 feature_conf, dataset, outputs, image_list=names, executor=executor
             )
         with folder.stage("retrieval"):
             common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
         with folder.stage("match_queries"):
-            matches = match_features.main(
-                matcher_conf, loc_pairs, features.stem, outputs, executor=executor
-            )
+            matches = common.match(matcher_conf, loc_pairs, features, outputs, executor)
         with folder.stage("localization"):
             records = localize_inloc.main(
                 dataset,
@@ -116,7 +122,7 @@ def _main() -> None:
         parser,
         outputs="outputs/<dataset>/<feature>",
         truth="<dataset>/ground_truth_poses.txt",
-        num_loc=40,
+        num_loc=NUMBERS["num_loc"],
     )
     args = parser.parse_args()
     common.check_options(args)

@@ -1,4 +1,4 @@
-"""How tests run a pipeline as a user does."""
+"""How tests run a pipeline as a user does, and what it left."""
 
 import csv
 import json
@@ -6,9 +6,10 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import h5py
 import pytest
 
-from hloc_reduce import cli
+from hloc_reduce import cli, io
 
 
 def run(monkeypatch: pytest.MonkeyPatch, pipeline: ModuleType, *arguments) -> None:
@@ -38,3 +39,24 @@ def outcome(outputs: Path) -> tuple[dict, dict[str, dict]]:
     with (outputs / "queries.csv").open() as file:
         rows = {row["query"]: row for row in csv.DictReader(file)}
     return json.loads((outputs / "summary.json").read_text()), rows
+
+
+def contents(path: Path) -> dict:
+    """Return all data sets of an h5 file with their attributes, and those of the file."""
+    with h5py.File(path) as file:
+        # but the id, and what has ids of other files
+        found = {"": {key: v for key, v in file.attrs.items() if key not in ("id", "conf")}}
+        for name in io.iterate_h5_names(file.id):
+            for key, dataset in file[name].items():
+                found[f"{name}/{key}"] = dataset[()].tobytes(), dict(dataset.attrs)
+    return found
+
+
+def results(outputs: Path) -> tuple:
+    """Return what a run left, but for what says when and where it ran."""
+    summary, rows = outcome(outputs)
+    for key in ("seconds", "bytes"):
+        del summary[key]
+    del summary["bytes_per_keypoint"]["feature_file"]  # pieces take more or less space in a file
+    poses = (outputs / summary["poses"]).read_text()
+    return summary, rows, poses, {path.name: contents(path) for path in outputs.glob("*.h5")}

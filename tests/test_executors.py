@@ -1,17 +1,15 @@
 """Work in this process, and in others: the results are the same."""
 
-import csv
-import json
 import os
 import signal
 from concurrent.futures import Future
 from functools import partial
 
-import h5py
 import numpy as np
 import pytest
+from command import contents, results
 
-from hloc_reduce import executors, extract_features, io
+from hloc_reduce import executors, extract_features, io, localize_inloc, match_features
 from hloc_reduce.cli import InputError
 from hloc_reduce.executors import SERIAL, Pool, processes_of_this_machine
 from hloc_reduce.group_writer import GroupWriter, fill
@@ -22,29 +20,6 @@ from pipelines import aachen, inloc
 def pool():
     with processes_of_this_machine(2) as pool:
         yield pool
-
-
-def contents(path):
-    """All data sets of an h5 file with their attributes, and those of the file but its id."""
-    found = {"": {key: value for key, value in h5py.File(path).attrs.items() if key != "id"}}
-    with h5py.File(path) as file:
-        for name in io.list_h5_names(path):
-            for key, dataset in file[name].items():
-                found[f"{name}/{key}"] = dataset[()].tobytes(), dict(dataset.attrs)
-    found[""].pop("conf", None)  # has ids of other files
-    return found
-
-
-def results(folder):
-    """What a run left, but for what says when and where it ran."""
-    summary = json.loads((folder / "summary.json").read_text())
-    for key in ("seconds", "bytes"):
-        del summary[key]
-    del summary["bytes_per_keypoint"]["feature_file"]  # pieces take more or less space in a file
-    with (folder / "queries.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    poses = (folder / summary["poses"]).read_text()
-    return summary, rows, poses, {path.name: contents(path) for path in folder.glob("*.h5")}
 
 
 def squares(items):
@@ -83,7 +58,7 @@ def test_items_are_drawn_as_workers_get_free():
         future.set_result(function(*arguments))
         return future
 
-    results = Pool(submit, 2).map(squares, (drawn.append(i) or i for i in range(1000)), 5)
+    results = Pool(submit, lambda: 2).map(squares, (drawn.append(i) or i for i in range(1000)), 5)
     assert next(results) in [(i, i * i) for i in range(20)]
     assert len(drawn) == 5 * 2 * executors.BACKLOG
 
@@ -118,7 +93,7 @@ def test_groups_are_the_same_and_a_failure_loses_none_that_is_done(pool, tmp_pat
 @pytest.mark.parametrize("layout, pipeline", [("aachen_layout", aachen), ("inloc_layout", inloc)])
 def test_a_pipeline_is_the_same(layout, pipeline, pool, request, tmp_path, monkeypatch):
     place = request.getfixturevalue(layout)
-    for module in (extract_features, aachen.match_features, inloc.localize_inloc):
+    for module in (extract_features, match_features, localize_inloc):
         monkeypatch.setattr(module, "CHUNK", 2)
     for name, executor in (("serial", SERIAL), ("pool", pool)):
         outputs = tmp_path / name / "run"

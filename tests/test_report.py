@@ -273,7 +273,7 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_lay
     assert "Unknown feature 'sift_sv65'" in message(aachen_layout, "sift", "sift_sv65")
     assert "is a folder: name the HTML file" in message(aachen_layout, "sift", "-o", tmp_path)
     assert not (tmp_path / "o").exists()
-    assert compare.pipeline_of(inloc_layout) is inloc.main
+    assert compare.pipeline_of(inloc_layout) is inloc
 
 
 def test_wrong_input(compared, tmp_path, monkeypatch, caplog):

@@ -1,0 +1,190 @@
+"""Job files: grids of runs of the pipelines of data sets, in YAML.
+
+    outputs: outputs/example           # default: outputs/<name of the file>
+    jobs:                              # grids: each option a value, or a list of values
+      - dataset: [datasets/aachen_v1.1, datasets/demo_town]
+        feature: [sift, {descriptor: [sift, mkd], scheme: sv, dim: [64, 16]}]
+        matcher: NN-ratio
+    exclude:                           # jobs that agree with all that is named, * is anything
+      - {dataset: "*demo_town", feature: "*16"}
+
+Options are those of `pipelines.aachen` and `pipelines.inloc`.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+from fnmatch import fnmatchcase
+from itertools import product
+from pathlib import Path
+
+import yaml
+
+import confs
+from confs import features as features_confs
+from confs import matchers as matchers_confs
+
+from . import cli
+from .cli import InputError
+from .storage import STORAGES
+
+SHIPPED = Path(confs.__file__).parent / "jobs"
+NAME_PARTS = ("descriptor", "scheme", "dim")  # of the name of a feature
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run of a pipeline.
+
+    Args:
+        dataset: the folder of a data set.
+        feature: name of a feature or YAML file, as of `confs.features.get`.
+        matcher: name of a matcher.
+        storage: how descriptors are kept.
+        retrieval: vlad, of the first feature of the data set, or a file.
+        ground_truth: true poses of the queries; default: those of the data set.
+        num_covis: pairs of each map image; default: that of the pipeline.
+        num_loc: map images of each query; default: that of the pipeline.
+    """
+
+    dataset: Path
+    feature: str = features_confs.RECOMMENDED
+    matcher: str = "NN-ratio"
+    storage: str = STORAGES[0]
+    retrieval: str = "vlad"
+    ground_truth: Path | None = None
+    num_covis: int | None = None
+    num_loc: int | None = None
+
+    @property
+    def name(self) -> str:
+        """What its folder is called: the feature, and whatever is not by default."""
+        parts = [Path(self.feature).stem]
+        for field in fields(self)[2:]:
+            value = getattr(self, field.name)
+            if value != field.default and field.name != "ground_truth":
+                prefix = field.name if isinstance(value, int) else ""
+                parts.append(prefix + Path(str(value)).stem.removeprefix("pairs-query-"))
+        return "+".join(parts)
+
+    @property
+    def numbers(self) -> dict[str, int]:
+        """The numbers that are given."""
+        given = {"num_covis": self.num_covis, "num_loc": self.num_loc}
+        return {name: number for name, number in given.items() if number is not None}
+
+
+OPTIONS = tuple(field.name for field in fields(Job))
+
+
+def read(path: Path) -> tuple[Path, list[Job]]:
+    """Read a job file, or one that ships and is called as `path`.
+
+    Returns:
+        The folder for the results, and the jobs in the order of the file, each once.
+
+    Raises:
+        InputError: when it is none.
+    """
+    shipped = SHIPPED / path.name
+    path = shipped if not path.exists() and shipped.exists() else path
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{path} cannot be read ({' '.join(str(error).split())}).") from None
+    try:
+        content = _mapping("a job file", content, ("outputs", "jobs", "exclude"))
+        found = [job for grid in _list(content.get("jobs")) for job in _expand(grid)]
+        excluded = [
+            _mapping("what is excluded", item, OPTIONS) for item in _list(content.get("exclude"))
+        ]
+        outputs = content.get("outputs", f"outputs/{path.stem}")
+        if not isinstance(outputs, str):
+            raise InputError(f"outputs is a folder, not {outputs!r}.")
+        jobs = [job for job in dict.fromkeys(found) if not any(_agrees(job, e) for e in excluded)]
+        _check(jobs)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return Path(outputs), jobs
+
+
+def by_dataset(jobs: Iterable[Job]) -> dict[Path, list[Job]]:
+    """Group jobs by data set."""
+    groups: dict[Path, list[Job]] = {}
+    for job in jobs:
+        groups.setdefault(job.dataset, []).append(job)
+    return groups
+
+
+def _expand(grid: object) -> Iterator[Job]:
+    """Yield the jobs of a grid."""
+    grid = _mapping("a grid of jobs", grid, OPTIONS)
+    if "dataset" not in grid:
+        raise InputError("a grid of jobs names no dataset.")
+    axes = {name: _list(value) for name, value in grid.items()}
+    if "feature" in axes:
+        axes["feature"] = [name for item in axes["feature"] for name in _features(item)]
+    for values in product(*axes.values()):
+        yield _job(dict(zip(axes, values, strict=True)))
+
+
+def _features(item: object) -> list[str]:
+    """Return the names of a feature, or of a grid of descriptors, schemes and dimensions."""
+    if not isinstance(item, dict):
+        return [item]
+    item = _mapping("a grid of features", item, NAME_PARTS)
+    if absent := [part for part in NAME_PARTS if part not in item]:
+        raise InputError(f"a grid of features has no {absent[0]}.")
+    parts = product(*(_list(item[part]) for part in NAME_PARTS))
+    return [f"{descriptor}_{scheme}{dim}" for descriptor, scheme, dim in parts]
+
+
+def _job(options: dict) -> Job:
+    """Make a job of options of the right types."""
+    for name, value in options.items():
+        number = name.startswith("num_")
+        if not isinstance(value, int if number else str) or isinstance(value, bool):
+            raise InputError(f"{name} is {value!r}: a {'number' if number else 'name'} is needed.")
+        if number and value < 1:
+            raise InputError(f"{name} is {value}: at least 1.")
+    paths = {name: Path(options[name]) for name in ("dataset", "ground_truth") if name in options}
+    job = Job(**options | paths)
+    features_confs.get(job.feature, storage=job.storage)
+    cli.choose("matcher", job.matcher, matchers_confs.confs)
+    return job
+
+
+def _agrees(job: Job, excluded: dict) -> bool:
+    """Return whether a job has one of the named values of each named option."""
+    return all(
+        any(fnmatchcase(str(getattr(job, name)), str(value)) for value in _list(values))
+        for name, values in excluded.items()
+    )
+
+
+def _check(jobs: list[Job]) -> None:
+    """Refuse that there is no job, or that two would have the same folder."""
+    if not jobs:
+        raise InputError("there is no job.")
+    folders: dict[tuple[str, str], Job] = {}
+    for job in jobs:
+        other = folders.setdefault((job.dataset.resolve().name, job.name), job)
+        if other != job:
+            differ = [name for name in OPTIONS if getattr(other, name) != getattr(job, name)]
+            raise InputError(
+                f"two jobs are called {job.name} of {job.dataset.name}, but differ in "
+                f"{' and '.join(differ)}: rename a file or a folder, or use two job files."
+            )
+
+
+def _mapping(what: str, value: object, keys: Iterable[str]) -> dict:
+    if not isinstance(value, dict):
+        raise InputError(f"{what} is a mapping of {', '.join(keys)}, not {value!r}.")
+    for key in value:
+        cli.choose(f"key of {what}", key, keys)
+    return value
+
+
+def _list(value: object) -> list:
+    if value is None:
+        return []
+    return value if isinstance(value, list) else [value]

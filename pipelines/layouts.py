@@ -1,0 +1,22 @@
+"""The pipeline for the layout of a data set."""
+
+from pathlib import Path
+from types import ModuleType
+
+from hloc_reduce.cli import InputError
+
+from . import aachen, inloc
+
+PIPELINES = {"3D-models": aachen, "database": inloc}  # by a folder that a layout has
+
+
+def pipeline_of(dataset: Path) -> ModuleType:
+    """Return the pipeline for a data set.
+
+    Raises:
+        InputError: when it has no layout that is known.
+    """
+    for folder, pipeline in PIPELINES.items():
+        if (dataset / folder).is_dir():
+            return pipeline
+    raise InputError(f"{dataset} has neither of the folders {' and '.join(PIPELINES)}.")

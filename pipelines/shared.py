@@ -1,0 +1,178 @@
+"""What the jobs of a batch have in common on a data set: features, and retrieval."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from confs import features as features_confs
+from hloc_reduce import (
+    aggregate_features,
+    cli,
+    extract_features,
+    extractors,
+    io,
+    logger,
+    results,
+    stamps,
+)
+from hloc_reduce.cli import InputError
+from hloc_reduce.descriptors import DIM
+from hloc_reduce.executors import Executor
+from hloc_reduce.group_writer import GroupWriter
+from hloc_reduce.jobs import Job
+from hloc_reduce.storage import STORAGES
+
+from . import common
+from .layouts import pipeline_of
+
+FILES = "features.json"  # the ids of feature files that something else was made of
+
+
+class Shared:
+    """The jobs of a data set, checked as far as can be before any work is done.
+
+    Args:
+        dataset: the folder of the data set.
+        jobs: its jobs.
+        folder: for what they have in common.
+
+    Attributes:
+        failed: from each job that cannot be run to the reason.
+        features: from each other job to its feature file.
+        confs: from each feature file to the configuration.
+        dims: from each feature file to the number of dimensions.
+        pipeline: the module of the pipeline.
+    """
+
+    def __init__(self, dataset: Path, jobs: list[Job], folder: Path):
+        self.dataset, self.jobs, self.folder = dataset, jobs, folder
+        self.failed: dict[Job, Exception] = {}
+        self.features: dict[Job, Path] = {}
+        self.confs: dict[Path, dict] = {}
+        self.dims: dict[Path, int] = {}
+        self._used: set[str] = set()  # map images
+        with self.failing(jobs):
+            self.pipeline = pipeline_of(dataset)
+            self._place = self.pipeline.Place(dataset)
+            self.map_names = self._place.map_names()
+            self.query_names = self._place.query_names()
+            for job in jobs:
+                with self.failing([job]):
+                    self._check(job)
+
+    def _check(self, job: Job) -> None:
+        """Refuse a job that cannot be run, or note what it needs."""
+        for name in job.numbers:
+            cli.choose(f"option for {self.dataset.name}", name, self.pipeline.NUMBERS)
+        if job.retrieval != "vlad" and not Path(job.retrieval).is_file():
+            raise InputError(f"retrieval {job.retrieval}: neither vlad nor a file that is there.")
+        num_loc, names = self.numbers(job)["num_loc"], (self.query_names, self.map_names)
+        used = common.check_retrieval(job.retrieval, self.folder, num_loc, *names)
+        _, conf = features_confs.get(job.feature, storage=job.storage)
+        extract_features.provenance(conf)
+        project = getattr(extractors.load(conf["model"]), "project", None)
+        stored = "" if job.storage == STORAGES[0] else f"-{job.storage}"
+        path = self.folder / f"{conf['output']}{stored}.h5"
+        self.features[job], self.confs[path] = path, conf
+        self.dims[path] = project.dim if project else DIM
+        self._used |= set(self.map_names if self._place.whole_map else used)
+
+    @contextmanager
+    def failing(self, jobs: list[Job]) -> Iterator[None]:
+        """Have an error of a block be that of jobs, and go no further."""
+        try:
+            yield
+        except Exception as error:
+            logger.error(
+                "%s, %s: %s",
+                self.dataset.name,
+                cli.some(job.name for job in jobs),
+                error,
+                exc_info=not isinstance(error, (InputError, OSError)),
+            )
+            self.failed = dict.fromkeys(jobs, error) | self.failed
+
+    def running(self) -> list[Job]:
+        """Return the jobs that did not fail so far."""
+        return [job for job in self.jobs if job not in self.failed]
+
+    def numbers(self, job: Job) -> dict[str, int]:
+        """Return the numbers of a job, those of its pipeline where it does not say."""
+        return {**self.pipeline.NUMBERS, **job.numbers}
+
+    def images(self) -> list[str]:
+        """Return the images whose features are needed."""
+        return [*sorted(self._used), *self.query_names]
+
+    def groups(self) -> list[list[Path]]:
+        """Return the feature files that are extracted together."""
+        groups: dict[str, list[Path]] = {}
+        for path in dict.fromkeys(self.features[job] for job in self.running()):
+            groups.setdefault(extract_features.shared_key(self.confs[path]), []).append(path)
+        return list(groups.values())
+
+    def retrieval(self, job: Job) -> str:
+        """Return the retrieval file of a job, which is by VLAD of the first feature or its own."""
+        if job.retrieval != "vlad":
+            return str(Path(job.retrieval).resolve())
+        return str(self.folder / f"pairs-query-vlad{self.numbers(job)['num_loc']}.txt")
+
+    def seconds(self) -> dict[str, float]:
+        """Return how long each stage of `main` took, all runs together."""
+        kept = stamps.read(self.folder / results.STAGES)
+        return {name: stage["seconds"] for name, stage in kept.items()}
+
+    def main(self, executor: Executor, strict: bool, overwrite: bool) -> None:
+        """Extract the features and retrieve.
+
+        Args:
+            executor: does the work.
+            strict: as of `extract_features.extract_several`.
+            overwrite: begin anew.
+        """
+        if not self.running():
+            return
+        first = self.features[self.running()[0]]
+        conf = {"dataset": str(self.dataset), "vlad": first.stem}
+        with (
+            self.failing(self.running()),
+            results.RunFolder(self.folder, conf, overwrite) as folder,
+        ):
+            with folder.stage("extract_features"):
+                for group in self.groups():
+                    with self.failing([j for j in self.running() if self.features[j] in group]):
+                        self._extract(group, executor, strict)
+            self._drop_stale()
+            by_vlad = {
+                Path(self.retrieval(job)): self.numbers(job)["num_loc"]
+                for job in self.running()
+                if job.retrieval == "vlad"
+            }
+            with folder.stage("retrieval"):
+                for pairs, num_loc in by_vlad.items():
+                    names = self.query_names, self.map_names
+                    common.retrieve("vlad", first, pairs, num_loc, *names)
+
+    def _extract(self, paths: list[Path], executor: Executor, strict: bool) -> None:
+        """Extract features whose keypoints are the same."""
+        with ExitStack() as stack:
+            features = {}
+            for path in paths:
+                made_by = extract_features.provenance(self.confs[path])
+                writer = stack.enter_context(GroupWriter(path, made_by))
+                features[path] = {"storage": STORAGES[0], **self.confs[path]}, writer
+            extract_features.extract_several(
+                features, self._place.images, self.images(), executor, strict
+            )
+
+    def _drop_stale(self) -> None:
+        """Delete what was made of features that changed, as more images can be read now."""
+        before, now = stamps.read(self.folder / FILES), {}
+        for path in {self.features[job] for job in self.running()}:
+            with io.open_h5(path) as file:
+                now[path.name] = file.attrs["id"]
+        if any(before.get(name, made) != made for name, made in now.items()):
+            for pattern in (f"{aggregate_features.confs['vlad']['output']}*", "*-points3D.h5"):
+                for derived in self.folder.glob(pattern):
+                    derived.unlink()
+        stamps.write(self.folder / FILES, before | now)

@@ -1,0 +1,291 @@
+"""Job files, and batches: what jobs share, what fails, what is left behind."""
+
+import csv
+import json
+from collections import Counter
+from pathlib import Path
+
+import command
+import pytest
+
+from hloc_reduce import aggregate_features, cli, colmap, extract_features, jobs
+from hloc_reduce.cli import InputError
+from hloc_reduce.descriptors import Descriptor
+from hloc_reduce.evaluation import published
+from pipelines import aachen, batch
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def table(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def names(found):
+    return [f"{job.dataset.name}/{job.name}" for job in found]
+
+
+def test_a_grid_with_exclusions(tmp_path):
+    file = write(
+        tmp_path / "some.yaml",
+        """
+        jobs:
+          - dataset: [data/a, data/b]
+            feature: [sift, {descriptor: [sift, mkd], scheme: sv, dim: [64, 16]}]
+          - {dataset: data/a, feature: sift, matcher: [NN-ratio, NN-mutual], num_loc: 3}
+        exclude:
+          - {dataset: "*b", feature: ["sift_sv*", mkd_sv16]}
+        """,
+    )
+    outputs, found = jobs.read(file)
+    assert outputs == Path("outputs/some")
+    assert names(found) == [
+        *("a/sift", "a/sift_sv64", "a/sift_sv16", "a/mkd_sv64", "a/mkd_sv16", "b/sift"),
+        *("b/mkd_sv64", "a/sift+num_loc3", "a/sift+NN-mutual+num_loc3"),
+    ]
+    assert found[-1].numbers == {"num_loc": 3} and found[0].numbers == {}
+    assert list(jobs.by_dataset(found)) == [Path("data/a"), Path("data/b")]
+
+
+def test_a_job_that_is_listed_twice_is_one(tmp_path):
+    text = "jobs: [{dataset: a, feature: [sift, sift]}, {dataset: [a], feature: sift}]"
+    assert names(jobs.read(write(tmp_path / "a.yaml", text))[1]) == ["a/sift"]
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("", "a job file is a mapping of outputs, jobs, exclude, not None"),
+        ("jobs: []", "there is no job"),
+        ("jobs: [{feature: sift}]", "a grid of jobs names no dataset"),
+        ("jobs: [{dataset: a, features: sift}]", "Unknown key of a grid of jobs 'features'"),
+        ("jobs: [{dataset: a, feature: sft}]", "Unknown feature 'sft'. The nearest .* sift,"),
+        ("jobs: [{dataset: a, feature: {descriptor: sift, dim: 64}}]", "has no scheme"),
+        ("jobs: [{dataset: a, matcher: NN}]", "Unknown matcher 'NN'"),
+        ("jobs: [{dataset: a, storage: int4}]", "Unknown storage 'int4'"),
+        ("jobs: [{dataset: a, num_loc: 0}]", "num_loc is 0: at least 1"),
+        ("jobs: [{dataset: a, num_loc: many}]", "num_loc is 'many': a number is needed"),
+        ("jobs: [{dataset: 3}]", "dataset is 3: a name is needed"),
+        ("jobs: [{dataset: a}]\nexclude: [{job: a}]", "Unknown key of what is excluded 'job'"),
+        ("jobs: [{dataset: [x/a, y/a]}]", "two jobs are called .* of a, but differ in dataset"),
+        ("outputs: [a]\njobs: [{dataset: a}]", "outputs is a folder, not"),
+        ("jobs: !!python/object/apply:os.getcwd []", "cannot be read"),
+        ("jobs: [", "cannot be read"),
+    ],
+)
+def test_what_is_no_job_file(text, message, tmp_path):
+    path = write(tmp_path / "jobs.yaml", text)
+    with pytest.raises(InputError, match=message) as error:
+        jobs.read(path)
+    assert str(error.value).startswith(str(path))
+
+
+def test_the_job_files_of_the_tables_have_all_features_of_the_paper():
+    for place in ("aachen", "inloc"):
+        files = [Path("anywhere") / f"{place}_table{number}.yaml" for number in range(1, 5)]
+        found = [job.feature for file in files for job in jobs.read(file)[1]]
+        assert sorted(found) == sorted(published.localization())
+    assert names(jobs.read(Path("demo.yaml"))[1])[0] == "demo_town/sift_sv64"
+
+
+@pytest.fixture
+def run_batch(tmp_path, monkeypatch, capsys):
+    """Runs the batch of a grid in this process and returns its outputs and what it printed."""
+    monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
+
+    def run(*grids, options=()):
+        job_file = write(tmp_path / "jobs.yaml", json.dumps({"jobs": list(grids)}))
+        arguments = (job_file, "--outputs", tmp_path / "out", "--executor", "serial", *options)
+        try:
+            command.run(monkeypatch, batch, *arguments)
+        finally:
+            run.printed = capsys.readouterr().out
+        return tmp_path / "out"
+
+    return run
+
+
+def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_path, monkeypatch):
+    done = Counter()
+
+    def count(module, name):
+        original = getattr(module, name)
+
+        def counted(*args, **kwargs):
+            done[name] += 1
+            return original(*args, **kwargs)
+
+        monkeypatch.setattr(module, name, counted)
+
+    count(colmap, "detect_dog")
+    count(Descriptor, "forward")
+    count(extract_features, "read_image")
+    count(aggregate_features, "main")
+    features = ["sift_sv64", "sift", "sift_sv16", "colmap_sift"]
+    grid = {"dataset": str(aachen_layout), "feature": features, "matcher": "NN-ratio"}
+    outputs = run_batch(grid)
+    images = 7
+    assert done["detect_dog"] == done["read_image"] == images
+    assert done["forward"] == images
+    assert done["main"] == 1
+    folder = outputs / aachen_layout.name
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*features, "shared"])
+    assert not list(folder.glob("[!s]*/feats*sift.h5"))
+
+    pairs = folder / "shared/pairs-query-vlad50.txt"
+    for feature in features:
+        alone = tmp_path / "alone" / feature
+        aachen.main(aachen_layout, alone, feature, retrieval=str(pairs))
+        (poses,) = alone.glob("*_hloc_*.txt")
+        assert (folder / feature / poses.name).read_text() == poses.read_text()
+        assert (folder / feature / "queries.csv").read_text() == (alone / "queries.csv").read_text()
+
+    rows = table(outputs / "jobs.csv")
+    assert list(rows[0]) == list(batch.COLUMNS)
+    assert [(row["job"], row["list"][:3], row["threshold_m"]) for row in rows[:4]] == [
+        ("sift_sv64", "day", "0.25"),
+        *(("sift_sv64", "day", "0.5"), ("sift_sv64", "day", "5.0"), ("sift_sv64", "nig", "0.5")),
+    ]
+    assert len(rows) == len(features) * 2 * 3 and not any(row["error"] for row in rows)
+    assert {row["descriptor_bytes"] for row in rows if row["job"] == "sift_sv16"} == {"32"}
+    assert table(outputs / "failures.csv") == []
+    assert all(feature in run_batch.printed for feature in features)
+    assert "in common: extract_features" in run_batch.printed
+
+    states = {path: path.stat().st_mtime_ns for path in folder.rglob("*.h5")}
+    done.clear()
+    run_batch(grid)
+    assert done["detect_dog"] == done["forward"] == 0
+    assert states == {path: path.stat().st_mtime_ns for path in folder.rglob("*.h5")}
+
+
+def test_a_grid_of_matchers_and_storages_in_both_layouts(aachen_layout, inloc_layout, run_batch):
+    outputs = run_batch(
+        {
+            "dataset": str(aachen_layout),
+            "feature": "sift_sv16",
+            "matcher": ["NN-ratio", "NN-mutual"],
+        },
+        {"dataset": str(inloc_layout), "feature": "sift_sv16", "storage": ["uint8", "float16"]},
+    )
+    jobs_of = {path.name for path in (outputs / aachen_layout.name).iterdir()}
+    assert jobs_of == {"shared", "sift_sv16", "sift_sv16+NN-mutual"}
+    shared = outputs / inloc_layout.name / "shared"
+    assert {path.name for path in shared.glob("feats*.h5")} >= {
+        "feats-dog-sift_sv16.h5",
+        "feats-dog-sift_sv16-uint8.h5",
+    }
+    sizes = {row["job"]: row["descriptor_bytes"] for row in table(outputs / "jobs.csv")}
+    assert sizes["sift_sv16+uint8"] == "16" and sizes["sift_sv16"] == "32"
+
+
+def test_a_job_that_fails_does_not_stop_the_others(aachen_layout, run_batch, monkeypatch, caplog):
+    monkeypatch.setattr(extract_features, "check_weights", refuse_tfeat)
+    grid = {"dataset": [str(aachen_layout), "nowhere"], "feature": ["tfeat", "sift_sv16"]}
+    with pytest.raises(SystemExit) as exit:
+        run_batch(grid)
+    assert exit.value.code == 2
+    assert "3 jobs failed, see above" in caplog.records[-1].getMessage()
+    rows = table(aachen_layout.parent / "out/jobs.csv")
+    errors = [(row["dataset"], row["job"], row["error"]) for row in rows if row["error"]]
+    nowhere = f"{Path('nowhere').resolve()} has neither of the folders 3D-models and database."
+    assert errors == [
+        (aachen_layout.name, "tfeat", "no tfeat"),
+        ("nowhere", "tfeat", nowhere),
+        ("nowhere", "sift_sv16", nowhere),
+    ]
+    assert [row["recall_percent"] for row in rows if row["list"].startswith("night")] == [
+        "100.0"
+    ] * 3
+    assert "tfeat failed: no tfeat" in run_batch.printed
+
+
+def refuse_tfeat(name):
+    if name == "tfeat":
+        raise InputError("no tfeat")
+
+
+def test_a_bug_in_one_job_does_not_stop_the_others(aachen_layout, run_batch, monkeypatch, caplog):
+    original = aachen.main
+
+    def broken(*args, **kwargs):
+        if args[2] == "sift":
+            raise ZeroDivisionError("a bug")
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(aachen, "main", broken)
+    with pytest.raises(SystemExit):
+        run_batch({"dataset": str(aachen_layout), "feature": ["sift", "sift_sv16"]})
+    assert any(record.exc_info for record in caplog.records)  # the traceback
+    assert (aachen_layout.parent / "out" / aachen_layout.name / "sift_sv16/summary.json").exists()
+
+
+def test_options_that_a_data_set_has_not(inloc_layout, run_batch, caplog):
+    with pytest.raises(SystemExit):
+        run_batch({"dataset": str(inloc_layout), "num_covis": 3})
+    assert "Unknown option for" in caplog.text and "num_covis" in caplog.text
+
+
+@pytest.mark.parametrize("layout", ["aachen_layout", "inloc_layout"])
+def test_unreadable_images(layout, request, run_batch, tmp_path, caplog):
+    place = request.getfixturevalue(layout)
+    grid = {"dataset": str(place), "feature": ["sift_sv16", "sift_sv64"]}
+    whole = run_batch(grid)
+    expected = {path.relative_to(whole): path.read_text() for path in whole.rglob("queries.csv")}
+    whole.rename(tmp_path / "whole")
+
+    images = place / "images_upright" if layout == "aachen_layout" else place
+    broken = next(path for path in sorted(images.rglob("*.[pj][np]g")) if "query" not in str(path))
+    absent = next(path for path in images.rglob("*") if path.name in ("a.png", "a.JPG"))
+    content = broken.read_bytes(), absent.read_bytes()
+    broken.write_bytes(content[0][:1000])
+    absent.unlink()
+    for _ in range(2):
+        outputs = run_batch(grid)
+        rows = table(outputs / "failures.csv")
+        assert {(row["image"], row["reason"].rpartition(": ")[2]) for row in rows} == {
+            (broken.relative_to(images).as_posix(), "it is no image, or a part of one."),
+            (absent.relative_to(images).as_posix(), "No such file or directory."),
+        }
+    summary, queries = command.outcome(outputs / place.name / "sift_sv16")
+    name = absent.relative_to(images).as_posix()
+    assert queries[name]["num_matches"] == "0" and queries[name]["status"] != "localized"
+    with pytest.raises(SystemExit):
+        run_batch(grid, options=("--strict",))
+    assert "Cannot read image" in caplog.text
+    assert {row["error"][:17] for row in table(outputs / "jobs.csv")} == {"Cannot read image"}
+
+    broken.write_bytes(content[0])
+    absent.write_bytes(content[1])
+    run_batch(grid)
+    assert table(outputs / "failures.csv") == []
+    assert expected == {
+        path.relative_to(outputs): path.read_text() for path in outputs.rglob("queries.csv")
+    }
+
+
+def test_a_dry_run_shows_the_steps_and_writes_nothing(aachen_layout, run_batch, tmp_path):
+    grid = {"dataset": str(aachen_layout), "feature": ["sift", "sift_sv16", "colmap_sift"]}
+    outputs = run_batch(grid, options=("--dry_run",))
+    assert not outputs.exists()
+    lines = [[cell.strip() for cell in line.split("|")] for line in run_batch.printed.splitlines()]
+    # 7 images of 5000 keypoints with 14 bytes and 128, 16 and 128 numbers of 2 bytes
+    size = f"{7 * 5000 * (3 * 14 + 2 * 272) / 1e6:.1f}"
+    assert lines[1] == [
+        *(
+            aachen_layout.name,
+            "extract_features",
+            "sift, sift_sv16, colmap_sift",
+            "7",
+            "images",
+            size,
+        )
+    ]
+    assert [line[1] for line in lines[2:7]] == [
+        *("retrieval", "match_map", "triangulation", "match_queries", "localization")
+    ]
+    assert lines[3][3:5] == ["12", "pairs"] and lines[5][3:5] == ["12", "pairs"]

@@ -1,0 +1,80 @@
+"""A batch on a Ray cluster of several nodes: the same results, also when one is removed."""
+
+import os
+import sys
+import threading
+import time
+
+import pytest
+from test_executors import results
+
+from hloc_reduce import extract_features, match_features
+from hloc_reduce.cli import InputError
+from hloc_reduce.executors import SERIAL, ray_cluster
+from pipelines import aachen
+
+ray = pytest.importorskip("ray")
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    from ray.cluster_utils import Cluster
+
+    # no node can import this module
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    cluster = Cluster()
+    for _ in range(3):
+        cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)
+    yield cluster
+    cluster.shutdown()
+
+
+def slow_squares(items):
+    for i in items:
+        time.sleep(0.2)
+        yield i, i * i, os.environ["OMP_NUM_THREADS"], ray.get_runtime_context().get_node_id()
+
+
+def failing(items):
+    raise InputError(f"item {items[0]}")
+    yield
+
+
+def test_a_node_is_removed(cluster):
+    node = cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)
+    with ray_cluster(cluster.address) as executor:
+        assert executor.workers() == 4
+        found, nodes = [], set()
+        for i, square, threads, node_id in executor.map(slow_squares, range(60), 2):
+            assert threads == "1"
+            found.append((i, square))
+            nodes.add(node_id)
+            if node is not None and node.node_id in nodes:
+                cluster.remove_node(node, allow_graceful=False)
+                node = None
+        assert node is None and len(nodes) == 4
+        assert sorted(found) == [(i, i * i) for i in range(60)]
+
+
+def test_an_error_is_as_in_this_process(cluster):
+    with ray_cluster(cluster.address) as executor, pytest.raises(InputError, match="^item 0$"):
+        list(executor.map(failing, range(3), 5))
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:9", "ray://127.0.0.1:9", "nowhere", "a:99999"])
+def test_a_cluster_that_does_not_answer(address):
+    with pytest.raises(InputError, match=f"{address} does not answer"), ray_cluster(address):
+        pass
+
+
+def test_a_pipeline_is_the_same(cluster, aachen_layout, tmp_path, monkeypatch):
+    for module in (extract_features, match_features):
+        monkeypatch.setattr(module, "CHUNK", 1)
+    aachen.main(aachen_layout, tmp_path / "serial/run", "sift_sv32", executor=SERIAL)
+    node = cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)
+    removed = threading.Timer(1, cluster.remove_node, (node,), {"allow_graceful": False})
+    with ray_cluster(cluster.address) as executor:
+        removed.start()
+        aachen.main(aachen_layout, tmp_path / "ray/run", "sift_sv32", executor=executor)
+    removed.join()
+    assert results(tmp_path / "serial/run") == results(tmp_path / "ray/run")
