@@ -7,11 +7,10 @@
 from argparse import ArgumentParser
 from pathlib import Path
 
-import yaml
-
 from hloc_reduce import projections
 from hloc_reduce.cli import InputError, choose
 from hloc_reduce.descriptors import COLMAP, DESCRIPTORS
+from hloc_reduce.parsers import read_yaml
 from hloc_reduce.storage import STORAGES
 
 RECOMMENDED = "colmap_sift_sv64"  # the fastest, and the best measured (docs/performance.md)
@@ -110,10 +109,7 @@ def read(path: Path) -> dict:
     Raises:
         InputError: when it is none.
     """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except Exception as error:  # yaml raises whatever a broken value leads it to
-        raise InputError(f"{path} cannot be read ({' '.join(str(error).split())}).") from None
+    content = read_yaml(path)
     model = content.get("model") if isinstance(content, dict) else None
     for part in (model, model.get("base", model) if isinstance(model, dict) else None):
         if not isinstance(part, dict) or "name" not in part:

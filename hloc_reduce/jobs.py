@@ -17,14 +17,13 @@ from fnmatch import fnmatchcase
 from itertools import product
 from pathlib import Path
 
-import yaml
-
 import confs
 from confs import features as features_confs
 from confs import matchers as matchers_confs
 
 from . import cli
 from .cli import InputError
+from .parsers import read_yaml
 from .storage import STORAGES
 
 SHIPPED = Path(confs.__file__).parent / "jobs"
@@ -87,10 +86,7 @@ def read(path: Path) -> tuple[Path, list[Job]]:
     """
     shipped = SHIPPED / path.name
     path = shipped if not path.exists() and shipped.exists() else path
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path} cannot be read ({' '.join(str(error).split())}).") from None
+    content = read_yaml(path)
     try:
         content = _mapping("a job file", content, ("outputs", "jobs", "exclude"))
         found = [job for grid in _list(content.get("jobs")) for job in _expand(grid)]

@@ -1,4 +1,4 @@
-"""The text files of hloc: image lists, query lists with intrinsics, pairs, poses."""
+"""Text files: those of hloc, image lists, query lists with intrinsics, pairs, poses; and YAML."""
 
 import re
 import sys
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import yaml
 from scipy.spatial.transform import Rotation
 
 from .cli import InputError, choose, some
@@ -51,6 +52,18 @@ def _lines(path: Path, names: int = 1) -> Iterator[tuple[str, list[str]]]:
                     yield place, words
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"Cannot read {path}: {error}.") from None
+
+
+def read_yaml(path: Path) -> object:
+    """Read a YAML file of plain values.
+
+    Raises:
+        InputError: when it is none.
+    """
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except Exception as error:  # yaml raises whatever a broken value leads it to
+        raise InputError(f"{path} cannot be read ({' '.join(str(error).split())}).") from None
 
 
 def parse_image_list(path: Path) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command import contents, results
 
-from hloc_reduce import executors, extract_features, io, localize_inloc, match_features
+from hloc_reduce import executors, extract_features, localize_inloc, match_features
 from hloc_reduce.cli import InputError
 from hloc_reduce.executors import SERIAL, Pool, processes_of_this_machine
 from hloc_reduce.group_writer import GroupWriter, fill

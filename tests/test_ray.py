@@ -6,7 +6,7 @@ import threading
 import time
 
 import pytest
-from test_executors import results
+from command import results
 
 from hloc_reduce import extract_features, match_features
 from hloc_reduce.cli import InputError
