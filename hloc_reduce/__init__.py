@@ -3,6 +3,8 @@
 import logging
 from typing import TYPE_CHECKING
 
+from . import interrupts
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
@@ -23,9 +25,7 @@ if not logger.handlers:
     logger.setLevel(logging.INFO)
     logger.propagate = False
 
-from . import cli  # noqa: E402, it needs the logger
-
-cli.while_importing()
+interrupts.while_importing()
 
 
 def __getattr__(name: str) -> "type[Localizer]":

@@ -2,20 +2,13 @@
 
 import argparse
 import difflib
-import os
-import signal
 import sys
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from threading import Timer
 
-from . import logger
+from . import interrupts, logger
 
 NEAREST = 8  # names shown in place of an unknown one
-INTERRUPTED = "Interrupted. The same command, but for any --overwrite, goes on from here."
-STOPS = (signal.SIGINT, signal.SIGTERM)
-REPEATED = 2.0  # seconds: `timeout` for one sends a signal twice
 
 
 class InputError(ValueError):
@@ -28,60 +21,18 @@ def run(main: Callable[[], None]) -> None:
     Ctrl-C, and a SIGTERM as of Slurm, end it as an error would, so that what is done is written.
     """
     try:
-        for number in STOPS:
-            signal.signal(number, _stop)
-        sys.unraisablehook = _unraisable
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
+        interrupts.hear()
         # argparse would call a module by its file
         if spec := sys.modules["__main__"].__spec__:
             sys.argv[0] = f"python -m {spec.name.removesuffix('.__main__')}"
         main()
+        if spec and spec.name.startswith(interrupts.COMMANDS):
+            interrupts.ignore()
     except (InputError, OSError) as error:
         logger.error(error)
         sys.exit(2)
     except KeyboardInterrupt as interrupt:
-        for number in STOPS:
-            signal.signal(number, signal.SIG_IGN)
-        logger.error(INTERRUPTED)
-        sys.exit(128 + (interrupt.args[0] if interrupt.args else signal.SIGINT))
-
-
-_stopped = -REPEATED  # the time of the last signal
-
-
-def _stop(number: int, _) -> None:
-    """Interrupt the main thread, but not while it writes what is done because of the same."""
-    global _stopped
-    if time.monotonic() - _stopped > REPEATED:
-        _stopped = time.monotonic()
-        raise KeyboardInterrupt(number)
-
-
-def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Interrupt once more where Python has ignored it, as in a destructor."""
-    global _stopped
-    if isinstance(unraisable.exc_value, KeyboardInterrupt):
-        _stopped = -REPEATED
-        Timer(0.1, os.kill, (os.getpid(), *unraisable.exc_value.args)).start()  # not in here
-    else:
-        sys.__unraisablehook__(unraisable)
-
-
-def while_importing() -> None:
-    """Have Ctrl-C end `python -m` without a traceback in the seconds before `run` is called.
-
-    A SIGTERM, which pycolmap would answer with a trace of its stack, waits for that.
-    """
-    # so it is while python looks for the module
-    name = sys.orig_argv[-len(sys.argv)] if sys.argv[:1] == ["-m"] else ""
-    if name.startswith(("hloc_reduce.", "pipelines.")):
-        signal.signal(signal.SIGINT, _quit)
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
-
-
-def _quit(number: int, _) -> None:
-    logger.error(INTERRUPTED)
-    os._exit(128 + number)  # an exception would be any import's to handle
+        interrupts.end(interrupt)
 
 
 def choose(kind: str, name: str, names: Iterable[str]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 
 from .cli import InputError
+from .interrupts import interruptible
 from .parsers import check_names
 
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
@@ -248,7 +249,7 @@ def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
     """Estimate the two-view geometries of the matches of a database, with hloc's options."""
     options = {"ransac": {"max_num_trials": 20000, "min_inlier_ratio": 0.1, "random_seed": 0}}
     with _log(verbose):
-        pycolmap.verify_matches(database, pairs, options=options)
+        interruptible(pycolmap.verify_matches, database, pairs, options=options)
 
 
 def triangulate_points(
@@ -267,13 +268,8 @@ def triangulate_points(
         if opened.num_inlier_matches() == 0:
             return pycolmap.Reconstruction()
     with _log(verbose), _full_disk(output):
-        return pycolmap.triangulate_points(
-            reference,
-            database,
-            image_dir,
-            output,
-            options=options,
-        )
+        inputs = reference, database, image_dir, output
+        return interruptible(pycolmap.triangulate_points, *inputs, options=options)
 
 
 def incremental_mapping(
@@ -286,7 +282,8 @@ def incremental_mapping(
     """Reconstruct the images of a database of verified matches, the largest model first."""
     output.mkdir()
     with _log(verbose), _full_disk(output):
-        models = pycolmap.incremental_mapping(database, image_dir, output, options=options)
+        inputs = database, image_dir, output
+        models = interruptible(pycolmap.incremental_mapping, *inputs, options=options)
     return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
 

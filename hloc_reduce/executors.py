@@ -21,6 +21,7 @@ from . import parallel, processes
 from .cli import InputError
 
 Item, Result = TypeVar("Item"), TypeVar("Result")
+Work = Callable[[Iterable[Item]], Iterator[Result]]
 BACKLOG = 2  # chunks for each worker that are handed out
 RETRIES = 20  # of a chunk whose machine is gone
 TIMEOUT = 10  # seconds to wait for a Ray cluster
@@ -30,11 +31,7 @@ class Executor(Protocol):
     """Does work."""
 
     def map(
-        self,
-        work: Callable[[Iterable[Item]], Iterator[Result]],
-        items: Iterable[Item],
-        size: int,
-        gpu: bool = False,
+        self, work: Work, items: Iterable[Item], size: int, gpu: bool = False
     ) -> Iterator[Result]:
         """Yield what work makes of items, in any order.
 
@@ -54,11 +51,7 @@ class Serial:
     """Does work in this process, with threads on all of its cores."""
 
     def map(
-        self,
-        work: Callable[[Iterable[Item]], Iterator[Result]],
-        items: Iterable[Item],
-        size: int,
-        gpu: bool = False,
+        self, work: Work, items: Iterable[Item], size: int, gpu: bool = False
     ) -> Iterator[Result]:
         """Yield what work makes of items, as `Executor.map`."""
         return work(items)
@@ -85,11 +78,7 @@ class Pool:
         self.submit, self.workers, self.gpu = submit, workers, gpu
 
     def map(
-        self,
-        work: Callable[[Iterable[Item]], Iterator[Result]],
-        items: Iterable[Item],
-        size: int,
-        gpu: bool = False,
+        self, work: Work, items: Iterable[Item], size: int, gpu: bool = False
     ) -> Iterator[Result]:
         """Yield what work makes of items, as `Executor.map`, chunk by chunk as they are done."""
         if gpu and self.gpu is not None:
@@ -121,9 +110,7 @@ class Pool:
                 future.cancel()
 
 
-def _all(
-    work: Callable[[Iterable[Item]], Iterator[Result]], items: list[Item]
-) -> list[Result] | InputError:
+def _all(work: Work, items: list[Item]) -> list[Result] | InputError:
     """Return what work makes of items, or its error, which a cluster would wrap in its own."""
     try:
         return list(work(items))

@@ -2,6 +2,11 @@
 
 import csv
 import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -289,3 +294,42 @@ def test_a_dry_run_shows_the_steps_and_writes_nothing(aachen_layout, run_batch, 
         *("retrieval", "match_map", "triangulation", "match_queries", "localization")
     ]
     assert lines[3][3:5] == ["12", "pairs"] and lines[5][3:5] == ["12", "pairs"]
+
+
+@pytest.mark.long
+def test_a_batch_that_is_killed_again_and_again_goes_on(aachen_layout, tmp_path):
+    grid = {"dataset": str(aachen_layout), "feature": ["sift_sv64", "sift_sv16", "colmap_sift"]}
+    job_file = write(tmp_path / "jobs.yaml", json.dumps({"jobs": [grid]}))
+
+    def run(outputs, limit=None):
+        command_line = [sys.executable, "-m", "pipelines.batch", job_file, "--outputs", outputs]
+        process = subprocess.Popen(command_line, stderr=-1, stdout=-1, start_new_session=True)
+        try:
+            process.communicate(timeout=limit)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+        return process.returncode
+
+    assert run(tmp_path / "whole") == 0
+    draw, kills = random.Random(0), 0
+    for _ in range(20):
+        code = run(tmp_path / "killed", draw.uniform(3, 12))
+        kills += code == -signal.SIGKILL
+        if code == 0:
+            shutil.rmtree(tmp_path / "killed")
+    assert kills >= 10
+    assert run(tmp_path / "killed") == 0
+    whole, killed = (
+        {
+            path.relative_to(tmp_path / name): path.read_text()
+            for pattern in ("queries.csv", "*_hloc_*.txt", "pairs*.txt", "failures.csv")
+            for path in (tmp_path / name).rglob(pattern)
+        }
+        for name in ("whole", "killed")
+    )
+    assert whole == killed and len(whole) == 3 * 4 + 2
+    for path in (tmp_path / "whole").rglob("*.h5"):
+        other = tmp_path / "killed" / path.relative_to(tmp_path / "whole")
+        assert command.contents(path) == command.contents(other)
+    assert not [path for path in (tmp_path / "killed").rglob("*.tmp")]

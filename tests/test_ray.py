@@ -1,17 +1,18 @@
 """A batch on a Ray cluster of several nodes: the same results, also when one is removed."""
 
+import json
 import os
 import sys
 import threading
 import time
 
 import pytest
-from command import results
+from command import contents, results
 
-from hloc_reduce import extract_features, match_features
+from hloc_reduce import demo, extract_features, match_features
 from hloc_reduce.cli import InputError
-from hloc_reduce.executors import SERIAL, ray_cluster
-from pipelines import aachen
+from hloc_reduce.executors import SERIAL, processes_of_this_machine, ray_cluster
+from pipelines import aachen, batch
 
 ray = pytest.importorskip("ray")
 
@@ -78,3 +79,31 @@ def test_a_pipeline_is_the_same(cluster, aachen_layout, tmp_path, monkeypatch):
         aachen.main(aachen_layout, tmp_path / "ray/run", "sift_sv32", executor=executor)
     removed.join()
     assert results(tmp_path / "serial/run") == results(tmp_path / "ray/run")
+
+
+@pytest.mark.long
+def test_a_grid_of_real_photos_and_the_demo_is_the_same(
+    cluster, herz_jesus, base_weights, tmp_path, monkeypatch
+):
+    base_weights("mkd")
+    demo.main(tmp_path / "demo_town")
+    grid = {
+        "dataset": [str(herz_jesus), str(tmp_path / "demo_town")],
+        "feature": {"descriptor": ["sift", "mkd"], "scheme": "sv", "dim": [64, 16]},
+    }
+    job_file = tmp_path / "grid.yaml"
+    job_file.write_text(json.dumps({"jobs": [grid]}))
+    with processes_of_this_machine() as executor:
+        rows = batch.main(job_file, tmp_path / "processes", executor=executor)
+    with ray_cluster(cluster.address) as executor:
+        on_ray = batch.main(job_file, tmp_path / "ray", executor=executor)
+    recall = [
+        [(row["job"], row["list"], row["recall_percent"]) for row in r] for r in (rows, on_ray)
+    ]
+    assert recall[0] == recall[1] and len(recall[0]) == 2 * 4 * 2 * 3
+    for place in (herz_jesus.name, "demo_town"):
+        for path in (tmp_path / "ray" / place).glob("*/queries.csv"):
+            other = tmp_path / "processes" / path.relative_to(tmp_path / "ray")
+            assert path.read_text() == other.read_text()
+        for path in (tmp_path / "ray" / place / "shared").glob("feats*.h5"):
+            assert contents(path) == contents(tmp_path / "processes" / place / "shared" / path.name)
