@@ -117,6 +117,8 @@ def read(path: Path) -> dict:
     projection = model.get("projection", "" if model["name"] == "reduced" else None)
     if projection is not None and not (isinstance(projection, str) and projection):
         raise InputError(f"{path}: the {model['name']} model names no projection.")
+    if projection and Path(projections.split_prefix(projection)[0]).suffix:
+        model = {**model, "projection": str(Path(projection).absolute())}  # other machines read it
     given = content.get("preprocessing") or {}
     if not isinstance(given, dict):
         raise InputError(f"{path}: preprocessing cannot be {given!r}.")

@@ -102,7 +102,7 @@ def table(tables: list[dict]) -> str:
     lines = [["", "bytes", *(found["list"] for found in tables)]]
     for unit, place in (("distance [m]", 0), ("orient. [deg]", 1)):
         limits = [[limit[place] for limit in found["thresholds"]] for found in tables]
-        lines.append([unit, "", *(_joined(values, "g") for values in limits)])
+        lines.append([unit, "", *(results.joined(values, "g") for values in limits)])
     compared = dict.fromkeys(row["run"].label for found in tables for row in found["rows"])
     for label in compared:
         of_lists = [
@@ -110,17 +110,12 @@ def table(tables: list[dict]) -> str:
             for found in tables
         ]
         (size,) = {row["run"].bytes for row in of_lists if row}
-        recall = (_joined(row and row["recall"], ".1f") for row in of_lists)
+        recall = (results.joined(row and row["recall"], ".1f") for row in of_lists)
         lines.append([label, str(size), *recall])
-        paper = [_joined(row and row["paper"], ".1f") for row in of_lists]
+        paper = [results.joined(row and row["paper"], ".1f") for row in of_lists]
         if set(paper) != {"-"}:
             lines.append(["  in the paper", "", *paper])
     return results.aligned(lines)
-
-
-def _joined(values: list[float] | None, kind: str) -> str:
-    known = [value for value in values or () if value is not None]
-    return " / ".join(format(value, kind) for value in known) or "-"
 
 
 def _main() -> None:

@@ -48,12 +48,16 @@ class Aachen:
             missing += [folder / name for name in absent if folder.is_dir()]
         _refuse(self.root, missing, AACHEN_SOURCE)
 
-    def check_images(self, names: list[str]) -> None:
+    def check(self, map_names: list[str]) -> None:
         """Check that the folders of all images are there, before any work is done.
+
+        Args:
+            map_names: the map images that are needed.
 
         Raises:
             InputError: naming every folder that is missing.
         """
+        names = [*map_names, *self.query_names()]
         folders = sorted({(self.images / name).parent for name in names})
         missing = [folder for folder in folders if not folder.is_dir()]
         _refuse(self.root, missing, AACHEN_SOURCE)
@@ -149,14 +153,17 @@ class InLoc:
             raise InputError(f"{self.cutouts} has no <floor>/<scan>/<building>_cutout_*.jpg.")
         return [path.relative_to(self.root).as_posix() for path in paths]
 
-    def check_scans(self, names: list[str]) -> None:
+    def check(self, map_names: list[str]) -> None:
         """Check that the scans of cutouts are there, before any work is done.
+
+        Args:
+            map_names: the cutouts that are needed.
 
         Raises:
             InputError: naming a file that is missing.
         """
-        files = {self.root / f"{name}.mat" for name in names}
-        files |= {scans.transformation_file(self.root, name) for name in names}
+        files = {self.root / f"{name}.mat" for name in map_names}
+        files |= {scans.transformation_file(self.root, name) for name in map_names}
         missing = sorted(file for file in files if not file.is_file())
         if missing:
             raise InputError(

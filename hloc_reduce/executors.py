@@ -12,6 +12,7 @@ import socket
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from itertools import islice
 from typing import Protocol, TypeVar
 
@@ -67,6 +68,8 @@ class Pool:
         submit: hands a function and its arguments to a process.
         workers: tells how many processes there are.
         gpu: does the work that uses a GPU; default: the same.
+        cancel: ends what was handed out.
+        broken: errors of processes and machines.
     """
 
     def __init__(
@@ -74,8 +77,11 @@ class Pool:
         submit: Callable[..., Future],
         workers: Callable[[], int],
         gpu: Executor | None = None,
+        cancel: Callable[[Future], object] = Future.cancel,
+        broken: tuple[type[Exception], ...] = (),
     ):
         self.submit, self.workers, self.gpu = submit, workers, gpu
+        self.cancel, self.broken = cancel, broken
 
     def map(
         self, work: Work, items: Iterable[Item], size: int, gpu: bool = False
@@ -105,9 +111,12 @@ class Pool:
                 "A process was killed, perhaps for want of memory: try fewer, for example with "
                 "OMP_NUM_THREADS=1. What is written is kept."
             ) from None
+        except self.broken as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise InputError(f"The cluster gave up ({reason}). What is written is kept.") from None
         finally:
             for future in pending:
-                future.cancel()
+                self.cancel(future)
 
 
 def _all(work: Work, items: list[Item]) -> list[Result] | InputError:
@@ -136,8 +145,8 @@ def processes_of_this_machine(workers: int | None = None) -> Iterator[Pool]:
 def ray_cluster(address: str | None = None) -> Iterator[Pool]:
     """Use a Ray cluster for the time of a block: a process of one thread on each of its cores.
 
-    Work that uses a GPU is done where there are some. What a machine that is gone had to do is done
-    by another.
+    If it has GPUs at first, work that uses one is done there only. What a machine that is gone had
+    to do is done by another.
 
     Args:
         address: as of `ray.init`; default: that of the environment variable RAY_ADDRESS, or else a
@@ -151,31 +160,45 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
     except ImportError:
         raise InputError("Ray is not installed: pip install 'hloc-reduce[ray]'.") from None
     handler = signal.getsignal(signal.SIGTERM)
-    address = address or os.environ.get("RAY_ADDRESS")
+    address = address or os.environ.get("RAY_ADDRESS") or "local"
     try:
-        if match := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address or ""):
-            # Ray itself would try for minutes
-            socket.create_connection((match[1], int(match[2])), timeout=TIMEOUT).close()
-        ray.init(address, include_dashboard=False, logging_level="warning")
-    except (OSError, ValueError, OverflowError, RuntimeError) as error:
-        raise InputError(f"The Ray cluster {address} does not answer ({error}).") from None
-    signal.signal(signal.SIGTERM, handler)  # Ray sets its own
+        try:
+            if match := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
+                # Ray itself would try for minutes
+                socket.create_connection((match[1], int(match[2])), timeout=TIMEOUT).close()
+            ray.init(
+                address,
+                include_dashboard=False,
+                logging_level="warning",
+                runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}},
+                **({"num_cpus": parallel.cores()} if address == "local" else {}),
+            )
+        except (OSError, ValueError, OverflowError, RuntimeError) as error:
+            raise InputError(f"The Ray cluster {address} does not answer ({error}).") from None
+        signal.signal(signal.SIGTERM, handler)  # Ray sets its own
+        task = ray.remote(_all)
+        running: dict[Future, ray.ObjectRef] = {}
 
-    def submit(function: Callable, *arguments: object, **resources: int) -> Future:
-        task = ray.remote(function).options(num_cpus=1, max_retries=RETRIES, **resources)
-        return task.remote(*arguments).future()
+        def start(number_of_gpus: int, _: Callable, *arguments: object) -> Future:
+            options = {"num_cpus": 1, "num_gpus": number_of_gpus, "max_retries": RETRIES}
+            reference = task.options(**options).remote(*arguments)
+            future = reference.future()
+            running[future] = reference
+            future.add_done_callback(lambda done: running.pop(done, None))
+            return future
 
-    def number(kind: str) -> int:
-        return int(ray.cluster_resources().get(kind, 0))
+        def number(kind: str) -> int:
+            return int(ray.cluster_resources().get(kind, 0)) or 1
 
-    gpu = None
-    if number("GPU"):
-        gpu = Pool(lambda *given: submit(*given, num_gpus=1), lambda: number("GPU") or 1)
-    try:
-        yield Pool(submit, lambda: number("CPU") or 1, gpu)
-    except ray.exceptions.RayError as error:
-        reason = str(error).strip().splitlines()[-1]
-        raise InputError(f"Ray gave up ({reason}). What is written is kept.") from None
+        def cancel(future: Future) -> None:
+            if reference := running.get(future):
+                ray.cancel(reference)
+
+        how = {"cancel": cancel, "broken": (ray.exceptions.RayError,)}
+        gpu = None
+        if "GPU" in ray.cluster_resources():
+            gpu = Pool(partial(start, 1), partial(number, "GPU"), **how)
+        yield Pool(partial(start, 0), partial(number, "CPU"), gpu, **how)
     finally:
         ray.shutdown()
 

@@ -64,15 +64,16 @@ class GroupWriter:
             path.unlink(missing_ok=True)
         self.names = _Names()
         self.expected: dict[str, str] = {}  # pieces of other processes, and a group of each
-        header = {"conf": json.dumps(conf, sort_keys=True), "id": uuid.uuid4().hex}
+        header = {"conf": json.dumps(conf, sort_keys=True)}
         for part in [path] * path.exists() + self._pieces():
             with open_h5(part) as file:
                 _check(file, part, header["conf"])
-                header["id"] = file.attrs.get("id", header["id"])
+                header.setdefault("id", file.attrs.get("id", uuid.uuid4().hex))
                 failed = _failed(file)
                 for name in iterate_h5_names(file.id):
                     if name not in failed:
                         self.names.add(name)
+        header.setdefault("id", uuid.uuid4().hex)
         self.header = header
         self.new_pieces = partial(Pieces, self.folder, header, compression)
         self.added = self.new_pieces()
@@ -145,10 +146,13 @@ class GroupWriter:
         return self._pieces()
 
     def _has_news(self, piece: Path) -> bool:
-        """Return whether a piece has what the file has not, or has as a failure."""
+        """Return whether a piece has what the file has not, or has as another failure."""
         with open_h5(piece) as new, open_h5(self.path) as old:
-            done = _failed(old) - _failed(new)
-            return any(name in done or name not in old for name in iterate_h5_names(new.id))
+            known = _failed(old)
+            return any(
+                name not in old or name in known and _reason(new, name) != _reason(old, name)
+                for name in iterate_h5_names(new.id)
+            )
 
 
 @dataclass
@@ -305,6 +309,10 @@ def failures(path: Path) -> dict[str, str]:
         return {name: str(file[name].attrs[FAILURE]) for name in sorted(_failed(file))}
 
 
+def _reason(file: h5py.File, name: str) -> str | None:
+    return file[name].attrs.get(FAILURE)
+
+
 def _failed(file: h5py.File) -> set[str]:
     return set(json.loads(file.attrs.get(FAILURES, "[]")))
 
@@ -316,14 +324,15 @@ def _set_failed(file: h5py.File, names: set[str]) -> None:
 
 def _merge_piece(piece: h5py.File, merged: h5py.File) -> None:
     """Add what a piece has and a file has not, or has as a failure."""
-    failed = _failed(merged)
-    mended = {name for name in failed - _failed(piece) if name in piece}
-    for name in mended:
+    failed, again = _failed(merged), _failed(piece)
+    for name in {name for name in failed if name in piece}:
         del merged[name]
-        merged.attrs["id"] = uuid.uuid4().hex
-    new = {name for name in _failed(piece) if name not in merged}
+        if name not in again:
+            failed.remove(name)
+            merged.attrs["id"] = uuid.uuid4().hex
+    failed |= {name for name in again if name not in merged}
     _copy_missing(piece, merged)
-    _set_failed(merged, failed - mended | new)
+    _set_failed(merged, failed)
 
 
 def _copy_missing(source: h5py.Group, target: h5py.Group) -> None:

@@ -37,6 +37,8 @@ def replacing(path: Path) -> Iterator[Path]:
         filecmp.clear_cache()  # which goes by sizes and times
         if path.exists() and filecmp.cmp(temporary, path, shallow=False):
             shutil.copystat(path, temporary)
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())  # else a power cut may leave an empty file
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -84,6 +86,8 @@ class Lock:
             raise InputError(f"Another run is at work in {folder} ({who}).") from None
         except OSError as error:
             logger.warning("%s cannot be locked (%s): start no second run in it.", folder, error)
+        for left in folder.glob(".*.tmp"):  # by a killed run: only who has the lock makes these
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
         with suppress(OSError):  # of a full disk: it is locked all the same
             self.file.truncate(0)
             self.file.write(f"process {os.getpid()} on {platform.node()}")

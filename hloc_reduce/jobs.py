@@ -11,6 +11,7 @@
 Options are those of `pipelines.aachen` and `pipelines.inloc`.
 """
 
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
@@ -27,6 +28,7 @@ from .parsers import read_yaml
 from .storage import STORAGES
 
 SHIPPED = Path(confs.__file__).parent / "jobs"
+SHARED = "shared"  # the folder of what the jobs of a data set have in common
 NAME_PARTS = ("descriptor", "scheme", "dim")  # of the name of a feature
 
 
@@ -85,7 +87,8 @@ def read(path: Path) -> tuple[Path, list[Job]]:
         InputError: when it is none.
     """
     shipped = SHIPPED / path.name
-    path = shipped if not path.exists() and shipped.exists() else path
+    if not path.exists() and shipped.exists() and path.parent in (Path(), Path("confs/jobs")):
+        path = shipped
     content = read_yaml(path)
     try:
         content = _mapping("a job file", content, ("outputs", "jobs", "exclude"))
@@ -96,7 +99,12 @@ def read(path: Path) -> tuple[Path, list[Job]]:
         outputs = content.get("outputs", f"outputs/{path.stem}")
         if not isinstance(outputs, str):
             raise InputError(f"outputs is a folder, not {outputs!r}.")
+        for item in excluded:
+            if not any(_agrees(job, item) for job in found):
+                raise InputError(f"no job is excluded by {item}.")
         jobs = [job for job in dict.fromkeys(found) if not any(_agrees(job, e) for e in excluded)]
+        if found and not jobs:
+            raise InputError(f"all {len(found)} jobs are excluded.")
         _check(jobs)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -107,7 +115,8 @@ def by_dataset(jobs: Iterable[Job]) -> dict[Path, list[Job]]:
     """Group jobs by data set."""
     groups: dict[Path, list[Job]] = {}
     for job in jobs:
-        groups.setdefault(job.dataset, []).append(job)
+        # links keep their names
+        groups.setdefault(Path(os.path.abspath(job.dataset)), []).append(job)
     return groups
 
 
@@ -119,6 +128,8 @@ def _expand(grid: object) -> Iterator[Job]:
     axes = {name: _list(value) for name, value in grid.items()}
     if "feature" in axes:
         axes["feature"] = [name for item in axes["feature"] for name in _features(item)]
+    if empty := [name for name, values in axes.items() if not values]:
+        raise InputError(f"{empty[0]} of a grid of jobs has no value.")
     for values in product(*axes.values()):
         yield _job(dict(zip(axes, values, strict=True)))
 
@@ -142,7 +153,11 @@ def _job(options: dict) -> Job:
             raise InputError(f"{name} is {value!r}: a {'number' if number else 'name'} is needed.")
         if number and value < 1:
             raise InputError(f"{name} is {value}: at least 1.")
-    paths = {name: Path(options[name]) for name in ("dataset", "ground_truth") if name in options}
+    paths = {
+        name: Path(os.path.normpath(options[name]))
+        for name in ("dataset", "ground_truth")
+        if name in options
+    }
     job = Job(**options | paths)
     features_confs.get(job.feature, storage=job.storage)
     cli.choose("matcher", job.matcher, matchers_confs.confs)
@@ -161,9 +176,18 @@ def _check(jobs: list[Job]) -> None:
     """Refuse that there is no job, or that two would have the same folder."""
     if not jobs:
         raise InputError("there is no job.")
+    datasets: dict[str, Path] = {}
     folders: dict[tuple[str, str], Job] = {}
     for job in jobs:
-        other = folders.setdefault((job.dataset.resolve().name, job.name), job)
+        path = Path(os.path.abspath(job.dataset))
+        if datasets.setdefault(path.name, path) != path:
+            raise InputError(
+                f"{path} and {datasets[path.name]} would have the same folder: rename one, or use "
+                "two job files."
+            )
+        if job.name == SHARED:
+            raise InputError(f"a feature cannot be called {SHARED}: rename {job.feature}.")
+        other = folders.setdefault((path.name, job.name), job)
         if other != job:
             differ = [name for name in OPTIONS if getattr(other, name) != getattr(job, name)]
             raise InputError(

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from . import cli, colmap, logger, parallel
 from .cli import InputError
 from .executors import SERIAL, Executor
+from .group_writer import FAILURE
 from .io import (
     find_pair,
     get_colmap_keypoints,
@@ -266,7 +267,7 @@ def _check_sizes(feature_file: h5py.File, queries: list[tuple[str, pycolmap.Came
     """Warn of intrinsics that are for photos of another size."""
     wrong = []
     for name, camera in queries:
-        if f"{name}/image_size" in feature_file:
+        if f"{name}/image_size" in feature_file and FAILURE not in feature_file[name].attrs:
             width, height = get_image_size(feature_file, name)
             if (width, height) != (camera.width, camera.height):
                 wrong.append(f"{name} ({camera.width}x{camera.height}, not {width}x{height})")

@@ -5,7 +5,7 @@ import signal
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import BrokenExecutor, Future
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from threading import Thread
@@ -27,26 +27,37 @@ def pool(number: int) -> Iterator["_Pool"]:
     """
     for trackers in (resource_tracker, loky_tracker):
         trackers.ensure_running()  # which may unblock the signals that `submit` blocks
-    processes = _Pool(
-        number, env={"OMP_NUM_THREADS": "1"}, initializer=_end_without, initargs=(os.getpid(),)
-    )
+    processes = _Pool(number)
     try:
         yield processes
     except BaseException:
-        processes.shutdown(kill_workers=True)
+        processes.executor.shutdown(kill_workers=True)
         raise
-    processes.shutdown()
+    processes.executor.shutdown()
 
 
-class _Pool(ProcessPoolExecutor):
+class _Pool:
+    def __init__(self, number: int):
+        self.number = number
+        self.executor = self._start()
+
+    def _start(self) -> ProcessPoolExecutor:
+        env, arguments = {"OMP_NUM_THREADS": "1"}, (os.getpid(),)
+        return ProcessPoolExecutor(
+            self.number, env=env, initializer=_end_without, initargs=arguments
+        )
+
     def submit(self, function: Callable, *args) -> Future:
-        """Hand a function to a process, and start processes if need be.
+        """Hand a function to a process, and start processes if need be, also when one was killed.
 
         They inherit the mask of signals: Ctrl-C is for this process, which ends them.
         """
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
         try:
-            return super().submit(function, *args)
+            return self.executor.submit(function, *args)
+        except BrokenExecutor:
+            self.executor = self._start()
+            return self.executor.submit(function, *args)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 

@@ -112,8 +112,6 @@ class RunFolder:
         if overwrite or before is None:
             with replacing(conf_file) as temporary:
                 temporary.write_text(json.dumps(conf, indent=1))
-        for left in path.glob(".*.tmp"):  # by a killed run: only who has the lock makes such files
-            shutil.rmtree(left) if left.is_dir() else left.unlink()
 
     def seconds(self) -> dict[str, float]:
         """Return how long each stage took, all runs together."""
@@ -306,3 +304,9 @@ def aligned(lines: list[Sequence[str]], left: int = 1) -> str:
         ).rstrip()
         for line in lines
     )
+
+
+def joined(values: Sequence[float | None] | None, kind: str) -> str:
+    """Format numbers, as far as they are known, in one cell of a table."""
+    known = [value for value in values or () if value is not None]
+    return " / ".join(format(value, kind) for value in known) or "-"

@@ -54,7 +54,7 @@ def main(
     map_names = place.map_names()
     lists = {name: [query for query, _ in part] for name, part in place.query_lists().items()}
     query_names = [name for part in lists.values() for name in part]
-    place.check_images([*map_names, *query_names])
+    place.check(map_names)
     truth_file = ground_truth or place.ground_truth
     truth = true_poses(query_names, truth_file, bool(ground_truth))
     retrieved = common.retrieval_name(retrieval, num_loc)

@@ -6,6 +6,7 @@ does not stop the others; a batch that was stopped goes on where it was.
 """
 
 import argparse
+import csv
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -16,16 +17,20 @@ from hloc_reduce.cli import InputError
 from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.group_writer import failures
 from hloc_reduce.jobs import Job
+from hloc_reduce.storage import STORAGES
 
 from .shared import Shared
 
 # what --dry_run takes for granted, of keypoints as DoG finds them at 1600 pixels
 KEYPOINTS = 5000  # of an image
 FEATURE_BYTES, MATCH_BYTES, MAP_BYTES = 14, 0.75, 67  # of a keypoint but for its descriptor, ...
+HEADINGS = ("bytes/descriptor", "bytes/keypoint", "seconds", "localized")
+LIMITS = "thresholds_m_deg"  # of a list in summary.json
 COLUMNS = (
-    *("dataset", "job", "feature", "matcher", "storage", "error"),
+    *("dataset", "job", "feature", "matcher", "storage", "retrieval", "num_covis", "num_loc"),
+    "error",
     *("descriptor_bytes", "bytes_per_keypoint", "seconds", "shared_seconds"),
-    *("list", "threshold_m", "threshold_deg", "recall_percent"),
+    *("list", "queries", "localized", "threshold_m", "threshold_deg", "recall_percent"),
 )
 
 
@@ -40,8 +45,8 @@ def main(
 
     Args:
         job_file: as of `jobs.read`.
-        outputs: the folder for the results: jobs.csv, failures.csv, and for each data set a folder
-            with one for each job; default: that of the file.
+        outputs: the folder for the results: jobs.csv, jobs.txt, failures.csv, and for each data
+            set a folder with one for each job; default: that of the file.
         overwrite: begin anew.
         strict: stop the jobs of a data set at an image that cannot be read. Else it counts as one
             without keypoints, is listed in failures.csv, and read again by a later run.
@@ -59,10 +64,11 @@ def main(
     cli.check_folder(outputs)
     lock = io.Lock(outputs)
     try:
-        rows, unreadable, tables = [], [], []
-        for shared in plan(all_jobs, outputs):
+        done: list[tuple[Shared, dict[Job, dict]]] = []
+        for shared in list(plan(all_jobs, outputs)):
+            summaries: dict[Job, dict] = {}
+            done.append((shared, summaries))
             shared.main(executor, strict, overwrite)
-            summaries = {}
             for job in shared.running():
                 logger.info("%s, %s:", shared.dataset.name, job.name)
                 with shared.failing([job]):
@@ -79,24 +85,52 @@ def main(
                         features=shared.features[job],
                         **job.numbers,
                     )
-            rows += [row for job in shared.jobs for row in job_rows(shared, job, summaries)]
-            unreadable += unreadable_images(shared)
-            tables.append(table(shared, summaries))
-            io.write_csv(rows, outputs / "jobs.csv", COLUMNS)
-            io.write_csv(unreadable, outputs / "failures.csv", ("dataset", "image", "reason"))
+                write_tables(done, outputs)
+        rows, text = write_tables(done, outputs)
     finally:
         lock.release()
-    print("\n\n".join(tables))
-    if unreadable:
-        logger.warning("%d images could not be read: %s", len(unreadable), outputs / "failures.csv")
+    print(text)
+    logger.info("The tables are %s and jobs.txt.", outputs / "jobs.csv")
     return rows
+
+
+def write_tables(
+    done: list[tuple[Shared, dict[Job, dict]]], outputs: Path
+) -> tuple[list[dict], str]:
+    """Write jobs.csv, jobs.txt and failures.csv, and return what is in the first two.
+
+    jobs.csv keeps the rows of other jobs.
+    """
+    rows = [row for shared, summaries in done for row in job_rows(shared, summaries)]
+    over = {(row["dataset"], row["job"]) for row in rows}
+    before = [
+        row for row in read_rows(outputs / "jobs.csv") if (row["dataset"], row["job"]) not in over
+    ]
+    unreadable = [row for shared, _ in done for row in unreadable_images(shared)]
+    texts = [table(shared, summaries) for shared, summaries in done]
+    if unreadable:
+        texts.append(f"{len(unreadable)} images could not be read: {outputs / 'failures.csv'}")
+    text = "\n\n".join(texts)
+    io.write_csv(before + rows, outputs / "jobs.csv", COLUMNS)
+    io.write_csv(unreadable, outputs / "failures.csv", ("dataset", "image", "reason"))
+    with io.replacing(outputs / "jobs.txt") as temporary:
+        temporary.write_text(f"{text}\n", encoding="utf-8")
+    return rows, text
+
+
+def read_rows(path: Path) -> list[dict]:
+    """Read the rows of an earlier jobs.csv, none if it is of another version."""
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        return list(reader) if tuple(reader.fieldnames or ()) == COLUMNS else []
 
 
 def plan(all_jobs: list[Job], outputs: Path) -> Iterator[Shared]:
     """Yield the jobs of each data set, checked."""
     for dataset, of_dataset in jobs.by_dataset(all_jobs).items():
-        dataset = dataset.resolve()
-        yield Shared(dataset, of_dataset, outputs / dataset.name / "shared")
+        yield Shared(dataset, of_dataset, outputs / dataset.name / jobs.SHARED)
 
 
 def folder_of(shared: Shared, job: Job) -> Path:
@@ -116,123 +150,127 @@ def unreadable_images(shared: Shared) -> list[dict]:
     ]
 
 
-def job_rows(shared: Shared, job: Job, summaries: Mapping[Job, dict]) -> Iterator[dict]:
-    """Yield the rows of a job in jobs.csv."""
-    row = {
-        **dict.fromkeys(COLUMNS),
-        "dataset": shared.dataset.name,
-        "job": job.name,
-        "feature": Path(job.feature).stem,
-        "matcher": job.matcher,
-        "storage": job.storage,
-    }
-    if job not in summaries:
-        yield row | {"error": " ".join(str(shared.failed[job]).split())}
-        return
-    summary = summaries[job]
-    row |= {
+def job_rows(shared: Shared, summaries: Mapping[Job, dict]) -> Iterator[dict]:
+    """Yield the rows of jobs.csv of the jobs that are over."""
+    for job in shared.jobs:
+        row = {
+            **dict.fromkeys(COLUMNS),
+            "dataset": shared.dataset.name,
+            "job": job.name,
+            "feature": Path(job.feature).stem,
+            "matcher": job.matcher,
+            "storage": job.storage,
+            "retrieval": job.retrieval,
+        }
+        if job in shared.features:
+            row |= shared.numbers(job)
+        if job in shared.failed:
+            yield row | {"error": one_line(shared.failed[job])}
+        elif job in summaries:
+            yield from _recall_rows(row, summaries[job], sum(shared.seconds().values()))
+
+
+def _recall_rows(row: dict, summary: dict, shared_seconds: float) -> Iterator[dict]:
+    """Yield the rows of a job, one for each list and threshold."""
+    row = row | {
         "descriptor_bytes": summary["bytes_per_keypoint"]["descriptor"],
         "bytes_per_keypoint": summary["bytes_per_keypoint"]["feature_file"],
         "seconds": round(sum(summary["seconds"].values()), 1),
-        "shared_seconds": round(sum(shared.seconds().values()), 1),
+        "shared_seconds": round(shared_seconds, 1),
     }
     for name, found in summary["lists"].items():
-        known = zip(found.get("thresholds_m_deg", ()), found.get("recall_percent", ()), strict=True)
+        known = zip(found.get(LIMITS, ()), found.get("recall_percent", ()), strict=True)
         for (metres, degrees), recall in list(known) or [((None, None), None)]:
-            values = name, metres, degrees, recall
-            yield row | dict(zip(COLUMNS[-4:], values, strict=True))
+            values = name, found["queries"], found["localized"], metres, degrees, recall
+            yield row | dict(zip(COLUMNS[-6:], values, strict=True))
 
 
 def table(shared: Shared, summaries: Mapping[Job, dict]) -> str:
     """Format what came out of the jobs of a data set, with a line for each."""
-    lists = next(iter(summaries.values()))["lists"] if summaries else {}
-    limits = [
-        list(zip(*found.get("thresholds_m_deg", ()), strict=True)) for found in lists.values()
-    ]
-    lines = [
-        [shared.dataset.name, "bytes", "bytes/keypoint", "seconds", *lists],
-        [
-            "distance [m]",
-            "",
-            "",
-            "",
-            *(_joined(limit[0], "g") if limit else "" for limit in limits),
-        ],
-        [
-            "orient. [deg]",
-            "",
-            "",
-            "",
-            *(_joined(limit[1], "g") if limit else "" for limit in limits),
-        ],
-    ]
+    lists = {name: found for s in summaries.values() for name, found in s["lists"].items()}
+    lines = [[shared.dataset.name, *HEADINGS, *lists]]
+    for label, place in (("distance [m]", 0), ("orient. [deg]", 1)):
+        limits = ([m_deg[place] for m_deg in found.get(LIMITS, ())] for found in lists.values())
+        lines.append([label, *[""] * 4, *(results.joined(values, "g") for values in limits)])
     for job, summary in summaries.items():
         size = summary["bytes_per_keypoint"]
+        recall = (summary["lists"].get(name, {}).get("recall_percent") for name in lists)
         lines.append(
             [
                 job.name,
                 str(size["descriptor"]),
                 str(size["feature_file"]),
                 f"{sum(summary['seconds'].values()):.1f}",
-                *(
-                    _joined(found.get("recall_percent", ()), ".1f")
-                    or f"{found['localized']} localized"
-                    for found in summary["lists"].values()
-                ),
+                f"{summary['queries_localized']} of {summary['queries']}",
+                *(results.joined(values, ".1f") for values in recall),
             ]
         )
-    common = [f"{name} {seconds:.1f} s" for name, seconds in shared.seconds().items()]
-    said = [f"in common: {', '.join(common)}"] if common else []
-    said += [
-        f"{job.name} failed: {' '.join(str(shared.failed[job]).split())}" for job in shared.failed
-    ]
-    return "\n".join([results.aligned(lines), *said] if summaries else [shared.dataset.name, *said])
+    said = [results.aligned(lines)] if summaries else [f"{shared.dataset.name}:"]
+    if seconds := shared.seconds():
+        said.append("in common: " + ", ".join(f"{name} {s:.1f} s" for name, s in seconds.items()))
+    failed = [job for job in shared.jobs if job in shared.failed]
+    said += [f"{job.name} failed: {one_line(shared.failed[job])}" for job in failed]
+    return "\n".join(said)
 
 
-def _joined(values: Iterator[float], kind: str) -> str:
-    return " / ".join(format(value, kind) for value in values)
+def one_line(error: Exception) -> str:
+    """Return what an error says, in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
-def dry_run(job_file: Path, outputs: Path | None = None) -> str:
-    """Format what `main` would do: the steps, with about how many bytes they write.
+def dry_run(job_file: Path, outputs: Path | None = None, overwrite: bool = False) -> list[str]:
+    """Print what `main` would do: the steps, with about how many bytes they write.
 
     Args:
         job_file: as of `jobs.read`.
         outputs: as of `main`.
+        overwrite: as of `main`.
+
+    Returns:
+        The jobs that cannot be run.
     """
     named, all_jobs = jobs.read(job_file)
     outputs = (outputs or named).resolve()
-    lines, total = [["data set", "step", "of", "items", "", "MB"]], 0.0
+    cli.check_folder(outputs)
+    lines, total, failed = [["data set", "step", "of", "items", "", "MB"]], 0.0, []
     for shared in plan(all_jobs, outputs):
-        for step, of, number, items, size in steps(shared) if shared.running() else ():
-            lines.append(
-                [shared.dataset.name, step, of, f"{number:,}", items, f"{size / 1e6:,.1f}"]
-            )
-            total += size
-    return (
+        failed += [f"{shared.dataset.name}/{job.name}" for job in shared.failed]
+        for step, of, number, items, size in steps(shared, overwrite):
+            if number:
+                size /= 1e6
+                lines.append([shared.dataset.name, step, of, f"{number:,}", items, f"{size:,.1f}"])
+                total += size
+    print(
         f"{results.aligned(lines, left=3)}\n"
-        f"About {total / 1e9:,.2f} GB in {outputs}, for {KEYPOINTS:,} keypoints an image. Pairs "
-        "are at most so many. What is done already is done no more."
+        f"About {total / 1e3:,.2f} GB in {outputs}, for {KEYPOINTS:,} keypoints an image. Numbers "
+        "of pairs are upper limits. What is done is left out."
     )
+    return failed
 
 
-def steps(shared: Shared) -> Iterator[tuple[str, str, int, str, float]]:
+def steps(shared: Shared, overwrite: bool) -> Iterator[tuple[str, str, int, str, float]]:
     """Yield the steps of the jobs of a data set: name, of what, how many of what items, bytes."""
-    images, queries = len(shared.images()), len(shared.query_names)
-    map_images = len(shared.map_names)
+    running = shared.running()
+    if not running:
+        return
+    map_images, queries = len(shared.map_names), len(shared.query_names)
     for group in shared.groups():
-        each = [
-            FEATURE_BYTES
-            + shared.dims[path] * np.dtype(shared.confs[path].get("storage", "float16")).itemsize
-            for path in group
-        ]
+        todo, size = set(), 0.0
+        for path in group:
+            done = path.exists() and not overwrite
+            missing = set(shared.images()) - set(io.list_h5_names(path) if done else ())
+            number_bytes = np.dtype(shared.confs[path].get("storage", STORAGES[0])).itemsize
+            each = FEATURE_BYTES + shared.dims[path] * number_bytes
+            size += len(missing) * KEYPOINTS * each
+            todo |= missing
         names = ", ".join(path.stem.removeprefix("feats-dog-") for path in group)
-        yield "extract_features", names, images, "images", images * KEYPOINTS * sum(each)
-    for path in {shared.retrieval(job) for job in shared.running() if job.retrieval == "vlad"}:
-        yield "retrieval", Path(path).stem, queries, "queries", 0
-    for job in shared.running():
-        if (folder_of(shared, job) / "summary.json").exists():
-            yield "done", job.name, queries, "queries", 0
+        yield "extract_features", names, len(todo), "images", size
+    by_vlad = [Path(shared.retrieval(job)) for job in running if job.retrieval == "vlad"]
+    for path in dict.fromkeys(by_vlad):
+        if overwrite or not path.exists():
+            yield "retrieval", path.stem.removeprefix("pairs-query-"), queries, "queries", 0
+    for job in running:
+        if (folder_of(shared, job) / "summary.json").exists() and not overwrite:
             continue
         numbers = shared.numbers(job)
         if "num_covis" in numbers:
@@ -275,15 +313,15 @@ def _main() -> None:
     cli.choose("executor", args.executor, executors.EXECUTORS)
     if args.address and args.executor != "ray":
         raise InputError("--address is of --executor ray.")
-    if args.dry_run:
-        print(dry_run(args.job_file, args.outputs))
-        return
     jobs.read(args.job_file)  # is wrong before processes are started
-    with executors.EXECUTORS[args.executor](args.address) as executor:
-        rows = main(args.job_file, args.outputs, args.overwrite, args.strict, executor)
-    failed = [f"{row['dataset']}/{row['job']}" for row in rows if row["error"]]
+    if args.dry_run:
+        failed = dry_run(args.job_file, args.outputs, args.overwrite)
+    else:
+        with executors.EXECUTORS[args.executor](args.address) as executor:
+            rows = main(args.job_file, args.outputs, args.overwrite, args.strict, executor)
+        failed = [f"{row['dataset']}/{row['job']}" for row in rows if row["error"]]
     if failed:
-        raise InputError(f"{len(failed)} jobs failed, see above: {cli.some(failed)}.")
+        raise InputError(f"Failed, as said above: {cli.some(failed)} ({len(failed)} in all).")
 
 
 if __name__ == "__main__":

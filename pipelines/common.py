@@ -166,6 +166,8 @@ def run_folder(
         "retrieval": retrieval,
         **numbers,
     }
+    if retrieval != "vlad" and outputs.resolve().parent in Path(retrieval).resolve().parents:
+        conf["retrieval"] = _placed(Path(retrieval), outputs)  # which may be moved with it
     if features is not None:
         with io.open_h5(features) as file:
             conf["features"] = file.attrs.get("id", str(features))

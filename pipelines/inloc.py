@@ -54,7 +54,7 @@ def main(
     used = common.check_retrieval(retrieval, loc_pairs, num_loc, query_names, map_names)
     if features is None:
         extract_features.list_images(dataset, [*used, *query_names])
-    place.check_scans(used)
+    place.check(used)
     truth_file = ground_truth or place.ground_truth
     truth = true_poses(query_names, truth_file, bool(ground_truth))
     lists = place.buildings(query_names, truth, used)

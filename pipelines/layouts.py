@@ -16,6 +16,8 @@ def pipeline_of(dataset: Path) -> ModuleType:
     Raises:
         InputError: when it has no layout that is known.
     """
+    if not dataset.is_dir():
+        raise InputError(f"There is no folder {dataset}.")
     for folder, pipeline in PIPELINES.items():
         if (dataset / folder).is_dir():
             return pipeline

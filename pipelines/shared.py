@@ -1,5 +1,6 @@
 """What the jobs of a batch have in common on a data set: features, and retrieval."""
 
+import errno
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -16,6 +17,7 @@ from hloc_reduce import (
     stamps,
 )
 from hloc_reduce.cli import InputError
+from hloc_reduce.datasets import true_poses
 from hloc_reduce.descriptors import DIM
 from hloc_reduce.executors import Executor
 from hloc_reduce.group_writer import GroupWriter
@@ -25,7 +27,7 @@ from hloc_reduce.storage import STORAGES
 from . import common
 from .layouts import pipeline_of
 
-FILES = "features.json"  # the ids of feature files that something else was made of
+RECORD = "shared.json"  # the ids of feature files, and the feature by which VLAD is
 
 
 class Shared:
@@ -51,6 +53,7 @@ class Shared:
         self.confs: dict[Path, dict] = {}
         self.dims: dict[Path, int] = {}
         self._used: set[str] = set()  # map images
+        self._record = stamps.read(folder / RECORD)
         with self.failing(jobs):
             self.pipeline = pipeline_of(dataset)
             self._place = self.pipeline.Place(dataset)
@@ -68,12 +71,17 @@ class Shared:
             raise InputError(f"retrieval {job.retrieval}: neither vlad nor a file that is there.")
         num_loc, names = self.numbers(job)["num_loc"], (self.query_names, self.map_names)
         used = common.check_retrieval(job.retrieval, self.folder, num_loc, *names)
+        self._place.check(used)
+        truth = job.ground_truth or self._place.ground_truth
+        true_poses(self.query_names, truth, job.ground_truth is not None)
         _, conf = features_confs.get(job.feature, storage=job.storage)
         extract_features.provenance(conf)
         project = getattr(extractors.load(conf["model"]), "project", None)
         stored = "" if job.storage == STORAGES[0] else f"-{job.storage}"
         path = self.folder / f"{conf['output']}{stored}.h5"
-        self.features[job], self.confs[path] = path, conf
+        if self.confs.setdefault(path, conf) != conf:
+            raise InputError(f"{path.name} is that of another feature, too: rename its YAML file.")
+        self.features[job] = path
         self.dims[path] = project.dim if project else DIM
         self._used |= set(self.map_names if self._place.whole_map else used)
 
@@ -83,6 +91,8 @@ class Shared:
         try:
             yield
         except Exception as error:
+            if getattr(error, "errno", None) == errno.ENOSPC:  # which is no job's own
+                raise
             logger.error(
                 "%s, %s: %s",
                 self.dataset.name,
@@ -112,10 +122,16 @@ class Shared:
         return list(groups.values())
 
     def retrieval(self, job: Job) -> str:
-        """Return the retrieval file of a job, which is by VLAD of the first feature or its own."""
+        """Return the retrieval file of a job, its own or by VLAD."""
         if job.retrieval != "vlad":
             return str(Path(job.retrieval).resolve())
-        return str(self.folder / f"pairs-query-vlad{self.numbers(job)['num_loc']}.txt")
+        name = f"pairs-query-vlad{self.numbers(job)['num_loc']}.txt"
+        return str(self.folder / f"vlad_{self._vlad_features().stem}" / name)
+
+    def _vlad_features(self) -> Path:
+        """Return the feature file of which VLAD is made: the first one, or that of before."""
+        before = self.folder / self._record.get("vlad", "")
+        return before if before in self.confs else self.features[next(iter(self.features))]
 
     def seconds(self) -> dict[str, float]:
         """Return how long each stage of `main` took, all runs together."""
@@ -132,8 +148,7 @@ class Shared:
         """
         if not self.running():
             return
-        first = self.features[self.running()[0]]
-        conf = {"dataset": str(self.dataset), "vlad": first.stem}
+        conf = {"dataset": str(self.dataset)}
         with (
             self.failing(self.running()),
             results.RunFolder(self.folder, conf, overwrite) as folder,
@@ -143,15 +158,17 @@ class Shared:
                     with self.failing([j for j in self.running() if self.features[j] in group]):
                         self._extract(group, executor, strict)
             self._drop_stale()
-            by_vlad = {
-                Path(self.retrieval(job)): self.numbers(job)["num_loc"]
-                for job in self.running()
-                if job.retrieval == "vlad"
-            }
-            with folder.stage("retrieval"):
-                for pairs, num_loc in by_vlad.items():
-                    names = self.query_names, self.map_names
-                    common.retrieve("vlad", first, pairs, num_loc, *names)
+            by_vlad = [job for job in self.running() if job.retrieval == "vlad"]
+            with folder.stage("retrieval"), self.failing(by_vlad):
+                self._retrieve(by_vlad)
+
+    def _retrieve(self, jobs: list[Job]) -> None:
+        """Retrieve by VLAD for jobs."""
+        features, names = self._vlad_features(), (self.query_names, self.map_names)
+        if jobs and features not in {self.features[job] for job in self.running()}:
+            raise InputError(f"Retrieval is by VLAD of {features.stem}, which failed.")
+        for pairs, num_loc in {(self.retrieval(j), self.numbers(j)["num_loc"]) for j in jobs}:
+            common.retrieve("vlad", features, Path(pairs), num_loc, *names)
 
     def _extract(self, paths: list[Path], executor: Executor, strict: bool) -> None:
         """Extract features whose keypoints are the same."""
@@ -167,12 +184,14 @@ class Shared:
 
     def _drop_stale(self) -> None:
         """Delete what was made of features that changed, as more images can be read now."""
-        before, now = stamps.read(self.folder / FILES), {}
+        ids = {}
         for path in {self.features[job] for job in self.running()}:
             with io.open_h5(path) as file:
-                now[path.name] = file.attrs["id"]
-        if any(before.get(name, made) != made for name, made in now.items()):
+                ids[path.name] = file.attrs["id"]
+        before = self._record.get("ids", {})
+        if any(before.get(name, made) != made for name, made in ids.items()):
             for pattern in (f"{aggregate_features.confs['vlad']['output']}*", "*-points3D.h5"):
                 for derived in self.folder.glob(pattern):
                     derived.unlink()
-        stamps.write(self.folder / FILES, before | now)
+        self._record = {"vlad": self._vlad_features().name, "ids": before | ids}
+        stamps.write(self.folder / RECORD, self._record)

@@ -1,7 +1,9 @@
 """Job files, and batches: what jobs share, what fails, what is left behind."""
 
 import csv
+import errno
 import json
+import os
 import random
 import shutil
 import signal
@@ -17,7 +19,9 @@ from hloc_reduce import aggregate_features, cli, colmap, extract_features, jobs
 from hloc_reduce.cli import InputError
 from hloc_reduce.descriptors import Descriptor
 from hloc_reduce.evaluation import published
+from hloc_reduce.jobs import Job
 from pipelines import aachen, batch
+from pipelines.shared import Shared
 
 
 def write(path, text):
@@ -53,7 +57,7 @@ def test_a_grid_with_exclusions(tmp_path):
         *("b/mkd_sv64", "a/sift+num_loc3", "a/sift+NN-mutual+num_loc3"),
     ]
     assert found[-1].numbers == {"num_loc": 3} and found[0].numbers == {}
-    assert list(jobs.by_dataset(found)) == [Path("data/a"), Path("data/b")]
+    assert list(jobs.by_dataset(found)) == [Path("data/a").absolute(), Path("data/b").absolute()]
 
 
 def test_a_job_that_is_listed_twice_is_one(tmp_path):
@@ -76,7 +80,10 @@ def test_a_job_that_is_listed_twice_is_one(tmp_path):
         ("jobs: [{dataset: a, num_loc: many}]", "num_loc is 'many': a number is needed"),
         ("jobs: [{dataset: 3}]", "dataset is 3: a name is needed"),
         ("jobs: [{dataset: a}]\nexclude: [{job: a}]", "Unknown key of what is excluded 'job'"),
-        ("jobs: [{dataset: [x/a, y/a]}]", "two jobs are called .* of a, but differ in dataset"),
+        ("jobs: [{dataset: [x/a, y/a]}]", "y/a and .*x/a would have the same folder"),
+        ("jobs: [{dataset: a, num_loc: 2, retrieval: [x/b, y/b]}]", "two jobs .* differ in retri"),
+        ("jobs: [{dataset: a, feature: [], num_loc: 3}]", "feature of a grid of jobs has no value"),
+        ("jobs: [{dataset: a}]\nexclude: [{feature: mdk}]", "no job is excluded by"),
         ("outputs: [a]\njobs: [{dataset: a}]", "outputs is a folder, not"),
         ("jobs: !!python/object/apply:os.getcwd []", "cannot be read"),
         ("jobs: [", "cannot be read"),
@@ -89,9 +96,10 @@ def test_what_is_no_job_file(text, message, tmp_path):
     assert str(error.value).startswith(str(path))
 
 
-def test_the_job_files_of_the_tables_have_all_features_of_the_paper():
+def test_the_job_files_of_the_tables_have_all_features_of_the_paper(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where they are not
     for place in ("aachen", "inloc"):
-        files = [Path("anywhere") / f"{place}_table{number}.yaml" for number in range(1, 5)]
+        files = [Path("confs/jobs") / f"{place}_table{number}.yaml" for number in range(1, 5)]
         found = [job.feature for file in files for job in jobs.read(file)[1]]
         assert sorted(found) == sorted(published.localization())
     assert names(jobs.read(Path("demo.yaml"))[1])[0] == "demo_town/sift_sv64"
@@ -126,6 +134,7 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
 
         monkeypatch.setattr(module, name, counted)
 
+    monkeypatch.setattr(extract_features.parallel, "cores", lambda: 1)  # no process detects
     count(colmap, "detect_dog")
     count(Descriptor, "forward")
     count(extract_features, "read_image")
@@ -141,7 +150,7 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
     assert sorted(path.name for path in folder.iterdir()) == sorted([*features, "shared"])
     assert not list(folder.glob("[!s]*/feats*sift.h5"))
 
-    pairs = folder / "shared/pairs-query-vlad50.txt"
+    pairs = folder / "shared/vlad_feats-dog-sift_sv64/pairs-query-vlad50.txt"
     for feature in features:
         alone = tmp_path / "alone" / feature
         aachen.main(aachen_layout, alone, feature, retrieval=str(pairs))
@@ -194,10 +203,10 @@ def test_a_job_that_fails_does_not_stop_the_others(aachen_layout, run_batch, mon
     with pytest.raises(SystemExit) as exit:
         run_batch(grid)
     assert exit.value.code == 2
-    assert "3 jobs failed, see above" in caplog.records[-1].getMessage()
+    assert "(3 in all)" in caplog.records[-1].getMessage()
     rows = table(aachen_layout.parent / "out/jobs.csv")
     errors = [(row["dataset"], row["job"], row["error"]) for row in rows if row["error"]]
-    nowhere = f"{Path('nowhere').resolve()} has neither of the folders 3D-models and database."
+    nowhere = f"There is no folder {Path('nowhere').absolute()}."
     assert errors == [
         (aachen_layout.name, "tfeat", "no tfeat"),
         ("nowhere", "tfeat", nowhere),
@@ -294,6 +303,121 @@ def test_a_dry_run_shows_the_steps_and_writes_nothing(aachen_layout, run_batch, 
         *("retrieval", "match_map", "triangulation", "match_queries", "localization")
     ]
     assert lines[3][3:5] == ["12", "pairs"] and lines[5][3:5] == ["12", "pairs"]
+
+    run_batch({**grid, "feature": "sift"})
+    run_batch({**grid, "feature": ["sift", "sift_sv16"]}, options=("--dry_run",))
+    lines = [[cell.strip() for cell in line.split("|")] for line in run_batch.printed.splitlines()]
+    assert [line[1:4] for line in lines[1:-1]] == [
+        ["extract_features", "sift, sift_sv16", "7"],
+        *([step, "sift_sv16", n] for step, n in (("match_map", "12"), ("triangulation", "4"))),
+        *([step, "sift_sv16", n] for step, n in (("match_queries", "12"), ("localization", "3"))),
+    ]
+    assert {row["job"] for row in table(outputs / "jobs.csv")} == {"sift"}
+    run_batch({**grid, "feature": "sift_sv16"})  # a narrower batch keeps the rows of others
+    assert {row["job"] for row in table(outputs / "jobs.csv")} == {"sift", "sift_sv16"}
+
+
+def test_two_features_of_one_file_name(aachen_layout, run_batch, tmp_path, caplog):
+    grids = []
+    for folder, dim in (("f1", 64), ("f2", 16)):
+        (tmp_path / folder).mkdir()
+        text = f"model: {{name: reduced, base: {{name: dog}}, projection: sift_sv{dim}}}"
+        feature = write(tmp_path / folder / "my.yaml", text)
+        grids.append({"dataset": str(aachen_layout), "feature": str(feature), "num_loc": dim})
+    with pytest.raises(SystemExit):
+        run_batch(*grids)
+    assert "my+num_loc16: feats-my.h5 is that of another feature, too" in caplog.text
+    rows = table(tmp_path / "out/jobs.csv")
+    assert {row["job"]: row["descriptor_bytes"] for row in rows} == {
+        "my+num_loc64": "128",
+        "my+num_loc16": "",
+    }
+
+
+def test_retrieval_that_fails_concerns_its_own_jobs(
+    aachen_layout, run_batch, tmp_path, monkeypatch
+):
+    own = write(tmp_path / "pairs-query-own.txt", "query/day/a.png db/0.png\n")
+    grid = {"dataset": str(aachen_layout), "feature": "sift_sv16", "retrieval": ["vlad", str(own)]}
+
+    def broken(*_):
+        raise InputError("no VLAD")
+
+    monkeypatch.setattr(aggregate_features, "main", broken)
+    with pytest.raises(SystemExit):
+        run_batch(grid)
+    rows = table(tmp_path / "out/jobs.csv")
+    assert {row["job"]: row["error"] for row in rows} == {
+        "sift_sv16": "no VLAD",
+        "sift_sv16+own": "",
+    }
+
+
+def test_another_first_feature_retrieves_as_before_and_a_moved_folder_goes_on(
+    aachen_layout, run_batch, tmp_path
+):
+    name = aachen_layout.name
+    outputs = run_batch({"dataset": str(aachen_layout), "feature": ["sift_sv16"]})
+    before = (outputs / name / "sift_sv16/queries.csv").stat().st_mtime_ns
+    run_batch({"dataset": str(aachen_layout), "feature": ["sift_sv64", "sift_sv16"]})
+    assert [path.name for path in (outputs / name / "shared").glob("vlad_*")] == [
+        "vlad_feats-dog-sift_sv16"
+    ]
+    outputs.rename(tmp_path / "moved")
+    command_line = ("--outputs", tmp_path / "moved")
+    run_batch({"dataset": str(aachen_layout), "feature": "sift_sv16"}, options=command_line)
+    assert (tmp_path / "moved" / name / "sift_sv16/queries.csv").stat().st_mtime_ns == before
+
+
+def test_a_job_without_a_list_of_another(aachen_layout, tmp_path):
+    found = {"recall_percent": [50.0], "thresholds_m_deg": [[0.25, 10]]}
+    size = {"descriptor": 32, "feature_file": 40.0}
+    found |= {"queries": 3, "localized": 2}
+    rest = {"bytes_per_keypoint": size, "seconds": {}, "queries": 3, "queries_localized": 2}
+    made = [Job(aachen_layout, "sift", num_loc=n) for n in (1, 2)]
+    shared = Shared(aachen_layout, made, tmp_path / "shared")
+    summaries = {
+        made[0]: {"lists": {"DUC1": found}, **rest},
+        made[1]: {"lists": {"DUC2": {**found, "recall_percent": [25.0]}}, **rest},
+    }
+    lines = [
+        [cell.strip() for cell in line.split("|")][-2:]
+        for line in batch.table(shared, summaries).splitlines()
+    ]
+    assert lines == [["DUC1", "DUC2"], ["0.25", "0.25"], ["10", "10"], ["50.0", "-"], ["-", "25.0"]]
+    assert [(row["job"], row["list"]) for row in batch.job_rows(shared, summaries)] == [
+        ("sift+num_loc1", "DUC1"),
+        ("sift+num_loc2", "DUC2"),
+    ]
+
+
+def test_a_full_disk_ends_a_batch(aachen_layout, run_batch, monkeypatch, caplog):
+    def full(*args, **kwargs):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "a file")
+
+    monkeypatch.setattr(aachen, "main", full)
+    with pytest.raises(SystemExit):
+        run_batch({"dataset": str(aachen_layout), "feature": ["sift", "sift_sv16"]})
+    (line,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert line == "[Errno 28] No space left on device: 'a file'"
+
+
+def test_what_can_be_known_is_refused_before_any_work(
+    aachen_layout, inloc_layout, run_batch, caplog
+):
+    (aachen_layout / "images_upright/query/night/a.png").unlink()
+    (aachen_layout / "images_upright/query/night").rmdir()
+    next(inloc_layout.rglob("*.mat")).unlink()
+    with pytest.raises(SystemExit):
+        run_batch(
+            {"dataset": [str(aachen_layout), str(inloc_layout)]},
+            {"dataset": str(inloc_layout), "ground_truth": "nowhere.txt", "num_loc": 1},
+            options=("--dry_run",),
+        )
+    errors = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert len(errors) == 4 and "(3 in all)" in errors[3]
+    assert "lacks" in errors[0] and "query/night" in errors[0]
+    assert "lacks 1 files of scans" in errors[1]
 
 
 @pytest.mark.long

@@ -69,6 +69,13 @@ def test_what_fails_is_one_clear_error(work, message):
         list(pool.map(work, range(100), 2))
 
 
+def test_a_killed_process_concerns_its_own_work():
+    with processes_of_this_machine(2) as pool:
+        with pytest.raises(InputError, match="A process was killed"):
+            list(pool.map(killed, range(100), 2))
+        assert sorted(pool.map(squares, range(20), 3)) == [(i, i * i) for i in range(20)]
+
+
 def groups(fail_at, items):
     for i in items:
         if i == fail_at:
