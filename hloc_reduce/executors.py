@@ -14,6 +14,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from itertools import islice
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 import torch
@@ -26,6 +27,7 @@ Work = Callable[[Iterable[Item]], Iterator[Result]]
 BACKLOG = 2  # chunks for each worker that are handed out
 RETRIES = 20  # of a chunk whose machine is gone
 TIMEOUT = 10  # seconds to wait for a Ray cluster
+TOKEN = Path.home() / ".ray/auth_token"  # from Ray 2.60 on a cluster asks for it
 
 
 class Executor(Protocol):
@@ -155,12 +157,14 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
     Raises:
         InputError: when Ray is not installed or the cluster does not answer.
     """
+    address = address or os.environ.get("RAY_ADDRESS") or "local"
+    if address != "local" and TOKEN.exists():
+        os.environ.setdefault("RAY_AUTH_MODE", "token")  # or Ray would not send it
     try:
         import ray
     except ImportError:
         raise InputError("Ray is not installed: pip install 'hloc-reduce[ray]'.") from None
     handler = signal.getsignal(signal.SIGTERM)
-    address = address or os.environ.get("RAY_ADDRESS") or "local"
     try:
         try:
             if match := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
@@ -174,7 +178,10 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
                 **({"num_cpus": parallel.cores()} if address == "local" else {}),
             )
         except (OSError, ValueError, OverflowError, RuntimeError) as error:
-            raise InputError(f"The Ray cluster {address} does not answer ({error}).") from None
+            raise InputError(
+                f"The Ray cluster {address} does not answer, or refuses: is {TOKEN} the same here "
+                f"and there? ({error})"
+            ) from None
         signal.signal(signal.SIGTERM, handler)  # Ray sets its own
         task = ray.remote(_all)
         running: dict[Future, ray.ObjectRef] = {}
