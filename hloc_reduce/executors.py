@@ -104,7 +104,7 @@ class Pool:
             while pending:
                 for future in wait(pending, return_when=FIRST_COMPLETED).done:
                     pending.remove(future)
-                    if isinstance(found := future.result(), InputError):
+                    if isinstance(found := future.result(), Exception):
                         raise found
                     yield from found
                 submit()
@@ -121,11 +121,11 @@ class Pool:
                 self.cancel(future)
 
 
-def _all(work: Work, items: list[Item]) -> list[Result] | InputError:
+def _all(work: Work, items: list[Item]) -> list[Result] | InputError | OSError:
     """Return what work makes of items, or its error, which a cluster would wrap in its own."""
     try:
         return list(work(items))
-    except InputError as error:
+    except (InputError, OSError) as error:
         return error
 
 
@@ -201,7 +201,10 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
             if reference := running.get(future):
                 ray.cancel(reference)
 
-        how = {"cancel": cancel, "broken": (ray.exceptions.RayError,)}
+        errors = [e for e in vars(ray.exceptions).values() if isinstance(e, type)]
+        of_work = (ray.exceptions.RayError, ray.exceptions.RayTaskError)
+        broken = tuple(e for e in errors if issubclass(e, of_work[0]) and e not in of_work)
+        how = {"cancel": cancel, "broken": broken}
         gpu = None
         if "GPU" in ray.cluster_resources():
             gpu = Pool(partial(start, 1), partial(number, "GPU"), **how)

@@ -1,10 +1,12 @@
 """A batch on a Ray cluster of several nodes: the same results, also when one is removed."""
 
+import errno
 import json
 import os
 import sys
 import threading
 import time
+from functools import partial
 
 import pytest
 from command import contents, results
@@ -36,8 +38,8 @@ def slow_squares(items):
         yield i, i * i, os.environ["OMP_NUM_THREADS"], ray.get_runtime_context().get_node_id()
 
 
-def failing(items):
-    raise InputError(f"item {items[0]}")
+def failing(error, items):
+    raise error(*items)
     yield
 
 
@@ -59,7 +61,14 @@ def test_a_node_is_removed(cluster):
 
 def test_an_error_is_as_in_this_process(cluster):
     with ray_cluster(cluster.address) as executor, pytest.raises(InputError, match="^item 0$"):
-        list(executor.map(failing, range(3), 5))
+        list(executor.map(partial(failing, InputError), ["item 0"], 5))
+    with ray_cluster(cluster.address) as executor:
+        with pytest.raises(OSError, match="No space left") as error:
+            full = [errno.ENOSPC, os.strerror(errno.ENOSPC)]
+            list(executor.map(partial(failing, OSError), full, 5))
+        assert type(error.value) is OSError
+        with pytest.raises(ZeroDivisionError, match="a bug"):
+            list(executor.map(partial(failing, ZeroDivisionError), ["a bug"], 5))
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:9", "ray://127.0.0.1:9", "nowhere", "a:99999"])
