@@ -18,7 +18,7 @@ demo: $(VENV)/installed
 test: $(VENV)/installed $(OLD)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest tests/test_dog.py tests/test_stages.py \
 		tests/test_aachen.py::test_plane tests/test_inloc.py::test_plane tests/test_localize.py \
