@@ -63,7 +63,8 @@ def read_yaml(path: Path) -> object:
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except Exception as error:  # yaml raises whatever a broken value leads it to
-        raise InputError(f"{path} cannot be read ({' '.join(str(error).split())}).") from None
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise InputError(f"{path} cannot be read ({reason}).") from None
 
 
 def parse_image_list(path: Path) -> list[str]:

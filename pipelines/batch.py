@@ -240,8 +240,9 @@ def dry_run(job_file: Path, outputs: Path | None = None, overwrite: bool = False
                 size /= 1e6
                 lines.append([shared.dataset.name, step, of, f"{number:,}", items, f"{size:,.1f}"])
                 total += size
+    if len(lines) > 1:
+        print(results.aligned(lines, left=3))
     print(
-        f"{results.aligned(lines, left=3)}\n"
         f"About {total / 1e3:,.2f} GB in {outputs}, for {KEYPOINTS:,} keypoints an image. Numbers "
         "of pairs are upper limits. What is done is left out."
     )

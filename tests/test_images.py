@@ -108,13 +108,17 @@ def test_a_folder_is_no_image(tmp_path):
         read_image(tmp_path)
 
 
+SMALL = [(1, 1), (1, 300), (300, 1), (2, 2), (12_000, 40)]
+
+
 @pytest.mark.parametrize(
-    "size", [(1, 1), (1, 300), (300, 1), (2, 2), (12_000, 40), (9_000, 12_000)]
+    "size, feature",
+    [
+        *((size, feature) for size in SMALL for feature in ("sift_sv16", "colmap_sift")),
+        ((9_000, 12_000), "sift_sv16"),
+    ],
 )
-@pytest.mark.parametrize("feature", ["sift_sv16", "colmap_sift"])
 def test_sizes(size, feature, tmp_path):
-    if size == (9_000, 12_000) and feature != "sift_sv16":
-        pytest.skip("takes seconds; once is enough")
     image = cv2.resize(np.random.default_rng(0).integers(0, 256, (60, 80), np.uint8), size[::-1])
     cv2.imwrite(str(tmp_path / "a.jpg"), image)
     conf = features_confs.confs[feature]
