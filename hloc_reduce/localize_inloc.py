@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from tqdm import tqdm
 
-from . import cli, io, localization, logger, scans, stamps
+from . import cli, localization, logger, scans, stamps
 from .cli import InputError
 from .executors import SERIAL, Executor
 from .group_writer import Group, GroupWriter, fill
@@ -58,8 +58,8 @@ def main(
 
     Returns:
         A record for each query, as `localization.main`; a query with too few inliers has the pose
-        that PnP found all the same, if any. What the keypoints of cutouts show is kept in
-        `<features>-points3D.h5`, from which a later run goes on.
+        that PnP found all the same, if any. What the keypoints of cutouts show is kept beside the
+        features in points3D.h5, for later runs and for other features of the same keypoints.
 
     Raises:
         InputError: when an input is missing or broken.
@@ -71,21 +71,21 @@ def main(
         queries = [query for part in parse_query_lists(queries).values() for query in part]
     elif queries is None:
         queries = by_iphone7(features, retrieved)
-    wanted = [cutout for name, _ in queries for cutout in retrieved.get(name, [])]
-    if not wanted:
+    cutouts = sorted({cutout for name, _ in queries for cutout in retrieved.get(name, [])})
+    if not cutouts:
         raise InputError(f"{retrieval} has no pair of a query and a cutout.")
     points = points_file(features)
-    lift_keypoints(dataset_dir, features, sorted(set(wanted)), points, overwrite, executor)
+    groups = lift_keypoints(dataset_dir, features, cutouts, points, overwrite, executor)
 
     options = {"ransac_thresh": ransac_thresh, "skip_matches": skip_matches}
     options["queries"] = {
         name: [camera.model.name, camera.width, camera.height, *camera.params.tolist()]
         for name, camera in queries
     }
-    poses = {cutout: scans.read_pose(dataset_dir, cutout) for cutout in sorted(set(wanted))}
+    poses = {cutout: scans.read_pose(dataset_dir, cutout) for cutout in cutouts}
     options["scans"] = hashlib.sha256(np.array(list(poses.values())).tobytes()).hexdigest()
     return localization.main(
-        partial(_load, points, poses),
+        partial(_load, points, groups, poses),
         queries,
         retrieved,
         features,
@@ -99,8 +99,8 @@ def main(
     )
 
 
-def _load(points: Path, poses: Mapping[str, np.ndarray]) -> "ScanMap":
-    return ScanMap(h5py.File(points), poses)
+def _load(points: Path, groups: Mapping[str, str], poses: Mapping[str, np.ndarray]) -> "ScanMap":
+    return ScanMap(h5py.File(points), groups, poses)
 
 
 def _config(ransac_thresh: float, _: str, camera: pycolmap.Camera) -> dict:
@@ -109,8 +109,24 @@ def _config(ransac_thresh: float, _: str, camera: pycolmap.Camera) -> dict:
 
 
 def points_file(features: Path) -> Path:
-    """Return the file of the points that the keypoints of a feature file show."""
-    return features.with_name(f"{features.stem}-points3D.h5")
+    """Return the file of the points that keypoints show, of all feature files of a folder."""
+    return features.with_name("points3D.h5")
+
+
+def point_groups(features: Path, cutouts: Iterable[str]) -> dict[str, str]:
+    """Return from cutout to the group of its points, which is named by its keypoints, too.
+
+    So features that have the same keypoints have the same points, and others have others.
+    """
+    with open_h5(features) as file:
+        return {name: f"{name}/{_digest(file, name)}" for name in cutouts}
+
+
+def _digest(file: h5py.File, name: str) -> str:
+    """Return a digest of the keypoints and the size of an image."""
+    keypoints, _ = get_keypoints(file, name)
+    size = np.array(get_image_size(file, name), np.int64)
+    return hashlib.sha256(size.tobytes() + keypoints.tobytes()).hexdigest()[:16]
 
 
 def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap.Camera]]:
@@ -134,41 +150,40 @@ def lift_keypoints(
     output: Path,
     overwrite: bool = False,
     executor: Executor = SERIAL,
-) -> Path:
+) -> dict[str, str]:
     """Write the 3D points that the keypoints of cutouts show, reading each scan once.
 
     Args:
         dataset_dir: folder of the data set.
         features: feature file.
         cutouts: names of images.
-        output: h5 file, `points3D` (N, 3) float32 of each cutout: metres in the frame of its
-            scan, NaN where that has no depth.
+        output: h5 file, `points3D` (N, 3) float32 in each of the `point_groups`: metres in the
+            frame of the scan, NaN where that has no depth.
         overwrite: compute anew what is there.
         executor: does the work.
 
     Returns:
-        `output`; cutouts it holds already are skipped.
+        The `point_groups`; those that `output` holds already are skipped.
 
     Raises:
         InputError: when a scan is missing or broken.
     """
-    with open_h5(features) as file:
-        made_by = {"dataset": str(dataset_dir.resolve()), "features": io.provenance(file)}
-    with GroupWriter(output, made_by, overwrite) as writer:
-        todo = [name for name in cutouts if name not in writer]
+    groups = point_groups(features, cutouts)
+    with GroupWriter(output, {"dataset": str(dataset_dir.resolve())}, overwrite) as writer:
+        todo = [item for item in groups.items() if item[1] not in writer]
         work = partial(_lift, dataset_dir, features)
         with closing(fill({None: writer}, work, todo, executor, CHUNK)) as done:
             for _ in tqdm(done, desc="Reading scans", unit="scan", total=len(todo)):
                 pass
-    return output
+    return groups
 
 
 def _lift(
-    dataset_dir: Path, features: Path, cutouts: Iterable[str]
+    dataset_dir: Path, features: Path, groups: Iterable[tuple[str, str]]
 ) -> Iterator[tuple[None, Group]]:
-    """Yield the points that the keypoints of cutouts show."""
+    """Yield the points that the keypoints of cutouts show, for groups of such names."""
     with open_h5(features) as file:
-        for name in cutouts:
+        for name, group in groups:
             keypoints, _ = get_keypoints(file, name)
             scan = scans.read_scan(dataset_dir / f"{name}.mat")
             scale = np.array(scan.shape[1::-1]) / get_image_size(file, name)
@@ -176,7 +191,7 @@ def _lift(
             known = np.isfinite(points[:, 0]).mean() if len(points) else 1
             if known < 0.5:
                 logger.warning("%.0f %% of the keypoints of %s have depth.", 100 * known, name)
-            yield None, (name, {"points3D": points.astype(np.float32)}, {})
+            yield None, (group, {"points3D": points.astype(np.float32)}, {})
 
 
 class ScanMap:
@@ -184,17 +199,18 @@ class ScanMap:
 
     Args:
         file: open h5 file of `lift_keypoints`.
+        groups: of the cutouts in it.
         poses: from cutout to the pose of its scan, floor from scan (4, 4).
     """
 
-    def __init__(self, file: h5py.File, poses: Mapping[str, np.ndarray]):
-        self.file, self.poses = file, poses
+    def __init__(self, file: h5py.File, groups: Mapping[str, str], poses: Mapping[str, np.ndarray]):
+        self.file, self.groups, self.poses = file, groups, poses
         self.points = lru_cache(CACHED_IMAGES)(self._read)
         # by name, so that no order of queries or cutouts changes anything
         self.numbers = {name: number for number, name in enumerate(sorted(poses))}
 
     def _read(self, name: str) -> np.ndarray:
-        points = get_dataset(self.file, name, "points3D")[()].astype(np.float64)
+        points = get_dataset(self.file, self.groups[name], "points3D")[()].astype(np.float64)
         pose = self.poses[name]
         return points @ pose[:3, :3].T + pose[:3, 3]
 
@@ -203,7 +219,7 @@ class ScanMap:
 
     def num_keypoints(self, name: str) -> int:
         """Return how many keypoints a cutout has."""
-        return get_dataset(self.file, name, "points3D").shape[0]
+        return get_dataset(self.file, self.groups[name], "points3D").shape[0]
 
     def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the ids and coordinates of the points that keypoints of a cutout show.

@@ -53,6 +53,7 @@ class Shared:
         self.confs: dict[Path, dict] = {}
         self.dims: dict[Path, int] = {}
         self._used: set[str] = set()  # map images
+        self._truths: set[Path | None] = set()  # of which options ground_truth is checked
         self._record = stamps.read(folder / RECORD)
         with self.failing(jobs):
             self.pipeline = pipeline_of(dataset)
@@ -72,8 +73,10 @@ class Shared:
         num_loc, names = self.numbers(job)["num_loc"], (self.query_names, self.map_names)
         used = common.check_retrieval(job.retrieval, self.folder, num_loc, *names)
         self._place.check(used)
-        truth = job.ground_truth or self._place.ground_truth
-        true_poses(self.query_names, truth, job.ground_truth is not None)
+        if job.ground_truth not in self._truths:
+            truth = job.ground_truth or self._place.ground_truth
+            true_poses(self.query_names, truth, job.ground_truth is not None)
+            self._truths.add(job.ground_truth)
         _, conf = features_confs.get(job.feature, storage=job.storage)
         extract_features.provenance(conf)
         project = getattr(extractors.load(conf["model"]), "project", None)
@@ -190,8 +193,7 @@ class Shared:
                 ids[path.name] = file.attrs["id"]
         before = self._record.get("ids", {})
         if any(before.get(name, made) != made for name, made in ids.items()):
-            for pattern in (f"{aggregate_features.confs['vlad']['output']}*", "*-points3D.h5"):
-                for derived in self.folder.glob(pattern):
-                    derived.unlink()
+            for derived in self.folder.glob(f"{aggregate_features.confs['vlad']['output']}*"):
+                derived.unlink()
         self._record = {"vlad": self._vlad_features().name, "ids": before | ids}
         stamps.write(self.folder / RECORD, self._record)

@@ -15,12 +15,12 @@ from pathlib import Path
 import command
 import pytest
 
-from hloc_reduce import aggregate_features, cli, colmap, extract_features, jobs
+from hloc_reduce import aggregate_features, cli, colmap, extract_features, jobs, scans
 from hloc_reduce.cli import InputError
 from hloc_reduce.descriptors import Descriptor
 from hloc_reduce.evaluation import published
 from hloc_reduce.jobs import Job
-from pipelines import aachen, batch
+from pipelines import aachen, batch, inloc
 from pipelines.shared import Shared
 
 
@@ -175,6 +175,27 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
     run_batch(grid)
     assert done["detect_dog"] == done["forward"] == 0
     assert states == {path: path.stat().st_mtime_ns for path in folder.rglob("*.h5")}
+
+
+def test_scans_and_true_poses_are_read_once(inloc_layout, run_batch, monkeypatch, caplog):
+    read, original = [], scans.read_scan
+    monkeypatch.setattr(scans, "read_scan", lambda path: read.append(path) or original(path))
+    truth = inloc_layout / "ground_truth_poses.txt"
+    truth.write_text("\n".join(truth.read_text().splitlines()[:2]))
+    features = ["sift_sv64", "sift_sv16", "colmap_sift"]
+    grid = {"dataset": str(inloc_layout), "feature": features}
+    outputs = run_batch(grid)
+    assert len(read) == len(set(read)) == 4
+    warnings = [record for record in caplog.records if "lacks 1 of 3" in record.message]
+    assert len(warnings) == 1 + len(features)  # of the plan, and of each job as it is run
+    for feature in features:
+        alone = outputs.parent / "alone" / feature
+        inloc.main(inloc_layout, alone, feature, retrieval=str(next(outputs.rglob("pairs*.txt"))))
+        queries = (outputs / inloc_layout.name / feature / "queries.csv").read_text()
+        assert queries == (alone / "queries.csv").read_text()
+    read.clear()
+    run_batch({**grid, "feature": [*features, "sift_sv32"]})
+    assert not read  # for more features of the same keypoints
 
 
 def test_a_grid_of_matchers_and_storages_in_both_layouts(aachen_layout, inloc_layout, run_batch):

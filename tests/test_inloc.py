@@ -148,12 +148,13 @@ def test_points_are_those_of_the_plane(inloc_layout, tmp_path, monkeypatch):
     camera = next(iter(model.cameras.values()))
     with (
         h5py.File(tmp_path / "o/feats-dog-sift.h5") as features,
-        h5py.File(tmp_path / "o/feats-dog-sift-points3D.h5") as points,
+        h5py.File(tmp_path / "o/points3D.h5") as points,
     ):
         for number in range(4):
             floor = "PLA2" if number == 3 else "PLA1"
             name = f"database/cutouts/{floor}/00{number}/PLA_cutout_00{number}_0_0.jpg"
-            xyz = points[name]["points3D"][:].astype(float)
+            (of_keypoints,) = points[name].values()
+            xyz = of_keypoints["points3D"][:].astype(float)
             keypoints = features[name]["keypoints"][:]
             without = np.isnan(xyz).any(1)
             assert (without == (keypoints[:, 0] < 39)).all() and without.any()

@@ -15,7 +15,6 @@ from .. import colmap, localization, localize_inloc, logger, scans
 from ..cli import InputError
 from ..evaluation import published
 from ..evaluation.poses import FAILED
-from ..io import list_h5_names
 from ..localize_sfm import SfmMap
 from ..parsers import parse_poses, parse_retrieval
 
@@ -111,10 +110,10 @@ class Run:
         """The map, which knows what point each keypoint of its images shows."""
         if self.reconstruction is not None:
             return SfmMap(self.reconstruction)
-        file = self.files["map"]
-        names = list_h5_names(file)
+        names = sorted({name for names in self.retrieved.values() for name in names})
+        groups = localize_inloc.point_groups(self.files["map_features"], names)
         poses = {name: scans.read_pose(self.files["map_images"], name) for name in names}
-        return localize_inloc.ScanMap(h5py.File(file), poses)
+        return localize_inloc.ScanMap(h5py.File(self.files["map"]), groups, poses)
 
     @cached_property
     def retrieved(self) -> dict[str, list[str]]:
