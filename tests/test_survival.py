@@ -233,6 +233,7 @@ def start(place, outputs, workers=None):
     return subprocess.Popen(command, stdout=-1, stderr=-1, text=True, start_new_session=True)
 
 
+@pytest.mark.parametrize("workers", [None, pytest.param(2, marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     "stage, free, file",
     [
@@ -245,7 +246,7 @@ def start(place, outputs, workers=None):
                 ("extract_features", 5_000, ""),
                 ("extract_features", 100_000, ".h5.pieces/"),
                 ("extract_features", 400_000, "feats-dog-"),
-                ("extract_features", 550_000, "database.db"),
+                ("extract_features", 600_000, "database.db"),
                 ("pairs_from_covisibility", 0, ""),
                 ("match_map", 5_000, ".h5.pieces/"),
                 ("match_map", 30_000, "_matches-"),
@@ -267,7 +268,7 @@ def start(place, outputs, workers=None):
     ],
 )
 def test_a_full_disk_is_one_clear_error_and_the_run_goes_on_after_it(
-    stage, free, file, disk, aachen_layout, tmp_path
+    stage, free, file, workers, disk, aachen_layout, tmp_path
 ):
     folder, set_free = disk
     outputs = folder / "run"
@@ -286,7 +287,7 @@ def test_a_full_disk_is_one_clear_error_and_the_run_goes_on_after_it(
     set_free(free)
     before = survival.on_disk(outputs)
 
-    run = start(aachen_layout, outputs)
+    run = start(aachen_layout, outputs, workers)
     printed, said = run.communicate(timeout=survival.TIMEOUT)
     assert run.returncode == 2, said
     assert "Traceback" not in said and not printed
