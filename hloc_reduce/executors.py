@@ -7,7 +7,6 @@ paths.
 
 import os
 import re
-import signal
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
@@ -21,6 +20,7 @@ import torch
 
 from . import parallel, processes
 from .cli import InputError
+from .interrupts import uninterrupted
 
 Item, Result = TypeVar("Item"), TypeVar("Result")
 Work = Callable[[Iterable[Item]], Iterator[Result]]
@@ -69,7 +69,7 @@ class Pool:
     Args:
         submit: hands a function and its arguments to a process.
         workers: tells how many processes there are.
-        gpu: does the work that uses a GPU; default: the same.
+        gpu: tells what does the work that uses a GPU, None if the same.
         cancel: ends what was handed out.
         broken: errors of processes and machines.
     """
@@ -78,7 +78,7 @@ class Pool:
         self,
         submit: Callable[..., Future],
         workers: Callable[[], int],
-        gpu: Executor | None = None,
+        gpu: Callable[[], Executor | None] = lambda: None,
         cancel: Callable[[Future], object] = Future.cancel,
         broken: tuple[type[Exception], ...] = (),
     ):
@@ -89,8 +89,8 @@ class Pool:
         self, work: Work, items: Iterable[Item], size: int, gpu: bool = False
     ) -> Iterator[Result]:
         """Yield what work makes of items, as `Executor.map`, chunk by chunk as they are done."""
-        if gpu and self.gpu is not None:
-            yield from self.gpu.map(work, items, size)
+        if gpu and (other := self.gpu()):
+            yield from other.map(work, items, size)
             return
         drawn, pending = iter(items), set()
 
@@ -140,15 +140,16 @@ def processes_of_this_machine(workers: int | None = None) -> Iterator[Pool]:
     """
     workers = workers or parallel.cores()
     with processes.pool(workers) as pool:
-        yield Pool(pool.submit, lambda: workers, SERIAL if torch.cuda.is_available() else None)
+        gpu = SERIAL if torch.cuda.is_available() else None
+        yield Pool(pool.submit, lambda: workers, lambda: gpu)
 
 
 @contextmanager
 def ray_cluster(address: str | None = None) -> Iterator[Pool]:
     """Use a Ray cluster for the time of a block: a process of one thread on each of its cores.
 
-    If it has GPUs at first, work that uses one is done there only. What a machine that is gone had
-    to do is done by another.
+    If it has GPUs when a stage begins, work that uses one is done there only. What a machine that
+    is gone had to do is done by another.
 
     Args:
         address: as of `ray.init`; default: that of the environment variable RAY_ADDRESS, or else a
@@ -164,25 +165,24 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
         import ray
     except ImportError:
         raise InputError("Ray is not installed: pip install 'hloc-reduce[ray]'.") from None
-    handler = signal.getsignal(signal.SIGTERM)
     try:
         try:
             if match := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
                 # Ray itself would try for minutes
                 socket.create_connection((match[1], int(match[2])), timeout=TIMEOUT).close()
-            ray.init(
-                address,
-                include_dashboard=False,
-                logging_level="warning",
-                runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}},
-                **({"num_cpus": parallel.cores()} if address == "local" else {}),
-            )
+            with uninterrupted():  # half begun, it would not end; Ray sets a handler of SIGTERM
+                ray.init(
+                    address,
+                    include_dashboard=False,
+                    logging_level="warning",
+                    runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}},
+                    **({"num_cpus": parallel.cores()} if address == "local" else {}),
+                )
         except (OSError, ValueError, OverflowError, RuntimeError) as error:
             raise InputError(
                 f"The Ray cluster {address} does not answer, or refuses: is {TOKEN} the same here "
                 f"and there? ({error})"
             ) from None
-        signal.signal(signal.SIGTERM, handler)  # Ray sets its own
         task = ray.remote(_all)
         running: dict[Future, ray.ObjectRef] = {}
 
@@ -205,9 +205,11 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
         of_work = (ray.exceptions.RayError, ray.exceptions.RayTaskError)
         broken = tuple(e for e in errors if issubclass(e, of_work[0]) and e not in of_work)
         how = {"cancel": cancel, "broken": broken}
-        gpu = None
-        if "GPU" in ray.cluster_resources():
-            gpu = Pool(partial(start, 1), partial(number, "GPU"), **how)
+        gpus = Pool(partial(start, 1), partial(number, "GPU"), **how)
+
+        def gpu() -> Executor | None:
+            return gpus if "GPU" in ray.cluster_resources() else None
+
         yield Pool(partial(start, 0), partial(number, "CPU"), gpu, **how)
     finally:
         ray.shutdown()

@@ -4,9 +4,11 @@ import logging
 import os
 import signal
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from threading import Thread, Timer
 from typing import NoReturn, TypeVar
 
@@ -81,6 +83,23 @@ def interruptible(function: Callable[..., Result], *arguments, **options) -> Res
     finally:
         if result.done():
             _calls.remove(thread)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Have both signals wait for the end of a block; their handlers are then as they were."""
+    came, handlers = [], {}
+    if threading.current_thread() is threading.main_thread():
+        for number in STOPS:
+            if signal.getsignal(number) is not None:
+                handlers[number] = signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in came[:1]:
+            signal.raise_signal(number)
 
 
 def _stop(number: int, _) -> None:

@@ -7,8 +7,6 @@ import io
 import os
 import platform
 import shutil
-import signal
-import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,6 +17,7 @@ import numpy as np
 
 from . import logger
 from .cli import InputError
+from .interrupts import uninterrupted
 
 LOCK = ".lock"  # in an outputs folder
 
@@ -150,7 +149,7 @@ def write_h5(path: Path) -> Iterator[h5py.File]:
         OSError: after the block, when the disk is full; HDF5 itself would crash.
     """
     modes = ("r+b", "r+") if path.exists() else ("w+b", "w")
-    with _uninterrupted(), path.open(modes[0], buffering=0) as file:
+    with uninterrupted(), path.open(modes[0], buffering=0) as file:
         disk = _Disk(file)
         with h5py.File(disk, modes[1], libver="latest") as h5_file:
             yield h5_file
@@ -213,23 +212,6 @@ class _Disk:
 
     def flush(self) -> None:
         pass
-
-
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Have SIGINT and SIGTERM wait for the end of a block."""
-    came, handlers = [], {}
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if callable(signal.getsignal(number)):
-                handlers[number] = signal.signal(number, lambda number, _: came.append(number))
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for number in came[:1]:
-            signal.raise_signal(number)
 
 
 def list_h5_names(path: Path) -> list[str]:

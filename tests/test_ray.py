@@ -59,6 +59,18 @@ def test_a_node_is_removed(cluster):
         assert sorted(found) == [(i, i * i) for i in range(60)]
 
 
+def test_work_that_uses_a_gpu_is_done_where_one_is(cluster):
+    def nodes_of(executor, gpu):
+        return {node for *_, node in executor.map(slow_squares, range(8), 1, gpu)}
+
+    with ray_cluster(cluster.address) as executor:
+        assert len(nodes_of(executor, True)) > 1  # there is none yet
+        joined = cluster.add_node(num_cpus=1, num_gpus=1, object_store_memory=80 * 2**20)
+        assert nodes_of(executor, True) == {joined.node_id}
+        assert len(nodes_of(executor, False)) > 1
+        cluster.remove_node(joined)
+
+
 def test_an_error_is_as_in_this_process(cluster):
     with ray_cluster(cluster.address) as executor, pytest.raises(InputError, match="^item 0$"):
         list(executor.map(partial(failing, InputError), ["item 0"], 5))
