@@ -8,7 +8,6 @@ import kornia
 import numpy as np
 import pycolmap
 import safetensors
-import sklearn
 import torch
 
 from . import __version__
@@ -19,23 +18,21 @@ MODULES = {
     "opencv": cv2,
     "pycolmap": pycolmap,
     "safetensors": safetensors,
-    "scikit-learn": sklearn,
     "torch": torch,
 }
+# that not every command needs, and the optional one
+DISTRIBUTIONS = {"faiss": "faiss-cpu", "scikit-learn": "scikit-learn"}
 
 
 def versions() -> dict[str, str]:
     """Return the versions of this project, Python and the libraries, by name."""
-    return _faiss() | {
+    return {
         "hloc_reduce": __version__,
         "python": platform.python_version(),
         **{name: str(module.__version__) for name, module in MODULES.items()},
+        **{name: metadata.version(key) for name, key in DISTRIBUTIONS.items() if _installed(key)},
     }
 
 
-def _faiss() -> dict[str, str]:
-    """Return that of faiss, which is optional."""
-    try:
-        return {"faiss": metadata.version("faiss-cpu")}
-    except metadata.PackageNotFoundError:
-        return {}
+def _installed(distribution: str) -> bool:
+    return any(metadata.distributions(name=distribution))

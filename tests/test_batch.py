@@ -20,7 +20,7 @@ from hloc_reduce.cli import InputError
 from hloc_reduce.descriptors import Descriptor
 from hloc_reduce.evaluation import published
 from hloc_reduce.jobs import Job
-from pipelines import aachen, batch, inloc
+from pipelines import aachen, batch, inloc, tables
 from pipelines.shared import Shared
 
 
@@ -159,7 +159,7 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
         assert (folder / feature / "queries.csv").read_text() == (alone / "queries.csv").read_text()
 
     rows = table(outputs / "jobs.csv")
-    assert list(rows[0]) == list(batch.COLUMNS)
+    assert list(rows[0]) == list(tables.COLUMNS)
     assert [(row["job"], row["list"][:3], row["threshold_m"]) for row in rows[:4]] == [
         ("sift_sv64", "day", "0.25"),
         *(("sift_sv64", "day", "0.5"), ("sift_sv64", "day", "5.0"), ("sift_sv64", "nig", "0.5")),
@@ -403,10 +403,10 @@ def test_a_job_without_a_list_of_another(aachen_layout, tmp_path):
     }
     lines = [
         [cell.strip() for cell in line.split("|")][-2:]
-        for line in batch.table(shared, summaries).splitlines()
+        for line in tables.table(shared, summaries).splitlines()
     ]
     assert lines == [["DUC1", "DUC2"], ["0.25", "0.25"], ["10", "10"], ["50.0", "-"], ["-", "25.0"]]
-    assert [(row["job"], row["list"]) for row in batch.job_rows(shared, summaries)] == [
+    assert [(row["job"], row["list"]) for row in tables.job_rows(shared, summaries)] == [
         ("sift+num_loc1", "DUC1"),
         ("sift+num_loc2", "DUC2"),
     ]
