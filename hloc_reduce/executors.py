@@ -7,12 +7,13 @@ paths.
 
 import os
 import re
+import signal
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -27,6 +28,7 @@ Work = Callable[[Iterable[Item]], Iterator[Result]]
 BACKLOG = 2  # chunks for each worker that are handed out
 RETRIES = 20  # of a chunk whose machine is gone
 TIMEOUT = 10  # seconds to wait for a Ray cluster
+PATIENCE = 5  # seconds between looks whether there is a worker
 TOKEN = Path.home() / ".ray/auth_token"  # from Ray 2.60 on a cluster asks for it
 
 
@@ -69,7 +71,8 @@ class Pool:
     Args:
         submit: hands a function and its arguments to a process.
         workers: tells how many processes there are.
-        gpu: tells what does the work that uses a GPU, None if the same.
+        gpu: does the work that uses a GPU; default: the same.
+        instead: does the work while there is no process; default: it waits for one.
         cancel: ends what was handed out.
         broken: errors of processes and machines.
     """
@@ -78,36 +81,34 @@ class Pool:
         self,
         submit: Callable[..., Future],
         workers: Callable[[], int],
-        gpu: Callable[[], Executor | None] = lambda: None,
+        gpu: Executor | None = None,
+        instead: Executor | None = None,
         cancel: Callable[[Future], object] = Future.cancel,
         broken: tuple[type[Exception], ...] = (),
     ):
-        self.submit, self.workers, self.gpu = submit, workers, gpu
+        self.submit, self.workers, self.gpu, self.instead = submit, workers, gpu, instead
         self.cancel, self.broken = cancel, broken
 
     def map(
         self, work: Work, items: Iterable[Item], size: int, gpu: bool = False
     ) -> Iterator[Result]:
         """Yield what work makes of items, as `Executor.map`, chunk by chunk as they are done."""
-        if gpu and (other := self.gpu()):
-            yield from other.map(work, items, size)
+        if gpu and self.gpu is not None:
+            yield from self.gpu.map(work, items, size)
             return
-        drawn, pending = iter(items), set()
-
-        def submit() -> None:
-            backlog = BACKLOG * self.workers()
-            while len(pending) < backlog and (chunk := list(islice(drawn, size))):
-                pending.add(self.submit(_all, work, chunk))
-
+        drawn, pending = iter(items), {}
         try:
-            submit()
-            while pending:
-                for future in wait(pending, return_when=FIRST_COMPLETED).done:
-                    pending.remove(future)
+            while (workers := self.workers()) or self.instead is None:
+                backlog = BACKLOG * max(1, workers)
+                while len(pending) < backlog and (chunk := list(islice(drawn, size))):
+                    pending[self.submit(_all, work, chunk)] = chunk
+                if not pending:
+                    return
+                for future in wait(pending, PATIENCE, FIRST_COMPLETED).done:
+                    del pending[future]
                     if isinstance(found := future.result(), Exception):
                         raise found
                     yield from found
-                submit()
         except BrokenExecutor:
             raise InputError(
                 "A process was killed, perhaps for want of memory: try fewer, for example with "
@@ -119,6 +120,7 @@ class Pool:
         finally:
             for future in pending:
                 self.cancel(future)
+        yield from self.instead.map(work, chain(*pending.values(), drawn), size)
 
 
 def _all(work: Work, items: list[Item]) -> list[Result] | InputError | OSError:
@@ -140,16 +142,15 @@ def processes_of_this_machine(workers: int | None = None) -> Iterator[Pool]:
     """
     workers = workers or parallel.cores()
     with processes.pool(workers) as pool:
-        gpu = SERIAL if torch.cuda.is_available() else None
-        yield Pool(pool.submit, lambda: workers, lambda: gpu)
+        yield Pool(pool.submit, lambda: workers, SERIAL if torch.cuda.is_available() else None)
 
 
 @contextmanager
 def ray_cluster(address: str | None = None) -> Iterator[Pool]:
     """Use a Ray cluster for the time of a block: a process of one thread on each of its cores.
 
-    If it has GPUs when a stage begins, work that uses one is done there only. What a machine that
-    is gone had to do is done by another.
+    While it has GPUs, work that uses one is done there only. What a machine that is gone had to do
+    is done by another. TORCH_HOME is the same everywhere.
 
     Args:
         address: as of `ray.init`; default: that of the environment variable RAY_ADDRESS, or else a
@@ -165,24 +166,30 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
         import ray
     except ImportError:
         raise InputError("Ray is not installed: pip install 'hloc-reduce[ray]'.") from None
+    handler = signal.getsignal(signal.SIGTERM)
+    local = address == "local"
+    kept = {"OMP_NUM_THREADS": "1"}
+    if "TORCH_HOME" in os.environ:
+        kept["TORCH_HOME"] = os.path.abspath(os.environ["TORCH_HOME"])
     try:
         try:
             if match := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
                 # Ray itself would try for minutes
                 socket.create_connection((match[1], int(match[2])), timeout=TIMEOUT).close()
-            with uninterrupted():  # half begun, it would not end; Ray sets a handler of SIGTERM
+            with uninterrupted() if local else nullcontext():  # half begun, it would not end
                 ray.init(
                     address,
                     include_dashboard=False,
                     logging_level="warning",
-                    runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}},
-                    **({"num_cpus": parallel.cores()} if address == "local" else {}),
+                    runtime_env={"env_vars": kept},
+                    **({"num_cpus": parallel.cores()} if local else {}),
                 )
         except (OSError, ValueError, OverflowError, RuntimeError) as error:
             raise InputError(
                 f"The Ray cluster {address} does not answer, or refuses: is {TOKEN} the same here "
                 f"and there? ({error})"
             ) from None
+        signal.signal(signal.SIGTERM, handler)  # Ray sets its own
         task = ray.remote(_all)
         running: dict[Future, ray.ObjectRef] = {}
 
@@ -195,7 +202,7 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
             return future
 
         def number(kind: str) -> int:
-            return int(ray.cluster_resources().get(kind, 0)) or 1
+            return int(ray.cluster_resources().get(kind, 0))
 
         def cancel(future: Future) -> None:
             if reference := running.get(future):
@@ -205,12 +212,9 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
         of_work = (ray.exceptions.RayError, ray.exceptions.RayTaskError)
         broken = tuple(e for e in errors if issubclass(e, of_work[0]) and e not in of_work)
         how = {"cancel": cancel, "broken": broken}
-        gpus = Pool(partial(start, 1), partial(number, "GPU"), **how)
-
-        def gpu() -> Executor | None:
-            return gpus if "GPU" in ray.cluster_resources() else None
-
-        yield Pool(partial(start, 0), partial(number, "CPU"), gpu, **how)
+        cpus = partial(start, 0), partial(number, "CPU")
+        gpus = Pool(partial(start, 1), partial(number, "GPU"), instead=Pool(*cpus, **how), **how)
+        yield Pool(*cpus, gpus, **how)
     finally:
         ray.shutdown()
 

@@ -36,6 +36,7 @@ def main(
     ransac_thresh: float = RANSAC_THRESH,
     overwrite: bool = False,
     executor: Executor = SERIAL,
+    points: Path | None = None,
 ) -> dict[str, dict]:
     """Localize queries in a data set of InLoc's layout.
 
@@ -55,11 +56,12 @@ def main(
             in proportion.
         overwrite: localize anew what is there.
         executor: does the work.
+        points: keeps what the keypoints of cutouts show, for later runs, and if it is given for
+            other features of the same keypoints, too; default: `points_file(features)`.
 
     Returns:
         A record for each query, as `localization.main`; a query with too few inliers has the pose
-        that PnP found all the same, if any. What the keypoints of cutouts show is kept beside the
-        features in points3D.h5, for later runs and for other features of the same keypoints.
+        that PnP found all the same, if any.
 
     Raises:
         InputError: when an input is missing or broken.
@@ -74,8 +76,8 @@ def main(
     cutouts = sorted({cutout for name, _ in queries for cutout in retrieved.get(name, [])})
     if not cutouts:
         raise InputError(f"{retrieval} has no pair of a query and a cutout.")
-    points = points_file(features)
-    groups = lift_keypoints(dataset_dir, features, cutouts, points, overwrite, executor)
+    points = points or points_file(features)
+    lift_keypoints(dataset_dir, features, cutouts, points, overwrite, executor)
 
     options = {"ransac_thresh": ransac_thresh, "skip_matches": skip_matches}
     options["queries"] = {
@@ -85,7 +87,7 @@ def main(
     poses = {cutout: scans.read_pose(dataset_dir, cutout) for cutout in cutouts}
     options["scans"] = hashlib.sha256(np.array(list(poses.values())).tobytes()).hexdigest()
     return localization.main(
-        partial(_load, points, groups, poses),
+        partial(_load, points, features, poses),
         queries,
         retrieved,
         features,
@@ -99,8 +101,8 @@ def main(
     )
 
 
-def _load(points: Path, groups: Mapping[str, str], poses: Mapping[str, np.ndarray]) -> "ScanMap":
-    return ScanMap(h5py.File(points), groups, poses)
+def _load(points: Path, features: Path, poses: Mapping[str, np.ndarray]) -> "ScanMap":
+    return ScanMap(h5py.File(points), h5py.File(features), poses)
 
 
 def _config(ransac_thresh: float, _: str, camera: pycolmap.Camera) -> dict:
@@ -109,24 +111,18 @@ def _config(ransac_thresh: float, _: str, camera: pycolmap.Camera) -> dict:
 
 
 def points_file(features: Path) -> Path:
-    """Return the file of the points that keypoints show, of all feature files of a folder."""
-    return features.with_name("points3D.h5")
+    """Return the file of the points that the keypoints of a feature file show."""
+    return features.with_name(f"{features.stem}-points3D.h5")
 
 
-def point_groups(features: Path, cutouts: Iterable[str]) -> dict[str, str]:
-    """Return from cutout to the group of its points, which is named by its keypoints, too.
+def point_group(features: h5py.File, name: str) -> str:
+    """Return the group of the points of a cutout, which is named by its keypoints, too.
 
-    So features that have the same keypoints have the same points, and others have others.
+    So features that have the same keypoints share their points, and others do not.
     """
-    with open_h5(features) as file:
-        return {name: f"{name}/{_digest(file, name)}" for name in cutouts}
-
-
-def _digest(file: h5py.File, name: str) -> str:
-    """Return a digest of the keypoints and the size of an image."""
-    keypoints, _ = get_keypoints(file, name)
-    size = np.array(get_image_size(file, name), np.int64)
-    return hashlib.sha256(size.tobytes() + keypoints.tobytes()).hexdigest()[:16]
+    keypoints, _ = get_keypoints(features, name)
+    size = np.array(get_image_size(features, name))
+    return f"{name}/{hashlib.sha256(size.tobytes() + keypoints.tobytes()).hexdigest()[:16]}"
 
 
 def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap.Camera]]:
@@ -150,40 +146,40 @@ def lift_keypoints(
     output: Path,
     overwrite: bool = False,
     executor: Executor = SERIAL,
-) -> dict[str, str]:
+) -> Path:
     """Write the 3D points that the keypoints of cutouts show, reading each scan once.
 
     Args:
         dataset_dir: folder of the data set.
         features: feature file.
         cutouts: names of images.
-        output: h5 file, `points3D` (N, 3) float32 in each of the `point_groups`: metres in the
-            frame of the scan, NaN where that has no depth.
+        output: h5 file, `points3D` (N, 3) float32 in the `point_group` of each cutout: metres in
+            the frame of its scan, NaN where that has no depth.
         overwrite: compute anew what is there.
         executor: does the work.
 
     Returns:
-        The `point_groups`; those that `output` holds already are skipped.
+        `output`; cutouts it holds already are skipped.
 
     Raises:
         InputError: when a scan is missing or broken.
     """
-    groups = point_groups(features, cutouts)
     with GroupWriter(output, {"dataset": str(dataset_dir.resolve())}, overwrite) as writer:
-        todo = [item for item in groups.items() if item[1] not in writer]
+        with open_h5(features) as file:
+            todo = [name for name in cutouts if point_group(file, name) not in writer]
         work = partial(_lift, dataset_dir, features)
         with closing(fill({None: writer}, work, todo, executor, CHUNK)) as done:
             for _ in tqdm(done, desc="Reading scans", unit="scan", total=len(todo)):
                 pass
-    return groups
+    return output
 
 
 def _lift(
-    dataset_dir: Path, features: Path, groups: Iterable[tuple[str, str]]
+    dataset_dir: Path, features: Path, cutouts: Iterable[str]
 ) -> Iterator[tuple[None, Group]]:
-    """Yield the points that the keypoints of cutouts show, for groups of such names."""
+    """Yield the points that the keypoints of cutouts show."""
     with open_h5(features) as file:
-        for name, group in groups:
+        for name in cutouts:
             keypoints, _ = get_keypoints(file, name)
             scan = scans.read_scan(dataset_dir / f"{name}.mat")
             scale = np.array(scan.shape[1::-1]) / get_image_size(file, name)
@@ -191,7 +187,7 @@ def _lift(
             known = np.isfinite(points[:, 0]).mean() if len(points) else 1
             if known < 0.5:
                 logger.warning("%.0f %% of the keypoints of %s have depth.", 100 * known, name)
-            yield None, (group, {"points3D": points.astype(np.float32)}, {})
+            yield None, (point_group(file, name), {"points3D": points.astype(np.float32)}, {})
 
 
 class ScanMap:
@@ -199,18 +195,24 @@ class ScanMap:
 
     Args:
         file: open h5 file of `lift_keypoints`.
-        groups: of the cutouts in it.
+        features: open feature file.
         poses: from cutout to the pose of its scan, floor from scan (4, 4).
     """
 
-    def __init__(self, file: h5py.File, groups: Mapping[str, str], poses: Mapping[str, np.ndarray]):
-        self.file, self.groups, self.poses = file, groups, poses
+    def __init__(self, file: h5py.File, features: h5py.File, poses: Mapping[str, np.ndarray]):
+        self.file, self.features, self.poses = file, features, poses
         self.points = lru_cache(CACHED_IMAGES)(self._read)
         # by name, so that no order of queries or cutouts changes anything
         self.numbers = {name: number for number, name in enumerate(sorted(poses))}
 
     def _read(self, name: str) -> np.ndarray:
-        points = get_dataset(self.file, self.groups[name], "points3D")[()].astype(np.float64)
+        group = point_group(self.features, name)
+        if group not in self.file:
+            raise InputError(
+                f"{self.file.filename} is not of the keypoints of {name} that are now in "
+                f"{self.features.filename}: localize anew."
+            )
+        points = get_dataset(self.file, group, "points3D")[()].astype(np.float64)
         pose = self.poses[name]
         return points @ pose[:3, :3].T + pose[:3, 3]
 
@@ -219,7 +221,7 @@ class ScanMap:
 
     def num_keypoints(self, name: str) -> int:
         """Return how many keypoints a cutout has."""
-        return get_dataset(self.file, self.groups[name], "points3D").shape[0]
+        return get_dataset(self.features, name, "keypoints").shape[0]
 
     def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the ids and coordinates of the points that keypoints of a cutout show.

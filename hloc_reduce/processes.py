@@ -13,6 +13,8 @@ from threading import Thread
 from loky import ProcessPoolExecutor
 from loky.backend import resource_tracker as loky_tracker
 
+from .interrupts import STOPS
+
 POLL = 0.5  # seconds
 # loky kills a process all the same where there is no `pgrep` to look for its children
 warnings.filterwarnings("ignore", "Failed to kill subprocesses", UserWarning)
@@ -26,8 +28,9 @@ def pool(number: int) -> Iterator["_Pool"]:
     process is killed.
     """
     for trackers in (resource_tracker, loky_tracker):
-        trackers.ensure_running()  # which may unblock the signals that `submit` blocks
-    processes = _Pool(number)
+        trackers.ensure_running()  # which may unblock the signals that are to be blocked
+    with _blocked_signals():
+        processes = _Pool(number)
     try:
         yield processes
     except BaseException:
@@ -52,14 +55,22 @@ class _Pool:
 
         They inherit the mask of signals: Ctrl-C is for this process, which ends them.
         """
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-        try:
-            return self.executor.submit(function, *args)
-        except BrokenExecutor:
-            self.executor = self._start()
-            return self.executor.submit(function, *args)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        with _blocked_signals():
+            try:
+                return self.executor.submit(function, *args)
+            except BrokenExecutor:
+                self.executor = self._start()
+                return self.executor.submit(function, *args)
+
+
+@contextmanager
+def _blocked_signals() -> Iterator[None]:
+    """Have this thread not hear Ctrl-C and SIGTERM until the block ends."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _end_without(parent: int) -> None:

@@ -32,7 +32,16 @@ COLUMNS = (
 )
 # what a run leaves in its folder, first what says that it is whole; but for lists of pairs, which
 # are always written anew
-PRODUCTS = ("map.json", "*feats-*", ".*.tmp", "sfm*", "*_hloc_*", "queries.csv", "s*.json")
+PRODUCTS = (
+    "map.json",
+    "*feats-*",
+    "points3D.h5*",
+    ".*.tmp",
+    "sfm*",
+    "*_hloc_*",
+    "queries.csv",
+    "s*.json",
+)
 STAGES = "stages.json"
 BOOKKEEPING = {"conf.json", STAGES, "summary.json", "queries.csv", "trace.json"}
 DELETING = {"is": "being deleted"}

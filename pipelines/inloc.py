@@ -65,6 +65,8 @@ def main(
     ) as folder:
         poses = outputs / f"InLoc_hloc_{feature}+{matcher}_{retrieved}.txt"
 
+        # of all features of a batch
+        points = features.with_name("points3D.h5") if features else None
         with folder.stage("extract_features"):
             names = [*used, *query_names]
             features = features or extract_features.main(
@@ -84,6 +86,7 @@ def main(
                 queries=place.queries(features),
                 ransac_thresh=place.ransac_thresh,
                 executor=executor,
+                points=points,
             )
 
         summary = {
@@ -100,7 +103,7 @@ def main(
             "query_images": dataset,
             "map_images": dataset,
             "map_features": features,
-            "map": localize_inloc.points_file(features),
+            "map": points or localize_inloc.points_file(features),
             "pairs": loc_pairs,
             "matches": matches,
             "ground_truth": truth_file if truth else None,

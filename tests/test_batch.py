@@ -177,25 +177,30 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
     assert states == {path: path.stat().st_mtime_ns for path in folder.rglob("*.h5")}
 
 
-def test_scans_and_true_poses_are_read_once(inloc_layout, run_batch, monkeypatch, caplog):
+def test_scans_and_true_poses_are_read_once(inloc_layout, run_batch, tmp_path, monkeypatch, caplog):
     read, original = [], scans.read_scan
     monkeypatch.setattr(scans, "read_scan", lambda path: read.append(path) or original(path))
     truth = inloc_layout / "ground_truth_poses.txt"
     truth.write_text("\n".join(truth.read_text().splitlines()[:2]))
-    features = ["sift_sv64", "sift_sv16", "colmap_sift"]
+    fewer = write(tmp_path / "fewer.yaml", "model: {name: dog, max_keypoints: 100}")
+    features = ["sift_sv64", "sift_sv16", "colmap_sift", str(fewer)]
     grid = {"dataset": str(inloc_layout), "feature": features}
     outputs = run_batch(grid)
-    assert len(read) == len(set(read)) == 4
+    assert set(Counter(read).values()) == {2} and len(read) == 2 * 4  # for all, and for the fewer
     warnings = [record for record in caplog.records if "lacks 1 of 3" in record.message]
     assert len(warnings) == 1 + len(features)  # of the plan, and of each job as it is run
     for feature in features:
-        alone = outputs.parent / "alone" / feature
+        alone = outputs.parent / "alone" / Path(feature).stem
         inloc.main(inloc_layout, alone, feature, retrieval=str(next(outputs.rglob("pairs*.txt"))))
-        queries = (outputs / inloc_layout.name / feature / "queries.csv").read_text()
+        queries = (outputs / inloc_layout.name / alone.name / "queries.csv").read_text()
         assert queries == (alone / "queries.csv").read_text()
     read.clear()
     run_batch({**grid, "feature": [*features, "sift_sv32"]})
     assert not read  # for more features of the same keypoints
+    run_batch(grid, options=("--overwrite",))
+    assert set(Counter(read).values()) == {2} and len(read) == 2 * 4
+    place = shutil.copytree(inloc_layout, tmp_path / "copy" / inloc_layout.name)
+    run_batch({"dataset": str(place)}, options=("--overwrite",))  # of another data set
 
 
 def test_a_grid_of_matchers_and_storages_in_both_layouts(aachen_layout, inloc_layout, run_batch):

@@ -125,6 +125,10 @@ def test_plane(inloc_layout, tmp_path, monkeypatch, capsys):
     assert {path: path.stat().st_mtime_ns for path in times} == times and len(read) == 4
     assert (outputs / summary["poses"]).read_text() == poses
 
+    # but for scans that have changed
+    run(monkeypatch, *arguments, outputs, "--overwrite")
+    assert len(read) == 8 and (outputs / summary["poses"]).read_text() == poses
+
     # and so does one from nothing, of the queries in another order
     queries = inloc_layout / "queries_with_intrinsics.txt"
     queries.write_text("\n".join(reversed(queries.read_text().splitlines())))
@@ -148,7 +152,7 @@ def test_points_are_those_of_the_plane(inloc_layout, tmp_path, monkeypatch):
     camera = next(iter(model.cameras.values()))
     with (
         h5py.File(tmp_path / "o/feats-dog-sift.h5") as features,
-        h5py.File(tmp_path / "o/points3D.h5") as points,
+        h5py.File(tmp_path / "o/feats-dog-sift-points3D.h5") as points,
     ):
         for number in range(4):
             floor = "PLA2" if number == 3 else "PLA1"

@@ -38,6 +38,10 @@ def slow_squares(items):
         yield i, i * i, os.environ["OMP_NUM_THREADS"], ray.get_runtime_context().get_node_id()
 
 
+def torch_home(items):
+    yield os.environ["TORCH_HOME"]
+
+
 def failing(error, items):
     raise error(*items)
     yield
@@ -66,9 +70,22 @@ def test_work_that_uses_a_gpu_is_done_where_one_is(cluster):
     with ray_cluster(cluster.address) as executor:
         assert len(nodes_of(executor, True)) > 1  # there is none yet
         joined = cluster.add_node(num_cpus=1, num_gpus=1, object_store_memory=80 * 2**20)
-        assert nodes_of(executor, True) == {joined.node_id}
-        assert len(nodes_of(executor, False)) > 1
-        cluster.remove_node(joined)
+        try:
+            assert nodes_of(executor, True) == {joined.node_id}
+            assert len(nodes_of(executor, False)) > 1
+            results = executor.map(slow_squares, range(60), 2, True)
+            found = [next(results)]
+        finally:
+            cluster.remove_node(joined)
+        found += results  # of the cores of others
+        assert sorted(item[:2] for item in found) == [(i, i * i) for i in range(60)]
+        assert len({node for *_, node in found}) > 1
+
+
+def test_weights_are_where_the_command_finds_them(cluster, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    with ray_cluster(cluster.address) as executor:
+        assert list(executor.map(torch_home, [0], 1)) == [str(tmp_path)]
 
 
 def test_an_error_is_as_in_this_process(cluster):

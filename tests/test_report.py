@@ -6,6 +6,7 @@ import re
 import shutil
 
 import command
+import h5py
 import pytest
 
 from hloc_reduce import cli, compare, io
@@ -110,7 +111,7 @@ def test_queries_are_ranked_from_worst_to_best(compared):
 
 
 def test_runs_of_scans_and_of_a_map_of_ones_own(
-    inloc_layout, plane, tmp_path, monkeypatch, aachen_layout
+    inloc_layout, plane, tmp_path, monkeypatch, aachen_layout, caplog
 ):
     given = ("--outputs", tmp_path / "i", "--feature", "colmap_sift_sv32")
     command.run(monkeypatch, inloc, "--dataset", inloc_layout, *given)
@@ -137,6 +138,22 @@ def test_runs_of_scans_and_of_a_map_of_ones_own(
     (good,) = [name for name in by_run[0].rows if name.endswith("a.JPG")]
     command.run(monkeypatch, report, folders[0], "-o", output, "--queries", good)
     assert output.read_text().count("data:image/jpeg;base64,") == 1
+
+    # without maps, or the keypoints that one is of
+    (points,) = (tmp_path / "i").glob("*-points3D.h5")
+    (sfm,) = (tmp_path / "l/map").glob("sfm*")
+    sfm.rename(tmp_path / "l/away")
+    points.rename(tmp_path / "i/away")
+    command.run(monkeypatch, report, *folders, "-o", output)
+    for path in (points, sfm):
+        said = rf"in the report: Cannot open \S*{path.parent.name}/{path.name}: it is not there"
+        assert re.search(said, caplog.text)
+    (tmp_path / "i/away").rename(points)
+    with h5py.File(next((tmp_path / "i").glob("feats-*_sv32.h5")), "r+") as file:
+        for name in io.iterate_h5_names(file["database"].id, "database/"):
+            file[name]["keypoints"][0] += 1
+    command.run(monkeypatch, report, folders[0], "-o", output)
+    assert f"{points} is not of the keypoints of database/cutouts/" in caplog.text
 
 
 def test_nothing_in_a_name_is_taken_for_html(compared, tmp_path, monkeypatch):
