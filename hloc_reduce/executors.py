@@ -7,7 +7,6 @@ paths.
 
 import os
 import re
-import signal
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
@@ -21,7 +20,7 @@ import torch
 
 from . import parallel, processes
 from .cli import InputError
-from .interrupts import uninterrupted
+from .interrupts import interruptible, uninterrupted
 
 Item, Result = TypeVar("Item"), TypeVar("Result")
 Work = Callable[[Iterable[Item]], Iterator[Result]]
@@ -149,8 +148,9 @@ def processes_of_this_machine(workers: int | None = None) -> Iterator[Pool]:
 def ray_cluster(address: str | None = None) -> Iterator[Pool]:
     """Use a Ray cluster for the time of a block: a process of one thread on each of its cores.
 
-    While it has GPUs, work that uses one is done there only. What a machine that is gone had to do
-    is done by another. TORCH_HOME is the same everywhere.
+    If it has GPUs when work begins that uses one, it is done there, unless they all leave; one
+    that joins is for what begins later. What a machine that is gone had to do is done by another.
+    TORCH_HOME is the same everywhere.
 
     Args:
         address: as of `ray.init`; default: that of the environment variable RAY_ADDRESS, or else a
@@ -166,18 +166,18 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
         import ray
     except ImportError:
         raise InputError("Ray is not installed: pip install 'hloc-reduce[ray]'.") from None
-    handler = signal.getsignal(signal.SIGTERM)
     local = address == "local"
     kept = {"OMP_NUM_THREADS": "1"}
     if "TORCH_HOME" in os.environ:
-        kept["TORCH_HOME"] = os.path.abspath(os.environ["TORCH_HOME"])
+        kept["TORCH_HOME"] = os.path.abspath(os.path.expanduser(os.environ["TORCH_HOME"]))
     try:
         try:
             if match := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
                 # Ray itself would try for minutes
                 socket.create_connection((match[1], int(match[2])), timeout=TIMEOUT).close()
             with uninterrupted() if local else nullcontext():  # half begun, it would not end
-                ray.init(
+                interruptible(  # in a thread, where Ray leaves the handlers of signals alone
+                    ray.init,
                     address,
                     include_dashboard=False,
                     logging_level="warning",
@@ -189,7 +189,6 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
                 f"The Ray cluster {address} does not answer, or refuses: is {TOKEN} the same here "
                 f"and there? ({error})"
             ) from None
-        signal.signal(signal.SIGTERM, handler)  # Ray sets its own
         task = ray.remote(_all)
         running: dict[Future, ray.ObjectRef] = {}
 

@@ -13,7 +13,7 @@ from threading import Thread
 from loky import ProcessPoolExecutor
 from loky.backend import resource_tracker as loky_tracker
 
-from .interrupts import STOPS
+from .interrupts import STOPS, uninterrupted
 
 POLL = 0.5  # seconds
 # loky kills a process all the same where there is no `pgrep` to look for its children
@@ -28,8 +28,8 @@ def pool(number: int) -> Iterator["_Pool"]:
     process is killed.
     """
     for trackers in (resource_tracker, loky_tracker):
-        trackers.ensure_running()  # which may unblock the signals that are to be blocked
-    with _blocked_signals():
+        trackers.ensure_running()  # which may unblock the signals that `_starting` blocks
+    with _starting():
         processes = _Pool(number)
     try:
         yield processes
@@ -53,9 +53,9 @@ class _Pool:
     def submit(self, function: Callable, *args) -> Future:
         """Hand a function to a process, and start processes if need be, also when one was killed.
 
-        They inherit the mask of signals: Ctrl-C is for this process, which ends them.
+        They do not hear Ctrl-C, which is for this process, which ends them.
         """
-        with _blocked_signals():
+        with _starting():
             try:
                 return self.executor.submit(function, *args)
             except BrokenExecutor:
@@ -64,13 +64,14 @@ class _Pool:
 
 
 @contextmanager
-def _blocked_signals() -> Iterator[None]:
-    """Have this thread not hear Ctrl-C and SIGTERM until the block ends."""
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+def _starting() -> Iterator[None]:
+    """Have Ctrl-C and SIGTERM wait until the block ends, and processes of it never hear them."""
+    with uninterrupted():
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)  # of this thread, is inherited
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _end_without(parent: int) -> None:

@@ -42,7 +42,8 @@ def main(
     """Run all stages and return the summary, as in summary.json.
 
     Takes what the command line takes, and the executor that does the work, and `features`, a file
-    of them to use instead of extracting them.
+    of them to use instead of extracting them. What these show is then kept beside it, in
+    points3D.h5 of all feature files of that folder, which `overwrite` does not concern.
     """
     feature, feature_conf = features_confs.get(feature, projection, storage)
     matcher_conf = matchers_confs.confs[matcher]

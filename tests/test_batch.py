@@ -20,6 +20,7 @@ from hloc_reduce.cli import InputError
 from hloc_reduce.descriptors import Descriptor
 from hloc_reduce.evaluation import published
 from hloc_reduce.jobs import Job
+from hloc_reduce.report import __main__ as report
 from pipelines import aachen, batch, inloc, tables
 from pipelines.shared import Shared
 
@@ -201,6 +202,20 @@ def test_scans_and_true_poses_are_read_once(inloc_layout, run_batch, tmp_path, m
     assert set(Counter(read).values()) == {2} and len(read) == 2 * 4
     place = shutil.copytree(inloc_layout, tmp_path / "copy" / inloc_layout.name)
     run_batch({"dataset": str(place)}, options=("--overwrite",))  # of another data set
+
+
+def test_a_report_of_jobs_that_share_points_shows_what_each_retrieved(
+    inloc_layout, run_batch, tmp_path, monkeypatch, caplog
+):
+    fewer = write(tmp_path / "fewer.yaml", "model: {name: dog, max_keypoints: 100}")
+    place = {"dataset": str(inloc_layout)}
+    outputs = run_batch(
+        {**place, "feature": str(fewer), "num_loc": 1}, {**place, "feature": "sift_sv16"}
+    )
+    folder = outputs / inloc_layout.name
+    jobs_of = [folder / "fewer+num_loc1", folder / "sift_sv16"]
+    command.run(monkeypatch, report, *jobs_of, "-o", tmp_path / "report.html")
+    assert "There is no" not in caplog.text
 
 
 def test_a_grid_of_matchers_and_storages_in_both_layouts(aachen_layout, inloc_layout, run_batch):

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import signal
 import sys
 import threading
 import time
@@ -83,9 +84,36 @@ def test_work_that_uses_a_gpu_is_done_where_one_is(cluster):
 
 
 def test_weights_are_where_the_command_finds_them(cluster, tmp_path, monkeypatch):
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    with ray_cluster(cluster.address) as executor:
-        assert list(executor.map(torch_home, [0], 1)) == [str(tmp_path)]
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for given in (str(tmp_path), "~"):
+        monkeypatch.setenv("TORCH_HOME", given)
+        with ray_cluster(cluster.address) as executor:
+            assert list(executor.map(torch_home, [0], 1)) == [str(tmp_path)]
+
+
+def test_handlers_of_signals_are_as_before(cluster):
+    handler = signal.signal(signal.SIGTERM, lambda *_: None)
+    try:
+        mine = signal.getsignal(signal.SIGTERM)
+        with ray_cluster(cluster.address):
+            assert signal.getsignal(signal.SIGTERM) is mine
+        with pytest.raises(InputError), ray_cluster("nowhere"):
+            pass
+        assert signal.getsignal(signal.SIGTERM) is mine
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+def test_a_cluster_is_used_in_a_thread(cluster):
+    def use():
+        with ray_cluster(cluster.address) as executor:
+            found.extend(item[1] for item in executor.map(slow_squares, range(4), 1))
+
+    found = []
+    thread = threading.Thread(target=use)
+    thread.start()
+    thread.join()
+    assert sorted(found) == [0, 1, 4, 9]
 
 
 def test_an_error_is_as_in_this_process(cluster):

@@ -15,7 +15,7 @@ from .. import colmap, localization, localize_inloc, logger, scans
 from ..cli import InputError
 from ..evaluation import published
 from ..evaluation.poses import FAILED
-from ..io import list_h5_names, open_h5
+from ..io import open_h5
 from ..localize_sfm import SfmMap
 from ..parsers import parse_poses, parse_retrieval
 
@@ -111,12 +111,12 @@ class Run:
         """The map, which knows what point each keypoint of its images shows."""
         if self.reconstruction is not None:
             return SfmMap(self.reconstruction)
-        file = self.files["map"]
-        names = sorted({group.rpartition("/")[0] for group in list_h5_names(file)})
+        points, features = self.files["map"], self.files["map_features"]
+        with open_h5(points), open_h5(features):  # or they say why not
+            files = h5py.File(points), h5py.File(features)
+        names = sorted({name for names in self.retrieved.values() for name in names})
         poses = {name: scans.read_pose(self.files["map_images"], name) for name in names}
-        features = self.files["map_features"]
-        with open_h5(features):  # or it says why not
-            return localize_inloc.ScanMap(h5py.File(file), h5py.File(features), poses)
+        return localize_inloc.ScanMap(*files, poses)
 
     @cached_property
     def retrieved(self) -> dict[str, list[str]]:
