@@ -5,11 +5,12 @@ gives it all items at once, or chunks of them in processes that find the same fi
 paths.
 """
 
+import logging
 import os
 import re
 import socket
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from itertools import chain, islice
@@ -166,24 +167,29 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
         import ray
     except ImportError:
         raise InputError("Ray is not installed: pip install 'hloc-reduce[ray]'.") from None
-    local = address == "local"
     kept = {"OMP_NUM_THREADS": "1"}
     if "TORCH_HOME" in os.environ:
         kept["TORCH_HOME"] = os.path.abspath(os.path.expanduser(os.environ["TORCH_HOME"]))
+    # in a thread, with which its processes end, Ray sets no handler of signals, but warns of that
+    thread = ThreadPoolExecutor(1)
+    logging.getLogger("ray._private.worker").setLevel("ERROR")
     try:
         try:
             if match := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
                 # Ray itself would try for minutes
                 socket.create_connection((match[1], int(match[2])), timeout=TIMEOUT).close()
-            with uninterrupted() if local else nullcontext():  # half begun, it would not end
-                interruptible(  # in a thread, where Ray leaves the handlers of signals alone
-                    ray.init,
-                    address,
-                    include_dashboard=False,
-                    logging_level="warning",
-                    runtime_env={"env_vars": kept},
-                    **({"num_cpus": parallel.cores()} if local else {}),
-                )
+            begin = partial(
+                ray.init,
+                address,
+                include_dashboard=False,
+                logging_level="warning",
+                runtime_env={"env_vars": kept},
+            )
+            if address == "local":
+                with uninterrupted():  # half begun, it would not end
+                    thread.submit(begin, num_cpus=parallel.cores()).result()
+            else:
+                interruptible(begin)
         except (OSError, ValueError, OverflowError, RuntimeError) as error:
             raise InputError(
                 f"The Ray cluster {address} does not answer, or refuses: is {TOKEN} the same here "
@@ -216,6 +222,7 @@ def ray_cluster(address: str | None = None) -> Iterator[Pool]:
         yield Pool(*cpus, gpus, **how)
     finally:
         ray.shutdown()
+        thread.shutdown()
 
 
 # by name; each is given the address of a cluster
