@@ -20,7 +20,8 @@ test: $(VENV)/installed $(OLD)/installed
 	$(BIN)/ruff format --check .
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
-	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest tests/test_dog.py tests/test_stages.py \
+	OMP_NUM_THREADS=1 PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest -n 2 --dist loadfile \
+		tests/test_dog.py tests/test_stages.py \
 		tests/test_aachen.py::test_plane tests/test_inloc.py::test_plane tests/test_localize.py \
 		-k "not test_localize or intrinsics or reconstruction or the_same_as"
 

@@ -184,13 +184,13 @@ def test_scans_and_true_poses_are_read_once(inloc_layout, run_batch, tmp_path, m
     truth = inloc_layout / "ground_truth_poses.txt"
     truth.write_text("\n".join(truth.read_text().splitlines()[:2]))
     fewer = write(tmp_path / "fewer.yaml", "model: {name: dog, max_keypoints: 100}")
-    features = ["sift_sv64", "sift_sv16", "colmap_sift", str(fewer)]
+    features = ["sift_sv16", "colmap_sift", str(fewer)]
     grid = {"dataset": str(inloc_layout), "feature": features}
     outputs = run_batch(grid)
     assert set(Counter(read).values()) == {2} and len(read) == 2 * 4  # for all, and for the fewer
     warnings = [record for record in caplog.records if "lacks 1 of 3" in record.message]
     assert len(warnings) == 1 + len(features)  # of the plan, and of each job as it is run
-    for feature in features:
+    for feature in features[1:]:
         alone = outputs.parent / "alone" / Path(feature).stem
         inloc.main(inloc_layout, alone, feature, retrieval=str(next(outputs.rglob("pairs*.txt"))))
         queries = (outputs / inloc_layout.name / alone.name / "queries.csv").read_text()

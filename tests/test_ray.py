@@ -66,6 +66,7 @@ def test_a_node_is_removed(cluster):
         assert sorted(found) == [(i, i * i) for i in range(60)]
 
 
+@pytest.mark.long
 def test_work_that_uses_a_gpu_is_done_where_one_is(cluster):
     def nodes_of(executor, gpu):
         found = list(executor.map(slow_squares, range(8), 1, gpu))
@@ -107,6 +108,7 @@ def test_handlers_of_signals_are_as_before(cluster):
         signal.signal(signal.SIGTERM, handler)
 
 
+@pytest.mark.long
 def test_a_cluster_is_used_in_a_thread(cluster):
     def use():
         with ray_cluster(cluster.address) as executor:
