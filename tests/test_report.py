@@ -149,9 +149,11 @@ def test_runs_of_scans_and_of_a_map_of_ones_own(
         said = rf"in the report: Cannot open \S*{path.parent.name}/{path.name}: it is not there"
         assert re.search(said, caplog.text)
     (tmp_path / "i/away").rename(points)
-    with h5py.File(next((tmp_path / "i").glob("feats-*_sv32.h5")), "r+") as file:
+    features = next((tmp_path / "i").glob("feats-*_sv32.h5"))
+    with h5py.File(shutil.copy(features, tmp_path / "other.h5"), "r+") as file:
         for name in io.iterate_h5_names(file["database"].id, "database/"):
             file[name]["keypoints"][0] += 1
+    (tmp_path / "other.h5").replace(features)
     command.run(monkeypatch, report, folders[0], "-o", output)
     assert f"{points} is not of the keypoints of database/cutouts/" in caplog.text
 
