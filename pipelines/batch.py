@@ -185,7 +185,7 @@ def _main() -> None:
     )
     parser.add_argument(
         "--address",
-        help="of a Ray cluster, for --executor ray (default: RAY_ADDRESS, or a new one, of this machine)",
+        help="of a Ray cluster, for --executor ray (default: RAY_ADDRESS, or a new one here)",
     )
     parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
     args = parser.parse_args()
