@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from confs import features as features_confs
 
-from . import cli, colmap, extractors, logger, parallel, processes, projections
+from . import cli, detection, extractors, logger, parallel, processes, projections
 from .cli import InputError
 from .descriptors import DESCRIPTORS, check_weights
 from .executors import SERIAL, Executor
@@ -193,7 +193,8 @@ def extract_all(
         def detect(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             try:
                 with span("detect"):
-                    return pool.submit(colmap.detect_dog, image, base.conf["options"]).result()
+                    arguments = image, base.conf["options"], base.adaptive
+                    return pool.submit(detection.detect, *arguments).result()
             except BrokenExecutor:
                 raise InputError(
                     "A process that detects keypoints was killed, perhaps for want of memory: "
@@ -387,11 +388,12 @@ def _main() -> None:
     )
     parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
     features_confs.add_storage_option(parser)
+    features_confs.add_keypoints_option(parser)
     parser.add_argument("--overwrite", action="store_true", help="extract anew what is there")
     args = parser.parse_args()
     if args.export_dir is None and args.feature_path is None:
         raise InputError("Give --export_dir or --feature_path.")
-    _, conf = features_confs.get(args.conf, storage=args.storage)
+    _, conf = features_confs.get(args.conf, storage=args.storage, keypoints=args.keypoints)
     main(
         conf,
         args.image_dir,

@@ -24,6 +24,7 @@ from . import (
     triangulation,
 )
 from .cli import InputError, choose
+from .detection import KEYPOINTS
 from .extract_features import list_images
 from .io import replacing
 from .results import RunFolder
@@ -90,7 +91,7 @@ class Map:
         Raises:
             InputError: if it is another, or has the same name but another projection.
         """
-        name, conf = features_confs.get(feature, projection, self.storage)
+        name, conf = features_confs.get(feature, projection, self.storage, self.keypoints)
         made_by = extract_features.provenance(conf)
         if json.loads((self.folder / "conf.json").read_text())["feature"] != made_by:
             other = "" if name != self.feature else f", but not of the {name} that it is now"
@@ -103,6 +104,12 @@ class Map:
     def storage(self) -> str:
         """How descriptors are kept, as in `confs.features.get`."""
         return self._conf.get("storage", STORAGES[0])
+
+    @property
+    def keypoints(self) -> str:
+        """The settings of the DoG detector, as in `confs.features.get`."""
+        model = self._conf["model"]
+        return model.get("base", model).get("keypoints", KEYPOINTS[0])
 
     @property
     def sfm(self) -> Path:
@@ -139,6 +146,7 @@ def main(
     num_covis: int = 20,
     overwrite: bool = False,
     storage: str = STORAGES[0],
+    keypoints: str = KEYPOINTS[0],
 ) -> Map:
     """Build a map, or open one that was made from the same.
 
@@ -154,6 +162,7 @@ def main(
             the most similar.
         overwrite: build anew.
         storage: as in `confs.features.get`.
+        keypoints: as in `confs.features.get`.
 
     Returns:
         The map.
@@ -162,7 +171,7 @@ def main(
         InputError: when the folder has a map that was made from something else, or something is
             missing or wrong.
     """
-    feature, conf = features_confs.get(feature, projection, storage)
+    feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher_conf = matchers_confs.confs[matcher]
     model_files: dict[str, Path] = {}
     names = None

@@ -19,6 +19,7 @@ from hloc_reduce import (
     triangulation,
 )
 from hloc_reduce.datasets import Aachen, thresholds, true_poses
+from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.storage import STORAGES
 
@@ -40,6 +41,7 @@ def main(
     overwrite: bool = False,
     projection: Path | None = None,
     storage: str = STORAGES[0],
+    keypoints: str = KEYPOINTS[0],
     executor: Executor = SERIAL,
     features: Path | None = None,
 ) -> dict:
@@ -48,7 +50,7 @@ def main(
     Takes what the command line takes, and the executor that does the work, and `features`, a file
     of them to use instead of extracting them.
     """
-    feature, feature_conf = features_confs.get(feature, projection, storage)
+    feature, feature_conf = features_confs.get(feature, projection, storage, keypoints)
     matcher_conf = matchers_confs.confs[matcher]
     place = Aachen(dataset)
     map_names = place.map_names()
@@ -158,6 +160,7 @@ def _main() -> None:
             args.overwrite,
             args.projection,
             args.storage,
+            args.keypoints,
         )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)

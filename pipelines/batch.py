@@ -72,6 +72,7 @@ def main(
                         ground_truth=job.ground_truth,
                         overwrite=overwrite,
                         storage=job.storage,
+                        keypoints=job.keypoints,
                         executor=executor,
                         features=shared.features[job],
                         **job.numbers,

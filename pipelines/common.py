@@ -69,6 +69,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
         help="file of a projection to use with the base descriptor of --feature",
     )
     features_confs.add_storage_option(parser)
+    features_confs.add_keypoints_option(parser)
     parser.add_argument(
         "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
     )

@@ -16,6 +16,7 @@ from hloc_reduce import (
     trace,
 )
 from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
+from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.storage import STORAGES
 
@@ -36,6 +37,7 @@ def main(
     overwrite: bool = False,
     projection: Path | None = None,
     storage: str = STORAGES[0],
+    keypoints: str = KEYPOINTS[0],
     executor: Executor = SERIAL,
     features: Path | None = None,
 ) -> dict:
@@ -45,7 +47,7 @@ def main(
     of them to use instead of extracting them. What these show is then kept beside it, in
     points3D.h5 of all feature files of that folder, which `overwrite` does not concern.
     """
-    feature, feature_conf = features_confs.get(feature, projection, storage)
+    feature, feature_conf = features_confs.get(feature, projection, storage, keypoints)
     matcher_conf = matchers_confs.confs[matcher]
     place = InLoc(dataset)
     map_names, query_names = place.map_names(), place.query_names()
@@ -144,6 +146,7 @@ def _main() -> None:
             args.overwrite,
             args.projection,
             args.storage,
+            args.keypoints,
         )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)

@@ -28,6 +28,7 @@ from hloc_reduce import (
 )
 from hloc_reduce.cli import InputError
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
+from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.maps import Map
 from hloc_reduce.parsers import parse_query_lists
 from hloc_reduce.storage import STORAGES
@@ -49,6 +50,7 @@ def open_map(
     num_covis: int = 20,
     overwrite: bool = False,
     storage: str | None = None,
+    keypoints: str | None = None,
 ) -> Map:
     """Build a map in `outputs`, or open one that was built before.
 
@@ -63,6 +65,7 @@ def open_map(
         num_covis: pairs of each map image.
         overwrite: build anew.
         storage: of descriptors; likewise, float16.
+        keypoints: settings of the DoG detector; likewise, adaptive.
     """
     if map_images is None:
         if model_or_map is None:
@@ -76,6 +79,8 @@ def open_map(
             built.check_feature(feature or FEATURE, projection)
         if storage not in (None, built.storage):
             raise InputError(f"The map {model_or_map} is of --storage {built.storage}.")
+        if keypoints not in (None, built.keypoints):
+            raise InputError(f"The map {model_or_map} is of --keypoints {built.keypoints}.")
         if matcher not in (None, built.matcher):
             raise InputError(f"The map {model_or_map} is of --matcher {built.matcher}.")
         return built
@@ -94,6 +99,7 @@ def open_map(
         num_covis,
         overwrite,
         storage or STORAGES[0],
+        keypoints or KEYPOINTS[0],
     )
 
 
@@ -247,11 +253,14 @@ def _main() -> None:
     parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
     common.add_feature_options(parser)
     common.add_localization_options(parser, "none", 50)
-    parser.set_defaults(feature=None, matcher=None, storage=None)  # those of a map that was built
+    # None: those of a map that was built
+    parser.set_defaults(feature=None, matcher=None, storage=None, keypoints=None)
     args = parser.parse_args()
     common.check_options(args)
     if args.storage is not None:
         cli.choose("storage", args.storage, STORAGES)
+    if args.keypoints is not None:
+        cli.choose("keypoints", args.keypoints, KEYPOINTS)
     if args.outputs is None:
         raise InputError("Give --outputs, a folder.")
     if args.queries is not None and args.query_images is None:
@@ -271,6 +280,7 @@ def _run(args: argparse.Namespace) -> None:
         args.num_covis,
         args.overwrite,
         args.storage,
+        args.keypoints,
     )
     if args.query_images is None:
         print(f"The map {built.folder} is there. Localize photos in it with --query_images.")

@@ -19,6 +19,7 @@ from hloc_reduce import (
 from hloc_reduce.cli import InputError
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.descriptors import DIM
+from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import Executor
 from hloc_reduce.group_writer import GroupWriter
 from hloc_reduce.jobs import Job
@@ -77,11 +78,12 @@ class Shared:
             truth = job.ground_truth or self._place.ground_truth
             true_poses(self.query_names, truth, job.ground_truth is not None)
             self._truths.add(job.ground_truth)
-        _, conf = features_confs.get(job.feature, storage=job.storage)
+        _, conf = features_confs.get(job.feature, None, job.storage, job.keypoints)
         extract_features.provenance(conf)
         project = getattr(extractors.load(conf["model"]), "project", None)
         stored = "" if job.storage == STORAGES[0] else f"-{job.storage}"
-        path = self.folder / f"{conf['output']}{stored}.h5"
+        found = "" if job.keypoints == KEYPOINTS[0] else f"-keypoints_{job.keypoints}"
+        path = self.folder / f"{conf['output']}{stored}{found}.h5"
         if self.confs.setdefault(path, conf) != conf:
             raise InputError(f"{path.name} is that of another feature, too: rename its YAML file.")
         self.features[job] = path

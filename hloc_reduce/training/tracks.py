@@ -35,6 +35,7 @@ from .loop import device
 
 NUM_COVIS = 20
 MATCHED = "sift"  # which descriptor finds the tracks, whatever they are described with
+KEYPOINTS = "hloc"  # settings of DoG, which the projections that ship were trained with
 # The photo as it is and three photometric variants, each as seen and mirrored.
 VARIANTS = 4
 MAX_SHIFT = 1.5  # pixels between a keypoint and the same one of a variant
@@ -102,9 +103,9 @@ def main(
         raise InputError(f"{output} holds the tracks of another map. Choose another folder.")
     stamps.write(output / "source.json", source)
     if conf is None and descriptor not in DESCRIPTORS:
-        conf = features_confs.confs[descriptor]
+        conf = features_confs.get(descriptor, keypoints=KEYPOINTS)[1]
     found_by, patches = (descriptor, False) if conf else (MATCHED, True)
-    conf = conf or features_confs.confs[MATCHED]
+    conf = conf or features_confs.get(MATCHED, keypoints=KEYPOINTS)[1]
     pairs = pairs_from_covisibility.main(
         model, output / f"pairs-db-covis{NUM_COVIS}.txt", NUM_COVIS
     )
