@@ -32,7 +32,7 @@ from .parsers import write_poses
 MIN_INLIERS = 8
 SEED = 0
 CHUNK = 8  # queries
-RECORDS = 3  # the version of what a record holds
+RECORDS = 4  # the version of what a record holds
 
 
 class Reference(Protocol):
@@ -157,9 +157,9 @@ def main(
     Returns:
         A record for each query: `localized` (from MIN_INLIERS inliers on), the pose that is
         written as `qvec` (w, x, y, z) and `tvec`, the fallback where it is not localized, None
-        where there is none; `camera`, the model, width, height and parameters in a list;
-        `max_error`, the pixels within which inliers reproject, None for pycolmap's default; and
-        the numbers and `db` of `localize`.
+        where there is none; `reason`, why it is not localized, None where it is; `camera`, the
+        model, width, height and parameters in a list; `max_error`, the pixels within which inliers
+        reproject, None for pycolmap's default; and the numbers and `db` of `localize`.
     """
     log = _Log(log_file(results), {"records": RECORDS, **made_from}, overwrite)
     todo = [query for query in queries if query[0] not in log.records]
@@ -200,6 +200,7 @@ def _localize_all(
         options = config(name, camera)
         cam_from_world, info = localize(reference, keypoints, camera, used, options)
         info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
+        info["num_keypoints"] = len(keypoints)
         return name, _record(reference, list(found), cam_from_world, info)
 
     with open_h5(features) as feature_file, open_h5(matches) as match_file:
@@ -316,6 +317,7 @@ def _record(
     numbers = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
     return {
         "localized": localized,
+        "reason": None if localized else _reason(names, info),
         "qvec": qvec,
         "tvec": tvec,
         "camera": [refined.model.name, refined.width, refined.height, *refined.params.tolist()],
@@ -323,6 +325,22 @@ def _record(
         **{key: info[key] for key in numbers},
         "db": info["db"] if localized else next(iter(names), None),
     }
+
+
+def _reason(names: list[str], info: dict) -> str:
+    """Say why a query is not localized.
+
+    Args:
+        names: the map images that were retrieved for it.
+        info: as from `localize`, and `num_keypoints` of the query.
+    """
+    if not info["num_keypoints"]:
+        return "no keypoints"
+    if not names:
+        return "no map image was retrieved"
+    if not info["num_matches"]:
+        return "no match with a 3D point"
+    return f"too few inliers: {info['num_inliers']}, at least {MIN_INLIERS} are needed"
 
 
 class _Log:

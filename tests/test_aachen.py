@@ -56,7 +56,8 @@ def test_plane(aachen_layout, tmp_path, monkeypatch, capsys):
     assert good["status"] == "localized" and float(good["position_error_m"]) < 0.02
     assert 0 < int(good["num_inliers"]) <= int(good["num_matches"])
     assert grey["status"] == "fallback" and grey["num_matches"] == "0"
-    assert grey["retrieved"].startswith("db/")
+    assert grey["retrieved"].startswith("db/") and grey["reason"] == "no keypoints"
+    assert good["reason"] == ""
     poses = outputs / summary["poses"]
     assert [line.split()[0] for line in poses.read_text().splitlines()] == ["a.png", "grey.png"] + [
         "a.png"
@@ -148,6 +149,7 @@ def test_retrieval_from_files(aachen_layout, tmp_path, monkeypatch, caplog):
     assert rows["query/night/a.png"]["retrieved"] == "db/2.png"
     grey = rows["query/day/grey.png"]  # for which the file has nothing
     assert grey["status"] == "fallback" and grey["retrieved"] == ""
+    assert grey["reason"] == "no keypoints"
 
     global_descriptors = tmp_path / "netvlad.h5"
     generator = np.random.default_rng(0)
