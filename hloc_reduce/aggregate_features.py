@@ -15,7 +15,7 @@ from . import cli, colmap, extractors, io, logger, stamps
 from .base_model import dynamic_load
 from .cli import InputError
 from .extractors.vlad import read_vocabulary
-from .group_writer import GroupWriter
+from .group_writer import GroupWriter, failures
 from .io import list_h5_names, open_h5, replacing
 from .storage import get_descriptors
 
@@ -30,7 +30,7 @@ def main(
     overwrite: bool = False,
     vocabulary: Path | None = None,
 ) -> Path:
-    """Compute a global descriptor of every image of a feature file.
+    """Compute a global descriptor of every image of a feature file that could be read.
 
     Args:
         conf: an entry of `confs`.
@@ -57,7 +57,8 @@ def main(
         else:
             made_by["vocabulary"] = stamps.sha256(vocabulary)
         with GroupWriter(output, made_by, overwrite) as writer:
-            names = list_h5_names(features)
+            failed = failures(features)
+            names = [name for name in list_h5_names(features) if name not in failed]
             todo = [name for name in names if name not in writer]
             if not todo:
                 return output

@@ -4,7 +4,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +15,7 @@ import pycolmap
 
 from .cli import InputError
 from .interrupts import interruptible
+from .io import replacing
 from .parsers import check_names
 
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
@@ -91,6 +92,34 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         raise InputError(f"{path} is not a COLMAP model ({reason}).") from None
     check_names(names, path)
     return model
+
+
+def write_part(path: Path, names: Collection[str], output: Path) -> Path:
+    """Write the part of a COLMAP model that some of its images see.
+
+    Args:
+        path: the model.
+        names: the images.
+        output: the folder of the part; files that stay the same keep their times.
+
+    Returns:
+        `output`.
+    """
+    model = read_model(path)
+    for image in model.images.values():
+        if image.name not in names:
+            model.deregister_frame(image.frame_id)
+    written = output.with_name(f".{output.name}.tmp")
+    shutil.rmtree(written, ignore_errors=True)
+    written.mkdir(parents=True)
+    try:
+        model.write_binary(written)
+        for file in written.iterdir():
+            with replacing(output / file.name) as temporary:
+                shutil.copyfile(file, temporary)
+    finally:
+        shutil.rmtree(written)
+    return output
 
 
 def add_image(

@@ -20,7 +20,7 @@ from .cli import InputError
 from .descriptors import DESCRIPTORS, check_weights
 from .executors import SERIAL, Executor
 from .extractors.dog import DoG
-from .group_writer import FAILURE, Group, GroupWriter, Key, fill
+from .group_writer import FAILURE, Group, GroupWriter, Key, failures, fill
 from .io import UnreadableImage, read_image
 from .parsers import check_names, image_names
 from .storage import STORAGES, store
@@ -42,6 +42,7 @@ def main(
     feature_path: Path | None = None,
     overwrite: bool = False,
     executor: Executor = SERIAL,
+    strict: bool = True,
 ) -> Path:
     """Extract the features of all images of a folder, or of a list of them.
 
@@ -54,22 +55,27 @@ def main(
         feature_path: the h5 file itself, instead of `export_dir`.
         overwrite: extract anew what is there.
         executor: does the work.
+        strict: as of `extract_several`.
 
     Returns:
         The feature file; images it holds already are skipped.
 
     Raises:
-        InputError: for an image that is not there or cannot be read, or an unknown storage.
+        InputError: for an unknown storage, or if `strict` for an image that is not there or cannot
+            be read.
     """
     if feature_path is None:
         feature_path = Path(export_dir) / f"{conf['output']}.h5"
     stored = {"storage": "float16" if as_half else "float32", **conf}
     cli.choose("storage", stored["storage"], STORAGES)
-    names = list_images(image_dir, image_list)
+    if strict or image_list is None:
+        names = list_images(image_dir, image_list)
+    else:
+        names = image_names(image_list)
     if overwrite:
         extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
     with GroupWriter(feature_path, provenance(conf, as_half), overwrite) as writer:
-        extract_several({feature_path: (stored, writer)}, image_dir, names, executor)
+        extract_several({feature_path: (stored, writer)}, image_dir, names, executor, strict)
     return feature_path
 
 
@@ -256,6 +262,63 @@ def list_images(
             f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
         )
     return names
+
+
+def keep_present(image_dir: Path, names: list[str], accept_partial: bool) -> list[str]:
+    """Return the images of a map whose files are there.
+
+    Args:
+        image_dir: the folder that names are relative to.
+        names: the images of the map.
+        accept_partial: leave out those that are not there.
+
+    Raises:
+        InputError: when one is missing that may not be left out, or all are.
+    """
+    absent = [name for name in names if not (image_dir / name).is_file()]
+    if absent and (not accept_partial or len(absent) == len(names)):
+        raise InputError(
+            f"{len(absent)} of {len(names)} images of the map are not in {image_dir}: "
+            f"{cli.some(absent)}."
+            + (" Give --accept_partial to do without them." if len(absent) < len(names) else "")
+        )
+    return _without(names, absent)
+
+
+def keep_readable(features: Path, names: list[str], accept_partial: bool) -> list[str]:
+    """Return the images of a map that could be read, as its feature file tells.
+
+    Args:
+        features: feature file, made without `strict`.
+        names: the images of the map.
+        accept_partial: leave out those that could not be read.
+
+    Raises:
+        InputError: when one could not be read that may not be left out, or all could not.
+    """
+    failed = failures(features)
+    broken = [name for name in names if name in failed]
+    if broken and (not accept_partial or len(broken) == len(names)):
+        raise InputError(
+            f"{len(broken)} of {len(names)} images of the map cannot be read: "
+            f"{with_reasons({name: failed[name] for name in broken})}."
+            + (" Give --accept_partial to do without them." if len(broken) < len(names) else "")
+        )
+    return _without(names, broken)
+
+
+def _without(names: list[str], left_out: list[str]) -> list[str]:
+    if left_out:
+        logger.warning("The map is without %d images: %s.", len(left_out), cli.some(left_out))
+    dropped = set(left_out)
+    return [name for name in names if name not in dropped]
+
+
+def with_reasons(failed: Mapping[str, str]) -> str:
+    """Name the first few images that could not be read, and why."""
+    return cli.some(
+        f"{name} ({reason.rpartition(': ')[2].rstrip('.')})" for name, reason in failed.items()
+    )
 
 
 def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:

@@ -150,7 +150,7 @@ class GroupWriter:
         with open_h5(piece) as new, open_h5(self.path) as old:
             known = _failed(old)
             return any(
-                name not in old or name in known and _reason(new, name) != _reason(old, name)
+                name not in old or name in known and failure_of(new, name) != failure_of(old, name)
                 for name in iterate_h5_names(new.id)
             )
 
@@ -309,8 +309,10 @@ def failures(path: Path) -> dict[str, str]:
         return {name: str(file[name].attrs[FAILURE]) for name in sorted(_failed(file))}
 
 
-def _reason(file: h5py.File, name: str) -> str | None:
-    return file[name].attrs.get(FAILURE)
+def failure_of(file: h5py.File, name: str) -> str | None:
+    """Return why a group of an open h5 file could not be computed; None where it was."""
+    group = file.get(name)
+    return None if group is None else group.attrs.get(FAILURE)
 
 
 def _failed(file: h5py.File) -> set[str]:
@@ -329,7 +331,6 @@ def _merge_piece(piece: h5py.File, merged: h5py.File) -> None:
         del merged[name]
         if name not in again:
             failed.remove(name)
-            merged.attrs["id"] = uuid.uuid4().hex
     failed |= {name for name in again if name not in merged}
     _copy_missing(piece, merged)
     _set_failed(merged, failed)

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from . import cli, colmap, logger, parallel
 from .cli import InputError
 from .executors import SERIAL, Executor
-from .group_writer import FAILURE
+from .group_writer import failure_of
 from .io import (
     find_pair,
     get_colmap_keypoints,
@@ -32,7 +32,7 @@ from .parsers import write_poses
 MIN_INLIERS = 8
 SEED = 0
 CHUNK = 8  # queries
-RECORDS = 3  # the version of what a record holds
+RECORDS = 4  # the version of what a record holds
 
 
 class Reference(Protocol):
@@ -125,7 +125,7 @@ def _correspondences(
 
 def main(
     load_reference: Callable[[], Reference],
-    queries: list[tuple[str, pycolmap.Camera]],
+    queries: list[tuple[str, pycolmap.Camera | None]],
     retrieved: Mapping[str, list[str]],
     features: Path,
     matches: Path,
@@ -139,9 +139,12 @@ def main(
 ) -> dict[str, dict]:
     """Localize queries by the files of their features and matches.
 
+    A query whose photo could not be read, or is of another size than its intrinsics, is not
+    localized.
+
     Args:
         load_reference: gives the map, in each process where there is something to do.
-        queries: names and intrinsics.
+        queries: names and intrinsics, None where these are not known.
         retrieved: the map images of each query, best first.
         features: feature file of the queries.
         matches: match file of the pairs.
@@ -157,16 +160,23 @@ def main(
     Returns:
         A record for each query: `localized` (from MIN_INLIERS inliers on), the pose that is
         written as `qvec` (w, x, y, z) and `tvec`, the fallback where it is not localized, None
-        where there is none; `camera`, the model, width, height and parameters in a list;
-        `max_error`, the pixels within which inliers reproject, None for pycolmap's default; and
-        the numbers and `db` of `localize`.
+        where there is none; `reason`, why it is not localized, None where it is; `camera`, the
+        model, width, height and parameters in a list, None where not known; `max_error`, the
+        pixels within which inliers reproject, None for pycolmap's default; and the numbers and `db`
+        of `localize`.
     """
     log = _Log(log_file(results), {"records": RECORDS, **made_from}, overwrite)
     todo = [query for query in queries if query[0] not in log.records]
     if todo:
-        with open_h5(features) as feature_file, open_h5(matches) as match_file:
+        with open_h5(features) as feature_file:
+            refused = _refused(feature_file, todo)
+        with log:
+            for name, record in _refuse(load_reference, todo, refused, retrieved):
+                log.add(name, record)
+        todo = [query for query in todo if query[0] not in refused]
+    if todo:
+        with open_h5(matches) as match_file:
             _check_some_matched(match_file, queries, retrieved)
-            _check_sizes(feature_file, todo)
         work = partial(_localize_all, load_reference, features, matches, config, skip_matches)
         tasks = ((name, camera, retrieved.get(name, [])) for name, camera in todo)
         with log, closing(executor.map(work, tasks, CHUNK)) as found:
@@ -200,6 +210,7 @@ def _localize_all(
         options = config(name, camera)
         cam_from_world, info = localize(reference, keypoints, camera, used, options)
         info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
+        info["num_keypoints"] = len(keypoints)
         return name, _record(reference, list(found), cam_from_world, info)
 
     with open_h5(features) as feature_file, open_h5(matches) as match_file:
@@ -223,6 +234,15 @@ def camera(record: dict) -> pycolmap.Camera:
     """Return the intrinsics of a query's record, as they were refined."""
     model, width, height, *params = record["camera"]
     return pycolmap.Camera(model=model, width=width, height=height, params=params)
+
+
+def to_stamp(queries: list[tuple[str, pycolmap.Camera | None]]) -> dict[str, list | None]:
+    """Return the intrinsics of queries as a stamp has them."""
+    return {name: camera and _intrinsics(camera) for name, camera in queries}
+
+
+def _intrinsics(camera: pycolmap.Camera) -> list:
+    return [camera.model.name, camera.width, camera.height, *camera.params.tolist()]
 
 
 def read_records(path: Path) -> dict[str, dict]:
@@ -263,20 +283,47 @@ def _check_some_matched(
         )
 
 
-def _check_sizes(feature_file: h5py.File, queries: list[tuple[str, pycolmap.Camera]]) -> None:
-    """Warn of intrinsics that are for photos of another size."""
-    wrong = []
+def _refused(
+    feature_file: h5py.File, queries: list[tuple[str, pycolmap.Camera | None]]
+) -> dict[str, str]:
+    """Return the queries that are not to be localized, and why."""
+    refused, wrong = {}, []
     for name, camera in queries:
-        if f"{name}/image_size" in feature_file and FAILURE not in feature_file[name].attrs:
+        if failure := failure_of(feature_file, name):
+            refused[name] = failure
+        elif camera is None:
+            refused[name] = "its intrinsics are not known"
+        elif f"{name}/image_size" in feature_file:
             width, height = get_image_size(feature_file, name)
             if (width, height) != (camera.width, camera.height):
+                refused[name] = (
+                    f"the intrinsics are for {camera.width}x{camera.height} pixels, the photo has "
+                    f"{width}x{height}"
+                )
                 wrong.append(f"{name} ({camera.width}x{camera.height}, not {width}x{height})")
     if wrong:
         logger.warning(
-            "The intrinsics of %d queries are for another size than that of the photo, so that "
-            "their poses are wrong: %s.",
+            "%d queries are not localized, as their intrinsics are for photos of another size: %s.",
             *(len(wrong), cli.some(wrong)),
         )
+    return refused
+
+
+def _refuse(
+    load_reference: Callable[[], Reference],
+    queries: list[tuple[str, pycolmap.Camera | None]],
+    refused: Mapping[str, str],
+    retrieved: Mapping[str, list[str]],
+) -> Iterator[tuple[str, dict]]:
+    """Yield the names and the records of the queries that are refused."""
+    reference = load_reference() if refused else None
+    for name, camera in queries:
+        if name in refused:
+            _, info = localize(reference, np.zeros((0, 2)), camera or pycolmap.Camera(), {}, {})
+            info |= {"max_error": None, "num_keypoints": 0}
+            names = [other for other in retrieved.get(name, []) if other in reference]
+            record = _record(reference, names, None, info) | {"reason": refused[name]}
+            yield name, record | ({} if camera else {"camera": None})
 
 
 def _read(
@@ -312,17 +359,33 @@ def _record(
         x, y, z, w = cam_from_world.rotation.quat
         qvec = [float(value) for value in (w, x, y, z)]
         tvec = [float(value) for value in cam_from_world.translation]
-    refined = info["camera"]
     numbers = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
     return {
         "localized": localized,
+        "reason": None if localized else _reason(names, info),
         "qvec": qvec,
         "tvec": tvec,
-        "camera": [refined.model.name, refined.width, refined.height, *refined.params.tolist()],
+        "camera": _intrinsics(info["camera"]),
         "max_error": info["max_error"],
         **{key: info[key] for key in numbers},
         "db": info["db"] if localized else next(iter(names), None),
     }
+
+
+def _reason(names: list[str], info: dict) -> str:
+    """Say why a query is not localized.
+
+    Args:
+        names: the map images that were retrieved for it.
+        info: as from `localize`, and `num_keypoints` of the query.
+    """
+    if not info["num_keypoints"]:
+        return "no keypoints"
+    if not names:
+        return "no map image was retrieved"
+    if not info["num_matches"]:
+        return "no match with a 3D point"
+    return f"too few inliers: {info['num_inliers']}, at least {MIN_INLIERS} are needed"
 
 
 class _Log:

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from . import cli, localization, logger, scans, stamps
 from .cli import InputError
 from .executors import SERIAL, Executor
-from .group_writer import Group, GroupWriter, fill
+from .group_writer import Group, GroupWriter, failures, fill
 from .io import get_dataset, get_image_size, get_keypoints, open_h5
 from .parsers import parse_query_lists, parse_retrieval
 
@@ -74,16 +74,14 @@ def main(
     elif queries is None:
         queries = by_iphone7(features, retrieved)
     cutouts = sorted({cutout for name, _ in queries for cutout in retrieved.get(name, [])})
-    if not cutouts:
+    failed = failures(features)
+    if not cutouts and not (queries and all(name in failed for name, _ in queries)):
         raise InputError(f"{retrieval} has no pair of a query and a cutout.")
     points = points or points_file(features)
     lift_keypoints(dataset_dir, features, cutouts, points, overwrite, executor)
 
     options = {"ransac_thresh": ransac_thresh, "skip_matches": skip_matches}
-    options["queries"] = {
-        name: [camera.model.name, camera.width, camera.height, *camera.params.tolist()]
-        for name, camera in queries
-    }
+    options["queries"] = localization.to_stamp(queries)
     poses = {cutout: scans.read_pose(dataset_dir, cutout) for cutout in cutouts}
     options["scans"] = hashlib.sha256(np.array(list(poses.values())).tobytes()).hexdigest()
     return localization.main(
@@ -94,7 +92,7 @@ def main(
         matches,
         results,
         partial(_config, ransac_thresh),
-        stamps.stamp(options, [retrieval, features, matches]),
+        stamps.stamp(options, [p for p in (retrieval, features, matches) if p.exists()]),
         overwrite,
         skip_matches=skip_matches,
         executor=executor,

@@ -20,7 +20,7 @@ RANSAC_THRESH = 12.0  # pixels, as in hloc
 
 def main(
     reference_sfm: Path | pycolmap.Reconstruction,
-    queries: Path,
+    queries: Path | list[tuple[str, pycolmap.Camera | None]],
     retrieval: Path,
     features: Path,
     matches: Path,
@@ -40,7 +40,8 @@ def main(
 
     Args:
         reference_sfm: the map, made from the same features.
-        queries: query list with intrinsics, or a glob of several.
+        queries: query list with intrinsics, or a glob of several; or names and intrinsics, None
+            where these are not known.
         retrieval: pairs of queries and map images, best first.
         features: feature file of the queries.
         matches: match file of the pairs.
@@ -66,13 +67,17 @@ def main(
     """
     if ransac_thresh <= 0:
         raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
-    query_list = [query for queries in parse_query_lists(queries).values() for query in queries]
     retrieved = parse_retrieval(retrieval)
     in_memory = isinstance(reference_sfm, pycolmap.Reconstruction)
     config = {**(config or {})}
     config.setdefault("estimation", {"ransac": {"max_error": ransac_thresh}})
 
-    inputs = [retrieval, features, matches, *sorted(queries.parent.glob(queries.name))]
+    inputs, options = [retrieval, features, matches], {"config": config}
+    if isinstance(queries, Path):
+        inputs += sorted(queries.parent.glob(queries.name))
+        queries = [query for part in parse_query_lists(queries).values() for query in part]
+    else:
+        options["queries"] = localization.to_stamp(queries)
     if in_memory:
         load = partial(SfmMap, reference_sfm, covisibility_clustering)
     else:
@@ -83,7 +88,6 @@ def main(
             _load, reference_sfm, covisibility_clustering, reference_sfm.stat().st_mtime_ns
         )
     refinements = refinements or {}
-    options = {"config": config}
     if refinements:
         options["refinements"] = refinements
     if covisibility_clustering:
@@ -91,7 +95,7 @@ def main(
     try:
         return localization.main(
             load,
-            query_list,
+            queries,
             retrieved,
             features,
             matches,

@@ -25,7 +25,7 @@ from . import (
 )
 from .cli import InputError, choose
 from .detection import KEYPOINTS
-from .extract_features import list_images
+from .extract_features import keep_present, keep_readable, list_images
 from .io import replacing
 from .results import RunFolder
 from .storage import STORAGES
@@ -147,6 +147,7 @@ def main(
     overwrite: bool = False,
     storage: str = STORAGES[0],
     keypoints: str = KEYPOINTS[0],
+    accept_partial: bool = False,
 ) -> Map:
     """Build a map, or open one that was made from the same.
 
@@ -163,6 +164,8 @@ def main(
         overwrite: build anew.
         storage: as in `confs.features.get`.
         keypoints: as in `confs.features.get`.
+        accept_partial: do without images of the model that are missing, and without images that
+            cannot be read.
 
     Returns:
         The map.
@@ -173,7 +176,7 @@ def main(
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher_conf = matchers_confs.confs[matcher]
-    model_files: dict[str, Path] = {}
+    given, model_files = model, {}
     names = None
     if model is not None:
         reference = colmap.read_model(model)
@@ -185,6 +188,7 @@ def main(
             for path in sorted(model.iterdir())
             if path.stem in triangulation.PARTS and path.is_file()
         }
+        names = keep_present(image_dir, names, accept_partial)
     names = list_images(image_dir, names)
     made_by = extract_features.provenance(conf)
     if overwrite or not (map_dir / "conf.json").exists():
@@ -219,9 +223,14 @@ def main(
         stamps.write(map_dir / FINGERPRINTS, fingerprints)
         conf = _keep_projection(conf, map_dir)
         with folder.stage("extract_features"):
-            features = extract_features.main(conf, image_dir, map_dir, image_list=names)
+            features = extract_features.main(
+                conf, image_dir, map_dir, image_list=names, strict=not accept_partial
+            )
+            names = keep_readable(features, names, accept_partial)
         with folder.stage("retrieval"):
             descriptors = aggregate_features.main(RETRIEVAL, features, names)
+        if model is not None and len(names) < len(reference.images):
+            model = colmap.write_part(model, set(names), map_dir / "sfm_reference")
         pairs = map_dir / f"pairs-db-{num_covis}.txt"
         with folder.stage("pairs"):
             if model is not None and reference.num_points3D():
@@ -236,12 +245,13 @@ def main(
                 sfm = triangulation.main(map_dir / "sfm", model, *inputs)
             else:
                 sfm = reconstruction.main(map_dir / "sfm", *inputs, image_list=names)
+        shutil.rmtree(map_dir / "sfm_reference", ignore_errors=True)
         summary = {
             "id": uuid.uuid4().hex,
             "feature": feature,
             "matcher": matcher,
             "image_dir": str(image_dir.resolve()),
-            "model": str(model.resolve()) if model is not None else None,
+            "model": str(given.resolve()) if given is not None else None,
             "conf": _with_projection(conf, lambda path: Path(path).name),
             "images": len(names),
             "images_with_pose": sfm.num_reg_images(),

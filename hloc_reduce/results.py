@@ -29,6 +29,7 @@ COLUMNS = (
     "position_error_m",
     "rotation_error_deg",
     "retrieved",
+    "reason",
 )
 # what a run leaves in its folder, first what says that it is whole; but for lists of pairs, which
 # are always written anew
@@ -233,6 +234,7 @@ def query_table(
                 round(inliers / correspondences, 4) if correspondences else 0.0,
                 *errors,
                 record["db"],
+                record["reason"],
             )
             rows.append(dict(zip(COLUMNS, values, strict=True)))
     return rows

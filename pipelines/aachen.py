@@ -11,6 +11,7 @@ from confs import features as features_confs
 from confs import matchers as matchers_confs
 from hloc_reduce import (
     cli,
+    colmap,
     demo,
     extract_features,
     localize_sfm,
@@ -44,6 +45,8 @@ def main(
     keypoints: str = KEYPOINTS[0],
     executor: Executor = SERIAL,
     features: Path | None = None,
+    strict: bool = False,
+    accept_partial: bool = False,
 ) -> dict:
     """Run all stages and return the summary, as in summary.json.
 
@@ -56,7 +59,11 @@ def main(
     map_names = place.map_names()
     lists = {name: [query for query, _ in part] for name, part in place.query_lists().items()}
     query_names = [name for part in lists.values() for name in part]
-    place.check(map_names)
+    place.check([] if accept_partial else map_names)
+    number = len(map_names)
+    map_names = extract_features.keep_present(place.images, map_names, accept_partial)
+    if features is None:
+        common.check_queries(place.images, query_names, strict)
     truth_file = ground_truth or place.ground_truth
     truth = true_poses(query_names, truth_file, bool(ground_truth))
     retrieved = common.retrieval_name(retrieval, num_loc)
@@ -74,18 +81,26 @@ def main(
         with folder.stage("extract_features"):
             names = [*map_names, *query_names]
             features = features or extract_features.main(
-                feature_conf, place.images, outputs, image_list=names, executor=executor
+                *(feature_conf, place.images, outputs),
+                image_list=names,
+                executor=executor,
+                strict=strict,
             )
+            map_names = extract_features.keep_readable(features, map_names, accept_partial)
+            queries = common.readable(features, query_names)
+        reference = place.reference_model
+        if len(map_names) < number:
+            reference = colmap.write_part(reference, set(map_names), outputs / "sfm_reference")
         with folder.stage("pairs_from_covisibility"):
-            pairs_from_covisibility.main(place.reference_model, sfm_pairs, num_covis)
+            pairs_from_covisibility.main(reference, sfm_pairs, num_covis)
         with folder.stage("match_map"):
             sfm_matches = common.match(matcher_conf, sfm_pairs, features, outputs, executor)
         with folder.stage("triangulation"):
             reconstruction = triangulation.main(
-                sfm, place.reference_model, place.images, sfm_pairs, features, sfm_matches
+                sfm, reference, place.images, sfm_pairs, features, sfm_matches
             )
         with folder.stage("retrieval"):
-            common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
+            common.retrieve(retrieval, features, loc_pairs, num_loc, queries, map_names)
         with folder.stage("match_queries"):
             loc_matches = common.match(matcher_conf, loc_pairs, features, outputs, executor)
         with folder.stage("localization"):
@@ -161,6 +176,8 @@ def _main() -> None:
             args.projection,
             args.storage,
             args.keypoints,
+            strict=args.strict,
+            accept_partial=args.accept_partial,
         )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)

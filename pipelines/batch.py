@@ -39,8 +39,9 @@ def main(
         outputs: the folder for the results: jobs.csv, jobs.txt, failures.csv, and for each data
             set a folder with one for each job; default: that of the file.
         overwrite: begin anew.
-        strict: stop the jobs of a data set at an image that cannot be read. Else it counts as one
-            without keypoints, is listed in failures.csv, and read again by a later run.
+        strict: stop the jobs of a data set at an image that cannot be read. Else it is left out
+            of the map, or as a query not localized; it is listed in failures.csv, and read again
+            by a later run.
         executor: does the work.
 
     Returns:
@@ -75,6 +76,8 @@ def main(
                         keypoints=job.keypoints,
                         executor=executor,
                         features=shared.features[job],
+                        strict=strict,
+                        accept_partial=not strict,
                         **job.numbers,
                     )
                 tables.write(done, outputs)

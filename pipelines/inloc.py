@@ -40,6 +40,8 @@ def main(
     keypoints: str = KEYPOINTS[0],
     executor: Executor = SERIAL,
     features: Path | None = None,
+    strict: bool = False,
+    accept_partial: bool = False,
 ) -> dict:
     """Run all stages and return the summary, as in summary.json.
 
@@ -56,7 +58,7 @@ def main(
     # what is not retrieved needs neither features nor a scan
     used = common.check_retrieval(retrieval, loc_pairs, num_loc, query_names, map_names)
     if features is None:
-        extract_features.list_images(dataset, [*used, *query_names])
+        common.check_queries(dataset, query_names, strict)
     place.check(used)
     truth_file = ground_truth or place.ground_truth
     truth = true_poses(query_names, truth_file, bool(ground_truth))
@@ -73,10 +75,17 @@ def main(
         with folder.stage("extract_features"):
             names = [*used, *query_names]
             features = features or extract_features.main(
-                feature_conf, dataset, outputs, image_list=names, executor=executor
+                *(feature_conf, dataset, outputs),
+                image_list=names,
+                executor=executor,
+                strict=strict,
             )
+            kept = extract_features.keep_readable(features, used, accept_partial)
+            if len(kept) < len(used):
+                map_names = used = kept
+            queries = common.readable(features, query_names)
         with folder.stage("retrieval"):
-            common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
+            common.retrieve(retrieval, features, loc_pairs, num_loc, queries, map_names)
         with folder.stage("match_queries"):
             matches = common.match(matcher_conf, loc_pairs, features, outputs, executor)
         with folder.stage("localization"):
@@ -147,6 +156,8 @@ def _main() -> None:
             args.projection,
             args.storage,
             args.keypoints,
+            strict=args.strict,
+            accept_partial=args.accept_partial,
         )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)

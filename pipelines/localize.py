@@ -10,6 +10,8 @@ import re
 from collections import Counter
 from pathlib import Path
 
+import pycolmap
+
 from confs import features as features_confs
 from confs import matchers as matchers_confs
 from hloc_reduce import (
@@ -29,8 +31,9 @@ from hloc_reduce import (
 from hloc_reduce.cli import InputError
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detection import KEYPOINTS
+from hloc_reduce.group_writer import failures
 from hloc_reduce.maps import Map
-from hloc_reduce.parsers import parse_query_lists
+from hloc_reduce.parsers import parse_query_lists, write_pairs
 from hloc_reduce.storage import STORAGES
 
 from . import common
@@ -51,6 +54,7 @@ def open_map(
     overwrite: bool = False,
     storage: str | None = None,
     keypoints: str | None = None,
+    accept_partial: bool = False,
 ) -> Map:
     """Build a map in `outputs`, or open one that was built before.
 
@@ -66,6 +70,7 @@ def open_map(
         overwrite: build anew.
         storage: of descriptors; likewise, float16.
         keypoints: settings of the DoG detector; likewise, adaptive.
+        accept_partial: as of `maps.main`.
     """
     if map_images is None:
         if model_or_map is None:
@@ -100,6 +105,7 @@ def open_map(
         overwrite,
         storage or STORAGES[0],
         keypoints or KEYPOINTS[0],
+        accept_partial=accept_partial,
     )
 
 
@@ -111,25 +117,26 @@ def main(
     num_loc: int = 50,
     ground_truth: Path | None = None,
     overwrite: bool = False,
+    strict: bool = False,
 ) -> dict:
     """Localize queries in a map and return the summary, as in summary.json."""
     matcher_conf = matchers_confs.confs[built.matcher]
-    cameras = {}
-    if queries is None:
+    given, cameras = queries, {}
+    if given is None:
         names = extract_features.list_images(query_images)
         lists = {query_images.resolve().name: names}
-        cameras = {name: intrinsics.infer(query_images / name) for name in names}
+        cameras = _infer(query_images, names, strict)
         queries = outputs / "queries_with_intrinsics.txt"
     else:
         parts = parse_query_lists(queries)
         lists = {stem: [name for name, _ in part] for stem, part in parts.items()}
     names = [name for part in lists.values() for name in part]
-    extract_features.list_images(query_images, names)
+    common.check_queries(query_images, names, strict)
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
     made_from = outputs / MADE_FROM
     before = stamps.read(made_from)
-    files = {name: query_images / name for name in names}
+    files = {name: query_images / name for name in names if (query_images / name).is_file()}
     now = {"map": built.id, "queries": stamps.fingerprints(files, before.get("queries", {}))}
     changed = stamps.changed(before.get("queries", {}), now["queries"])
     if before and before.get("map") != now["map"]:
@@ -145,18 +152,18 @@ def main(
             "num_loc": num_loc,
         },
         overwrite,
-        inputs=[query_images] if cameras else [query_images, queries],
+        inputs=[query_images, *([given] if given else [])],
         stale=bool(changed),
     ) as folder:
         if not changed:  # photos that are not in this list may be in the next
             now["queries"] = {**before.get("queries", {}), **now["queries"]}
         stamps.write(made_from, now)
-        sources = dict.fromkeys(names, "list")
+        sources = dict.fromkeys(names, "list") if given else {}
         sources |= {name: source for name, (_, source) in cameras.items()}
-        if cameras:
+        if given is None:
             intrinsics.write_queries(cameras, queries)
         for source, said in (("EXIF", "from EXIF data"), ("guess", "guessed")):
-            if some := [name for name in names if sources[name] == source]:
+            if some := [name for name in names if sources.get(name) == source]:
                 logger.info(
                     "Intrinsics of %d queries are %s; the focal length is refined with the pose: "
                     "%s",
@@ -166,28 +173,39 @@ def main(
         poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
 
         with folder.stage("extract_features"):
-            features = extract_features.main(built.conf, query_images, outputs, image_list=names)
+            features = extract_features.main(
+                built.conf, query_images, outputs, image_list=names, strict=strict
+            )
+            readable = common.readable(features, names)
+        # when another one has been read, what is finished of these stays
+        failed = failures(features)
+        now["queries"] = {name: made for name, made in now["queries"].items() if name not in failed}
+        stamps.write(made_from, now)
         with folder.stage("retrieval"):
             descriptors = aggregate_features.main(
                 maps.RETRIEVAL, features, vocabulary=built.vocabulary
             )
-            pairs_from_retrieval.main(
-                descriptors,
-                loc_pairs,
-                num_loc,
-                query_list=names,
-                db_list=built.names(),
-                db_descriptors=built.descriptors,
-            )
+            if readable:
+                pairs_from_retrieval.main(
+                    descriptors,
+                    loc_pairs,
+                    num_loc,
+                    query_list=readable,
+                    db_list=built.names(),
+                    db_descriptors=built.descriptors,
+                )
+            else:
+                write_pairs([], loc_pairs)
         with folder.stage("match_queries"):
             matches = outputs / f"{features.stem}_{matcher_conf['output']}_{loc_pairs.stem}.h5"
-            match_features.main(
-                matcher_conf, loc_pairs, features, matches=matches, features_ref=built.features
-            )
+            if readable:
+                match_features.main(
+                    matcher_conf, loc_pairs, features, matches=matches, features_ref=built.features
+                )
         with folder.stage("localization"):
             records = localize_sfm.main(
                 built.sfm,
-                queries,
+                given or [(name, cameras[name][0] if name in cameras else None) for name in names],
                 loc_pairs,
                 features,
                 matches,
@@ -220,6 +238,20 @@ def main(
             "ground_truth": ground_truth,
         }
         return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
+
+
+def _infer(
+    query_images: Path, names: list[str], strict: bool
+) -> dict[str, tuple[pycolmap.Camera, str]]:
+    """Infer the intrinsics of photos, unless `strict` without those that cannot be read."""
+    cameras = {}
+    for name in names:
+        try:
+            cameras[name] = intrinsics.infer(query_images / name)
+        except InputError:
+            if strict:
+                raise
+    return cameras
 
 
 def _main() -> None:
@@ -281,6 +313,7 @@ def _run(args: argparse.Namespace) -> None:
         args.overwrite,
         args.storage,
         args.keypoints,
+        accept_partial=args.accept_partial,
     )
     if args.query_images is None:
         print(f"The map {built.folder} is there. Localize photos in it with --query_images.")
@@ -296,6 +329,7 @@ def _run(args: argparse.Namespace) -> None:
         args.num_loc,
         args.ground_truth,
         args.overwrite,
+        args.strict,
     )
     common.print_result(summary, outputs, "The poses, camera from world, are in {}.")
 

@@ -165,13 +165,19 @@ class Shared:
             self._drop_stale()
             by_vlad = [job for job in self.running() if job.retrieval == "vlad"]
             with folder.stage("retrieval"), self.failing(by_vlad):
-                self._retrieve(by_vlad)
+                self._retrieve(by_vlad, not strict)
 
-    def _retrieve(self, jobs: list[Job]) -> None:
+    def _retrieve(self, jobs: list[Job], accept_partial: bool) -> None:
         """Retrieve by VLAD for jobs."""
-        features, names = self._vlad_features(), (self.query_names, self.map_names)
-        if jobs and features not in {self.features[job] for job in self.running()}:
+        if not jobs:
+            return
+        features = self._vlad_features()
+        if features not in {self.features[job] for job in self.running()}:
             raise InputError(f"Retrieval is by VLAD of {features.stem}, which failed.")
+        names = (
+            common.readable(features, self.query_names),
+            extract_features.keep_readable(features, self.map_names, accept_partial),
+        )
         for pairs, num_loc in {(self.retrieval(j), self.numbers(j)["num_loc"]) for j in jobs}:
             common.retrieve("vlad", features, Path(pairs), num_loc, *names)
 
@@ -188,7 +194,7 @@ class Shared:
             )
 
     def _drop_stale(self) -> None:
-        """Delete what was made of features that changed, as more images can be read now."""
+        """Delete what was made of features that were begun anew."""
         ids = {}
         for path in {self.features[job] for job in self.running()}:
             with io.open_h5(path) as file:

@@ -149,7 +149,7 @@ def test_what_has_changed_is_noticed(place, aachen_layout, monkeypatch, caplog):
     cv2.imwrite(str(photo), 255 - cv2.imread(str(photo)))
     assert "differs: images (db/2.png)" in refused(monkeypatch, caplog, *build)
     photo.unlink()
-    assert "1 of 4 images are not in" in refused(monkeypatch, caplog, *build)
+    assert "1 of 4 images of the map are not in" in refused(monkeypatch, caplog, *build)
     photo.write_bytes(content)
     model = aachen_layout / "3D-models/aachen_v_1_1"
     reference = pycolmap.Reconstruction(model)
