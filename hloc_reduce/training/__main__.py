@@ -127,7 +127,8 @@ def main(
             made_from=json.dumps(metadata, sort_keys=True),
         )
         projections.save(mlp, metadata, path)
-        checkpoint.unlink(missing_ok=True)
+        for file in (checkpoint, ss.clusters_of(checkpoint)):
+            file.unlink(missing_ok=True)
         logger.info("Saved %s.", path)
     return list(paths.values())
 
