@@ -10,7 +10,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pycolmap
-from tqdm import tqdm
 
 from . import cli, localization, logger, scans, stamps
 from .cli import InputError
@@ -18,6 +17,7 @@ from .executors import SERIAL, Executor
 from .group_writer import Group, GroupWriter, fill
 from .io import get_dataset, get_image_size, get_keypoints, open_h5
 from .parsers import parse_query_lists, parse_retrieval
+from .progress import progress
 
 RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
 RANSAC_SIZE = 4032  # the longer side of such a photo
@@ -169,7 +169,7 @@ def lift_keypoints(
             todo = [name for name in cutouts if point_group(file, name) not in writer]
         work = partial(_lift, dataset_dir, features)
         with closing(fill({None: writer}, work, todo, executor, CHUNK)) as done:
-            for _ in tqdm(done, desc="Reading scans", unit="scan", total=len(todo)):
+            for _ in progress(done, "Reading scans", "scan", len(todo)):
                 pass
     return output
 

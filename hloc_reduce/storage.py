@@ -10,12 +10,12 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from tqdm import tqdm
 
 from . import cli, io, logger
 from .cli import InputError
 from .group_writer import GroupWriter
 from .io import get_array, get_dataset, list_h5_names, open_h5
+from .progress import progress
 
 STORAGES = ("float16", "float32", "uint8")  # hloc's `as_half`, without it, and ours
 QUANTIZED = "descriptors_uint8"
@@ -130,7 +130,7 @@ def main(features: Path, output: Path, storage: str = "float16", overwrite: bool
         made_by = {"converted": io.provenance(file), "storage": storage}
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [name for name in names if name not in writer]
-            for name in tqdm(todo, desc="Converting features", unit="image"):
+            for name in progress(todo, "Converting features", "image"):
                 datasets = {
                     key: dataset
                     for key, dataset in file[name].items()

@@ -6,11 +6,10 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
-from tqdm import tqdm
-
 from .. import __version__, cli, logger, plots
 from ..cli import InputError
 from ..io import replacing
+from ..progress import progress
 from . import pictures, runs, scene
 from .runs import ERRORS, Run
 
@@ -80,7 +79,7 @@ def check() -> None:
 
 def _scenes(compared: list[Run]) -> dict[str, dict]:
     scenes = {}
-    for run in tqdm(compared, desc="Reading maps", unit="run"):
+    for run in progress(compared, "Reading maps", "run"):
         try:
             scenes |= scene.scenes(run)
         except InputError as error:
@@ -122,7 +121,7 @@ def _plotted(compared: list[Run]) -> "dict[str, dict[str, plots.Panel]]":
 def _shown(compared: list[Run], chosen: list[str]) -> list[dict]:
     """Return of each chosen query the pictures of the runs."""
     shown = []
-    for name in tqdm(chosen, desc="Drawing matches", unit="query"):
+    for name in progress(chosen, "Drawing matches", "query"):
         drawn = []
         for run in compared:
             if name not in run.rows:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import torch
 from torch import nn
-from tqdm import trange
 
 from .. import logger
 from ..io import replacing
+from ..progress import progress
 
 CHECKPOINT_STEPS, CHECKPOINT_SECONDS = 500, 30.0  # whichever comes first
 
@@ -65,8 +65,8 @@ def fit(
                 part.load_state_dict(state[key])
             logger.info("Going on from step %d of %s.", start, checkpoint)
     mean_loss, saved = None, time.monotonic()
-    progress = trange(start, steps, initial=start, total=steps, desc="Training", unit="step")
-    for step in progress:
+    shown = progress(range(start, steps), "Training", "step", steps, start)
+    for step in shown:
         if before and step != prepared and (renewed := list(before(step))):
             for parameter in renewed:
                 optimizer.state.pop(parameter, None)
@@ -77,7 +77,7 @@ def fit(
         optimizer.step()
         schedule.step()
         mean_loss = value.item() if mean_loss is None else 0.99 * mean_loss + 0.01 * value.item()
-        progress.set_postfix(loss=f"{mean_loss:.4f}", refresh=False)
+        shown.set_postfix(loss=f"{mean_loss:.4f}", refresh=False)
         late = time.monotonic() - saved > CHECKPOINT_SECONDS
         if (step + 1) % CHECKPOINT_STEPS == 0 or late:
             save(step + 1)

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from .. import stamps
 from ..descriptors import DIM, Descriptor
 from ..group_writer import resume_or_replace
 from ..phototour import SHEET, read_points, read_sheet, sheets
+from ..progress import progress
 from .loop import device
 from .tracks import (
     VARIANTS,
@@ -45,7 +45,8 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
     files = sheets(folder)[: -(-len(points) // SHEET**2)]  # those with listed patches
     with resume_or_replace(parts_of(path), made_from) as writer:
         todo = [number for number, sheet in enumerate(files) if sheet.stem not in writer]
-        for number in tqdm(todo, "Describing patches", len(files), initial=len(files) - len(todo)):
+        done = len(files) - len(todo)
+        for number in progress(todo, "Describing patches", "sheet", len(files), done):
             rows = np.arange(len(points))[number * SHEET**2 : (number + 1) * SHEET**2]
             patches = read_sheet(files[number])[: len(rows)]
             generator = np.random.default_rng([seed, number])

@@ -10,7 +10,6 @@ import pycolmap
 import torch
 from safetensors.numpy import load_file, save_file
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from confs import features as features_confs
 
@@ -31,6 +30,7 @@ from ..extractors.dog import extract_patches
 from ..group_writer import resume_or_replace
 from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
 from ..maps import Map, is_map
+from ..progress import progress
 from ..storage import get_descriptors
 from .completion import Completion
 from .loop import device
@@ -128,7 +128,7 @@ def main(
     with resume_or_replace(parts, made_from) as writer, open_h5(features) as file:
         todo = [(number, name) for number, name in enumerate(names) if name not in writer]
         done = len(names) - len(todo)
-        for number, name in tqdm(todo, "Describing tracks", len(names), initial=done):
+        for number, name in progress(todo, "Describing tracks", "image", len(names), done):
             observed = complete(name)
             kept = np.flatnonzero(observed >= 0)
             if not len(kept):
