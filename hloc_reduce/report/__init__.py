@@ -49,9 +49,11 @@ def main(
     chosen = [cli.choose("query", name, ranked) for name in queries or ()]
     chosen = chosen or runs.spread(ranked, num_queries)
     plotted = _plotted(compared)
+    tables = runs.recall_tables(compared)
     content = {
         "runs": compared,
-        "recall": runs.recall_tables(compared),
+        "recall": tables,
+        "paper": any(row["paper"] for table in tables for row in table["rows"]),
         "charts": {
             key: [plots.svg(plots.figure([panel])) for panel in panels.values()]
             for key, panels in plotted.items()
