@@ -7,8 +7,8 @@ from torch.nn.functional import grid_sample
 
 from .. import colmap
 from ..base_model import BaseModel
-from ..cli import InputError
-from ..descriptors import COLMAP, PATCH_SIZE, Descriptor
+from ..cli import InputError, choose
+from ..descriptors import BASES, COLMAP, PATCH_SIZE, Descriptor
 
 
 def extract_patches(
@@ -87,7 +87,8 @@ class DoG(BaseModel):
     detection_noise = 1.0
 
     def _init(self, conf: dict) -> None:
-        self.describe = None if conf["descriptor"] == COLMAP else Descriptor(conf["descriptor"])
+        descriptor = choose("descriptor", conf["descriptor"], BASES)
+        self.describe = None if descriptor == COLMAP else Descriptor(descriptor)
         colmap.check_dog_options(conf["options"])
 
     @property

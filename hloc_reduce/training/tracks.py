@@ -23,9 +23,9 @@ from .. import (
     stamps,
     triangulation,
 )
-from ..cli import InputError
+from ..cli import InputError, choose
 from ..colmap import point3D_ids
-from ..descriptors import COLMAP, DESCRIPTORS, DIM, Descriptor
+from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM, Descriptor
 from ..extractors.dog import extract_patches
 from ..group_writer import resume_or_replace
 from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
@@ -95,8 +95,10 @@ def main(
         The file of `load`.
 
     Raises:
-        InputError: when the map cannot be read or gives no tracks.
+        InputError: for an unknown descriptor, or when the map cannot be read or gives no tracks.
     """
+    if conf is None:
+        choose("descriptor", descriptor, BASES)
     source = {"images": str(images.resolve()), "model": str(model.resolve())}
     if is_map(model.parent):  # which may have been built anew, of other photos
         source["map"] = Map(model.parent).id
