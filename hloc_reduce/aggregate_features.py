@@ -16,12 +16,14 @@ from .cli import InputError
 from .extractors.vlad import read_vocabulary
 from .group_writer import GroupWriter
 from .io import list_h5_names, open_h5, replacing
+from .paths import strings_as_paths
 from .progress import progress
 from .storage import get_descriptors
 
 confs = retrieval_confs.confs
 
 
+@strings_as_paths
 def main(
     conf: dict,
     features: Path,

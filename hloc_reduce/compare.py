@@ -14,9 +14,11 @@ from pipelines.layouts import pipeline_of
 
 from . import cli, io, logger, report, results, stamps
 from .cli import InputError
+from .paths import strings_as_paths
 from .report import runs
 
 
+@strings_as_paths
 def main(
     dataset: Path,
     features: Iterable[str],

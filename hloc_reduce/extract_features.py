@@ -22,6 +22,7 @@ from .extractors.dog import DoG
 from .group_writer import FAILURE, Group, GroupWriter, Key, fill
 from .io import UnreadableImage, read_image
 from .parsers import check_names, image_names
+from .paths import strings_as_paths
 from .progress import progress
 from .storage import STORAGES, store
 from .trace import span
@@ -33,6 +34,7 @@ Detect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # as colmap.dete
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 
+@strings_as_paths
 def main(
     conf: dict,
     image_dir: Path,

@@ -17,6 +17,7 @@ from .executors import SERIAL, Executor
 from .group_writer import Group, GroupWriter, fill
 from .io import get_dataset, get_image_size, get_keypoints, open_h5
 from .parsers import parse_query_lists, parse_retrieval
+from .paths import strings_as_paths
 from .progress import progress
 
 RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
@@ -25,6 +26,7 @@ CHUNK = 4  # cutouts
 CACHED_IMAGES = 128  # points of so many cutouts stay in memory: 25 MB at 8,000 keypoints
 
 
+@strings_as_paths
 def main(
     dataset_dir: Path,
     retrieval: Path,
@@ -139,6 +141,7 @@ def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap
     return queries
 
 
+@strings_as_paths
 def lift_keypoints(
     dataset_dir: Path,
     features: Path,

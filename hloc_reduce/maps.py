@@ -26,6 +26,7 @@ from . import (
 from .cli import InputError, choose
 from .extract_features import list_images
 from .io import replacing
+from .paths import strings_as_paths
 from .results import RunFolder
 from .storage import STORAGES
 
@@ -45,6 +46,7 @@ class Map:
         InputError: when the folder is not there, is no map or not a finished one.
     """
 
+    @strings_as_paths
     def __init__(self, folder: Path):
         self.folder = folder
         try:
@@ -129,6 +131,7 @@ class Map:
         return sorted(image.name for image in colmap.read_model(self.sfm).images.values())
 
 
+@strings_as_paths
 def main(
     map_dir: Path,
     image_dir: Path,

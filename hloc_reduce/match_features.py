@@ -23,6 +23,7 @@ from .group_writer import Group, GroupWriter, fill
 from .io import names_to_pair, open_h5
 from .matchers.nearest_neighbor import GPU_BYTES
 from .parsers import parse_pairs
+from .paths import strings_as_paths
 from .progress import progress
 from .storage import get_descriptors
 
@@ -32,6 +33,7 @@ CHUNK = 64  # pairs
 PAIRS_ON_GPU = 16  # handed to a GPU at once, which matches as many together as its memory allows
 
 
+@strings_as_paths
 def main(
     conf: dict,
     pairs: Path,

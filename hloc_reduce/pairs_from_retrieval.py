@@ -10,6 +10,7 @@ from . import cli, colmap, logger
 from .cli import InputError
 from .io import get_array, list_h5_names, open_h5
 from .parsers import check_names, image_names, parse_retrieval, write_pairs
+from .paths import strings_as_paths
 from .progress import progress
 
 # queries, and images of the database, whose descriptors are in memory at once
@@ -17,6 +18,7 @@ BLOCK, BLOCK_BYTES = 2**14, 2**28
 QUERIES = 1024  # of them so many rows of the similarity matrix
 
 
+@strings_as_paths
 def main(
     descriptors: Path,
     output: Path,
@@ -136,6 +138,7 @@ def _best(similarity: np.ndarray, number: int) -> np.ndarray:
     return np.argsort(-similarity, axis=1, kind="stable")[:, :number]
 
 
+@strings_as_paths
 def select(
     pairs: Path,
     output: Path,

@@ -13,6 +13,7 @@ from . import cli, colmap, logger, stamps
 from .cli import InputError
 from .io import get_colmap_keypoints, get_matches, open_h5
 from .parsers import parse_retrieval
+from .paths import strings_as_paths
 from .progress import progress
 
 MAX_EPIPOLAR_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
@@ -21,6 +22,7 @@ PARTS = ("cameras", "frames", "images", "points3D", "rigs")
 MADE_BY_HLOC = {"database.db", *(f"{part}.bin" for part in PARTS)}
 
 
+@strings_as_paths
 def main(
     sfm_dir: Path,
     reference_model: Path,

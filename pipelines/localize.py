@@ -30,6 +30,7 @@ from hloc_reduce.cli import InputError
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.maps import Map
 from hloc_reduce.parsers import parse_query_lists
+from hloc_reduce.paths import strings_as_paths
 from hloc_reduce.storage import STORAGES
 
 from . import common
@@ -39,6 +40,7 @@ MADE_FROM = "made_from.json"  # the map and the photos of queries
 NOT_IN_NAMES = r"[^\w.-]+"  # of a glob
 
 
+@strings_as_paths
 def open_map(
     outputs: Path,
     map_images: Path | None = None,
@@ -97,6 +99,7 @@ def open_map(
     )
 
 
+@strings_as_paths
 def main(
     built: Map,
     query_images: Path,

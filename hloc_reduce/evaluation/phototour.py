@@ -11,6 +11,7 @@ from ..cli import InputError
 from ..descriptors import Descriptor
 from ..group_writer import GroupWriter
 from ..io import get_dataset, open_h5
+from ..paths import strings_as_paths
 from ..phototour import SHEET, read_pairs, read_points, read_sheet, sheets
 from ..progress import progress
 
@@ -36,6 +37,7 @@ def fpr95(distances: np.ndarray, matches: np.ndarray) -> float:
     return float((distances[~matches] <= threshold).mean())
 
 
+@strings_as_paths
 def main(
     folder: Path, outputs: Path, descriptor: str, projects: Mapping[str, torch.nn.Module]
 ) -> dict[str, float]:

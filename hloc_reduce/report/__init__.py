@@ -9,6 +9,7 @@ from pathlib import Path
 from .. import __version__, cli, logger, plots
 from ..cli import InputError
 from ..io import replacing
+from ..paths import strings_as_paths
 from ..progress import progress
 from . import pictures, runs, scene
 from .runs import ERRORS, Run
@@ -18,6 +19,7 @@ NUM_QUERIES = 6
 RECALL, INLIERS = "recall, finest threshold [%]", "mean inliers"
 
 
+@strings_as_paths
 def main(
     folders: list[Path],
     output: Path,
@@ -44,7 +46,7 @@ def main(
     """
     check()
     cli.check_file(output, "the HTML file")
-    compared = runs.load(folders)
+    compared = runs.load([Path(folder) for folder in folders])
     ranked = runs.ranked(compared)
     chosen = [cli.choose("query", name, ranked) for name in queries or ()]
     chosen = chosen or runs.spread(ranked, num_queries)

@@ -18,6 +18,7 @@ from ..cli import InputError
 from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM, check_weights
 from ..evaluation import phototour as verification
 from ..maps import Map, is_map
+from ..paths import strings_as_paths
 from ..versions import versions
 from . import nested, pca, phototour, ss, sv, tracks, us
 
@@ -29,6 +30,7 @@ HIDDEN = {COLMAP: (256, 256)}
 HIDDEN_BY_DEFAULT = (512, 512)
 
 
+@strings_as_paths
 def main(
     maps: dict[str, tuple[Path, Path]],
     sequences: list[Path],
@@ -62,7 +64,7 @@ def main(
     Raises:
         InputError: when a map or a sequence cannot be used, or has descriptors of fewer dimensions.
     """
-    trainer = SCHEMES[scheme]
+    trainer, sequences = SCHEMES[scheme], [Path(folder) for folder in sequences]
     if trainer is nested:
         paths = {nested.PREFIXES[0]: output / f"{descriptor}_nested.safetensors"}
     else:

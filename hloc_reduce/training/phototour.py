@@ -8,6 +8,7 @@ import torch
 from .. import stamps
 from ..descriptors import DIM, Descriptor
 from ..group_writer import resume_or_replace
+from ..paths import strings_as_paths
 from ..phototour import SHEET, read_points, read_sheet, sheets
 from ..progress import progress
 from .loop import device
@@ -21,6 +22,7 @@ from .tracks import (
 )
 
 
+@strings_as_paths
 def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) -> Path:
     """Describe the patches of a sequence, labelled by point.
 

@@ -30,6 +30,7 @@ from ..extractors.dog import extract_patches
 from ..group_writer import resume_or_replace
 from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
 from ..maps import Map, is_map
+from ..paths import strings_as_paths
 from ..progress import progress
 from ..storage import get_descriptors
 from .completion import Completion
@@ -72,6 +73,7 @@ class Tracks:
         return Tracks(**{key: value[kept] for key, value in vars(self).items()})
 
 
+@strings_as_paths
 def main(
     images: Path,
     model: Path,
