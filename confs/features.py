@@ -107,9 +107,10 @@ def of_patches(name: str) -> tuple[str, str | None]:
     name, conf = get(name)
     model = conf["model"]
     base = model.get("base", model)
-    if base["name"] != "dog" or base.get("descriptor", "sift") not in DESCRIPTORS:
+    descriptor = base.get("descriptor", "sift")
+    if base["name"] != "dog" or descriptor == COLMAP:
         raise InputError(f"{name} describes photos, not patches.")
-    return base.get("descriptor", "sift"), model.get("projection")
+    return choose("descriptor", descriptor, DESCRIPTORS), model.get("projection")
 
 
 def add_storage_option(parser: ArgumentParser) -> None:

@@ -7,7 +7,6 @@ import h5py
 import numpy as np
 import torch
 from safetensors.torch import save
-from tqdm import tqdm
 
 from confs import retrieval as retrieval_confs
 
@@ -17,11 +16,14 @@ from .cli import InputError
 from .extractors.vlad import read_vocabulary
 from .group_writer import GroupWriter, failures
 from .io import list_h5_names, open_h5, replacing
+from .paths import strings_as_paths
+from .progress import progress
 from .storage import get_descriptors
 
 confs = retrieval_confs.confs
 
 
+@strings_as_paths
 def main(
     conf: dict,
     features: Path,
@@ -69,7 +71,7 @@ def main(
                 with replacing(vocabulary) as temporary:
                     temporary.write_bytes(save({"vocabulary": model.vocabulary}))
             model.vocabulary = read_vocabulary(vocabulary)
-            for name in tqdm(todo, desc="Aggregating", unit="image"):
+            for name in progress(todo, "Aggregating", "image"):
                 local = torch.from_numpy(get_descriptors(file, name).T)
                 try:
                     descriptor = model({"descriptors": local[None]})["global_descriptor"][0]

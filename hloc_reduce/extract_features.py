@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from confs import features as features_confs
 
@@ -23,6 +22,8 @@ from .extractors.dog import DoG
 from .group_writer import FAILURE, Group, GroupWriter, Key, failures, fill
 from .io import UnreadableImage, read_image
 from .parsers import check_names, image_names
+from .paths import strings_as_paths
+from .progress import progress
 from .storage import STORAGES, store
 from .trace import span
 
@@ -33,6 +34,7 @@ Detect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # as colmap.dete
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 
+@strings_as_paths
 def main(
     conf: dict,
     image_dir: Path,
@@ -113,7 +115,7 @@ def extract_several(
         # counts files: an image is as many as are wanted of it
         number = sum(len(paths) for _, paths in todo)
         with closing(fill(writers, work, todo, executor, CHUNK, gpu=True)) as done:
-            for _ in tqdm(done, desc="Extracting features", unit="image", total=number):
+            for _ in progress(done, "Extracting features", "image", number):
                 pass
     for path in writers:
         logger.info("Features of %d images are in %s.", len(names), path)

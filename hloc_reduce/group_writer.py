@@ -155,6 +155,14 @@ class GroupWriter:
             )
 
 
+def resume_or_replace(path: Path, made_from: dict) -> GroupWriter:
+    """Return a writer that resumes an intermediate file, or starts it anew if it is stale."""
+    try:
+        return GroupWriter(path, made_from)
+    except InputError:  # made from something else, or broken
+        return GroupWriter(path, made_from, overwrite=True)
+
+
 @dataclass
 class Pieces:
     """Gathers groups in memory and writes them into pieces of an h5 file.

@@ -11,7 +11,6 @@ from typing import Protocol
 import h5py
 import numpy as np
 import pycolmap
-from tqdm import tqdm
 
 from . import cli, colmap, logger, parallel
 from .cli import InputError
@@ -27,6 +26,7 @@ from .io import (
     replacing,
 )
 from .parsers import write_poses
+from .progress import progress
 
 # Three points fit a pose always, and among hundreds of wrong matches a few more agree by chance.
 MIN_INLIERS = 8
@@ -180,7 +180,7 @@ def main(
         work = partial(_localize_all, load_reference, features, matches, config, skip_matches)
         tasks = ((name, camera, retrieved.get(name, [])) for name, camera in todo)
         with log, closing(executor.map(work, tasks, CHUNK)) as found:
-            for name, record in tqdm(found, desc="Localizing", unit="query", total=len(todo)):
+            for name, record in progress(found, "Localizing", "query", len(todo)):
                 log.add(name, record)
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose(record) for name, record in records.items()}

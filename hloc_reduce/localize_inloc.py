@@ -10,7 +10,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pycolmap
-from tqdm import tqdm
 
 from . import cli, localization, logger, scans, stamps
 from .cli import InputError
@@ -18,6 +17,8 @@ from .executors import SERIAL, Executor
 from .group_writer import Group, GroupWriter, failures, fill
 from .io import get_dataset, get_image_size, get_keypoints, open_h5
 from .parsers import parse_query_lists, parse_retrieval
+from .paths import strings_as_paths
+from .progress import progress
 
 RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
 RANSAC_SIZE = 4032  # the longer side of such a photo
@@ -25,6 +26,7 @@ CHUNK = 4  # cutouts
 CACHED_IMAGES = 128  # points of so many cutouts stay in memory: 25 MB at 8,000 keypoints
 
 
+@strings_as_paths
 def main(
     dataset_dir: Path,
     retrieval: Path,
@@ -137,6 +139,7 @@ def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap
     return queries
 
 
+@strings_as_paths
 def lift_keypoints(
     dataset_dir: Path,
     features: Path,
@@ -167,7 +170,7 @@ def lift_keypoints(
             todo = [name for name in cutouts if point_group(file, name) not in writer]
         work = partial(_lift, dataset_dir, features)
         with closing(fill({None: writer}, work, todo, executor, CHUNK)) as done:
-            for _ in tqdm(done, desc="Reading scans", unit="scan", total=len(todo)):
+            for _ in progress(done, "Reading scans", "scan", len(todo)):
                 pass
     return output
 

@@ -14,10 +14,12 @@ from . import cli, colmap, localization, stamps
 from .cli import InputError
 from .executors import SERIAL, Executor
 from .parsers import parse_query_lists, parse_retrieval
+from .paths import strings_as_paths
 
 RANSAC_THRESH = 12.0  # pixels, as in hloc
 
 
+@strings_as_paths
 def main(
     reference_sfm: Path | pycolmap.Reconstruction,
     queries: Path | list[tuple[str, pycolmap.Camera | None]],

@@ -43,7 +43,7 @@ class Localizer:
     def __init__(
         self, map_dir: Path | str, num_loc: int = 50, ransac_thresh: float = RANSAC_THRESH
     ):
-        built = Map(Path(map_dir))
+        built = Map(map_dir)
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.preprocessing = built.conf["preprocessing"]
         self.storage = built.storage

@@ -27,6 +27,7 @@ from .cli import InputError, choose
 from .detection import KEYPOINTS
 from .extract_features import keep_present, keep_readable, list_images
 from .io import replacing
+from .paths import strings_as_paths
 from .results import RunFolder
 from .storage import STORAGES
 
@@ -46,6 +47,7 @@ class Map:
         InputError: when the folder is not there, is no map or not a finished one.
     """
 
+    @strings_as_paths
     def __init__(self, folder: Path):
         self.folder = folder
         try:
@@ -136,6 +138,7 @@ class Map:
         return sorted(image.name for image in colmap.read_model(self.sfm).images.values())
 
 
+@strings_as_paths
 def main(
     map_dir: Path,
     image_dir: Path,

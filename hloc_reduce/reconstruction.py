@@ -11,9 +11,11 @@ from . import cli, colmap, logger, stamps
 from .cli import InputError
 from .extract_features import list_images
 from .io import list_h5_names
+from .paths import strings_as_paths
 from .triangulation import STAMP, read_matches, replacing_map
 
 
+@strings_as_paths
 def main(
     sfm_dir: Path,
     image_dir: Path,

@@ -10,12 +10,13 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from tqdm import tqdm
 
 from . import cli, io, logger
 from .cli import InputError
 from .group_writer import GroupWriter
 from .io import get_array, get_dataset, list_h5_names, open_h5
+from .paths import strings_as_paths
+from .progress import progress
 
 STORAGES = ("float16", "float32", "uint8")  # hloc's `as_half`, without it, and ours
 QUANTIZED = "descriptors_uint8"
@@ -107,6 +108,7 @@ def get_descriptors(file: h5py.File, name: str) -> np.ndarray:
         raise InputError(f"{file.filename}: {name} has no scale and offset.") from None
 
 
+@strings_as_paths
 def main(features: Path, output: Path, storage: str = "float16", overwrite: bool = False) -> Path:
     """Write a feature file with descriptors kept in another way; other data sets are copied.
 
@@ -130,7 +132,7 @@ def main(features: Path, output: Path, storage: str = "float16", overwrite: bool
         made_by = {"converted": io.provenance(file), "storage": storage}
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [name for name in names if name not in writer]
-            for name in tqdm(todo, desc="Converting features", unit="image"):
+            for name in progress(todo, "Converting features", "image"):
                 datasets = {
                     key: dataset
                     for key, dataset in file[name].items()

@@ -22,6 +22,7 @@ from hloc_reduce import (
 from hloc_reduce.datasets import Aachen, thresholds, true_poses
 from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import SERIAL, Executor
+from hloc_reduce.paths import strings_as_paths
 from hloc_reduce.storage import STORAGES
 
 from . import common
@@ -30,6 +31,7 @@ NUMBERS = {"num_covis": 20, "num_loc": 50}
 Place = Aachen
 
 
+@strings_as_paths
 def main(
     dataset: Path,
     outputs: Path,

@@ -15,6 +15,7 @@ from hloc_reduce import cli, executors, io, jobs, logger, results
 from hloc_reduce.cli import InputError
 from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.jobs import Job
+from hloc_reduce.paths import strings_as_paths
 from hloc_reduce.storage import STORAGES
 
 from . import tables
@@ -25,6 +26,7 @@ KEYPOINTS = 5000  # of an image
 FEATURE_BYTES, MATCH_BYTES, MAP_BYTES = 14, 0.75, 67  # of a keypoint but for its descriptor, ...
 
 
+@strings_as_paths
 def main(
     job_file: Path,
     outputs: Path | None = None,
@@ -100,6 +102,7 @@ def folder_of(shared: Shared, job: Job) -> Path:
     return shared.folder.with_name(job.name)
 
 
+@strings_as_paths
 def dry_run(job_file: Path, outputs: Path | None = None, overwrite: bool = False) -> list[str]:
     """Print what `main` would do: the steps, with about how many bytes they write.
 

@@ -18,6 +18,7 @@ from hloc_reduce import (
 from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
 from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import SERIAL, Executor
+from hloc_reduce.paths import strings_as_paths
 from hloc_reduce.storage import STORAGES
 
 from . import common
@@ -26,6 +27,7 @@ NUMBERS = {"num_loc": 40}
 Place = InLoc
 
 
+@strings_as_paths
 def main(
     dataset: Path,
     outputs: Path,

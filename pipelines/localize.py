@@ -34,6 +34,7 @@ from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.group_writer import failures
 from hloc_reduce.maps import Map
 from hloc_reduce.parsers import parse_query_lists, write_pairs
+from hloc_reduce.paths import strings_as_paths
 from hloc_reduce.storage import STORAGES
 
 from . import common
@@ -43,6 +44,7 @@ MADE_FROM = "made_from.json"  # the map and the photos of queries
 NOT_IN_NAMES = r"[^\w.-]+"  # of a glob
 
 
+@strings_as_paths
 def open_map(
     outputs: Path,
     map_images: Path | None = None,
@@ -109,6 +111,7 @@ def open_map(
     )
 
 
+@strings_as_paths
 def main(
     built: Map,
     query_images: Path,

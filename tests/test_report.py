@@ -10,6 +10,7 @@ import h5py
 import pytest
 
 from hloc_reduce import cli, compare, io
+from hloc_reduce.evaluation import published
 from hloc_reduce.report import __main__ as report
 from hloc_reduce.report import runs
 from pipelines import aachen, inloc, localize
@@ -186,7 +187,12 @@ def test_runs_of_one_feature_are_told_apart(compared, tmp_path, monkeypatch):
         assert recall in [row[1:4] for row in rows if row[0] == label and len(row) == 7]
 
 
+# the lists of the plane, as if it were a data set of the paper
+PLANE = {"Plane": {"day": (2, "query/day/"), "night": (1, "query/night/")}}
+
+
 def test_without_true_poses_columns_stay_in_place(compared, tmp_path, monkeypatch, aachen_layout):
+    monkeypatch.setattr(published, "DATASETS", PLANE)
     (aachen_layout / "queries/ground_truth_poses.txt").rename(tmp_path / "truth.txt")
     unknown = tmp_path / "sift_sv16"
     given = ("--dataset", aachen_layout, "--outputs", unknown, "--feature", "sift_sv16")
@@ -198,6 +204,12 @@ def test_without_true_poses_columns_stay_in_place(compared, tmp_path, monkeypatc
         (row, _) = [row for row in rows if row[0] == "sift_sv16"]
         assert row[:6] == ["sift_sv16", "", "", "", "", "1 of 2"]
         assert ["in the paper", "85.9", "91.5", "96.2", "", "", ""] in rows
+    # of another place nothing is known
+    monkeypatch.setattr(published, "DATASETS", {})
+    command.run(monkeypatch, report, unknown, "-o", tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert ["sift_sv16", "", "1 of 2"] in [row[:3] for row in text_of(page) if len(row) == 4]
+    assert "the paper" not in page
     # a comparison keeps what a folder was made with
     for truth in (["--ground_truth", tmp_path / "truth.txt"], []):
         outputs = ("--outputs", tmp_path, "-o", tmp_path / "r.html")
@@ -255,14 +267,24 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_lay
         ["distance [m]", "", "0.25 / 0.5 / 5", "0.5 / 1 / 5"],
         ["orient. [deg]", "", "2 / 5 / 10", "2 / 5 / 10"],
         ["sift_sv16", "32", "50.0 / 50.0 / 50.0", "100.0 / 100.0 / 100.0"],
-        ["in the paper", "", "85.9 / 91.5 / 96.2", "34.6 / 46.1 / 58.6"],
         ["colmap_sift_sv16", "32", "50.0 / 50.0 / 50.0", "100.0 / 100.0 / 100.0"],
     ]
-    assert "colmap_sift_sv16" in (outputs / "report.html").read_text()
+    page = (outputs / "report.html").read_text()
+    assert "colmap_sift_sv16" in page and "the paper" not in page
     with (outputs / "compare.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 2 * 3
-    assert (rows[0]["recall_percent"], rows[0]["paper_percent"]) == ("50.0", "85.9")
+    assert (rows[0]["recall_percent"], rows[0]["paper_percent"]) == ("50.0", "")
+
+    # if it were a data set of the paper
+    with monkeypatch.context() as other:
+        other.setattr(published, "DATASETS", PLANE)
+        command.run(other, compare, *given, *features[:2])
+    paper = "in the paper |       | 85.9 / 91.5 / 96.2 | 34.6 / 46.1 / 58.6"
+    assert re.sub(" +", " ", paper) in re.sub(" +", " ", capsys.readouterr().out)
+    assert "Rows in grey are the paper" in (outputs / "report.html").read_text()
+    with (outputs / "compare.csv").open() as file:
+        assert next(csv.DictReader(file))["paper_percent"] == "85.9"
 
     # what is there is not run again
     times = {path: path.stat().st_mtime_ns for path in (outputs / "sift_sv16").rglob("*")}

@@ -8,7 +8,7 @@ from torch.nn.functional import grid_sample
 from .. import colmap, detection
 from ..base_model import BaseModel
 from ..cli import InputError, choose
-from ..descriptors import COLMAP, PATCH_SIZE, Descriptor
+from ..descriptors import BASES, COLMAP, PATCH_SIZE, Descriptor
 
 
 def extract_patches(
@@ -91,8 +91,9 @@ class DoG(BaseModel):
     detection_noise = 1.0
 
     def _init(self, conf: dict) -> None:
-        self.describe = None if conf["descriptor"] == COLMAP else Descriptor(conf["descriptor"])
         choose("keypoints", conf["keypoints"], detection.KEYPOINTS)
+        descriptor = choose("descriptor", conf["descriptor"], BASES)
+        self.describe = None if descriptor == COLMAP else Descriptor(descriptor)
         colmap.check_dog_options(conf["options"])
         self.adaptive = conf["keypoints"] == "adaptive" and conf["options"] == detection.HLOC
 

@@ -86,6 +86,14 @@ class Run:
         """The data set, or the map that was localized in."""
         return Path(self.summary.get("dataset") or self.summary["map"])
 
+    @cached_property
+    def published(self) -> str | None:
+        """The data set of the paper that was localized in; None for another place."""
+        lists: dict[str, list[str]] = {}
+        for query, row in self.rows.items():
+            lists.setdefault(row["list"], []).append(query)
+        return published.dataset(lists)
+
     def errors(self, name: str) -> list[tuple[float, float]]:
         """Return the errors of the queries of a list with known truth; of failures infinite."""
         rows = [row for row in self.rows.values() if row["list"] == name]
@@ -181,7 +189,7 @@ def recall_tables(runs: list[Run]) -> list[dict]:
         A dict for each list: `list`; `thresholds`, pairs of metres and degrees, those of the paper
         where no true pose is known but the paper has numbers, or none; and `rows`, a dict for each
         run that has the list: `run`, `summary` of it, and as many numbers in percent or None of
-        `recall` and, if the paper has the feature, of `paper`.
+        `recall` and of `paper`, which is None unless the paper has the feature on this data set.
     """
     tables: dict[str, dict] = {}
     for run in runs:
@@ -189,7 +197,7 @@ def recall_tables(runs: list[Run]) -> list[dict]:
             table = tables.setdefault(
                 short(name), {"list": short(name), "thresholds": [], "rows": []}
             )
-            paper = published.recall(run.summary["feature"], name)
+            paper = run.published and published.recall(run.summary["feature"], name)
             limits = summary.get("thresholds_m_deg") or (paper and published.thresholds(name))
             table["thresholds"] = table["thresholds"] or limits or []
             row = {"run": run, "summary": summary, "paper": paper}
