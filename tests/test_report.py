@@ -317,12 +317,67 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_lay
     assert compare.pipeline_of(inloc_layout) is inloc
 
 
+@pytest.fixture
+def batch(compared, tmp_path):
+    """Runs in the layout of a batch, with what is beside them; two are not finished."""
+    outputs = tmp_path / "batch"
+    for run, place in zip(compared, ("town", "park"), strict=True):
+        shutil.copytree(run, outputs / place / run.name)
+        for name in ("shared", "begun"):
+            (outputs / place / name).mkdir()
+            (outputs / place / name / "conf.json").write_text("{}")
+    (outputs / "jobs.csv").touch()
+    # not of runs: a map, and a folder of other files
+    (outputs / "park/map").mkdir()
+    for name in ("conf.json", "map.json"):
+        (outputs / "park/map" / name).write_text("{}")
+    (outputs / "park/other").mkdir()
+    shutil.copytree(compared[0], outputs / "too/far/below")
+    return outputs
+
+
+def test_the_finished_runs_of_a_batch(batch, tmp_path, monkeypatch, caplog):
+    output = tmp_path / "r.html"
+    command.run(monkeypatch, report, batch, "-o", output)
+    said = f"Skipping 2 unfinished runs in {batch}: park/begun, town/begun."
+    assert said in [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    found = [run.folder.relative_to(batch).as_posix() for run in runs.load([batch])]
+    assert found == ["park/colmap_sift_sv32", "town/colmap_sift"]
+    assert all(name.rpartition("/")[2] in output.read_text() for name in found)
+
+    # as a shell expands town/*
+    shutil.rmtree(batch / "town/begun")
+    assert [run.folder for run in runs.load(sorted((batch / "town").iterdir()))] == [
+        batch / "town/colmap_sift"
+    ]
+
+    # of one data set; a run that is also named is shown once
+    town = batch / "town"
+    command.run(monkeypatch, report, town, town / "colmap_sift", "-o", output)
+    assert "given twice" in caplog.text
+    assert "sv32" not in re.sub("<script.*?</script>", "", output.read_text(), flags=re.S)
+
+
+def test_a_batch_without_finished_runs_is_refused(batch, tmp_path, monkeypatch, caplog):
+    for file in batch.glob("*/*/summary.json"):
+        file.unlink()
+    said = command.refused(monkeypatch, caplog, report, batch, "-o", tmp_path / "r.html")
+    runs_of = "park/begun, park/colmap_sift_sv32, town/begun, town/colmap_sift"
+    assert f"{batch} is not the outputs folder of a pipeline or a batch, or its runs" in said
+    assert f"are not finished ({runs_of})" in said and "run the pipeline again" in said
+    # named by itself it is not skipped
+    for name in ("begun", "shared"):
+        said = command.refused(monkeypatch, caplog, report, batch / "town" / name)
+        assert "no summary.json" in said
+
+
 def test_wrong_input(compared, tmp_path, monkeypatch, caplog):
     def message(*arguments):
         return command.refused(monkeypatch, caplog, report, "-o", tmp_path / "r.html", *arguments)
 
     assert "There is no folder" in message(tmp_path / "nowhere")
-    assert "not the outputs folder" in message(tmp_path)
+    (tmp_path / "empty").mkdir()
+    assert "or it has no runs" in message(tmp_path / "empty")
     assert "Unknown query 'b.png'" in message(compared[0], "--queries", "b.png")
     assert "is a folder" in message(compared[0], "-o", tmp_path)
     assert "--num_queries 0: at least 1" in message(compared[0], "--num_queries", "0")

@@ -30,7 +30,7 @@ def main(
     """Write the report of runs.
 
     Args:
-        folders: outputs folders of pipelines.
+        folders: outputs folders of pipelines, or folders of such, as of a batch.
         output: the HTML file.
         queries: those whose matches are shown; default: `num_queries`, evenly from the worst to
             the best.
@@ -41,7 +41,7 @@ def main(
         `output`.
 
     Raises:
-        InputError: for a folder that is no finished run's, an unknown query, or when what draws
+        InputError: for a folder without a finished run, an unknown query, or when what draws
             is not installed.
     """
     check()
