@@ -13,6 +13,7 @@ import pycolmap
 
 from . import cli, localization, logger, scans, stamps
 from .cli import InputError
+from .confidence import DEFAULT_GATE, Gate, add_gate_options
 from .executors import SERIAL, Executor
 from .group_writer import Group, GroupWriter, failures, fill
 from .io import get_dataset, get_image_size, get_keypoints, open_h5
@@ -39,6 +40,7 @@ def main(
     overwrite: bool = False,
     executor: Executor = SERIAL,
     points: Path | None = None,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict[str, dict]:
     """Localize queries in a data set of InLoc's layout.
 
@@ -60,6 +62,7 @@ def main(
         executor: does the work.
         points: keeps what the keypoints of cutouts show, for later runs, and if it is given for
             other features of the same keypoints, too; default: `points_file(features)`.
+        gate: what a pose must have for the query to be called localized.
 
     Returns:
         A record for each query, as `localization.main`; a query with too few inliers has the pose
@@ -98,6 +101,7 @@ def main(
         overwrite,
         skip_matches=skip_matches,
         executor=executor,
+        gate=gate,
     )
 
 
@@ -272,8 +276,10 @@ def _main() -> None:
         help="inliers reproject within so many pixels of a photo of 4032 pixels, of others in "
         "proportion",
     )
+    add_gate_options(parser)
     parser.add_argument("--overwrite", action="store_true", help="localize anew what is there")
-    main(**vars(parser.parse_args()))
+    args = vars(parser.parse_args())
+    main(**args, gate=Gate(args.pop("min_confidence"), args.pop("min_inliers")))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from . import cli, colmap, localization, stamps
 from .cli import InputError
+from .confidence import DEFAULT_GATE, Gate, add_gate_options
 from .executors import SERIAL, Executor
 from .parsers import parse_query_lists, parse_retrieval
 from .paths import strings_as_paths
@@ -35,6 +36,7 @@ def main(
     refinements: Mapping[str, dict] | None = None,
     full_names: bool = False,
     executor: Executor = SERIAL,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict[str, dict]:
     """Localize all queries of the lists that match a glob.
 
@@ -57,6 +59,7 @@ def main(
         refinements: for queries whose intrinsics are inexact more options, as in `config`.
         full_names: write whole names instead of `basename`.
         executor: does the work; for a map in memory it is this process.
+        gate: what a pose must have for the query to be called localized.
 
     Returns:
         A record for each query, as `localization.main`. A query that PnP could not solve is not
@@ -107,6 +110,7 @@ def main(
             overwrite or in_memory,
             name_parts=None if full_names else 2 if prepend_camera_name else 1,
             executor=SERIAL if in_memory else executor,
+            gate=gate,
         )
     finally:
         _load.cache_clear()  # a map may be large
@@ -222,8 +226,10 @@ def _main() -> None:
     parser.add_argument(
         "--prepend_camera_name", action="store_true", help="write folder/basename of each query"
     )
+    add_gate_options(parser)
     parser.add_argument("--overwrite", action="store_true", help="localize anew what is there")
-    main(**vars(parser.parse_args()))
+    args = vars(parser.parse_args())
+    main(**args, gate=Gate(args.pop("min_confidence"), args.pop("min_inliers")))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from hloc_reduce import (
     trace,
     triangulation,
 )
+from hloc_reduce.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.datasets import Aachen, thresholds, true_poses
 from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import SERIAL, Executor
@@ -49,6 +50,7 @@ def main(
     features: Path | None = None,
     strict: bool = False,
     accept_partial: bool = False,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict:
     """Run all stages and return the summary, as in summary.json.
 
@@ -107,7 +109,14 @@ def main(
             loc_matches = common.match(matcher_conf, loc_pairs, features, outputs, executor)
         with folder.stage("localization"):
             records = localize_sfm.main(
-                sfm, place.queries, loc_pairs, features, loc_matches, poses, executor=executor
+                sfm,
+                place.queries,
+                loc_pairs,
+                features,
+                loc_matches,
+                poses,
+                executor=executor,
+                gate=gate,
             )
 
         summary = {
@@ -180,6 +189,7 @@ def _main() -> None:
             args.keypoints,
             strict=args.strict,
             accept_partial=args.accept_partial,
+            gate=Gate(args.min_confidence, args.min_inliers),
         )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)

@@ -25,6 +25,7 @@ from hloc_reduce import (
     stamps,
 )
 from hloc_reduce.cli import InputError
+from hloc_reduce.confidence import add_gate_options
 from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.group_writer import failures
 from hloc_reduce.parsers import parse_pairs, parse_retrieval, write_pairs
@@ -96,6 +97,7 @@ def add_localization_options(parser: argparse.ArgumentParser, truth: str, num_lo
         action="store_true",
         help="do without map photos that are missing or cannot be read",
     )
+    add_gate_options(parser)
     parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
     parser.add_argument(
         "--profile",

@@ -15,6 +15,7 @@ from hloc_reduce import (
     localize_inloc,
     trace,
 )
+from hloc_reduce.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
 from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import SERIAL, Executor
@@ -44,6 +45,7 @@ def main(
     features: Path | None = None,
     strict: bool = False,
     accept_partial: bool = False,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict:
     """Run all stages and return the summary, as in summary.json.
 
@@ -101,6 +103,7 @@ def main(
                 ransac_thresh=place.ransac_thresh,
                 executor=executor,
                 points=points,
+                gate=gate,
             )
 
         summary = {
@@ -160,6 +163,7 @@ def _main() -> None:
             args.keypoints,
             strict=args.strict,
             accept_partial=args.accept_partial,
+            gate=Gate(args.min_confidence, args.min_inliers),
         )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)

@@ -29,6 +29,7 @@ from hloc_reduce import (
     trace,
 )
 from hloc_reduce.cli import InputError
+from hloc_reduce.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.group_writer import failures
@@ -121,6 +122,7 @@ def main(
     ground_truth: Path | None = None,
     overwrite: bool = False,
     strict: bool = False,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict:
     """Localize queries in a map and return the summary, as in summary.json."""
     matcher_conf = matchers_confs.confs[built.matcher]
@@ -219,6 +221,7 @@ def main(
                     if source != "list"
                 },
                 full_names=True,
+                gate=gate,
             )
         summary = {
             "feature": built.feature,
@@ -333,6 +336,7 @@ def _run(args: argparse.Namespace) -> None:
         args.ground_truth,
         args.overwrite,
         args.strict,
+        Gate(args.min_confidence, args.min_inliers),
     )
     common.print_result(summary, outputs, "The poses, camera from world, are in {}.")
 
