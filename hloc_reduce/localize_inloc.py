@@ -16,7 +16,7 @@ from . import cli, localization, logger, scans, stamps
 from .cli import InputError
 from .executors import SERIAL, Executor
 from .group_writer import Group, GroupWriter, failures, fill
-from .io import get_dataset, get_image_size, get_keypoints, open_h5
+from .io import get_dataset, get_image_size, get_keypoints, open_h5, reading
 from .parsers import parse_query_lists, parse_retrieval
 
 RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
@@ -205,7 +205,9 @@ class ScanMap:
 
     def _read(self, name: str) -> np.ndarray:
         group = point_group(self.features, name)
-        if group not in self.file:
+        with reading(self.file.filename):
+            found = group in self.file
+        if not found:
             raise InputError(
                 f"{self.file.filename} is not of the keypoints of {name} that are now in "
                 f"{self.features.filename}: localize anew."

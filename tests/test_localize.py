@@ -385,7 +385,7 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, monkeypat
     small = tmp_path / "small.txt"
     small.write_text("guess.png SIMPLE_PINHOLE 240 180 250 120 90\n")
     run(monkeypatch, *build, "--query_images", photos, "--queries", small)
-    assert "1 queries are for another size" in caplog.text
+    assert "1 queries are not localized, as their intrinsics are for photos of" in caplog.text
     assert "guess.png (240x180, not 480x360)" in caplog.text
     for wrong in (pixels.astype(float), pixels[None], np.zeros((0, 3), np.uint8)):
         with pytest.raises(InputError, match="uint8"):
