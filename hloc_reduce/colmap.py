@@ -7,7 +7,10 @@ import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from struct import error as struct_error
+from struct import unpack_from
 from threading import get_ident
 
 import numpy as np
@@ -16,7 +19,7 @@ import pycolmap
 from .cli import InputError
 from .interrupts import interruptible
 from .io import replacing
-from .parsers import check_names
+from .parsers import CAMERA_MODELS, check_names
 
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
 FULL = 2**16  # bytes: in less COLMAP cannot even open a database
@@ -84,6 +87,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     """
     if not path.is_dir():
         raise InputError(f"There is no COLMAP model folder {path}.")
+    check_whole(path)
     try:
         model = pycolmap.Reconstruction(path)
         names = [image.name for image in model.images.values()]
@@ -92,6 +96,69 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         raise InputError(f"{path} is not a COLMAP model ({reason}).") from None
     check_names(names, path)
     return model
+
+
+def check_whole(path: Path) -> None:
+    """Refuse a binary COLMAP model one of whose files is cut off: COLMAP may read it for ever.
+
+    Raises:
+        InputError: naming the file.
+    """
+    for name, skip in RECORDS.items():
+        file = path / f"{name}.bin"
+        if not file.is_file():
+            continue
+        try:
+            with file.open("rb") as opened, mmap(opened.fileno(), 0, access=ACCESS_READ) as data:
+                (number,), end = unpack_from("<Q", data, 0), 8
+                for _ in range(number):
+                    end = skip(data, end)
+                if end > len(data):
+                    raise ValueError
+        except (ValueError, struct_error, OverflowError):  # of an empty file, or at its end
+            raise InputError(f"{path} is not a COLMAP model ({file.name} is cut off).") from None
+
+
+def _skip_camera(data: mmap, start: int) -> int:
+    (model,) = unpack_from("<i", data, start + 4)
+    if model not in _num_params():
+        raise ValueError
+    return start + 24 + 8 * _num_params()[model]
+
+
+def _skip_image(data: mmap, start: int) -> int:
+    end_of_name = data.find(b"\0", start + 64)
+    if end_of_name < 0:
+        raise ValueError
+    return end_of_name + 9 + 24 * unpack_from("<Q", data, end_of_name + 1)[0]
+
+
+def _skip_point(data: mmap, start: int) -> int:
+    return start + 51 + 8 * unpack_from("<Q", data, start + 43)[0]
+
+
+def _skip_frame(data: mmap, start: int) -> int:
+    return start + 68 + 16 * unpack_from("<I", data, start + 64)[0]
+
+
+@lru_cache
+def _num_params() -> dict[int, int]:
+    """Return how many parameters a camera has, by the number of its model."""
+    return {
+        int(pycolmap.CameraModelId.__members__[name]): len(
+            pycolmap.Camera.create_from_model_name(1, name, 1.0, 1, 1).params
+        )
+        for name in CAMERA_MODELS
+    }
+
+
+# from a file of a binary COLMAP model to what finds the end of a record in it
+RECORDS = {
+    "cameras": _skip_camera,
+    "images": _skip_image,
+    "points3D": _skip_point,
+    "frames": _skip_frame,
+}
 
 
 def write_part(path: Path, names: Collection[str], output: Path) -> Path:

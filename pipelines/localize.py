@@ -126,6 +126,7 @@ def main(
         lists = {stem: [name for name, _ in part] for stem, part in parts.items()}
     names = [name for part in lists.values() for name in part]
     common.check_queries(query_images, names, strict)
+    map_names = built.names()  # a broken model is to be found before photos are read
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
     made_from = outputs / MADE_FROM
@@ -185,7 +186,7 @@ def main(
                     loc_pairs,
                     num_loc,
                     query_list=readable,
-                    db_list=built.names(),
+                    db_list=map_names,
                     db_descriptors=built.descriptors,
                 )
             else:

@@ -912,3 +912,17 @@ def test_no_code_of_features_is_run(tag, tmp_path):
     with pytest.raises(InputError, match="f.yaml cannot be read"):
         features_confs.read(path)
     assert not (tmp_path / "harmed").exists()
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "frames"])
+def test_models_that_are_cut_off_are_refused(name, aachen_layout):
+    """Of some COLMAP would read for ever, or until the memory is full."""
+    model = aachen_layout / "3D-models/aachen_v_1_1"
+    colmap.read_model(model).write(model)  # with frames
+    path = model / f"{name}.bin"
+    content = path.read_bytes()
+    colmap.read_model(model)
+    for length in (0, 7, 8, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:length])
+        with pytest.raises(InputError, match=f"not a COLMAP model .{name}.bin is cut off"):
+            colmap.read_model(model)

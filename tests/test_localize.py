@@ -269,6 +269,31 @@ def test_a_broken_map_is_refused(place, tmp_path, monkeypatch, caplog):
     assert "no sound map.json" in refused(monkeypatch, caplog, *arguments)
 
 
+def test_a_map_with_a_broken_file_is_refused_before_any_work(place, tmp_path, monkeypatch, caplog):
+    build, images, outputs = place
+    run(monkeypatch, *build, "--feature", "sift_sv16")
+    folder = outputs / "map"
+    given = ("--map", folder, "--outputs", tmp_path / "x", "--query_images", images / "query/day")
+    stem = "global-feats-vlad_feats-dog-sift_sv16"
+    for name in (
+        *("sfm/cameras.bin", "sfm/images.bin", "sfm/points3D.bin", "feats-dog-sift_sv16.h5"),
+        *(f"{stem}.h5", f"{stem}.vocabulary.safetensors", "sift_sv16.safetensors"),
+    ):
+        file = folder / name
+        content = file.read_bytes()
+        file.unlink()
+        message = refused(monkeypatch, caplog, *given)
+        assert f"The map {folder} is broken: it has no {name}." in message
+        assert "--overwrite" in message
+        for damaged in (content[: len(content) // 2], b""):
+            file.write_bytes(damaged)
+            message = refused(monkeypatch, caplog, *given)
+            assert str(file) in message or str(file.parent) in message, name
+        assert not (tmp_path / "x").exists()
+        file.write_bytes(content)
+    run(monkeypatch, *given)
+
+
 def test_a_build_that_was_stopped_goes_on(place, monkeypatch, caplog):
     build, images, outputs = place
     photo = images / "db/3.png"
