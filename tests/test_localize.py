@@ -177,9 +177,25 @@ def test_results_of_another_map_are_kept(place, tmp_path, monkeypatch, caplog):
     run(monkeypatch, *build[:4], "--outputs", other)
     message = refused(monkeypatch, caplog, "--map", other / "map", *new, "--outputs", outputs)
     assert "differs: map. " in message
-    (images / "query/night").rename(tmp_path / "day")  # of the same name
-    message = refused(monkeypatch, caplog, *build, "--query_images", tmp_path / "day")
-    assert "differs: query_images. " in message
+    assert state(outputs / "queries-day") == results
+
+
+def test_queries_of_the_same_name_have_folders_of_their_own(place, tmp_path, monkeypatch):
+    build, images, outputs = place
+    run(monkeypatch, *build, "--query_images", images / "query/day")
+    results = state(outputs / "queries-day")
+    other = shutil.move(images / "query/night", tmp_path / "day")
+    for _ in range(2):
+        run(monkeypatch, *build, "--query_images", other)
+        assert state(outputs / "queries-day") == results
+        (found,) = outputs.glob("queries-day-*")
+        assert list(outcome(found)[1]) == ["a.png"]
+    # a list of that name is another one, too; the first keeps its folder
+    listed = tmp_path / "day.txt"
+    listed.write_text("a.png SIMPLE_PINHOLE 480 360 500 240 180\n")
+    run(monkeypatch, *build, "--query_images", images / "query/day", "--queries", listed)
+    assert len(list(outputs.glob("queries-day-*"))) == 2
+    run(monkeypatch, *build, "--query_images", images / "query/day")
     assert state(outputs / "queries-day") == results
 
 
