@@ -19,7 +19,7 @@ import pycolmap
 from .cli import InputError
 from .interrupts import interruptible
 from .io import replacing
-from .parsers import CAMERA_MODELS, check_names
+from .parsers import CAMERA_MODELS, check_names, parse_pairs, write_pairs
 
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
 FULL = 2**16  # bytes: in less COLMAP cannot even open a database
@@ -344,8 +344,38 @@ def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
 def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
     """Estimate the two-view geometries of the matches of a database, with hloc's options."""
     options = {"ransac": {"max_num_trials": 20000, "min_inlier_ratio": 0.1, "random_seed": 0}}
-    with _log(verbose):
-        interruptible(pycolmap.verify_matches, database, pairs, options=options)
+    with _log(verbose), _named_by_ids(database, pairs) as pairs_by_ids:
+        interruptible(pycolmap.verify_matches, database, pairs_by_ids, options=options)
+
+
+@contextmanager
+def _named_by_ids(database: Path, pairs: Path) -> Iterator[Path]:
+    """Call the images of a database by their ids in a block, if COLMAP cannot read their pairs.
+
+    Gives the file of their pairs by these names. COLMAP's own has names without spaces.
+    """
+    with _open(database) as opened:
+        images = opened.read_all_images()
+    names = {image.image_id: image.name for image in images}
+    if all(name.split() == [name] for name in names.values()):
+        yield pairs
+        return
+    ids = {name: str(image_id) for image_id, name in names.items()}
+    by_ids = database.with_name("pairs_by_ids.txt")
+    write_pairs(((ids[a], ids[b]) for a, b in parse_pairs(pairs)), by_ids)
+    _rename(database, images, {image_id: str(image_id) for image_id in names})
+    try:
+        yield by_ids
+    finally:
+        by_ids.unlink()
+        _rename(database, images, names)
+
+
+def _rename(database: Path, images: list[pycolmap.Image], names: dict[int, str]) -> None:
+    with _open(database) as opened:
+        for image in images:
+            image.name = names[image.image_id]
+            opened.update_image(image)
 
 
 def triangulate_points(

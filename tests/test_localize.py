@@ -446,7 +446,7 @@ def test_wrong_input(place, tmp_path, monkeypatch, caplog):
     assert "Unknown matcher" in refused(monkeypatch, caplog, *build, "--matcher", "NN")
     photos = tmp_path / "photos"
     photos.mkdir()
-    for name in ("IMG 1.png", "#2.png"):
+    for name in ("IMG\t1.png", "#2.png"):
         shutil.copy(images / "db/1.png", photos / name)
         message = refused(monkeypatch, caplog, "--map_images", photos, *build[4:])
         assert repr(name) in message and "Rename" in message
@@ -549,6 +549,46 @@ def test_photos_alone(plane, tmp_path, monkeypatch):
     known = np.array([image.projection_center() for image in true])
     # of 2.2: a plane says little about the focal length
     assert np.linalg.norm(similarity(centres, known), axis=1).max() < 0.2
+
+
+@pytest.mark.parametrize("by_model", [True, False])
+def test_names_with_spaces(by_model, plane, tmp_path, monkeypatch):
+    """Of photos and of folders; hloc's lists cannot hold them, ours have tabs."""
+    images, new, outputs = tmp_path / "my photos", tmp_path / "new ones", tmp_path / "my outputs"
+    for folder in (images / "a b", new):
+        folder.mkdir(parents=True)
+    model = pycolmap.Reconstruction(plane / "model")
+    for image in model.images.values():
+        image.name = f"a b/my {image.name}"
+        shutil.copy(plane / "images" / image.name[-5:], images / image.name)
+    shutil.move(images / "a b/my 4.png", new / "I am 4.png")
+    query = model.find_image_with_name("a b/my 4.png")
+    true = query.cam_from_world()
+    model.deregister_frame(query.frame_id)
+    (tmp_path / "my model").mkdir()
+    model.write(tmp_path / "my model")
+    given = ("--map_images", images, "--query_images", new, "--outputs", outputs)
+    given += ("--feature", "sift_sv16")
+    run(monkeypatch, *given, *(("--map", tmp_path / "my model") if by_model else ()))
+    summary, rows = outcome(outputs / "queries-newones")
+    row = rows["I am 4.png"]
+    assert row["status"] == "localized" and row["retrieved"].startswith("a b/my ")
+    assert maps.Map(outputs / "map").names() == [f"a b/my {i}.png" for i in range(4)]
+    poses = parsers.parse_poses(outputs / "queries-newones" / summary["poses"])
+    assert list(poses) == ["I am 4.png"]
+    pose, info = Localizer(outputs / "map").localize(new / "I am 4.png")
+    assert max(pose_error(pose, poses["I am 4.png"])) < 1e-9
+    assert info["retrieved"][0] == row["retrieved"]
+    if by_model:  # and with a list, of the right intrinsics
+        assert pose_error(pose, true)[0] < 0.2
+        camera = "SIMPLE_PINHOLE 480 360 500 240 180"
+        (tmp_path / "my list.txt").write_text(f"I am 4.png\t{camera}\n")
+        run(
+            monkeypatch, *given[2:], "--map", outputs / "map", "--queries", tmp_path / "my list.txt"
+        )
+        summary, rows = outcome(outputs / "queries-mylist")
+        poses = parsers.parse_poses(outputs / "queries-mylist" / summary["poses"])
+        assert pose_error(poses["I am 4.png"], true)[0] < 0.02
 
 
 def test_records_of_failed_queries_have_no_pose():
