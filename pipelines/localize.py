@@ -7,6 +7,7 @@ colmap_sift_sv64 and the matcher NN-ratio, if no other is given or the map is no
 
 import argparse
 import hashlib
+import os
 import re
 from collections import Counter
 from pathlib import Path
@@ -133,7 +134,10 @@ def main(
 
     made_from = outputs / MADE_FROM
     before = stamps.read(made_from)
-    files = {name: query_images / name for name in names if (query_images / name).is_file()}
+    files = {name: query_images / name for name in names}
+    files = {
+        name: file for name, file in files.items() if file.is_file() and os.access(file, os.R_OK)
+    }
     now = {"map": built.id, "queries": stamps.fingerprints(files, before.get("queries", {}))}
     changed = stamps.changed(before.get("queries", {}), now["queries"])
     if before and before.get("map") != now["map"]:
