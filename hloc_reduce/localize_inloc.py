@@ -16,7 +16,7 @@ from .cli import InputError
 from .confidence import DEFAULT_GATE, Gate, add_gate_options
 from .executors import SERIAL, Executor
 from .group_writer import Group, GroupWriter, failures, fill
-from .io import get_dataset, get_image_size, get_keypoints, open_h5
+from .io import get_dataset, get_image_size, get_keypoints, open_h5, reading
 from .parsers import parse_query_lists, parse_retrieval
 from .paths import strings_as_paths
 from .progress import progress
@@ -212,7 +212,9 @@ class ScanMap:
 
     def _read(self, name: str) -> np.ndarray:
         group = point_group(self.features, name)
-        if group not in self.file:
+        with reading(self.file.filename):
+            found = group in self.file
+        if not found:
             raise InputError(
                 f"{self.file.filename} is not of the keypoints of {name} that are now in "
                 f"{self.features.filename}: localize anew."

@@ -26,7 +26,8 @@ from . import (
 from .cli import InputError, choose
 from .detection import KEYPOINTS
 from .extract_features import keep_present, keep_readable, list_images
-from .io import replacing
+from .extractors.vlad import read_vocabulary
+from .io import open_h5, provenance, replacing
 from .paths import strings_as_paths
 from .results import RunFolder
 from .storage import STORAGES
@@ -74,9 +75,32 @@ class Map:
                 if not folder.is_dir()
                 else f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}."
             ) from None
-        missing = [path for path in (self.features, self.descriptors) if not path.is_file()]
-        if missing:
-            raise InputError(f"The map {folder} is broken: it has no {missing[0].name}.")
+        self._check()
+
+    def _check(self) -> None:
+        """Refuse a map that lacks a file, or has a broken one, before any work is done in it."""
+        projection = self.conf["model"].get("projection")
+        needed = [self.features, self.descriptors, self.vocabulary]
+        needed += [Path(projections.split_prefix(projection)[0])] if projection else []
+        missing = [path for path in needed if not path.is_file()]
+        for part in ("cameras", "images", "points3D"):
+            if not any((self.sfm / f"{part}{suffix}").is_file() for suffix in (".bin", ".txt")):
+                missing.append(self.sfm / f"{part}.bin")
+        try:
+            if missing:
+                named = ", ".join(str(path.relative_to(self.folder)) for path in missing)
+                raise InputError(f"it has no {named}")
+            for path in (self.features, self.descriptors):
+                with open_h5(path) as file:
+                    provenance(file)
+            read_vocabulary(self.vocabulary)
+            if projection:
+                projections.load(projection)
+        except InputError as error:
+            raise InputError(
+                f"The map {self.folder} is broken: {str(error).rstrip('.')}. Copy it again, or "
+                "build it anew with --overwrite."
+            ) from None
 
     @property
     def conf(self) -> dict:

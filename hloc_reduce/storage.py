@@ -14,7 +14,7 @@ import numpy as np
 from . import cli, io, logger
 from .cli import InputError
 from .group_writer import GroupWriter
-from .io import get_array, get_dataset, list_h5_names, open_h5
+from .io import get_array, get_dataset, list_h5_names, open_h5, reading
 from .paths import strings_as_paths
 from .progress import progress
 
@@ -82,9 +82,10 @@ def stored_descriptors(file: h5py.File, name: str) -> h5py.Dataset:
     Raises:
         InputError: when the image is not there or has none, or not as many as keypoints.
     """
-    key = QUANTIZED if f"{name}/{QUANTIZED}" in file else "descriptors"
-    dataset, keypoints = get_dataset(file, name, key), file[name].get("keypoints")
-    shapes = [getattr(part, "shape", None) for part in (dataset, keypoints)]
+    with reading(file.filename):
+        key = QUANTIZED if f"{name}/{QUANTIZED}" in file else "descriptors"
+        dataset, keypoints = get_dataset(file, name, key), file[name].get("keypoints")
+        shapes = [getattr(part, "shape", None) for part in (dataset, keypoints)]
     if all(shapes) and shapes[0][-1] != shapes[1][0]:
         raise InputError(
             f"{file.filename}: the descriptors of {name} are {shapes[0]}, its keypoints "
@@ -103,7 +104,9 @@ def get_descriptors(file: h5py.File, name: str) -> np.ndarray:
     key = dataset.name.rpartition("/")[2]
     array = get_array(file, name, key, (0, 0))
     try:
-        return restore({key: array}, {key: dict(dataset.attrs)})
+        with reading(file.filename):
+            attrs = dict(dataset.attrs)
+        return restore({key: array}, {key: attrs})
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{file.filename}: {name} has no scale and offset.") from None
 

@@ -203,7 +203,7 @@ def run_folder(
         conf["retrieval"] = _placed(Path(retrieval), outputs)  # which may be moved with it
     if features is not None:
         with io.open_h5(features) as file:
-            conf["features"] = file.attrs.get("id", str(features))
+            conf["features"] = io.get_text(file, "id", str(features))
         before = stamps.read(outputs / "conf.json")
         made_anew = before.get("features") not in (None, conf["features"])
         overwrite |= made_anew and {**before, "features": conf["features"]} == conf

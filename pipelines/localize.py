@@ -6,6 +6,8 @@ colmap_sift_sv64 and the matcher NN-ratio, if no other is given or the map is no
 """
 
 import argparse
+import hashlib
+import os
 import re
 from collections import Counter
 from pathlib import Path
@@ -42,6 +44,7 @@ from . import common
 
 FEATURE, MATCHER = features_confs.RECOMMENDED, "NN-ratio"
 MADE_FROM = "made_from.json"  # the map and the photos of queries
+LISTED = "queries_with_intrinsics.txt"  # those of a folder
 NOT_IN_NAMES = r"[^\w.-]+"  # of a glob
 
 
@@ -131,17 +134,21 @@ def main(
         names = extract_features.list_images(query_images)
         lists = {query_images.resolve().name: names}
         cameras = _infer(query_images, names, strict)
-        queries = outputs / "queries_with_intrinsics.txt"
+        queries = outputs / LISTED
     else:
         parts = parse_query_lists(queries)
         lists = {stem: [name for name, _ in part] for stem, part in parts.items()}
     names = [name for part in lists.values() for name in part]
     common.check_queries(query_images, names, strict)
+    map_names = built.names()  # a broken model is to be found before photos are read
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
     made_from = outputs / MADE_FROM
     before = stamps.read(made_from)
-    files = {name: query_images / name for name in names if (query_images / name).is_file()}
+    files = {name: query_images / name for name in names}
+    files = {
+        name: file for name, file in files.items() if file.is_file() and os.access(file, os.R_OK)
+    }
     now = {"map": built.id, "queries": stamps.fingerprints(files, before.get("queries", {}))}
     changed = stamps.changed(before.get("queries", {}), now["queries"])
     if before and before.get("map") != now["map"]:
@@ -196,7 +203,7 @@ def main(
                     loc_pairs,
                     num_loc,
                     query_list=readable,
-                    db_list=built.names(),
+                    db_list=map_names,
                     db_descriptors=built.descriptors,
                 )
             else:
@@ -260,6 +267,28 @@ def _infer(
     return cameras
 
 
+def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> Path:
+    """Return the folder for the results of queries, which is called by their list or folder.
+
+    Where that is of other queries of the same name, a digest of their path follows the name.
+
+    Args:
+        outputs: the folder for it.
+        query_images: folder of the photos.
+        queries: their list, if there is one.
+    """
+    name = (queries or query_images.resolve()).stem
+    name = re.sub(NOT_IN_NAMES, "", name).strip("._-")
+    folder = outputs / f"queries-{name or 'all'}"
+    before = stamps.read(folder / "conf.json")
+    own = {"query_images": str(query_images.resolve())}
+    own["queries"] = str((queries or folder / LISTED).resolve())
+    if any(before.get(key, value) != value for key, value in own.items()):
+        where = f"{own['query_images']}\n{queries and own['queries']}"
+        folder = folder.with_name(f"{folder.name}-{hashlib.sha256(where.encode()).hexdigest()[:8]}")
+    return folder
+
+
 def _main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__,
@@ -286,7 +315,8 @@ def _main() -> None:
     parser.add_argument(
         "--outputs",
         type=Path,
-        help="folder for the map, in map, and for the results, in queries-<name>",
+        help="folder for the map, in map, and for the results, in queries-<name of --queries or "
+        "--query_images>; a digest of the path follows if others of that name have that folder",
     )
     parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
     common.add_feature_options(parser)
@@ -324,9 +354,7 @@ def _run(args: argparse.Namespace) -> None:
     if args.query_images is None:
         print(f"The map {built.folder} is there. Localize photos in it with --query_images.")
         return
-    name = (args.queries or args.query_images.resolve()).stem
-    name = re.sub(NOT_IN_NAMES, "", name).strip("._-")
-    outputs = args.outputs / f"queries-{name or 'all'}"
+    outputs = results_folder(args.outputs, args.query_images, args.queries)
     summary = main(
         built,
         args.query_images,

@@ -198,7 +198,7 @@ class Shared:
         ids = {}
         for path in {self.features[job] for job in self.running()}:
             with io.open_h5(path) as file:
-                ids[path.name] = file.attrs["id"]
+                ids[path.name] = io.get_text(file, "id")
         before = self._record.get("ids", {})
         if any(before.get(name, made) != made for name, made in ids.items()):
             for derived in self.folder.glob(f"{aggregate_features.confs['vlad']['output']}*"):
