@@ -1,0 +1,422 @@
+"""Count wrong poses that are called localized, and true ones that are refused.
+
+Every map is tried with photos of its own that it was not built from, with photos of all other
+places, and with its own blurred, mirrored, black and noisy; each with its intrinsics and without.
+Of a COLMAP model every third photo is kept out of the map. Keypoints and maps are those of the
+first feature, whatever descriptors are matched. Results go to trials.csv, and as a curve to
+false_accepts.svg; a run that was stopped goes on with the next place.
+"""
+
+import argparse
+import csv
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pycolmap
+import torch
+
+from confs import features as features_confs
+from confs import matchers as matchers_confs
+from hloc_reduce import (
+    cli,
+    colmap,
+    extract_features,
+    intrinsics,
+    localization,
+    localize_inloc,
+    maps,
+    projections,
+    scans,
+)
+from hloc_reduce.datasets import Aachen, InLoc, true_poses
+from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.io import get_colmap_keypoints, open_h5, read_image, replacing, write_csv
+from hloc_reduce.localize_sfm import RANSAC_THRESH, SfmMap, merged
+from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
+from hloc_reduce.storage import get_descriptors, restore, store
+from hloc_reduce.training.__main__ import parse_maps
+
+BASE, MAP_FEATURE = "colmap_sift", "colmap_sift_sv64"
+EVERY = 3
+ALTERED = ("blurred", "mirrored", "black", "noise")
+BLUR = 6.0  # standard deviation in pixels
+# a pose is true within both, or the second one within a share of the extent of the cameras
+TRUE_METRES, TRUE_EXTENT, TRUE_DEGREES = 0.25, 0.01, 2.0
+# a pose that is neither true nor farther off than this share of the distance is left out
+NEAR, NEAR_DEGREES = 0.1, 5.0
+LEVELS = (0, 2, 4, 6, 8, 10, 15, 20, 30)
+OLD_GATE = 8  # inliers, whatever their number among all
+COLUMNS = (
+    *("feature", "map", "place", "photo", "kind", "intrinsics", "matches", "inliers", "confidence"),
+    *("refusal", "position_error", "rotation_error_deg", "outcome"),
+)
+
+
+@dataclass
+class Place:
+    """A map and its own queries.
+
+    Args:
+        name: of the place.
+        images: folder of all its photos.
+        queries: names, intrinsics and true poses, camera from world.
+        reference: the map, and `names`, its images.
+        features: of the photos of the map and of the queries, by the base descriptor.
+        metric: whether units are metres.
+        thresh: RANSAC's inlier threshold by the longer side of a photo in pixels.
+    """
+
+    name: str
+    images: Path
+    queries: list[tuple[str, pycolmap.Camera, pycolmap.Rigid3d]]
+    reference: localization.Reference
+    names: list[str]
+    features: Path
+    metric: bool
+    extent: float
+
+
+def split(name: str, images: Path, model: Path, output: Path) -> Place:
+    """Build a map of two thirds of the photos of a COLMAP model."""
+    reconstruction = colmap.read_model(model)
+    photos = sorted(reconstruction.images.values(), key=lambda image: image.name)
+    held_out = photos[EVERY // 2 :: EVERY]
+    queries = [(photo.name, photo.camera, photo.cam_from_world()) for photo in held_out]
+    for photo in held_out:
+        reconstruction.deregister_frame(photo.frame_id)
+    reduced = output / "model"
+    reduced.mkdir(parents=True, exist_ok=True)
+    reconstruction.write_binary(reduced)
+    return _of_model(name, images, reduced, queries, output, metric=False)
+
+
+def of_dataset(root: Path, output: Path) -> Place:
+    """Take a place in the layout of Aachen Day-Night or of InLoc, and its queries."""
+    if (root / "database/cutouts").is_dir():
+        return _of_scans(InLoc(root), output)
+    place = Aachen(root)
+    listed = [query for part in place.query_lists().values() for query in part]
+    truth = true_poses([name for name, _ in listed], place.ground_truth, True)
+    queries = [(name, camera, truth[name]) for name, camera in listed]
+    return _of_model(root.name, place.images, place.reference_model, queries, output, metric=True)
+
+
+def _of_model(
+    name: str, images: Path, model: Path, queries: list, output: Path, metric: bool
+) -> Place:
+    built = maps.main(output / "map", images, model, MAP_FEATURE)
+    reference = SfmMap(colmap.read_model(built.sfm))
+    names = sorted(reference.images)
+    features = _extract(images, output, [*names, *(query for query, _, _ in queries)])
+    centres = [image.projection_center() for image in reference.images.values()]
+    extent = float(np.linalg.norm(np.std(centres, axis=0)))
+    return Place(name, images, queries, reference, names, features, metric, extent)
+
+
+def _of_scans(place: InLoc, output: Path) -> Place:
+    names = place.map_names()
+    features = _extract(place.root, output, [*names, *place.query_names()])
+    truth = true_poses(place.query_names(), place.ground_truth, True)
+    queries = [(name, camera, truth[name]) for name, camera in place.queries(features)]
+    points = localize_inloc.lift_keypoints(place.root, features, names, output / "points3D.h5")
+    poses = {name: scans.read_pose(place.root, name) for name in names}
+    reference = localize_inloc.ScanMap(h5py.File(points), h5py.File(features), poses)
+    extent = float(np.linalg.norm(np.std([pose[:3, 3] for pose in poses.values()], axis=0)))
+    return Place(place.root.name, place.root, queries, reference, names, features, True, extent)
+
+
+def _extract(images: Path, output: Path, names: list[str]) -> Path:
+    conf = features_confs.confs[BASE]
+    return extract_features.main(conf, images, output, image_list=sorted(set(names)))
+
+
+def alter(place: Place, output: Path) -> list[tuple[str, pycolmap.Camera, pycolmap.Rigid3d | None]]:
+    """Write altered photos of a place's queries, and extract their features."""
+    generator = np.random.default_rng(0)
+    altered = []
+    for i, (name, camera, truth) in enumerate(place.queries):
+        kind = ALTERED[i % 2] if i > 1 else ALTERED[2 + i]
+        photo = read_image(place.images / name)
+        views = {
+            "blurred": lambda photo=photo: cv2.GaussianBlur(photo, (0, 0), BLUR),
+            "mirrored": lambda photo=photo: photo[:, ::-1],
+            "black": lambda photo=photo: np.zeros_like(photo),
+            "noise": lambda photo=photo: generator.integers(0, 256, photo.shape, np.uint8),
+        }
+        path = output / "altered" / kind / Path(name).with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), views[kind]()[..., ::-1])
+        named = path.relative_to(output / "altered").as_posix()
+        altered.append((named, camera, truth if kind == "blurred" else None))
+    names = [name for name, _, _ in altered]
+    extract_features.main(
+        features_confs.confs[BASE],
+        output / "altered",
+        image_list=names,
+        feature_path=output / "altered.h5",
+    )
+    return altered
+
+
+class Described:
+    """Reads base descriptors as those of a feature, at the precision they are kept in.
+
+    Args:
+        feature: `<name>` or `<name>:<storage>`, a projection of the base descriptor or itself.
+    """
+
+    def __init__(self, feature: str):
+        name, _, storage = feature.partition(":")
+        conf = features_confs.get(name)[1]["model"]
+        projection = conf.get("projection")
+        self.project = projections.load(projection) if projection else torch.nn.Identity()
+        self.storage = storage or "float16"
+
+    @torch.no_grad()
+    def __call__(self, file: h5py.File, name: str) -> torch.Tensor:
+        """Return the descriptors (N, D) of an image of an open feature file."""
+        described = self.project(torch.from_numpy(get_descriptors(file, name))).numpy()
+        return torch.from_numpy(restore(*store({"descriptors": described.T}, self.storage)))
+
+
+def trials(
+    place: Place, others: list[Place], output: Path, number: int, generator: np.random.Generator
+) -> Iterator[tuple]:
+    """Yield the photos to try a map with: place, photo, camera, truth or None, features, kind."""
+    for name, camera, truth in place.queries:
+        yield place, name, camera, truth, place.features, "own"
+    for name, camera, truth in alter(place, output):
+        yield place, name, camera, truth, output / "altered.h5", name.split("/")[0]
+    pool = [(other, *query[:2]) for other in others for query in other.queries]
+    chosen = generator.choice(len(pool), min(number, len(pool)), replace=False)
+    for other, name, camera in (pool[i] for i in sorted(chosen)):
+        yield other, name, camera, None, other.features, "other"
+
+
+def run(
+    place: Place, others: list[Place], output: Path, features: list[str], number: int, matcher: str
+) -> list[dict]:
+    """Try a map with all photos, and return the rows of trials.csv."""
+    ratio_threshold = matchers_confs.confs[matcher]["model"].get("ratio_threshold")
+    tried = list(trials(place, others, output, number, np.random.default_rng(0)))
+    shown = {}
+    with open_h5(place.features) as file:
+        for name in place.names:
+            count = len(get_colmap_keypoints(file, name)[0])
+            ids, _ = place.reference.lift(name, np.arange(count))
+            shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
+    rows = []
+    for feature in features:
+        describe = Described(feature)
+        with open_h5(place.features) as file:
+            described = {name: describe(file, name) for name in place.names}
+        for source, name, camera, truth, path, kind in tried:
+            with open_h5(path) as file:
+                query, (keypoints, _) = describe(file, name), get_colmap_keypoints(file, name)
+            matches = {}
+            for other in place.names:
+                rows_of = shown[other]
+                found, _ = mutual_nearest(described[other], query, ratio_threshold, rows_of)
+                matched = found >= 0
+                matches[other] = torch.stack([found[matched], rows_of[matched]], 1).numpy()
+            for given in ("given", "guess"):
+                row = localize(place, keypoints, camera, matches, given)
+                cam_from_world = row.pop("cam_from_world")
+                row |= outcome(place, row, cam_from_world, truth)
+                known = {"feature": feature, "map": place.name, "place": source.name}
+                rows.append(known | {"photo": name, "kind": kind, "intrinsics": given} | row)
+    return rows
+
+
+def localize(
+    place: Place, keypoints: np.ndarray, camera: pycolmap.Camera, matches: dict, given: str
+) -> dict:
+    """Localize a query with its intrinsics, or with a guess of them."""
+    refinement = {}
+    if given == "guess":
+        size = max(camera.width, camera.height)
+        params = [intrinsics.GUESSED_FOCAL * size, camera.width / 2, camera.height / 2, 0]
+        camera = pycolmap.Camera(
+            model="SIMPLE_RADIAL", width=camera.width, height=camera.height, params=params
+        )
+        refinement = intrinsics.REFINEMENTS["guess"]
+    config = merged({"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}, refinement)
+    cam_from_world, info = localization.localize(
+        place.reference, keypoints, camera, matches, config
+    )
+    depths = [np.nan]
+    if cam_from_world is not None and info["inliers"].any():
+        points = info["points3D"][info["inliers"]]
+        depths = (points @ cam_from_world.rotation.matrix().T + cam_from_world.translation)[:, 2]
+    return {
+        "matches": info["num_correspondences"],
+        "inliers": info["num_inliers"],
+        "confidence": info["confidence"],
+        "refusal": info["reason"] or "",
+        "cam_from_world": cam_from_world,
+        "depth": float(np.median(depths)),
+    }
+
+
+def outcome(
+    place: Place, row: dict, cam_from_world: pycolmap.Rigid3d | None, truth: pycolmap.Rigid3d | None
+) -> dict:
+    """Tell true poses from wrong ones; those between are near, and of no pose there is none."""
+    depth = row.pop("depth")
+    if cam_from_world is None:
+        return {"position_error": "", "rotation_error_deg": "", "outcome": "none"}
+    if truth is None:
+        return {"position_error": "", "rotation_error_deg": "", "outcome": "wrong"}
+    distance, degrees = pose_error(cam_from_world, truth)
+    limit = max(TRUE_EXTENT * place.extent, TRUE_METRES if place.metric else 0)
+    if distance <= limit and degrees <= TRUE_DEGREES:
+        found = "true"
+    elif distance <= max(limit, NEAR * depth) and degrees <= NEAR_DEGREES:
+        found = "near"
+    else:
+        found = "wrong"
+    return {"position_error": distance, "rotation_error_deg": degrees, "outcome": found}
+
+
+def same_place(row: dict, same: list[set[str]]) -> bool:
+    """Tell whether the photo of a trial is of the place of the map, or of one beside it."""
+    return any({row["map"], row["place"]} <= names for names in same)
+
+
+def table(rows: list[dict], same: list[set[str]]) -> str:
+    """Format what is accepted and refused by feature."""
+    lines = [
+        "| feature | wrong place | accepted | with 8 inliers | highest confidence "
+        "| own, wrong pose | accepted | true pose | refused | lowest confidence |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for feature in dict.fromkeys(row["feature"] for row in rows):
+        of_feature = [row for row in rows if row["feature"] == feature]
+        away = [r for r in of_feature if is_away(r, same)]
+        wrong = [
+            r for r in of_feature if r["kind"] in ("own", "blurred") and r["outcome"] == "wrong"
+        ]
+        true = [r for r in of_feature if r["outcome"] == "true"]
+        lines.append(
+            f"| {feature} | {len(away):,} | {_accepted(away)} | "
+            f"{sum(int(r['inliers']) >= OLD_GATE for r in away)} | "
+            f"{max(float(r['confidence']) for r in away):.1f} | {len(wrong):,} | "
+            f"{_accepted(wrong)} | {len(true):,} | {len(true) - _accepted(true)} | "
+            f"{min(float(r['confidence']) for r in true):.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def is_away(row: dict, same: list[set[str]]) -> bool:
+    """Tell whether a trial is of a photo that no pose in the map is right for."""
+    if row["kind"] == "other":
+        return not same_place(row, same)
+    return row["kind"] in ("mirrored", "black", "noise")
+
+
+def _accepted(rows: list[dict]) -> int:
+    return sum(not row["refusal"] for row in rows)
+
+
+def levels(rows: list[dict], same: list[set[str]]) -> str:
+    """Format what each --min_confidence would accept and refuse, all features together."""
+    away = np.array([float(r["confidence"]) for r in rows if is_away(r, same)])
+    true = np.array([float(r["confidence"]) for r in rows if r["outcome"] == "true"])
+    lines = [
+        f"| confidence | false accepts of {len(away):,} | true poses refused of {len(true):,} |",
+        "| ---: | ---: | ---: |",
+    ]
+    for level in LEVELS:
+        lines.append(f"| {level} | {(away > level).sum()} | {(true <= level).sum()} |")
+    return "\n".join(lines)
+
+
+def plot(rows: list[dict], same: list[set[str]], path: Path) -> None:
+    """Draw true accepts against false ones, by confidence and by the number of inliers."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(6, 4))
+    away = [row for row in rows if is_away(row, same)]
+    true = [row for row in rows if row["outcome"] == "true"]
+    for key, label in (("confidence", "confidence"), ("inliers", "number of inliers")):
+        wrong, right = (np.array([float(row[key]) for row in part]) for part in (away, true))
+        at = np.unique(np.concatenate([wrong, right]))
+        axes.plot(
+            [(wrong >= level).mean() for level in at],
+            [(right >= level).mean() for level in at],
+            label=f"by {label}",
+        )
+    axes.set_xscale("symlog", linthresh=1e-4)
+    axes.set(xlabel="wrong poses accepted", ylabel="true poses accepted", ylim=(0.9, 1.003))
+    axes.legend(loc="lower right")
+    axes.grid(alpha=0.3)
+    figure.tight_layout()
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="svg", metadata={"Date": None})
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python benchmarks/false_accepts.py --map scenes/fox/images:scenes/fox/"
+        "sparse --map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv64",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument(
+        "--map", action="append", default=[], metavar="IMAGES:MODEL", help="may be repeated"
+    )
+    parser.add_argument(
+        "--dataset", type=Path, action="append", default=[], help="in Aachen's or InLoc's layout"
+    )
+    parser.add_argument(
+        "--feature",
+        nargs="+",
+        default=[MAP_FEATURE],
+        help=f"{BASE} or projections of it, NAME or NAME:uint8",
+    )
+    parser.add_argument("--matcher", default="NN-ratio", help="how to match")
+    parser.add_argument("--trials", type=int, default=85, help="photos of other places, a map")
+    parser.add_argument(
+        "--same",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar="PLACE",
+        help="places that see each other, whose photos are not tried as wrong ones",
+    )
+    parser.add_argument("--output", type=Path, default=Path("outputs/false_accepts"))
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    sources = [(root.name, of_dataset, (root,)) for root in args.dataset]
+    sources += [(name, split, (name, *both)) for name, both in parse_maps(args.map).items()]
+    places = {name: make(*arguments, args.output / name) for name, make, arguments in sources}
+    rows = []
+    for name, place in places.items():
+        others = [other for other in places.values() if other is not place]
+        for feature in args.feature:
+            file = args.output / name / f"trials_{feature.replace(':', '-')}_{args.matcher}.csv"
+            if not file.exists():
+                found = run(place, others, args.output / name, [feature], args.trials, args.matcher)
+                write_csv(found, file, COLUMNS)
+            with file.open(newline="") as opened:
+                rows += csv.DictReader(opened)
+        print(f"{name}: {len(rows):,} trials", flush=True)
+    same = [set(names) for names in args.same]
+    write_csv(rows, args.output / "trials.csv", COLUMNS)
+    print(table(sorted(rows, key=lambda row: args.feature.index(row["feature"])), same))
+    print()
+    print(levels(rows, same))
+    plot(rows, same, args.output / "false_accepts.svg")
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    cli.run(_main)
