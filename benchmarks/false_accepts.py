@@ -8,6 +8,7 @@ false_accepts.svg; a run that was stopped goes on with the next place.
 """
 
 import argparse
+import copy
 import csv
 import os
 from collections.abc import Iterator
@@ -86,7 +87,10 @@ def split(name: str, images: Path, model: Path, output: Path) -> Place:
     reconstruction = colmap.read_model(model)
     photos = sorted(reconstruction.images.values(), key=lambda image: image.name)
     held_out = photos[EVERY // 2 :: EVERY]
-    queries = [(photo.name, photo.camera, photo.cam_from_world()) for photo in held_out]
+    # copies, as the originals end with the model
+    queries = [
+        (photo.name, copy.deepcopy(photo.camera), photo.cam_from_world()) for photo in held_out
+    ]
     for photo in held_out:
         reconstruction.deregister_frame(photo.frame_id)
     reduced = output / "model"

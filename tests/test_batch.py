@@ -15,7 +15,7 @@ from pathlib import Path
 import command
 import pytest
 
-from hloc_reduce import aggregate_features, cli, colmap, extract_features, jobs, scans
+from hloc_reduce import aggregate_features, cli, detection, extract_features, jobs, scans
 from hloc_reduce.cli import InputError
 from hloc_reduce.descriptors import Descriptor
 from hloc_reduce.evaluation import published
@@ -136,7 +136,7 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
         monkeypatch.setattr(module, name, counted)
 
     monkeypatch.setattr(extract_features.parallel, "cores", lambda: 1)  # no process detects
-    count(colmap, "detect_dog")
+    count(detection, "detect")
     count(Descriptor, "forward")
     count(extract_features, "read_image")
     count(aggregate_features, "main")
@@ -144,7 +144,7 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
     grid = {"dataset": str(aachen_layout), "feature": features, "matcher": "NN-ratio"}
     outputs = run_batch(grid)
     images = 7
-    assert done["detect_dog"] == done["read_image"] == images
+    assert done["detect"] == done["read_image"] == images
     assert done["forward"] == images
     assert done["main"] == 1
     folder = outputs / aachen_layout.name
@@ -174,7 +174,7 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
     states = {path: path.stat().st_mtime_ns for path in folder.rglob("*.h5")}
     done.clear()
     run_batch(grid)
-    assert done["detect_dog"] == done["forward"] == 0
+    assert done["detect"] == done["forward"] == 0
     assert states == {path: path.stat().st_mtime_ns for path in folder.rglob("*.h5")}
 
 
