@@ -1,0 +1,90 @@
+"""Pair all images of a list or a feature file, with each other or with those of another."""
+
+import argparse
+from collections.abc import Iterable
+from itertools import combinations, product
+from pathlib import Path
+
+from . import cli, logger
+from .cli import InputError
+from .io import list_h5_names
+from .parsers import check_names, image_names, write_pairs
+
+
+def main(
+    output: Path,
+    image_list: Path | str | Iterable[str] | None = None,
+    features: Path | None = None,
+    ref_list: Path | str | Iterable[str] | None = None,
+    ref_features: Path | None = None,
+) -> Path:
+    """Write all pairs of images, or of queries and reference images.
+
+    Takes what hloc's `pairs_from_exhaustive.main` takes.
+
+    Args:
+        output: text file of pairs.
+        image_list: names, or a text file of them ...
+        features: ... or the feature file with the images.
+        ref_list: likewise for the reference images; default: the images themselves, where each
+            unordered pair is written once.
+        ref_features: likewise for the reference images.
+
+    Returns:
+        `output`.
+
+    Raises:
+        InputError: when neither a list nor a feature file is given, one has no image, or there
+            is only one image to pair.
+    """
+    output = Path(output)
+    names = _names(image_list, features)
+    if names is None:
+        raise InputError("There is nothing to pair: give a list of images or a feature file.")
+    references = _names(ref_list, ref_features)
+    if references is None or set(references) == set(names):
+        if len(names) == 1:
+            raise InputError(f"{names[0]} is the only image: there is no other to pair it with.")
+        pairs = combinations(names, 2)
+    else:
+        pairs = (pair for pair in product(names, references) if pair[0] != pair[1])
+    number = write_pairs(pairs, output)
+    logger.info("Wrote %d pairs of %d images.", number, len({*names, *(references or ())}))
+    return output
+
+
+def _names(images: Path | str | Iterable[str] | None, features: Path | None) -> list[str] | None:
+    """Return the different names of a list, or else of a feature file; None without either."""
+    if images is not None:
+        return list(dict.fromkeys(image_names(images)))
+    if features is None:
+        return None
+    names = check_names(list_h5_names(Path(features)), features)
+    if not names:
+        raise InputError(f"{features} has no image.")
+    return names
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.pairs_from_exhaustive --output pairs.txt "
+        "--features outputs/feats-dog-colmap_sift_sv64.h5",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
+    images = parser.add_mutually_exclusive_group(required=True)
+    images.add_argument("--image_list", type=Path, help="text file of the images' names")
+    images.add_argument("--features", type=Path, help="feature file of the images")
+    references = parser.add_mutually_exclusive_group()
+    references.add_argument(
+        "--ref_list",
+        type=Path,
+        help="text file of the reference images' names (default: pair the images with each other)",
+    )
+    references.add_argument("--ref_features", type=Path, help="feature file of reference images")
+    main(**vars(parser.parse_args()))
+
+
+if __name__ == "__main__":
+    cli.run(_main)
