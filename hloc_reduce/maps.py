@@ -17,6 +17,7 @@ from . import (
     logger,
     match_features,
     pairs_from_covisibility,
+    pairs_from_exhaustive,
     pairs_from_retrieval,
     projections,
     reconstruction,
@@ -139,6 +140,7 @@ def main(
     num_covis: int = 20,
     overwrite: bool = False,
     storage: str = STORAGES[0],
+    accept_partial: bool = False,
 ) -> Map:
     """Build a map, or open one that was made from the same.
 
@@ -213,12 +215,12 @@ def main(
             features = extract_features.main(conf, image_dir, map_dir, image_list=names)
         with folder.stage("retrieval"):
             descriptors = aggregate_features.main(RETRIEVAL, features, names)
-        pairs = map_dir / f"pairs-db-{num_covis}.txt"
+        pairs = map_dir / "pairs-db-exhaustive.txt"
         with folder.stage("pairs"):
             if model is not None and reference.num_points3D():
                 pairs_from_covisibility.main(model, pairs, num_covis)
             else:
-                pairs_from_retrieval.main(descriptors, pairs, num_covis)
+                pairs_from_exhaustive.main(pairs, names)
         with folder.stage("match_map"):
             matches = match_features.main(matcher_conf, pairs, features.stem, map_dir)
         with folder.stage("triangulation" if model is not None else "reconstruction"):
