@@ -144,14 +144,15 @@ def main(
                 target = folder / "photos" / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.symlink_to((images / name).resolve())
-            methods = {"ours": lambda: ours(photos, folder / "map", feature, options or {})}
-            if with_stock:
-                methods["stock"] = lambda: stock(photos, folder / "stock")
             photos = folder / "photos"
-            for method, reconstruct in methods.items():
+            for method in ("ours", "stock") if with_stock else ("ours",):
                 start = time.perf_counter()
                 try:
-                    cells = row(reconstruct(), reference, len(chosen))
+                    if method == "ours":
+                        found = ours(photos, folder / "map", feature, options or {})
+                    else:
+                        found = stock(photos, folder / "stock")
+                    cells = row(found, reference, len(chosen))
                     registered[method] = registered.get(method, 0) + int(cells[0].split()[0])
                 except InputError as error:
                     cells = [f"0 of {len(chosen)}", *["-"] * 4]

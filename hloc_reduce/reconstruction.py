@@ -13,6 +13,13 @@ from .extract_features import list_images
 from .io import list_h5_names
 from .triangulation import STAMP, read_matches, replacing_map
 
+REGISTRATION = "registration.json"  # which images are in the model, and in other parts
+# shares of the images that are in the model, below which it is reported in detail, or refused
+ENOUGH, LEAST = 0.8, 0.5
+NAMED = 10  # images that a message names
+# COLMAP would drop parts of fewer than 10 images, or than 8 of 10
+MAPPER_OPTIONS = {"random_seed": 0, "num_threads": 1, "min_model_size": 3}
+
 
 def main(
     sfm_dir: Path,
@@ -28,6 +35,7 @@ def main(
     image_options: dict | None = None,
     mapper_options: dict | None = None,
     overwrite: bool = False,
+    accept_partial: bool = False,
 ) -> pycolmap.Reconstruction:
     """Reconstruct poses, intrinsics and points by COLMAP's incremental mapper.
 
@@ -47,14 +55,16 @@ def main(
         image_options: of pycolmap's ImageReaderOptions.
         mapper_options: of pycolmap's IncrementalPipelineOptions.
         overwrite: reconstruct anew.
+        accept_partial: return a model of fewer than half of the images, too.
 
     Returns:
         The model of most images. Its keypoints are those of the feature file, in the same order.
 
     Raises:
-        InputError: when an input is missing or nothing can be reconstructed.
+        InputError: when an input is missing, nothing can be reconstructed, or fewer than half of
+            the images are in the model, which is kept for a run with `accept_partial`.
     """
-    options = {"random_seed": 0, "num_threads": 1, **(mapper_options or {})}
+    options = {**MAPPER_OPTIONS, **(mapper_options or {})}
     mapper = colmap.mapper_options(options)
     for path in (pairs, features, matches):
         if not path.is_file():
@@ -70,8 +80,10 @@ def main(
         "min_match_score": min_match_score,
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
-    if not overwrite and stamps.is_current(sfm_dir / STAMP, made_from):
+    is_whole = (sfm_dir / REGISTRATION).is_file()
+    if not overwrite and is_whole and stamps.is_current(sfm_dir / STAMP, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
+        _check(sfm_dir, accept_partial)
         return colmap.read_model(sfm_dir)
 
     with replacing_map(sfm_dir, made_from) as building:
@@ -92,15 +104,108 @@ def main(
         if not models:
             raise InputError(
                 f"COLMAP could not reconstruct the images of {image_dir} from the matches "
-                f"{matches}. Do enough of them overlap?"
+                f"{matches}. Do enough of them overlap? Take photos from several places, each "
+                "overlapping the one before by about two thirds."
             )
         models[0].write(building)
         shutil.rmtree(building / "models")
-    missing = sorted(set(names) - {image.name for image in models[0].images.values()})
-    if missing:
-        logger.warning("%d images are not in the map: %s.", len(missing), ", ".join(missing))
+        registered = [[image.name for image in model.images.values()] for model in models]
+        matched = {name for pair in colmap.count_verified(database) for name in pair}
+        state = {
+            "images": len(names),
+            "parts": _parts(registered),
+            "missing": sorted(set(names) - set(registered[0])),
+            "unmatched": sorted(set(names) - matched),
+            "camera_mode": camera_mode.name.lower(),
+        }
+        stamps.write(building / REGISTRATION, state)
     logger.info("The map %s:\n%s", sfm_dir, models[0].summary())
+    _check(sfm_dir, accept_partial)
     return models[0]
+
+
+def _parts(models: list[list[str]]) -> list[list[str]]:
+    """Return the images of each model that no larger one has; COLMAP's models may overlap."""
+    parts, seen = [], set()
+    for model in models:
+        if new := sorted(set(model) - seen):
+            parts.append(new)
+            seen.update(new)
+    return parts
+
+
+def _check(sfm_dir: Path, accept_partial: bool) -> None:
+    """Report what is missing in a model, or raise an InputError if that is more than half."""
+    state = stamps.read(sfm_dir / REGISTRATION)
+    missing, parts, number = state["missing"], state["parts"], state["images"]
+    share = 1 - len(missing) / number
+    if share >= ENOUGH and len(parts) == 1:
+        if missing:
+            logger.warning(
+                "%d of %d images are not in the map: %s.",
+                *(len(missing), number, cli.some(missing, NAMED)),
+            )
+        return
+    message = shortfall(sfm_dir / REGISTRATION, **state)
+    if share < LEAST and not accept_partial:
+        raise InputError(f"{message} To use the map as it is, run again with --accept_partial.")
+    logger.warning(message)
+
+
+def shortfall(
+    path: Path,
+    images: int,
+    parts: list[list[str]],
+    missing: list[str],
+    unmatched: list[str],
+    camera_mode: str,
+) -> str:
+    """Say which images are not in a model, why, and what to try.
+
+    Args:
+        path: file with all names.
+        images: number of images.
+        parts: the images of each part that COLMAP reconstructed, the model first.
+        missing: the images that are not in the model.
+        unmatched: those that match no other image.
+        camera_mode: in lower case.
+    """
+    said = [
+        f"Only {images - len(missing)} of {images} photos are in the map. "
+        f"Not in it: {cli.some(missing, NAMED)}" + (f" (all: {path})." if missing[NAMED:] else ".")
+    ]
+    tries = []
+    if len(parts) > 1:
+        sizes = [str(len(part)) for part in parts]
+        said.append(
+            f"COLMAP found {len(parts)} parts that do not connect, of {', '.join(sizes[:-1])} and "
+            f"{sizes[-1]} photos; the map is the first, the next one begins with {parts[1][0]}."
+        )
+        tries.append("add photos between the parts, each overlapping the one before by two thirds")
+    elif set(missing) - set(unmatched):
+        tries.append("add photos between those in the map and those that are not")
+    if unmatched:
+        said.append(f"No other photo matches {cli.some(unmatched)}.")
+        tries.append("leave out photos of other places, and retake blurred or dark ones")
+    if camera_mode != "single":
+        tries.append("--camera_mode single if one camera with a fixed zoom took all photos")
+    return f"{' '.join(said)} What to try: {'; '.join(tries)}."
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add --camera_mode and --accept_partial."""
+    modes = ", ".join(mode.lower() for mode in pycolmap.CameraMode.__members__)
+    parser.add_argument(
+        "--camera_mode",
+        default="auto",
+        help=f"which photos share a camera, as in COLMAP: {modes}; auto: those of the same camera, "
+        "lens and size by EXIF data",
+    )
+    parser.add_argument(
+        "--accept_partial",
+        action="store_true",
+        help="accept a map that has fewer than half of the photos",
+    )
 
 
 def _main() -> None:
@@ -116,10 +221,7 @@ def _main() -> None:
     parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
     parser.add_argument("--features", type=Path, required=True, help="feature file")
     parser.add_argument("--matches", type=Path, required=True, help="match file")
-    modes = list(pycolmap.CameraMode.__members__)
-    parser.add_argument(
-        "--camera_mode", default="AUTO", help=f"which images share a camera: {', '.join(modes)}"
-    )
+    add_options(parser)
     parser.add_argument(
         "--skip_geometric_verification", action="store_true", help="take all matches"
     )
@@ -128,8 +230,7 @@ def _main() -> None:
     parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
     parser.add_argument("--overwrite", action="store_true", help="reconstruct anew")
     args = parser.parse_args()
-    mode = cli.choose("camera mode", args.camera_mode, modes)
-    main(**{**vars(args), "camera_mode": pycolmap.CameraMode.__members__[mode]})
+    main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})
 
 
 if __name__ == "__main__":

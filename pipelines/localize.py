@@ -15,6 +15,7 @@ from confs import matchers as matchers_confs
 from hloc_reduce import (
     aggregate_features,
     cli,
+    colmap,
     extract_features,
     intrinsics,
     localize_sfm,
@@ -22,6 +23,7 @@ from hloc_reduce import (
     maps,
     match_features,
     pairs_from_retrieval,
+    reconstruction,
     results,
     stamps,
     trace,
@@ -49,6 +51,8 @@ def open_map(
     num_covis: int = 20,
     overwrite: bool = False,
     storage: str | None = None,
+    accept_partial: bool = False,
+    camera_mode: str | None = None,
 ) -> Map:
     """Build a map in `outputs`, or open one that was built before.
 
@@ -63,7 +67,15 @@ def open_map(
         num_covis: pairs of each map image.
         overwrite: build anew.
         storage: of descriptors; likewise, float16.
+        accept_partial: build a map of photos alone even if fewer than half of them are in it.
+        camera_mode: which of these share a camera, as in COLMAP; default: auto.
     """
+    if camera_mode is not None:
+        mode = colmap.camera_mode(camera_mode)
+        if map_images is None or model_or_map is not None:
+            raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
+    else:
+        mode = colmap.camera_mode("auto")
     if map_images is None:
         if model_or_map is None:
             raise InputError("Give --map_images, the folder of the photos to build a map of.")
@@ -94,6 +106,8 @@ def open_map(
         num_covis,
         overwrite,
         storage or STORAGES[0],
+        accept_partial,
+        mode,
     )
 
 
@@ -245,9 +259,11 @@ def _main() -> None:
         help="folder for the map, in map, and for the results, in queries-<name>",
     )
     parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
+    reconstruction.add_options(parser)
     common.add_feature_options(parser)
     common.add_localization_options(parser, "none", 50)
-    parser.set_defaults(feature=None, matcher=None, storage=None)  # those of a map that was built
+    # those of a map that was built
+    parser.set_defaults(feature=None, matcher=None, storage=None, camera_mode=None)
     args = parser.parse_args()
     common.check_options(args)
     if args.storage is not None:
@@ -271,6 +287,8 @@ def _run(args: argparse.Namespace) -> None:
         args.num_covis,
         args.overwrite,
         args.storage,
+        args.accept_partial,
+        args.camera_mode,
     )
     if args.query_images is None:
         print(f"The map {built.folder} is there. Localize photos in it with --query_images.")
