@@ -261,6 +261,7 @@ def main(
                     matches,
                     descriptors,
                     num_covis,
+                    num_covis if number == 1 else 0,
                     camera_mode,
                     names,
                 )

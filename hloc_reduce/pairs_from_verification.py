@@ -33,14 +33,16 @@ def main(
     matches: Path,
     descriptors: Path,
     num_matched: int,
+    num_covis: int = 0,
     camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
     image_list: Path | str | Iterable[str] | None = None,
 ) -> Path:
     """Write a list of pairs and more of them where it leaves images unconnected.
 
     COLMAP verifies the matches by two-view geometry. Images outside the largest connected component
-    are paired with the most similar images of other components, images with few verified pairs with
-    any similar ones, and every image with those that have verified neighbours in common with it.
+    are paired with the most similar images of other components, and images with few verified pairs
+    with any similar ones. Images that have verified neighbours in common are likely to see the same
+    points, so they are paired too.
     `<matches>_verified.json` keeps the results, so that a second call verifies only other pairs.
 
     Args:
@@ -50,7 +52,9 @@ def main(
         features: feature file.
         matches: match file, with all of `pairs`.
         descriptors: h5 file of global descriptors.
-        num_matched: new pairs of an image, at most, of each kind.
+        num_matched: new pairs of an image that is connected poorly: at most so many with similar
+            images, and as many with neighbours of its neighbours.
+        num_covis: new pairs of any other image with neighbours of its neighbours, at most.
         camera_mode: which images share a camera.
         image_list: the images, names or a text file of them; default: those of `features`.
 
@@ -60,8 +64,8 @@ def main(
     Raises:
         InputError: when an input is missing or wrong.
     """
-    if num_matched < 1:
-        raise InputError(f"num_matched is {num_matched}: at least 1.")
+    if num_matched < 1 or num_covis < 0:
+        raise InputError(f"num_matched is {num_matched}: at least 1; num_covis {num_covis}: 0.")
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
@@ -70,7 +74,7 @@ def main(
     verified = _verify(image_dir, names, listed, features, matches, camera_mode)
     connected = {pair: verified[pair] for pair in listed if verified[pair] >= MIN_INLIERS}
     global_descriptors = read_global(descriptors, names)
-    new = more_pairs(names, set(listed), connected, global_descriptors, num_matched)
+    new = more_pairs(names, set(listed), connected, global_descriptors, num_matched, num_covis)
     write_pairs([*listed, *new], output)
     logger.info("Added %d pairs to %d.", len(new), len(listed))
     return output
@@ -82,6 +86,7 @@ def more_pairs(
     connected: dict[Pair, int],
     descriptors: np.ndarray,
     num_matched: int,
+    num_covis: int = 0,
 ) -> list[Pair]:
     """Find pairs that may connect images better.
 
@@ -90,10 +95,11 @@ def more_pairs(
         listed: pairs that are known, each sorted.
         connected: numbers of verified matches of those that connect two images.
         descriptors: (N, G) global descriptors of the images.
-        num_matched: new pairs of an image, at most, of each kind.
+        num_matched: new pairs of an image that is connected poorly, at most, of each kind.
+        num_covis: new pairs of any other image with neighbours of its neighbours, at most.
 
     Returns:
-        New pairs, each sorted; none for images that are all connected well.
+        New pairs, each sorted.
     """
     index = {name: i for i, name in enumerate(names)}
     rows, columns = np.array([(index[a], index[b]) for a, b in connected]).reshape(-1, 2).T
@@ -108,7 +114,8 @@ def more_pairs(
         *(len(sizes), sizes.max(), len(names), sum(degrees[i] < MIN_PAIRS for i in weak)),
         MIN_PAIRS,
     )
-    found = dict.fromkeys(_by_neighbours(names, listed, connected, num_matched))
+    limits = dict.fromkeys(names, num_covis) | {names[i]: num_matched for i in weak}
+    found = dict.fromkeys(_by_neighbours(limits, listed, connected))
     if weak:
         for i, ranking in zip(weak, rank(descriptors[weak], descriptors, len(names)), strict=True):
             others = (
@@ -122,14 +129,14 @@ def more_pairs(
 
 
 def _by_neighbours(
-    names: list[str], listed: set[Pair], connected: dict[Pair, int], num_matched: int
+    limits: dict[str, int], listed: set[Pair], connected: dict[Pair, int]
 ) -> list[Pair]:
-    """Pair each image with neighbours of its neighbours, those of most verified matches first."""
+    """Pair images with neighbours of their neighbours, those of most verified matches first."""
     neighbours = defaultdict(dict)
     for (a, b), number in connected.items():
         neighbours[a][b] = neighbours[b][a] = number
     found = []
-    for name in names:
+    for name, limit in limits.items():
         scores = Counter()
         for between, number in neighbours[name].items():
             for other, other_number in neighbours[between].items():
@@ -137,7 +144,7 @@ def _by_neighbours(
                 if other != name and pair not in listed:
                     scores[pair] += min(number, other_number)
         best = sorted(scores, key=lambda pair: (-scores[pair], pair))
-        found += best[:num_matched]
+        found += best[:limit]
     return found
 
 
@@ -193,6 +200,9 @@ def _main() -> None:
     parser.add_argument("--matches", type=Path, required=True, help="match file")
     parser.add_argument("--descriptors", type=Path, required=True, help="global descriptors")
     parser.add_argument("--num_matched", type=int, default=20, help="new pairs an image, at most")
+    parser.add_argument(
+        "--num_covis", type=int, default=0, help="new pairs of images that are connected well"
+    )
     parser.add_argument("--camera_mode", default="auto", help="which photos share a camera")
     parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
     args = parser.parse_args()
