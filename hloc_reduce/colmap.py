@@ -208,7 +208,7 @@ def import_images(
     if skipped := [name for name in names if name not in imported]:
         reason = "they cannot be read"
         if camera_mode in (pycolmap.CameraMode.SINGLE, pycolmap.CameraMode.PER_FOLDER):
-            reason += f" or are not as large as the others of a camera ({camera_mode.name.lower()})"
+            reason += " or differ in size from those that they are to share a camera with"
         raise InputError(
             f"COLMAP skipped {len(skipped)} images in {image_dir}, because {reason}: "
             f"{some(skipped)}."

@@ -19,6 +19,13 @@ ENOUGH, LEAST = 0.8, 0.5
 NAMED = 10  # images that a message names
 # COLMAP would drop parts of fewer than 10 images, or than 8 of 10
 MAPPER_OPTIONS = {"random_seed": 0, "num_threads": 1, "min_model_size": 3}
+# half of COLMAP's thresholds, where images are missing; a quarter of them gave wrong poses
+RELAXED = {
+    "init_min_num_inliers": 50,
+    "init_min_tri_angle": 8.0,
+    "abs_pose_min_num_inliers": 15,
+}
+FEW = 100  # images of which a second attempt takes little time
 
 
 def main(
@@ -39,7 +46,9 @@ def main(
 ) -> pycolmap.Reconstruction:
     """Reconstruct poses, intrinsics and points by COLMAP's incremental mapper.
 
-    Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary.
+    Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary. Where
+    images are missing in the model, a second attempt with lower thresholds follows, and the model
+    of more images is kept; of more than 100 images only if fewer than 80 % are in the first.
 
     Args:
         sfm_dir: the folder of the new COLMAP model; one made from the same inputs is read back.
@@ -53,7 +62,8 @@ def main(
         min_match_score: take matches of a higher score only.
         image_list: the images, names or a text file of them; default: those of `features`.
         image_options: of pycolmap's ImageReaderOptions.
-        mapper_options: of pycolmap's IncrementalPipelineOptions.
+        mapper_options: of pycolmap's IncrementalPipelineOptions; with any there is no second
+            attempt.
         overwrite: reconstruct anew.
         accept_partial: return a model of fewer than half of the images, too.
 
@@ -78,6 +88,7 @@ def main(
         "images": names,
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
+        "relaxed": {} if mapper_options else RELAXED,
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
     is_whole = (sfm_dir / REGISTRATION).is_file()
@@ -101,6 +112,16 @@ def main(
         models = colmap.incremental_mapping(
             database, image_dir, building / "models", mapper, verbose
         )
+        registered = models[0].num_reg_images() if models else 0
+        enough = len(names) if len(names) <= FEW else ENOUGH * len(names)
+        if registered < enough and not mapper_options:
+            logger.info("Registered %d of %d images: trying again...", registered, len(names))
+            relaxed = colmap.mapper_options({**options, "mapper": RELAXED})
+            more = colmap.incremental_mapping(
+                database, image_dir, building / "relaxed", relaxed, verbose
+            )
+            if more and more[0].num_reg_images() > registered:
+                models = more
         if not models:
             raise InputError(
                 f"COLMAP could not reconstruct the images of {image_dir} from the matches "
@@ -108,13 +129,14 @@ def main(
                 "overlapping the one before by about two thirds."
             )
         models[0].write(building)
-        shutil.rmtree(building / "models")
-        registered = [[image.name for image in model.images.values()] for model in models]
+        for folder in ("models", "relaxed"):
+            shutil.rmtree(building / folder, ignore_errors=True)
+        parts = _parts(models)
         matched = {name for pair in colmap.count_verified(database) for name in pair}
         state = {
             "images": len(names),
-            "parts": _parts(registered),
-            "missing": sorted(set(names) - set(registered[0])),
+            "parts": parts,
+            "missing": sorted(set(names) - set(parts[0])),
             "unmatched": sorted(set(names) - matched),
             "camera_mode": camera_mode.name.lower(),
         }
@@ -124,11 +146,11 @@ def main(
     return models[0]
 
 
-def _parts(models: list[list[str]]) -> list[list[str]]:
+def _parts(models: list[pycolmap.Reconstruction]) -> list[list[str]]:
     """Return the images of each model that no larger one has; COLMAP's models may overlap."""
     parts, seen = [], set()
     for model in models:
-        if new := sorted(set(model) - seen):
+        if new := sorted({image.name for image in model.images.values()} - seen):
             parts.append(new)
             seen.update(new)
     return parts
@@ -171,15 +193,15 @@ def shortfall(
         camera_mode: in lower case.
     """
     said = [
-        f"Only {images - len(missing)} of {images} photos are in the map. "
-        f"Not in it: {cli.some(missing, NAMED)}" + (f" (all: {path})." if missing[NAMED:] else ".")
+        f"Only {images - len(missing)} of {images} photos are in the map.",
+        f"Missing: {cli.some(missing, NAMED)}{f' (all in {path})' * bool(missing[NAMED:])}.",
     ]
     tries = []
     if len(parts) > 1:
         sizes = [str(len(part)) for part in parts]
         said.append(
             f"COLMAP found {len(parts)} parts that do not connect, of {', '.join(sizes[:-1])} and "
-            f"{sizes[-1]} photos; the map is the first, the next one begins with {parts[1][0]}."
+            f"{sizes[-1]} photos, and the map is the first; the second has {cli.some(parts[1], 3)}."
         )
         tries.append("add photos between the parts, each overlapping the one before by two thirds")
     elif set(missing) - set(unmatched):
