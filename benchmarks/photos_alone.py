@@ -177,8 +177,16 @@ def _main() -> None:
     parser.add_argument("--subset", type=int, default=0, help="photos of each place; 0: all")
     parser.add_argument("--subsets", type=int, default=1, help="how many such subsets")
     parser.add_argument("--stock", action="store_true", help="run stock pycolmap too")
-    parser.add_argument("--num_covis", type=int, default=20, help="pairs of each photo beyond 100")
+    parser.add_argument("--camera_mode", default="auto", help="which photos share a camera")
+    parser.add_argument("--num_covis", type=int, default=20, help="pairs of a photo, where not all")
+    parser.add_argument(
+        "--max_exhaustive",
+        type=int,
+        default=maps.MAX_EXHAUSTIVE,
+        help="photos of which all pairs are matched",
+    )
     args = parser.parse_args()
+    maps.MAX_EXHAUSTIVE = args.max_exhaustive
     main(
         parse_maps(args.map),
         args.output,
@@ -186,7 +194,7 @@ def _main() -> None:
         args.subset,
         args.subsets,
         args.stock,
-        {"num_covis": args.num_covis},
+        {"num_covis": args.num_covis, "camera_mode": colmap.camera_mode(args.camera_mode)},
     )
 
 

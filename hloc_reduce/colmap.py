@@ -265,6 +265,12 @@ def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
         interruptible(pycolmap.verify_matches, database, pairs, options=options)
 
 
+def count_cameras(database: Path) -> int:
+    """Count the cameras of a COLMAP database."""
+    with _open(database) as opened:
+        return opened.num_cameras()
+
+
 def count_verified(database: Path) -> dict[tuple[str, str], int]:
     """Count the verified matches of each pair of images of a database that has any."""
     with _open(database) as opened:

@@ -100,6 +100,13 @@ def main(
     with replacing_map(sfm_dir, made_from) as building:
         database = building / "database.db"
         colmap.import_images(database, image_dir, names, camera_mode, image_options or {})
+        if camera_mode == pycolmap.CameraMode.AUTO and 1 < len(names) == colmap.count_cameras(
+            database
+        ):
+            logger.info(
+                "EXIF data do not say which images share a camera, so each has its own. If one "
+                "camera with a fixed zoom took all, --camera_mode single gives better poses."
+            )
         keypoints, _, found = read_matches(names, pairs, features, matches, min_match_score)
         verified = {
             pair: (indices, indices if skip_geometric_verification else None)
@@ -138,7 +145,6 @@ def main(
             "parts": parts,
             "missing": sorted(set(names) - set(parts[0])),
             "unmatched": sorted(set(names) - matched),
-            "camera_mode": camera_mode.name.lower(),
         }
         stamps.write(building / REGISTRATION, state)
     logger.info("The map %s:\n%s", sfm_dir, models[0].summary())
@@ -180,7 +186,6 @@ def shortfall(
     parts: list[list[str]],
     missing: list[str],
     unmatched: list[str],
-    camera_mode: str,
 ) -> str:
     """Say which images are not in a model, why, and what to try.
 
@@ -190,10 +195,11 @@ def shortfall(
         parts: the images of each part that COLMAP reconstructed, the model first.
         missing: the images that are not in the model.
         unmatched: those that match no other image.
-        camera_mode: in lower case.
     """
+    registered = images - len(missing)
+    only = "Only " if registered < ENOUGH * images else ""
     said = [
-        f"Only {images - len(missing)} of {images} photos are in the map.",
+        f"{only}{registered} of {images} photos are in the map.",
         f"Missing: {cli.some(missing, NAMED)}{f' (all in {path})' * bool(missing[NAMED:])}.",
     ]
     tries = []
@@ -201,7 +207,8 @@ def shortfall(
         sizes = [str(len(part)) for part in parts]
         said.append(
             f"COLMAP found {len(parts)} parts that do not connect, of {', '.join(sizes[:-1])} and "
-            f"{sizes[-1]} photos, and the map is the first; the second has {cli.some(parts[1], 3)}."
+            f"{sizes[-1]} photos, and the map is the first"
+            + (f"; the second has {cli.some(parts[1], 3)}." if parts[1] != missing else ".")
         )
         tries.append("add photos between the parts, each overlapping the one before by two thirds")
     elif set(missing) - set(unmatched):
@@ -209,8 +216,6 @@ def shortfall(
     if unmatched:
         said.append(f"No other photo matches {cli.some(unmatched)}.")
         tries.append("leave out photos of other places, and retake blurred or dark ones")
-    if camera_mode != "single":
-        tries.append("--camera_mode single if one camera with a fixed zoom took all photos")
     return f"{' '.join(said)} What to try: {'; '.join(tries)}."
 
 
