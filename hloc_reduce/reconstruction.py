@@ -165,9 +165,9 @@ def _parts(models: list[pycolmap.Reconstruction]) -> list[list[str]]:
 def _check(sfm_dir: Path, accept_partial: bool) -> None:
     """Report what is missing in a model, or raise an InputError if that is more than half."""
     state = stamps.read(sfm_dir / REGISTRATION)
-    missing, parts, number = state["missing"], state["parts"], state["images"]
-    share = 1 - len(missing) / number
-    if share >= ENOUGH and len(parts) == 1:
+    missing, number = state["missing"], state["images"]
+    registered = number - len(missing)
+    if registered >= ENOUGH * number and len(state["parts"]) == 1:
         if missing:
             logger.warning(
                 "%d of %d images are not in the map: %s.",
@@ -175,7 +175,7 @@ def _check(sfm_dir: Path, accept_partial: bool) -> None:
             )
         return
     message = shortfall(sfm_dir / REGISTRATION, **state)
-    if share < LEAST and not accept_partial:
+    if registered < LEAST * number and not accept_partial:
         raise InputError(f"{message} To use the map as it is, run again with --accept_partial.")
     logger.warning(message)
 

@@ -516,6 +516,30 @@ def test_photos_alone(plane, tmp_path, monkeypatch):
     assert np.linalg.norm(similarity(centres, known), axis=1).max() < 0.2
 
 
+def test_a_second_attempt_where_images_are_missing(scene, tmp_path, monkeypatch):
+    names = [f"db/{i}.jpg" for i in range(6)]
+    pairs, matches = tmp_path / "pairs.txt", tmp_path / "matches.h5"
+    parsers.write_pairs([(a, b) for a in names for b in names if a < b], pairs)
+    match_features.main(match_features.confs["NN-ratio"], pairs, scene.features, matches=matches)
+    attempts, mapping = [], colmap.incremental_mapping
+
+    def fails_first(database, image_dir, output, options, verbose):
+        attempts.append(options.mapper.abs_pose_min_num_inliers)
+        if len(attempts) == 1:
+            return []
+        return mapping(database, image_dir, output, options, verbose)
+
+    monkeypatch.setattr(colmap, "incremental_mapping", fails_first)
+    arguments = (scene.images, pairs, scene.features, matches)
+    model = reconstruction.main(tmp_path / "sfm", *arguments, image_list=names)
+    assert model.num_reg_images() == 6 and attempts == [30, 15]
+    attempts.clear()
+    with pytest.raises(InputError, match="could not reconstruct"):
+        own = {"min_model_size": 5}
+        reconstruction.main(tmp_path / "no", *arguments, image_list=names, mapper_options=own)
+    assert attempts == [30]
+
+
 def draw_noise(folder, numbers):
     """Write photos that match no other."""
     generator = np.random.default_rng(1)
