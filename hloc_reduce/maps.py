@@ -38,7 +38,7 @@ FINGERPRINTS = "fingerprints.json"
 PLACE = "place.txt"  # stays when the map is built anew
 RETRIEVAL = aggregate_features.confs["vlad"]
 MAX_EXHAUSTIVE = 100  # photos without covisibility of which all pairs are matched
-ROUNDS = 3  # of more pairs, at most, where they are more
+ROUNDS = 3  # in which larger sets get more pairs, where these leave photos unconnected
 
 
 class Map:
@@ -159,10 +159,10 @@ def main(
         feature: as in `confs.features.get`.
         projection: likewise.
         matcher: a key of `confs.matchers`.
-        num_covis: pairs of each image: the most covisible of the model. Of up to
-            `MAX_EXHAUSTIVE` images without a model, or with one without points, all pairs are
-            matched; of more, those of the most similar and, without a model, where these
-            leave images unconnected, more.
+        num_covis: pairs of each image with the most covisible ones of the model. If the model has
+            no points, or there is none, up to `MAX_EXHAUSTIVE` images are all paired, and of more
+            each is paired with the most similar ones; without a model, pairs are added where
+            these leave images unconnected.
         overwrite: build anew.
         storage: as in `confs.features.get`.
         accept_partial: build a map without a model even if fewer than half of the images are in it.
@@ -224,8 +224,8 @@ def main(
             built = Map(map_dir)
             if built.camera_mode not in (None, camera_mode.name.lower()):
                 raise InputError(
-                    f"The map {map_dir} was made with --camera_mode {built.camera_mode}. "
-                    "Choose other --outputs, or --overwrite."
+                    f"The map {map_dir} was made with --camera_mode {built.camera_mode}: give it "
+                    "again, choose other --outputs, or --overwrite."
                 )
             return built
         if not (map_dir / PLACE).exists():

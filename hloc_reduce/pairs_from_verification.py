@@ -3,6 +3,7 @@
 import argparse
 from collections import Counter, defaultdict
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -21,6 +22,7 @@ from .triangulation import read_matches
 
 MIN_INLIERS = 15  # verified matches of a pair that connects its images, COLMAP's min_num_matches
 MIN_PAIRS = 3  # verified pairs of an image that is connected well
+BLOCK = 256  # images whose similarity to all others is in memory at once
 
 Pair = tuple[str, str]
 
@@ -64,8 +66,10 @@ def main(
     Raises:
         InputError: when an input is missing or wrong.
     """
-    if num_matched < 1 or num_covis < 0:
-        raise InputError(f"num_matched is {num_matched}: at least 1; num_covis {num_covis}: 0.")
+    if num_matched < 1:
+        raise InputError(f"num_matched is {num_matched}: at least 1.")
+    if num_covis < 0:
+        raise InputError(f"num_covis is {num_covis}: at least 0.")
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
@@ -116,15 +120,17 @@ def more_pairs(
     )
     limits = dict.fromkeys(names, num_covis) | {names[i]: num_matched for i in weak}
     found = dict.fromkeys(_by_neighbours(limits, listed, connected))
-    if weak:
-        for i, ranking in zip(weak, rank(descriptors[weak], descriptors, len(names)), strict=True):
+    for start in range(0, len(weak), BLOCK):
+        block = weak[start : start + BLOCK]
+        ranking = rank(descriptors[block], descriptors, len(names))
+        for i, row in zip(block, ranking, strict=True):
             others = (
                 tuple(sorted((names[i], names[j])))
-                for j in ranking
+                for j in row
                 if i != j and not (apart[i] and component[i] == component[j])
             )
-            new = [pair for pair in others if pair not in listed]
-            found |= dict.fromkeys(new[:num_matched])
+            new = (pair for pair in others if pair not in listed)
+            found |= dict.fromkeys(islice(new, num_matched))
     return list(found)
 
 

@@ -225,8 +225,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--camera_mode",
         default="auto",
-        help=f"which photos share a camera, as in COLMAP: {modes}; auto: those of the same camera, "
-        "lens and size by EXIF data",
+        help=f"which photos share a camera, as in COLMAP: {modes}; auto, COLMAP's default: those "
+        "of the same make, model, focal length and size by EXIF data",
     )
     parser.add_argument(
         "--accept_partial",

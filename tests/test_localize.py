@@ -653,5 +653,16 @@ def test_which_pairs_are_added():
     assert more(names, set(), {}, descriptors, 9)  # nothing is verified
 
 
+def test_a_map_of_other_pairs_is_refused(plane, tmp_path, monkeypatch, caplog):
+    outputs = tmp_path / "outputs"
+    build = ("--map_images", plane / "images", "--outputs", outputs)
+    run(monkeypatch, *build)
+    run(monkeypatch, *build, "--num_covis", 3)  # of which all pairs know nothing
+    assert len(list(parsers.parse_pairs(outputs / "map/pairs-db-exhaustive.txt"))) == 10
+    monkeypatch.setattr(maps, "MAX_EXHAUSTIVE", 4)
+    message = refused(monkeypatch, caplog, *build)
+    assert "differs: num_covis and pairs" in message and "--overwrite" in message
+
+
 def test_records_of_failed_queries_have_no_pose():
     assert localization.pose({"qvec": None, "tvec": None}) is None
