@@ -205,11 +205,11 @@ def main(
         "images": {name: fingerprints[f"images/{name}"][2] for name in names},
         "model": {name: fingerprints[f"model/{name}"][2] for name in model_files},
     }
-    if not num_points3D:
-        if len(names) <= MAX_EXHAUSTIVE:
-            made_from |= {"num_covis": None, "pairs": "exhaustive"}
-        elif model is None:
-            made_from |= {"pairs": f"retrieval, {ROUNDS} rounds of verification"}
+    exhaustive = not num_points3D and len(names) <= MAX_EXHAUSTIVE
+    if exhaustive:
+        made_from |= {"num_covis": None, "pairs": "exhaustive"}
+    elif model is None:
+        made_from |= {"pairs": f"retrieval, {ROUNDS} rounds of verification"}
     before = stamps.read(map_dir / "conf.json")
     if before and before != made_from and not (map_dir / FINISHED).exists():
         logger.info("The map %s, which was not finished, is begun anew.", map_dir)
@@ -239,7 +239,6 @@ def main(
             features = extract_features.main(conf, image_dir, map_dir, image_list=names)
         with folder.stage("retrieval"):
             descriptors = aggregate_features.main(RETRIEVAL, features, names)
-        exhaustive = not num_points3D and len(names) <= MAX_EXHAUSTIVE
         pairs = map_dir / f"pairs-db-{'exhaustive' if exhaustive else num_covis}.txt"
         with folder.stage("pairs"):
             if num_points3D:
