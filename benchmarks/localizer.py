@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from hloc_reduce import Localizer, cli
 from hloc_reduce.extract_features import list_images
+from hloc_reduce.progress import progress
 
 STAGES = ("extraction", "retrieval", "matching", "pose")
 
@@ -27,7 +27,7 @@ def _main() -> None:
     photos = [args.query_images / name for name in list_images(args.query_images)]
     localizer.localize(photos[0])  # what is done once only
     seconds = []
-    for photo in tqdm(photos, desc="Localizing", unit="photo"):
+    for photo in progress(photos, "Localizing", "photo"):
         _, info = localizer.localize(photo)
         seconds.append([info["seconds"][stage] for stage in STAGES])
     seconds = np.array(seconds)

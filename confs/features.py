@@ -10,6 +10,7 @@ from pathlib import Path
 from hloc_reduce import projections
 from hloc_reduce.cli import InputError, choose
 from hloc_reduce.descriptors import COLMAP, DESCRIPTORS
+from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.parsers import read_yaml
 from hloc_reduce.storage import STORAGES
 
@@ -22,7 +23,7 @@ PREPROCESSING = {"grayscale": True, "resize_max": 1600}
 
 def base(descriptor: str) -> dict:
     """Return the model configuration of a base descriptor at DoG keypoints."""
-    return {"name": "dog", "descriptor": descriptor}
+    return {"name": "dog", "descriptor": descriptor, "keypoints": KEYPOINTS[0]}
 
 
 def feature(name: str, model: dict) -> dict:
@@ -46,7 +47,12 @@ confs = {name: feature(name, base(name)) for name in SCHEMES} | {
 }
 
 
-def get(name: str, projection: Path | None = None, storage: str = STORAGES[0]) -> tuple[str, dict]:
+def get(
+    name: str,
+    projection: Path | None = None,
+    storage: str = STORAGES[0],
+    keypoints: str = KEYPOINTS[0],
+) -> tuple[str, dict]:
     """Return the name and the configuration of a feature.
 
     Args:
@@ -54,17 +60,22 @@ def get(name: str, projection: Path | None = None, storage: str = STORAGES[0]) -
             `preprocessing`; that feature is called as the file.
         projection: file of another projection of the same base; the feature is called after it.
         storage: how descriptors are kept, one of `storage.STORAGES`.
+        keypoints: settings of DoG, one of `detection.KEYPOINTS`; "adaptive" leaves those of a YAML
+            file as they are.
 
     Raises:
         InputError: for an unknown name or a file that is none.
     """
     choose("storage", storage, STORAGES)
+    choose("keypoints", keypoints, KEYPOINTS)
     if Path(name).suffix in (".yaml", ".yml"):
         name, conf = Path(name).stem, read(Path(name))
     else:
         conf = confs[choose("feature", name, confs)]
     if storage != STORAGES[0]:
         conf = {**conf, "storage": storage}
+    if keypoints != KEYPOINTS[0]:
+        conf = {**conf, "model": _with_keypoints(conf["model"], keypoints)}
     if projection is None:
         return name, conf
     model = {
@@ -75,6 +86,13 @@ def get(name: str, projection: Path | None = None, storage: str = STORAGES[0]) -
     file, prefix = projections.split_prefix(projection)
     name = Path(file).stem + (prefix and f"@{prefix}")
     return name, {**conf, "output": feature(name, model)["output"], "model": model}
+
+
+def _with_keypoints(model: dict, keypoints: str) -> dict:
+    """Return the configuration of a model with other settings of DoG, if it is one."""
+    if "base" in model:
+        return {**model, "base": _with_keypoints(model["base"], keypoints)}
+    return {**model, "keypoints": keypoints} if model["name"] == "dog" else model
 
 
 def of_patches(name: str) -> tuple[str, str | None]:
@@ -89,9 +107,10 @@ def of_patches(name: str) -> tuple[str, str | None]:
     name, conf = get(name)
     model = conf["model"]
     base = model.get("base", model)
-    if base["name"] != "dog" or base.get("descriptor", "sift") not in DESCRIPTORS:
+    descriptor = base.get("descriptor", "sift")
+    if base["name"] != "dog" or descriptor == COLMAP:
         raise InputError(f"{name} describes photos, not patches.")
-    return base.get("descriptor", "sift"), model.get("projection")
+    return choose("descriptor", descriptor, DESCRIPTORS), model.get("projection")
 
 
 def add_storage_option(parser: ArgumentParser) -> None:
@@ -100,6 +119,16 @@ def add_storage_option(parser: ArgumentParser) -> None:
         "--storage",
         default=STORAGES[0],
         help=f"how descriptors are kept, one of {', '.join(STORAGES)}; hloc reads no uint8",
+    )
+
+
+def add_keypoints_option(parser: ArgumentParser) -> None:
+    """Add --keypoints."""
+    parser.add_argument(
+        "--keypoints",
+        default=KEYPOINTS[0],
+        help=f"settings of the DoG detector, one of {', '.join(KEYPOINTS)}: adaptive finds more "
+        "keypoints in small, dark and hazy photos; hloc uses hloc's settings for every photo",
     )
 
 

@@ -7,7 +7,6 @@ import h5py
 import numpy as np
 import torch
 from safetensors.torch import save
-from tqdm import tqdm
 
 from confs import retrieval as retrieval_confs
 
@@ -15,13 +14,16 @@ from . import cli, colmap, extractors, io, logger, stamps
 from .base_model import dynamic_load
 from .cli import InputError
 from .extractors.vlad import read_vocabulary
-from .group_writer import GroupWriter
+from .group_writer import GroupWriter, failures
 from .io import list_h5_names, open_h5, replacing
+from .paths import strings_as_paths
+from .progress import progress
 from .storage import get_descriptors
 
 confs = retrieval_confs.confs
 
 
+@strings_as_paths
 def main(
     conf: dict,
     features: Path,
@@ -30,7 +32,7 @@ def main(
     overwrite: bool = False,
     vocabulary: Path | None = None,
 ) -> Path:
-    """Compute a global descriptor of every image of a feature file.
+    """Compute a global descriptor of every image of a feature file that could be read.
 
     Args:
         conf: an entry of `confs`.
@@ -57,7 +59,8 @@ def main(
         else:
             made_by["vocabulary"] = stamps.sha256(vocabulary)
         with GroupWriter(output, made_by, overwrite) as writer:
-            names = list_h5_names(features)
+            failed = failures(features)
+            names = [name for name in list_h5_names(features) if name not in failed]
             todo = [name for name in names if name not in writer]
             if not todo:
                 return output
@@ -68,7 +71,7 @@ def main(
                 with replacing(vocabulary) as temporary:
                     temporary.write_bytes(save({"vocabulary": model.vocabulary}))
             model.vocabulary = read_vocabulary(vocabulary)
-            for name in tqdm(todo, desc="Aggregating", unit="image"):
+            for name in progress(todo, "Aggregating", "image"):
                 local = torch.from_numpy(get_descriptors(file, name).T)
                 try:
                     descriptor = model({"descriptors": local[None]})["global_descriptor"][0]

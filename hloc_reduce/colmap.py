@@ -4,10 +4,13 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from struct import error as struct_error
+from struct import unpack_from
 from threading import get_ident
 
 import numpy as np
@@ -15,7 +18,8 @@ import pycolmap
 
 from .cli import InputError, choose, some
 from .interrupts import interruptible
-from .parsers import check_names
+from .io import replacing
+from .parsers import CAMERA_MODELS, check_names, parse_pairs, write_pairs
 
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
 FULL = 2**16  # bytes: in less COLMAP cannot even open a database
@@ -83,6 +87,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     """
     if not path.is_dir():
         raise InputError(f"There is no COLMAP model folder {path}.")
+    check_whole(path)
     try:
         model = pycolmap.Reconstruction(path)
         names = [image.name for image in model.images.values()]
@@ -91,6 +96,97 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         raise InputError(f"{path} is not a COLMAP model ({reason}).") from None
     check_names(names, path)
     return model
+
+
+def check_whole(path: Path) -> None:
+    """Refuse a binary COLMAP model one of whose files is cut off: COLMAP may read it for ever.
+
+    Raises:
+        InputError: naming the file.
+    """
+    for name, skip in RECORDS.items():
+        file = path / f"{name}.bin"
+        if not file.is_file():
+            continue
+        try:
+            with file.open("rb") as opened, mmap(opened.fileno(), 0, access=ACCESS_READ) as data:
+                (number,), end = unpack_from("<Q", data, 0), 8
+                for _ in range(number):
+                    end = skip(data, end)
+                if end > len(data):
+                    raise ValueError
+        except (ValueError, struct_error, OverflowError):  # of an empty file, or at its end
+            raise InputError(f"{path} is not a COLMAP model ({file.name} is cut off).") from None
+
+
+def _skip_camera(data: mmap, start: int) -> int:
+    (model,) = unpack_from("<i", data, start + 4)
+    if model not in _num_params():
+        raise ValueError
+    return start + 24 + 8 * _num_params()[model]
+
+
+def _skip_image(data: mmap, start: int) -> int:
+    end_of_name = data.find(b"\0", start + 64)
+    if end_of_name < 0:
+        raise ValueError
+    return end_of_name + 9 + 24 * unpack_from("<Q", data, end_of_name + 1)[0]
+
+
+def _skip_point(data: mmap, start: int) -> int:
+    return start + 51 + 8 * unpack_from("<Q", data, start + 43)[0]
+
+
+def _skip_frame(data: mmap, start: int) -> int:
+    return start + 68 + 16 * unpack_from("<I", data, start + 64)[0]
+
+
+@lru_cache
+def _num_params() -> dict[int, int]:
+    """Return how many parameters a camera has, by the number of its model."""
+    return {
+        int(pycolmap.CameraModelId.__members__[name]): len(
+            pycolmap.Camera.create_from_model_name(1, name, 1.0, 1, 1).params
+        )
+        for name in CAMERA_MODELS
+    }
+
+
+# from a file of a binary COLMAP model to what finds the end of a record in it
+RECORDS = {
+    "cameras": _skip_camera,
+    "images": _skip_image,
+    "points3D": _skip_point,
+    "frames": _skip_frame,
+}
+
+
+def write_part(path: Path, names: Collection[str], output: Path) -> Path:
+    """Write the part of a COLMAP model that some of its images see.
+
+    Args:
+        path: the model.
+        names: the images.
+        output: the folder of the part; files that stay the same keep their times.
+
+    Returns:
+        `output`.
+    """
+    model = read_model(path)
+    for image in model.images.values():
+        if image.name not in names:
+            model.deregister_frame(image.frame_id)
+    written = output.with_name(f".{output.name}.tmp")
+    shutil.rmtree(written, ignore_errors=True)
+    written.mkdir(parents=True)
+    try:
+        model.write_binary(written)
+        for file in written.iterdir():
+            with replacing(output / file.name) as temporary:
+                shutil.copyfile(file, temporary)
+    finally:
+        shutil.rmtree(written)
+    return output
 
 
 def add_image(
@@ -261,8 +357,38 @@ def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
 def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
     """Estimate the two-view geometries of the matches of a database, with hloc's options."""
     options = {"ransac": {"max_num_trials": 20000, "min_inlier_ratio": 0.1, "random_seed": 0}}
-    with _log(verbose):
-        interruptible(pycolmap.verify_matches, database, pairs, options=options)
+    with _log(verbose), _named_by_ids(database, pairs) as pairs_by_ids:
+        interruptible(pycolmap.verify_matches, database, pairs_by_ids, options=options)
+
+
+@contextmanager
+def _named_by_ids(database: Path, pairs: Path) -> Iterator[Path]:
+    """Call the images of a database by their ids in a block, if COLMAP cannot read their pairs.
+
+    Gives the file of their pairs by these names. COLMAP's own has names without spaces.
+    """
+    with _open(database) as opened:
+        images = opened.read_all_images()
+    names = {image.image_id: image.name for image in images}
+    if all(name.split() == [name] for name in names.values()):
+        yield pairs
+        return
+    ids = {name: str(image_id) for image_id, name in names.items()}
+    by_ids = database.with_name("pairs_by_ids.txt")
+    write_pairs(((ids[a], ids[b]) for a, b in parse_pairs(pairs)), by_ids)
+    _rename(database, images, {image_id: str(image_id) for image_id in names})
+    try:
+        yield by_ids
+    finally:
+        by_ids.unlink()
+        _rename(database, images, names)
+
+
+def _rename(database: Path, images: list[pycolmap.Image], names: dict[int, str]) -> None:
+    with _open(database) as opened:
+        for image in images:
+            image.name = names[image.image_id]
+            opened.update_image(image)
 
 
 def count_cameras(database: Path) -> int:

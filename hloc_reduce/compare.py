@@ -1,7 +1,8 @@
-"""Compare features on a data set: run what is missing, print a table like the paper's, and report.
+"""Compare features on a data set: run what is missing, print a table of recall, and report.
 
-A data set is in the layout of Aachen Day-Night or of InLoc. Each feature has an outputs folder of
-its own, as that of pipelines.aachen or pipelines.inloc, where a run goes on that was stopped.
+A data set is in the layout of Aachen Day-Night or of InLoc. On Aachen Day-Night v1.1 and InLoc
+themselves the paper's recall is shown below that of each feature. Each feature has its own outputs
+folder, like those of pipelines.aachen and pipelines.inloc, where an interrupted run resumes.
 """
 
 import argparse
@@ -13,9 +14,11 @@ from pipelines.layouts import pipeline_of
 
 from . import cli, io, logger, report, results, stamps
 from .cli import InputError
+from .paths import strings_as_paths
 from .report import runs
 
 
+@strings_as_paths
 def main(
     dataset: Path,
     features: Iterable[str],
@@ -69,7 +72,7 @@ def main(
 
 
 def rows(tables: list[dict]) -> list[dict]:
-    """Return a row for each run, list and threshold: recall next to the paper's.
+    """Return a row for each run, list and threshold: recall, and the paper's if it has any.
 
     Args:
         tables: as of `runs.recall_tables`.
@@ -98,7 +101,7 @@ def rows(tables: list[dict]) -> list[dict]:
 
 
 def table(tables: list[dict]) -> str:
-    """Format recall as in the paper's tables, a row for each feature and below it the paper's."""
+    """Format recall, a row for each feature, and below it the paper's if it has any."""
     lines = [["", "bytes", *(found["list"] for found in tables)]]
     for unit, place in (("distance [m]", 0), ("orient. [deg]", 1)):
         limits = [[limit[place] for limit in found["thresholds"]] for found in tables]

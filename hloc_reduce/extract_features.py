@@ -11,18 +11,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from confs import features as features_confs
 
-from . import cli, colmap, extractors, logger, parallel, processes, projections
+from . import cli, detection, extractors, logger, parallel, processes, projections
 from .cli import InputError
 from .descriptors import DESCRIPTORS, check_weights
 from .executors import SERIAL, Executor
 from .extractors.dog import DoG
-from .group_writer import FAILURE, Group, GroupWriter, Key, fill
+from .group_writer import FAILURE, Group, GroupWriter, Key, failures, fill
 from .io import UnreadableImage, read_image
 from .parsers import check_names, image_names
+from .paths import strings_as_paths
+from .progress import progress
 from .storage import STORAGES, store
 from .trace import span
 
@@ -33,6 +34,7 @@ Detect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # as colmap.dete
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 
+@strings_as_paths
 def main(
     conf: dict,
     image_dir: Path,
@@ -42,6 +44,7 @@ def main(
     feature_path: Path | None = None,
     overwrite: bool = False,
     executor: Executor = SERIAL,
+    strict: bool = True,
 ) -> Path:
     """Extract the features of all images of a folder, or of a list of them.
 
@@ -54,22 +57,27 @@ def main(
         feature_path: the h5 file itself, instead of `export_dir`.
         overwrite: extract anew what is there.
         executor: does the work.
+        strict: as of `extract_several`.
 
     Returns:
         The feature file; images it holds already are skipped.
 
     Raises:
-        InputError: for an image that is not there or cannot be read, or an unknown storage.
+        InputError: for an unknown storage, or if `strict` for an image that is not there or cannot
+            be read.
     """
     if feature_path is None:
         feature_path = Path(export_dir) / f"{conf['output']}.h5"
     stored = {"storage": "float16" if as_half else "float32", **conf}
     cli.choose("storage", stored["storage"], STORAGES)
-    names = list_images(image_dir, image_list)
+    if strict or image_list is None:
+        names = list_images(image_dir, image_list)
+    else:
+        names = image_names(image_list)
     if overwrite:
         extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
     with GroupWriter(feature_path, provenance(conf, as_half), overwrite) as writer:
-        extract_several({feature_path: (stored, writer)}, image_dir, names, executor)
+        extract_several({feature_path: (stored, writer)}, image_dir, names, executor, strict)
     return feature_path
 
 
@@ -107,7 +115,7 @@ def extract_several(
         # counts files: an image is as many as are wanted of it
         number = sum(len(paths) for _, paths in todo)
         with closing(fill(writers, work, todo, executor, CHUNK, gpu=True)) as done:
-            for _ in tqdm(done, desc="Extracting features", unit="image", total=number):
+            for _ in progress(done, "Extracting features", "image", number):
                 pass
     for path in writers:
         logger.info("Features of %d images are in %s.", len(names), path)
@@ -193,7 +201,8 @@ def extract_all(
         def detect(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             try:
                 with span("detect"):
-                    return pool.submit(colmap.detect_dog, image, base.conf["options"]).result()
+                    arguments = image, base.conf["options"], base.adaptive
+                    return pool.submit(detection.detect, *arguments).result()
             except BrokenExecutor:
                 raise InputError(
                     "A process that detects keypoints was killed, perhaps for want of memory: "
@@ -255,6 +264,63 @@ def list_images(
             f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
         )
     return names
+
+
+def keep_present(image_dir: Path, names: list[str], accept_partial: bool) -> list[str]:
+    """Return the images of a map whose files are there.
+
+    Args:
+        image_dir: the folder that names are relative to.
+        names: the images of the map.
+        accept_partial: leave out those that are not there.
+
+    Raises:
+        InputError: when one is missing that may not be left out, or all are.
+    """
+    absent = [name for name in names if not (image_dir / name).is_file()]
+    if absent and (not accept_partial or len(absent) == len(names)):
+        raise InputError(
+            f"{len(absent)} of {len(names)} images of the map are not in {image_dir}: "
+            f"{cli.some(absent)}."
+            + (" Give --accept_partial to do without them." if len(absent) < len(names) else "")
+        )
+    return _without(names, absent)
+
+
+def keep_readable(features: Path, names: list[str], accept_partial: bool) -> list[str]:
+    """Return the images of a map that could be read, as its feature file tells.
+
+    Args:
+        features: feature file, made without `strict`.
+        names: the images of the map.
+        accept_partial: leave out those that could not be read.
+
+    Raises:
+        InputError: when one could not be read that may not be left out, or all could not.
+    """
+    failed = failures(features)
+    broken = [name for name in names if name in failed]
+    if broken and (not accept_partial or len(broken) == len(names)):
+        raise InputError(
+            f"{len(broken)} of {len(names)} images of the map cannot be read: "
+            f"{with_reasons({name: failed[name] for name in broken})}."
+            + (" Give --accept_partial to do without them." if len(broken) < len(names) else "")
+        )
+    return _without(names, broken)
+
+
+def _without(names: list[str], left_out: list[str]) -> list[str]:
+    if left_out:
+        logger.warning("The map is without %d images: %s.", len(left_out), cli.some(left_out))
+    dropped = set(left_out)
+    return [name for name in names if name not in dropped]
+
+
+def with_reasons(failed: Mapping[str, str]) -> str:
+    """Name the first few images that could not be read, and why."""
+    return cli.some(
+        f"{name} ({reason.rpartition(': ')[2].rstrip('.')})" for name, reason in failed.items()
+    )
 
 
 def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:
@@ -387,11 +453,12 @@ def _main() -> None:
     )
     parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
     features_confs.add_storage_option(parser)
+    features_confs.add_keypoints_option(parser)
     parser.add_argument("--overwrite", action="store_true", help="extract anew what is there")
     args = parser.parse_args()
     if args.export_dir is None and args.feature_path is None:
         raise InputError("Give --export_dir or --feature_path.")
-    _, conf = features_confs.get(args.conf, storage=args.storage)
+    _, conf = features_confs.get(args.conf, storage=args.storage, keypoints=args.keypoints)
     main(
         conf,
         args.image_dir,

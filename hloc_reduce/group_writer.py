@@ -18,7 +18,7 @@ import numpy as np
 from . import trace
 from .cli import InputError
 from .executors import Executor, Item
-from .io import iterate_h5_names, open_h5, replacing, write_h5
+from .io import get_text, iterate_h5_names, open_h5, reading, replacing, set_text, write_h5
 
 PIECE_SECONDS = 5.0  # of work that a killed run may lose
 PIECE_BYTES = 64 * 2**20
@@ -28,8 +28,8 @@ FAILURES = "failures"  # attribute of a file: the names of its groups that have 
 QUOTED = 200  # characters of a configuration in a message
 
 Arrays = dict[str, np.ndarray]
-# the name of a group, its arrays, and from the name of an array, "" for the group itself, to its
-# attributes
+# the name of a group, its arrays, and from the name of an array, "" for the group itself, whose
+# attributes are texts, to its attributes
 Group = tuple[str, Arrays, dict[str, dict]]
 Key = TypeVar("Key", bound=Hashable)
 
@@ -68,7 +68,7 @@ class GroupWriter:
         for part in [path] * path.exists() + self._pieces():
             with open_h5(part) as file:
                 _check(file, part, header["conf"])
-                header.setdefault("id", file.attrs.get("id", uuid.uuid4().hex))
+                header.setdefault("id", get_text(file, "id", uuid.uuid4().hex))
                 failed = _failed(file)
                 for name in iterate_h5_names(file.id):
                     if name not in failed:
@@ -122,7 +122,7 @@ class GroupWriter:
             if self.path.exists():
                 shutil.copyfile(self.path, temporary)
             with write_h5(temporary) as merged:
-                merged.attrs.update(self.header)
+                _set_header(merged, self.header)
             for piece in pieces:
                 with open_h5(piece) as file, write_h5(temporary) as merged:
                     _merge_piece(file, merged)
@@ -150,9 +150,17 @@ class GroupWriter:
         with open_h5(piece) as new, open_h5(self.path) as old:
             known = _failed(old)
             return any(
-                name not in old or name in known and _reason(new, name) != _reason(old, name)
+                name not in old or name in known and failure_of(new, name) != failure_of(old, name)
                 for name in iterate_h5_names(new.id)
             )
+
+
+def resume_or_replace(path: Path, made_from: dict) -> GroupWriter:
+    """Return a writer that resumes an intermediate file, or starts it anew if it is stale."""
+    try:
+        return GroupWriter(path, made_from)
+    except InputError:  # made from something else, or broken
+        return GroupWriter(path, made_from, overwrite=True)
 
 
 @dataclass
@@ -196,11 +204,12 @@ class Pieces:
 
     def _write(self, path: Path) -> None:
         with write_h5(path) as file:
-            file.attrs.update(self.header)
+            _set_header(file, self.header)
             _set_failed(file, {n for n, (_, a) in self.groups.items() if FAILURE in a.get("", ())})
             for name, (arrays, attrs) in self.groups.items():
                 group = file.create_group(name)
-                group.attrs.update(attrs.get("", {}))
+                for key, text in attrs.get("", {}).items():
+                    set_text(group, key, text)
                 for key, array in arrays.items():
                     packed = {}
                     if self.compression and array.size:
@@ -280,7 +289,7 @@ class _Names:
 
 def _check(file: h5py.File, path: Path, conf: str) -> None:
     """Raise an InputError if an h5 file was made with another configuration."""
-    before = file.attrs.get("conf", conf)  # hloc's own files say nothing
+    before = get_text(file, "conf", conf)  # hloc's own files say nothing
     if before != conf:
         try:
             old, new = dict(json.loads(before)), json.loads(conf)
@@ -306,20 +315,32 @@ def _quoted(conf: dict, key: str) -> str:
 def failures(path: Path) -> dict[str, str]:
     """Return the groups of an h5 file that stand for what could not be computed, and why."""
     with open_h5(path) as file:
-        return {name: str(file[name].attrs[FAILURE]) for name in sorted(_failed(file))}
+        reasons = {name: failure_of(file, name) for name in sorted(_failed(file))}
+    return {name: str(reason) for name, reason in reasons.items() if reason is not None}
 
 
-def _reason(file: h5py.File, name: str) -> str | None:
-    return file[name].attrs.get(FAILURE)
+def failure_of(file: h5py.File, name: str) -> str | None:
+    """Return why a group of an open h5 file could not be computed; None where it was."""
+    with reading(file.filename):
+        group = file.get(name)
+    return None if group is None else get_text(group, FAILURE)
+
+
+def _set_header(file: h5py.File, header: dict[str, str]) -> None:
+    for key, text in header.items():
+        set_text(file, key, text)
 
 
 def _failed(file: h5py.File) -> set[str]:
-    return set(json.loads(file.attrs.get(FAILURES, "[]")))
+    try:
+        return set(map(str, json.loads(get_text(file, FAILURES, "[]"))))
+    except (ValueError, TypeError) as error:
+        raise InputError(f"Cannot read {file.filename}: it is corrupted ({error}).") from error
 
 
 def _set_failed(file: h5py.File, names: set[str]) -> None:
     if names or FAILURES in file.attrs:
-        file.attrs[FAILURES] = json.dumps(sorted(names))
+        set_text(file, FAILURES, json.dumps(sorted(names)))
 
 
 def _merge_piece(piece: h5py.File, merged: h5py.File) -> None:
@@ -329,7 +350,6 @@ def _merge_piece(piece: h5py.File, merged: h5py.File) -> None:
         del merged[name]
         if name not in again:
             failed.remove(name)
-            merged.attrs["id"] = uuid.uuid4().hex
     failed |= {name for name in again if name not in merged}
     _copy_missing(piece, merged)
     _set_failed(merged, failed)

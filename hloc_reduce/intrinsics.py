@@ -8,6 +8,7 @@ import pycolmap
 
 from . import colmap
 from .io import replacing
+from .parsers import to_line
 
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
 _REFINED = {"refine_focal_length": True}
@@ -44,9 +45,9 @@ def write_queries(cameras: Mapping[str, tuple[pycolmap.Camera, str]], path: Path
     """Write a query list with intrinsics; comments say where they come from."""
     lines = []
     for name, (camera, source) in cameras.items():
-        params = " ".join(map(repr, camera.params.tolist()))
-        lines.append(f"# {source}")
-        lines.append(f"{name} {camera.model.name} {camera.width} {camera.height} {params}")
-    text = "\n".join(lines) + "\n"
+        params = map(repr, camera.params.tolist())
+        lines.append(f"# {source}\n")
+        lines.append(to_line(name, camera.model.name, camera.width, camera.height, *params))
+    text = "".join(lines)
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

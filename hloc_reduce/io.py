@@ -7,6 +7,7 @@ import io
 import os
 import platform
 import shutil
+import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,6 +20,7 @@ from . import logger
 from .cli import InputError
 from .interrupts import uninterrupted
 
+MOST_COMPRESSED = 2000  # times what an h5 file holds is more than gzip can pack into it
 LOCK = ".lock"  # in an outputs folder
 
 
@@ -134,11 +136,40 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
     """Open an h5 file for reading; one that is absent or broken raises an InputError."""
     try:
         file = h5py.File(path, "r", libver="latest")
-    except OSError as error:
+    except Exception as error:
+        if not _is_of_h5py(error):
+            raise
         reason = "it is not there" if not path.exists() else "not a whole h5 file"
         raise InputError(f"Cannot open {path}: {reason}.") from error
-    with file:
+    with file, reading(path):
         yield file
+
+
+@contextmanager
+def reading(path: Path | str) -> Iterator[None]:
+    """Have an error of h5py, which may be of any kind if the file is damaged, name the file.
+
+    Raises:
+        InputError: in its place.
+    """
+    try:
+        yield
+    except Exception as error:
+        if not _is_of_h5py(error):
+            raise
+        raise InputError(f"Cannot read {path}: it is corrupted ({_first_line(error)}).") from error
+
+
+def _is_of_h5py(error: Exception) -> bool:
+    """Tell whether h5py raised an error, but for a name that is not in a file."""
+    if isinstance(error, KeyError) and "doesn't exist" in str(error):
+        return False
+    *_, last = traceback.walk_tb(error.__traceback__)
+    return "h5py" in Path(last[0].f_code.co_filename).parts
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip("'\"").splitlines()), type(error).__name__)
 
 
 @contextmanager
@@ -252,10 +283,11 @@ def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]
 
 def get_dataset(file: h5py.File, name: str, key: str) -> h5py.Dataset:
     """Return a data set of an image or a pair in an open h5 file, or raise an InputError."""
-    group = file.get(name)
+    with reading(file.filename):
+        group = file.get(name)
+        dataset = group.get(key) if isinstance(group, h5py.Group) else None
     if group is None:
         raise InputError(f"{name} is not in the file {file.filename}.")
-    dataset = group.get(key) if isinstance(group, h5py.Group) else None
     if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"{file.filename} is not a file of {key}: {name} has none.")
     return dataset
@@ -275,30 +307,59 @@ def get_array(file: h5py.File, name: str, key: str, least: tuple[int, ...]) -> n
     """
     dataset = get_dataset(file, name, key)
     said = f"{file.filename}: the {key} of {name}"
-    shape = dataset.shape or ()
+    with reading(file.filename):
+        shape, dtype = dataset.shape or (), dataset.dtype
+        claimed = dataset.size * dtype.itemsize if dataset.size else 0
+    if claimed > MOST_COMPRESSED * Path(file.filename).stat().st_size:
+        raise InputError(f"{said} cannot be read (they claim to be {claimed:,} bytes).")
     if len(shape) != len(least) or any(n < m for n, m in zip(shape, least, strict=True)):
         raise InputError(f"{said} are of the wrong shape {shape}.")
-    if dataset.dtype.kind not in "iuf":
-        raise InputError(f"{said} are no numbers, but {dataset.dtype}.")
+    if dtype.kind not in "iuf":
+        raise InputError(f"{said} are no numbers, but {dtype}.")
     try:
         array = dataset[()]
-    except OSError as error:  # h5py names no file
-        raise InputError(f"{said} cannot be read ({error}).") from None
+    except Exception as error:
+        if not _is_of_h5py(error):
+            raise
+        raise InputError(f"{said} cannot be read ({_first_line(error)}).") from error
     if array.dtype.kind == "f" and not np.isfinite(array.astype(np.float32)).all():
         raise InputError(f"{said} have numbers that are not finite.")
     return array
 
 
+def set_text(item: h5py.Group | h5py.Dataset, key: str, text: str) -> None:
+    """Set a text attribute of an open h5 file.
+
+    It has a fixed length: HDF5 keeps others in a heap without checksums, and may hang if that is
+    damaged.
+    """
+    item.attrs[key] = np.bytes_(text.encode()) if text else h5py.Empty("S1")
+
+
+def get_text(item: h5py.Group | h5py.Dataset, key: str, default: str | None = None) -> str | None:
+    """Return a text attribute of an open h5 file, or the default where it has none.
+
+    Raises:
+        InputError: when the file is damaged.
+    """
+    with reading(item.file.filename):
+        value = item.attrs.get(key, default)
+    if isinstance(value, h5py.Empty):
+        return ""
+    return value.decode(errors="replace") if isinstance(value, bytes) else value
+
+
 def provenance(file: h5py.File) -> str:
     """Return what tells an open h5 file from others: what made it and when, or its name."""
-    conf = file.attrs.get("conf", Path(file.filename).name)
-    return f"{conf} {file.attrs.get('id', '')}".strip()
+    conf = get_text(file, "conf", Path(file.filename).name)
+    return f"{conf} {get_text(file, 'id', '')}".strip()
 
 
 def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
     """Read keypoints (N, 2) float64, pixel centres at integers, and their uncertainty in pixels."""
     keypoints = get_array(file, name, "keypoints", (0, 2))[:, :2].astype(np.float64)
-    uncertainty = get_dataset(file, name, "keypoints").attrs.get("uncertainty", 1.0)
+    with reading(file.filename):
+        uncertainty = get_dataset(file, name, "keypoints").attrs.get("uncertainty", 1.0)
     if not (np.isscalar(uncertainty) and np.isreal(uncertainty) and 0 < uncertainty < np.inf):
         raise InputError(f"{file.filename}: the uncertainty of {name} is {uncertainty!r}.")
     return keypoints, float(uncertainty)
@@ -337,7 +398,9 @@ def find_pair(file: h5py.File, name0: str, name1: str) -> tuple[str | None, bool
         for reverse in (False, True):
             names = (name1, name0) if reverse else (name0, name1)
             pair = names_to_pair(*names, separator)
-            if pair in file:
+            with reading(file.filename):
+                found = pair in file
+            if found:
                 return pair, reverse
     return None, False
 
@@ -369,7 +432,9 @@ def get_matches(
     matches = matches[:, ::-1] if reverse else matches
     if sizes is not None:
         _check_matches(file, matches, (name0, name1), sizes)
-    if "matching_scores0" not in file[pair]:
+    with reading(file.filename):
+        scored = "matching_scores0" in file[pair]
+    if not scored:
         return matches, None
     return matches, get_array(file, pair, "matching_scores0", matches0.shape)[matched]
 

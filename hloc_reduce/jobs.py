@@ -24,6 +24,7 @@ from confs import matchers as matchers_confs
 
 from . import cli
 from .cli import InputError
+from .detection import KEYPOINTS
 from .parsers import read_yaml
 from .storage import STORAGES
 
@@ -41,6 +42,7 @@ class Job:
         feature: name of a feature or YAML file, as of `confs.features.get`.
         matcher: name of a matcher.
         storage: how descriptors are kept.
+        keypoints: settings of the DoG detector.
         retrieval: vlad, of the first feature of the data set, or a file.
         ground_truth: true poses of the queries; default: those of the data set.
         num_covis: pairs of each map image; default: that of the pipeline.
@@ -51,6 +53,7 @@ class Job:
     feature: str = features_confs.RECOMMENDED
     matcher: str = "NN-ratio"
     storage: str = STORAGES[0]
+    keypoints: str = KEYPOINTS[0]
     retrieval: str = "vlad"
     ground_truth: Path | None = None
     num_covis: int | None = None
@@ -63,7 +66,8 @@ class Job:
         for field in fields(self)[2:]:
             value = getattr(self, field.name)
             if value != field.default and field.name != "ground_truth":
-                prefix = field.name if isinstance(value, int) else ""
+                named = isinstance(value, int) or field.name == "keypoints"
+                prefix = field.name if named else ""
                 parts.append(prefix + Path(str(value)).stem.removeprefix("pairs-query-"))
         return "+".join(parts)
 
@@ -159,7 +163,7 @@ def _job(options: dict) -> Job:
         if name in options
     }
     job = Job(**options | paths)
-    features_confs.get(job.feature, storage=job.storage)
+    features_confs.get(job.feature, storage=job.storage, keypoints=job.keypoints)
     cli.choose("matcher", job.matcher, matchers_confs.confs)
     return job
 

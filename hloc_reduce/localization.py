@@ -1,9 +1,9 @@
 """Localize queries in any map: 2D-3D matches through retrieved images, PnP + RANSAC, records."""
 
-import copy
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -11,12 +11,12 @@ from typing import Protocol
 import h5py
 import numpy as np
 import pycolmap
-from tqdm import tqdm
 
-from . import cli, colmap, logger, parallel
+from . import absolute_pose, cli, logger, parallel
 from .cli import InputError
+from .confidence import DEFAULT_GATE, Gate
 from .executors import SERIAL, Executor
-from .group_writer import FAILURE
+from .group_writer import failure_of
 from .io import (
     find_pair,
     get_colmap_keypoints,
@@ -27,12 +27,11 @@ from .io import (
     replacing,
 )
 from .parsers import write_poses
+from .progress import progress
 
-# Three points fit a pose always, and among hundreds of wrong matches a few more agree by chance.
-MIN_INLIERS = 8
-SEED = 0
 CHUNK = 8  # queries
-RECORDS = 3  # the version of what a record holds
+SHOWN = 3  # queries that a message gives the reason of
+RECORDS = 5  # the version of what a record holds
 
 
 class Reference(Protocol):
@@ -64,6 +63,7 @@ def localize(
     camera: pycolmap.Camera,
     matches: Mapping[str, np.ndarray],
     config: dict,
+    gate: Gate = DEFAULT_GATE,
 ) -> tuple[pycolmap.Rigid3d | None, dict]:
     """Localize a query.
 
@@ -74,9 +74,12 @@ def localize(
         matches: from map images, best first, to (M, 2) indices of the keypoints of the query and
             of the image.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
+        gate: what a pose must have to be trusted.
 
     Returns:
-        The pose (camera from world) or None, and info: `num_inliers`; `num_matches`, with a 3D
+        The pose (camera from world) or None, and info: `reason`, why the pose is not to be trusted,
+        None if it is; `confidence`, as of `confidence.confidence` and at least 0; `num_inliers`;
+        `num_matches`, with a 3D
         point, of `num_correspondences` different ones (M); `num_without_point`, the other
         matches; `camera`, the intrinsics, refined where `config` says so; `db`, the image
         retrieved first, of the cluster that was localized in; and of that cluster `keypoints`
@@ -85,25 +88,38 @@ def localize(
     """
     solved = []
     for names in reference.clusters(list(matches)) if matches else [[]]:
-        info = _correspondences(reference, names, matches)
-        refined = copy.deepcopy(camera)
-        found = colmap.estimate_pose(
-            keypoints[info["keypoints"]], info["points3D"], refined, config, SEED
-        )
+        info, images = _correspondences(reference, names, matches)
+        points = keypoints[info["keypoints"]], info["points3D"]
+        found = absolute_pose.estimate(*points, images, camera, config, gate)
         info |= {
-            "camera": refined,
-            "num_inliers": int(found["num_inliers"]) if found else 0,
-            "inliers": found["inlier_mask"] if found else np.zeros(len(info["keypoints"]), bool),
+            "reason": _reason(len(keypoints), names, info) or found.refusal,
+            "confidence": round(max(0.0, found.confidence), 2),
+            "camera": found.camera,
+            "num_inliers": found.num_inliers,
+            "inliers": found.inliers,
             "db": names[0] if names else None,
         }
-        solved.append((found["cam_from_world"] if found else None, info))
-    return max(solved, key=lambda pose_info: pose_info[1]["num_inliers"])
+        solved.append((found.cam_from_world, info))
+    return max(solved, key=lambda found: (found[1]["confidence"], found[1]["num_inliers"]))
+
+
+def _reason(num_keypoints: int, names: list[str], info: dict) -> str | None:
+    """Say why a query has no matches to localize it by, if it has none."""
+    if not num_keypoints:
+        return "no keypoints"
+    if not names:
+        return "no map image was retrieved"
+    return None if info["num_matches"] else "no match with a 3D point"
 
 
 def _correspondences(
     reference: Reference, names: list[str], matches: Mapping[str, np.ndarray]
-) -> dict:
-    """Collect the different 2D-3D matches through some images, sorted; parts of `info`."""
+) -> tuple[dict, list[np.ndarray]]:
+    """Collect the different 2D-3D matches through some images, sorted.
+
+    Returns:
+        Parts of `info` of `localize`, and of each image the indices of its matches.
+    """
     keypoints, ids, points = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 3))]
     for name in names:
         shown, xyz = reference.lift(name, matches[name][:, 1])
@@ -112,7 +128,11 @@ def _correspondences(
         points.append(xyz)
     pairs = np.stack([np.concatenate(keypoints), np.concatenate(ids)], 1)
     known = np.flatnonzero(pairs[:, 1] >= 0)
-    different, first = np.unique(pairs[known], axis=0, return_index=True)
+    different, first, which = np.unique(
+        pairs[known], axis=0, return_index=True, return_inverse=True
+    )
+    image = np.repeat(np.arange(len(names)), [len(matches[name]) for name in names])[known]
+    images = [np.unique(which.reshape(-1)[image == i]) for i in range(len(names))]
     return {
         "num_matches": len(known),
         "num_without_point": len(pairs) - len(known),
@@ -120,12 +140,12 @@ def _correspondences(
         "keypoints": different[:, 0],
         "point3D_ids": different[:, 1],
         "points3D": np.concatenate(points)[known[first]],
-    }
+    }, images
 
 
 def main(
     load_reference: Callable[[], Reference],
-    queries: list[tuple[str, pycolmap.Camera]],
+    queries: list[tuple[str, pycolmap.Camera | None]],
     retrieved: Mapping[str, list[str]],
     features: Path,
     matches: Path,
@@ -136,12 +156,16 @@ def main(
     skip_matches: int | None = None,
     name_parts: int | None = 1,
     executor: Executor = SERIAL,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict[str, dict]:
     """Localize queries by the files of their features and matches.
 
+    A query whose photo could not be read, or is of another size than its intrinsics, is not
+    localized.
+
     Args:
         load_reference: gives the map, in each process where there is something to do.
-        queries: names and intrinsics.
+        queries: names and intrinsics, None where these are not known.
         retrieved: the map images of each query, best first.
         features: feature file of the queries.
         matches: match file of the pairs.
@@ -153,24 +177,32 @@ def main(
         skip_matches: leave out retrieved images with fewer matches.
         name_parts: as of `parsers.write_poses`.
         executor: does the work; unless in this process, `load_reference` and `config` are pickled.
+        gate: what a pose must have for the query to be called localized.
 
     Returns:
-        A record for each query: `localized` (from MIN_INLIERS inliers on), the pose that is
-        written as `qvec` (w, x, y, z) and `tvec`, the fallback where it is not localized, None
-        where there is none; `camera`, the model, width, height and parameters in a list;
-        `max_error`, the pixels within which inliers reproject, None for pycolmap's default; and
-        the numbers and `db` of `localize`.
+        A record for each query: `localized`; `reason`, why it is not localized, None where it is;
+        `confidence`; the pose that is written as `qvec` (w, x, y, z) and `tvec`, the fallback where
+        the query is not localized, None where there is none; `camera`, the model, width, height and
+        parameters in a list, None where not known; `max_error`, the pixels within which inliers
+        reproject, None for pycolmap's default; and the numbers and `db` of `localize`.
     """
-    log = _Log(log_file(results), {"records": RECORDS, **made_from}, overwrite)
+    header = {"records": RECORDS, "gate": asdict(gate), **made_from}
+    log = _Log(log_file(results), header, overwrite)
     todo = [query for query in queries if query[0] not in log.records]
     if todo:
-        with open_h5(features) as feature_file, open_h5(matches) as match_file:
+        with open_h5(features) as feature_file:
+            refused = _refused(feature_file, todo)
+        with log:
+            for name, record in _refuse(load_reference, todo, refused, retrieved):
+                log.add(name, record)
+        todo = [query for query in todo if query[0] not in refused]
+    if todo:
+        with open_h5(matches) as match_file:
             _check_some_matched(match_file, queries, retrieved)
-            _check_sizes(feature_file, todo)
-        work = partial(_localize_all, load_reference, features, matches, config, skip_matches)
+        work = partial(_localize_all, load_reference, features, matches, config, skip_matches, gate)
         tasks = ((name, camera, retrieved.get(name, [])) for name, camera in todo)
         with log, closing(executor.map(work, tasks, CHUNK)) as found:
-            for name, record in tqdm(found, desc="Localizing", unit="query", total=len(todo)):
+            for name, record in progress(found, "Localizing", "query", len(todo)):
                 log.add(name, record)
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose(record) for name, record in records.items()}
@@ -178,6 +210,11 @@ def main(
     write_poses(submitted, results, name_parts)
     if failed := [name for name in poses if name not in submitted]:
         logger.warning("%d queries have no pose: %s.", len(failed), cli.some(failed))
+    reasons = [
+        f"{name} ({record['reason']})" for name, record in records.items() if record["reason"]
+    ]
+    if reasons:
+        logger.info("%d queries are not localized: %s.", len(reasons), cli.some(reasons, SHOWN))
     localized = sum(record["localized"] for record in records.values())
     logger.info("Localized %d of %d queries: %s", localized, len(records), results)
     return records
@@ -189,6 +226,7 @@ def _localize_all(
     matches: Path,
     config: Callable[[str, pycolmap.Camera], dict],
     skip_matches: int | None,
+    gate: Gate,
     queries: Iterable[tuple[str, pycolmap.Camera, list[str]]],
 ) -> Iterator[tuple[str, dict]]:
     """Yield the names and the records of queries with their intrinsics and retrieved images."""
@@ -198,7 +236,7 @@ def _localize_all(
         name, camera, keypoints, found = task
         used = {n: m for n, m in found.items() if len(m) >= (skip_matches or 0)}
         options = config(name, camera)
-        cam_from_world, info = localize(reference, keypoints, camera, used, options)
+        cam_from_world, info = localize(reference, keypoints, camera, used, options, gate)
         info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
         return name, _record(reference, list(found), cam_from_world, info)
 
@@ -223,6 +261,15 @@ def camera(record: dict) -> pycolmap.Camera:
     """Return the intrinsics of a query's record, as they were refined."""
     model, width, height, *params = record["camera"]
     return pycolmap.Camera(model=model, width=width, height=height, params=params)
+
+
+def to_stamp(queries: list[tuple[str, pycolmap.Camera | None]]) -> dict[str, list | None]:
+    """Return the intrinsics of queries as a stamp has them."""
+    return {name: camera and _intrinsics(camera) for name, camera in queries}
+
+
+def _intrinsics(camera: pycolmap.Camera) -> list:
+    return [camera.model.name, camera.width, camera.height, *camera.params.tolist()]
 
 
 def read_records(path: Path) -> dict[str, dict]:
@@ -263,20 +310,47 @@ def _check_some_matched(
         )
 
 
-def _check_sizes(feature_file: h5py.File, queries: list[tuple[str, pycolmap.Camera]]) -> None:
-    """Warn of intrinsics that are for photos of another size."""
-    wrong = []
+def _refused(
+    feature_file: h5py.File, queries: list[tuple[str, pycolmap.Camera | None]]
+) -> dict[str, str]:
+    """Return the queries that are not to be localized, and why."""
+    refused, wrong = {}, []
     for name, camera in queries:
-        if f"{name}/image_size" in feature_file and FAILURE not in feature_file[name].attrs:
+        if failure := failure_of(feature_file, name):
+            refused[name] = failure
+        elif camera is None:
+            refused[name] = "its intrinsics are not known"
+        elif f"{name}/image_size" in feature_file:
             width, height = get_image_size(feature_file, name)
             if (width, height) != (camera.width, camera.height):
+                refused[name] = (
+                    f"the intrinsics are for {camera.width}x{camera.height} pixels, the photo has "
+                    f"{width}x{height}"
+                )
                 wrong.append(f"{name} ({camera.width}x{camera.height}, not {width}x{height})")
     if wrong:
         logger.warning(
-            "The intrinsics of %d queries are for another size than that of the photo, so that "
-            "their poses are wrong: %s.",
+            "%d queries are not localized, as their intrinsics are for photos of another size: %s.",
             *(len(wrong), cli.some(wrong)),
         )
+    return refused
+
+
+def _refuse(
+    load_reference: Callable[[], Reference],
+    queries: list[tuple[str, pycolmap.Camera | None]],
+    refused: Mapping[str, str],
+    retrieved: Mapping[str, list[str]],
+) -> Iterator[tuple[str, dict]]:
+    """Yield the names and the records of the queries that are refused."""
+    reference = load_reference() if refused else None
+    for name, camera in queries:
+        if name in refused:
+            _, info = localize(reference, np.zeros((0, 2)), camera or pycolmap.Camera(), {}, {})
+            info |= {"max_error": None, "reason": refused[name]}
+            names = [other for other in retrieved.get(name, []) if other in reference]
+            record = _record(reference, names, None, info)
+            yield name, record | ({} if camera else {"camera": None})
 
 
 def _read(
@@ -304,7 +378,7 @@ def _read(
 def _record(
     reference: Reference, names: list[str], cam_from_world: pycolmap.Rigid3d | None, info: dict
 ) -> dict:
-    localized = info["num_inliers"] >= MIN_INLIERS
+    localized = info["reason"] is None
     if not localized:
         cam_from_world = reference.fallback(names) or cam_from_world
     qvec = tvec = None
@@ -312,13 +386,14 @@ def _record(
         x, y, z, w = cam_from_world.rotation.quat
         qvec = [float(value) for value in (w, x, y, z)]
         tvec = [float(value) for value in cam_from_world.translation]
-    refined = info["camera"]
     numbers = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
     return {
         "localized": localized,
+        "reason": info["reason"],
+        "confidence": info["confidence"],
         "qvec": qvec,
         "tvec": tvec,
-        "camera": [refined.model.name, refined.width, refined.height, *refined.params.tolist()],
+        "camera": _intrinsics(info["camera"]),
         "max_error": info["max_error"],
         **{key: info[key] for key in numbers},
         "db": info["db"] if localized else next(iter(names), None),

@@ -10,14 +10,16 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pycolmap
-from tqdm import tqdm
 
 from . import cli, localization, logger, scans, stamps
 from .cli import InputError
+from .confidence import DEFAULT_GATE, Gate, add_gate_options
 from .executors import SERIAL, Executor
-from .group_writer import Group, GroupWriter, fill
-from .io import get_dataset, get_image_size, get_keypoints, open_h5
+from .group_writer import Group, GroupWriter, failures, fill
+from .io import get_dataset, get_image_size, get_keypoints, open_h5, reading
 from .parsers import parse_query_lists, parse_retrieval
+from .paths import strings_as_paths
+from .progress import progress
 
 RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
 RANSAC_SIZE = 4032  # the longer side of such a photo
@@ -25,6 +27,7 @@ CHUNK = 4  # cutouts
 CACHED_IMAGES = 128  # points of so many cutouts stay in memory: 25 MB at 8,000 keypoints
 
 
+@strings_as_paths
 def main(
     dataset_dir: Path,
     retrieval: Path,
@@ -37,6 +40,7 @@ def main(
     overwrite: bool = False,
     executor: Executor = SERIAL,
     points: Path | None = None,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict[str, dict]:
     """Localize queries in a data set of InLoc's layout.
 
@@ -58,6 +62,7 @@ def main(
         executor: does the work.
         points: keeps what the keypoints of cutouts show, for later runs, and if it is given for
             other features of the same keypoints, too; default: `points_file(features)`.
+        gate: what a pose must have for the query to be called localized.
 
     Returns:
         A record for each query, as `localization.main`; a query with too few inliers has the pose
@@ -74,16 +79,14 @@ def main(
     elif queries is None:
         queries = by_iphone7(features, retrieved)
     cutouts = sorted({cutout for name, _ in queries for cutout in retrieved.get(name, [])})
-    if not cutouts:
+    failed = failures(features)
+    if not cutouts and not (queries and all(name in failed for name, _ in queries)):
         raise InputError(f"{retrieval} has no pair of a query and a cutout.")
     points = points or points_file(features)
     lift_keypoints(dataset_dir, features, cutouts, points, overwrite, executor)
 
     options = {"ransac_thresh": ransac_thresh, "skip_matches": skip_matches}
-    options["queries"] = {
-        name: [camera.model.name, camera.width, camera.height, *camera.params.tolist()]
-        for name, camera in queries
-    }
+    options["queries"] = localization.to_stamp(queries)
     poses = {cutout: scans.read_pose(dataset_dir, cutout) for cutout in cutouts}
     options["scans"] = hashlib.sha256(np.array(list(poses.values())).tobytes()).hexdigest()
     return localization.main(
@@ -94,10 +97,11 @@ def main(
         matches,
         results,
         partial(_config, ransac_thresh),
-        stamps.stamp(options, [retrieval, features, matches]),
+        stamps.stamp(options, [p for p in (retrieval, features, matches) if p.exists()]),
         overwrite,
         skip_matches=skip_matches,
         executor=executor,
+        gate=gate,
     )
 
 
@@ -139,6 +143,7 @@ def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap
     return queries
 
 
+@strings_as_paths
 def lift_keypoints(
     dataset_dir: Path,
     features: Path,
@@ -169,7 +174,7 @@ def lift_keypoints(
             todo = [name for name in cutouts if point_group(file, name) not in writer]
         work = partial(_lift, dataset_dir, features)
         with closing(fill({None: writer}, work, todo, executor, CHUNK)) as done:
-            for _ in tqdm(done, desc="Reading scans", unit="scan", total=len(todo)):
+            for _ in progress(done, "Reading scans", "scan", len(todo)):
                 pass
     return output
 
@@ -207,7 +212,9 @@ class ScanMap:
 
     def _read(self, name: str) -> np.ndarray:
         group = point_group(self.features, name)
-        if group not in self.file:
+        with reading(self.file.filename):
+            found = group in self.file
+        if not found:
             raise InputError(
                 f"{self.file.filename} is not of the keypoints of {name} that are now in "
                 f"{self.features.filename}: localize anew."
@@ -271,8 +278,10 @@ def _main() -> None:
         help="inliers reproject within so many pixels of a photo of 4032 pixels, of others in "
         "proportion",
     )
+    add_gate_options(parser)
     parser.add_argument("--overwrite", action="store_true", help="localize anew what is there")
-    main(**vars(parser.parse_args()))
+    args = vars(parser.parse_args())
+    main(**args, gate=Gate(args.pop("min_confidence"), args.pop("min_inliers")))
 
 
 if __name__ == "__main__":

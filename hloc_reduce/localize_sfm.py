@@ -12,15 +12,18 @@ from scipy.sparse.csgraph import connected_components
 
 from . import cli, colmap, localization, stamps
 from .cli import InputError
+from .confidence import DEFAULT_GATE, Gate, add_gate_options
 from .executors import SERIAL, Executor
 from .parsers import parse_query_lists, parse_retrieval
+from .paths import strings_as_paths
 
 RANSAC_THRESH = 12.0  # pixels, as in hloc
 
 
+@strings_as_paths
 def main(
     reference_sfm: Path | pycolmap.Reconstruction,
-    queries: Path,
+    queries: Path | list[tuple[str, pycolmap.Camera | None]],
     retrieval: Path,
     features: Path,
     matches: Path,
@@ -33,6 +36,7 @@ def main(
     refinements: Mapping[str, dict] | None = None,
     full_names: bool = False,
     executor: Executor = SERIAL,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict[str, dict]:
     """Localize all queries of the lists that match a glob.
 
@@ -40,7 +44,8 @@ def main(
 
     Args:
         reference_sfm: the map, made from the same features.
-        queries: query list with intrinsics, or a glob of several.
+        queries: query list with intrinsics, or a glob of several; or names and intrinsics, None
+            where these are not known.
         retrieval: pairs of queries and map images, best first.
         features: feature file of the queries.
         matches: match file of the pairs.
@@ -54,6 +59,7 @@ def main(
         refinements: for queries whose intrinsics are inexact more options, as in `config`.
         full_names: write whole names instead of `basename`.
         executor: does the work; for a map in memory it is this process.
+        gate: what a pose must have for the query to be called localized.
 
     Returns:
         A record for each query, as `localization.main`. A query that PnP could not solve is not
@@ -66,13 +72,17 @@ def main(
     """
     if ransac_thresh <= 0:
         raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
-    query_list = [query for queries in parse_query_lists(queries).values() for query in queries]
     retrieved = parse_retrieval(retrieval)
     in_memory = isinstance(reference_sfm, pycolmap.Reconstruction)
     config = {**(config or {})}
     config.setdefault("estimation", {"ransac": {"max_error": ransac_thresh}})
 
-    inputs = [retrieval, features, matches, *sorted(queries.parent.glob(queries.name))]
+    inputs, options = [retrieval, features, matches], {"config": config}
+    if isinstance(queries, Path):
+        inputs += sorted(queries.parent.glob(queries.name))
+        queries = [query for part in parse_query_lists(queries).values() for query in part]
+    else:
+        options["queries"] = localization.to_stamp(queries)
     if in_memory:
         load = partial(SfmMap, reference_sfm, covisibility_clustering)
     else:
@@ -83,7 +93,6 @@ def main(
             _load, reference_sfm, covisibility_clustering, reference_sfm.stat().st_mtime_ns
         )
     refinements = refinements or {}
-    options = {"config": config}
     if refinements:
         options["refinements"] = refinements
     if covisibility_clustering:
@@ -91,7 +100,7 @@ def main(
     try:
         return localization.main(
             load,
-            query_list,
+            queries,
             retrieved,
             features,
             matches,
@@ -101,6 +110,7 @@ def main(
             overwrite or in_memory,
             name_parts=None if full_names else 2 if prepend_camera_name else 1,
             executor=SERIAL if in_memory else executor,
+            gate=gate,
         )
     finally:
         _load.cache_clear()  # a map may be large
@@ -216,8 +226,10 @@ def _main() -> None:
     parser.add_argument(
         "--prepend_camera_name", action="store_true", help="write folder/basename of each query"
     )
+    add_gate_options(parser)
     parser.add_argument("--overwrite", action="store_true", help="localize anew what is there")
-    main(**vars(parser.parse_args()))
+    args = vars(parser.parse_args())
+    main(**args, gate=Gate(args.pop("min_confidence"), args.pop("min_inliers")))
 
 
 if __name__ == "__main__":

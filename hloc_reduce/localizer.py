@@ -12,6 +12,7 @@ from confs import matchers as matchers_confs
 from . import colmap, extract_features, extractors, intrinsics, localization, parallel
 from .base_model import dynamic_load
 from .cli import InputError
+from .confidence import DEFAULT_GATE, Gate
 from .extractors.vlad import read_vocabulary
 from .io import open_h5, to_colmap
 from .localize_sfm import RANSAC_THRESH, SfmMap, merged
@@ -30,7 +31,8 @@ class Localizer:
     Args:
         map_dir: the folder of a map, as `maps.main` or `pipelines.localize` makes it.
         num_loc: how many of the most similar map images a photo is matched with.
-        ransac_thresh: inliers reproject within so many pixels.
+        ransac_thresh: RANSAC's inlier threshold in pixels.
+        gate: what a pose must have to be trusted.
 
     Raises:
         InputError: when the folder is not a map.
@@ -41,10 +43,14 @@ class Localizer:
     """
 
     def __init__(
-        self, map_dir: Path | str, num_loc: int = 50, ransac_thresh: float = RANSAC_THRESH
+        self,
+        map_dir: Path | str,
+        num_loc: int = 50,
+        ransac_thresh: float = RANSAC_THRESH,
+        gate: Gate = DEFAULT_GATE,
     ):
-        built = Map(Path(map_dir))
-        self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
+        built = Map(map_dir)
+        self.num_loc, self.ransac_thresh, self.gate = num_loc, ransac_thresh, gate
         self.preprocessing = built.conf["preprocessing"]
         self.storage = built.storage
         self.ratio_threshold = matchers_confs.confs[built.matcher]["model"].get("ratio_threshold")
@@ -75,9 +81,9 @@ class Localizer:
 
         Returns:
             The pose, camera from world, in the units of the map, or None if the photo cannot be
-            localized; and info, as of `localization.localize`, with `points2D` (M, 2) in COLMAP's
-            pixels, `retrieved`, names of map images, best first, `intrinsics` ("given", "EXIF" or
-            "guess"), and `seconds` by stage.
+            localized, for the `reason` in info; and info, as of `localization.localize`, with
+            `points2D` (M, 2) in COLMAP's pixels, `retrieved`, names of map images, best first,
+            `intrinsics` ("given", "EXIF" or "guess"), and `seconds` by stage.
 
         Raises:
             InputError: when the image cannot be read, or the camera is of another size.
@@ -109,7 +115,7 @@ class Localizer:
         config = {"estimation": {"ransac": {"max_error": self.ransac_thresh}}}
         keypoints = to_colmap(features["keypoints"])
         cam_from_world, info = localization.localize(
-            self.reference, keypoints, camera, matches, merged(config, refinement)
+            self.reference, keypoints, camera, matches, merged(config, refinement), self.gate
         )
         lap("pose")
         info |= {
@@ -118,8 +124,7 @@ class Localizer:
             "intrinsics": source,
             "seconds": seconds,
         }
-        localized = info["num_inliers"] >= localization.MIN_INLIERS
-        return cam_from_world if localized else None, info
+        return cam_from_world if info["reason"] is None else None, info
 
     def _retrieve(self, descriptors: torch.Tensor) -> list[str]:
         """Return the names of the map images most similar to local descriptors (N, D)."""

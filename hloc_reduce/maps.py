@@ -28,8 +28,11 @@ from . import (
     triangulation,
 )
 from .cli import InputError, choose
-from .extract_features import list_images
-from .io import replacing
+from .detection import KEYPOINTS
+from .extract_features import keep_present, keep_readable, list_images
+from .extractors.vlad import read_vocabulary
+from .io import open_h5, provenance, replacing
+from .paths import strings_as_paths
 from .results import RunFolder
 from .storage import STORAGES
 
@@ -51,6 +54,7 @@ class Map:
         InputError: when the folder is not there, is no map or not a finished one.
     """
 
+    @strings_as_paths
     def __init__(self, folder: Path):
         self.folder = folder
         try:
@@ -78,9 +82,32 @@ class Map:
                 if not folder.is_dir()
                 else f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}."
             ) from None
-        missing = [path for path in (self.features, self.descriptors) if not path.is_file()]
-        if missing:
-            raise InputError(f"The map {folder} is broken: it has no {missing[0].name}.")
+        self._check()
+
+    def _check(self) -> None:
+        """Refuse a map that lacks a file, or has a broken one, before any work is done in it."""
+        projection = self.conf["model"].get("projection")
+        needed = [self.features, self.descriptors, self.vocabulary]
+        needed += [Path(projections.split_prefix(projection)[0])] if projection else []
+        missing = [path for path in needed if not path.is_file()]
+        for part in ("cameras", "images", "points3D"):
+            if not any((self.sfm / f"{part}{suffix}").is_file() for suffix in (".bin", ".txt")):
+                missing.append(self.sfm / f"{part}.bin")
+        try:
+            if missing:
+                named = ", ".join(str(path.relative_to(self.folder)) for path in missing)
+                raise InputError(f"it has no {named}")
+            for path in (self.features, self.descriptors):
+                with open_h5(path) as file:
+                    provenance(file)
+            read_vocabulary(self.vocabulary)
+            if projection:
+                projections.load(projection)
+        except InputError as error:
+            raise InputError(
+                f"The map {self.folder} is broken: {str(error).rstrip('.')}. Copy it again, or "
+                "build it anew with --overwrite."
+            ) from None
 
     @property
     def conf(self) -> dict:
@@ -97,7 +124,7 @@ class Map:
         Raises:
             InputError: if it is another, or has the same name but another projection.
         """
-        name, conf = features_confs.get(feature, projection, self.storage)
+        name, conf = features_confs.get(feature, projection, self.storage, self.keypoints)
         made_by = extract_features.provenance(conf)
         if json.loads((self.folder / "conf.json").read_text())["feature"] != made_by:
             other = "" if name != self.feature else f", but not of the {name} that it is now"
@@ -110,6 +137,12 @@ class Map:
     def storage(self) -> str:
         """How descriptors are kept, as in `confs.features.get`."""
         return self._conf.get("storage", STORAGES[0])
+
+    @property
+    def keypoints(self) -> str:
+        """The settings of the DoG detector, as in `confs.features.get`."""
+        model = self._conf["model"]
+        return model.get("base", model).get("keypoints", KEYPOINTS[0])
 
     @property
     def sfm(self) -> Path:
@@ -136,6 +169,7 @@ class Map:
         return sorted(image.name for image in colmap.read_model(self.sfm).images.values())
 
 
+@strings_as_paths
 def main(
     map_dir: Path,
     image_dir: Path,
@@ -146,6 +180,7 @@ def main(
     num_covis: int = 20,
     overwrite: bool = False,
     storage: str = STORAGES[0],
+    keypoints: str = KEYPOINTS[0],
     accept_partial: bool = False,
     camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
 ) -> Map:
@@ -165,7 +200,10 @@ def main(
             these leave images unconnected.
         overwrite: build anew.
         storage: as in `confs.features.get`.
-        accept_partial: build a map without a model even if fewer than half of the images are in it.
+        keypoints: as in `confs.features.get`.
+        accept_partial: do without images of the model that are missing, and without images that
+            cannot be read; without a model, build a map even if fewer than half of the images
+            are in it.
         camera_mode: which images share a camera, without a model.
 
     Returns:
@@ -176,9 +214,9 @@ def main(
             missing or wrong, or fewer than half of the images can be reconstructed; what is
             finished is kept, for a run with `accept_partial`.
     """
-    feature, conf = features_confs.get(feature, projection, storage)
+    feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher_conf = matchers_confs.confs[matcher]
-    model_files: dict[str, Path] = {}
+    given, model_files = model, {}
     names, num_points3D = None, 0
     if model is not None:
         reference = colmap.read_model(model)
@@ -191,6 +229,7 @@ def main(
             for path in sorted(model.iterdir())
             if path.stem in triangulation.PARTS and path.is_file()
         }
+        names = keep_present(image_dir, names, accept_partial)
     names = list_images(image_dir, names)
     made_by = extract_features.provenance(conf)
     if overwrite or not (map_dir / "conf.json").exists():
@@ -236,9 +275,14 @@ def main(
         stamps.write(map_dir / FINGERPRINTS, fingerprints)
         conf = _keep_projection(conf, map_dir)
         with folder.stage("extract_features"):
-            features = extract_features.main(conf, image_dir, map_dir, image_list=names)
+            features = extract_features.main(
+                conf, image_dir, map_dir, image_list=names, strict=not accept_partial
+            )
+            names = keep_readable(features, names, accept_partial)
         with folder.stage("retrieval"):
             descriptors = aggregate_features.main(RETRIEVAL, features, names)
+        if model is not None and len(names) < len(reference.images):
+            model = colmap.write_part(model, set(names), map_dir / "sfm_reference")
         pairs = map_dir / f"pairs-db-{'exhaustive' if exhaustive else num_covis}.txt"
         with folder.stage("pairs"):
             if num_points3D:
@@ -278,13 +322,14 @@ def main(
                     image_list=names,
                     accept_partial=accept_partial,
                 )
+        shutil.rmtree(map_dir / "sfm_reference", ignore_errors=True)
         summary = {
             "id": uuid.uuid4().hex,
             "feature": feature,
             "matcher": matcher,
             "image_dir": str(image_dir.resolve()),
-            "model": str(model.resolve()) if model is not None else None,
-            "camera_mode": camera_mode.name.lower() if model is None else None,
+            "model": str(given.resolve()) if given is not None else None,
+            "camera_mode": camera_mode.name.lower() if given is None else None,
             "conf": _with_projection(conf, lambda path: Path(path).name),
             "images": len(names),
             "images_with_pose": sfm.num_reg_images(),

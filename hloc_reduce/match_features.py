@@ -11,7 +11,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from confs import features as features_confs
 from confs import matchers as matchers_confs
@@ -24,6 +23,8 @@ from .group_writer import Group, GroupWriter, fill
 from .io import names_to_pair, open_h5
 from .matchers.nearest_neighbor import GPU_BYTES
 from .parsers import parse_pairs
+from .paths import strings_as_paths
+from .progress import progress
 from .storage import get_descriptors
 
 confs = matchers_confs.confs
@@ -32,6 +33,7 @@ CHUNK = 64  # pairs
 PAIRS_ON_GPU = 16  # handed to a GPU at once, which matches as many together as its memory allows
 
 
+@strings_as_paths
 def main(
     conf: dict,
     pairs: Path,
@@ -86,7 +88,7 @@ def main(
         files = [stack.enter_context(open_h5(path)) for path in feature_paths]
         made_by = provenance(conf, *files)
     with GroupWriter(matches, made_by, overwrite, compression="gzip") as writer:
-        listed = tqdm(parse_pairs(pairs), desc="Matching", unit="pair", total=number, smoothing=0.1)
+        listed = progress(parse_pairs(pairs), "Matching", "pair", number)
         todo = unmatched_pairs(listed, writer, ordered=features_ref not in (None, feature_path))
         work = partial(_match, conf, feature_paths, gpu_bytes)
         done = fill({None: writer}, work, todo, executor, CHUNK, gpu=True)

@@ -10,10 +10,12 @@ from scipy.sparse import coo_array
 
 from . import cli, colmap, logger
 from .parsers import write_pairs
+from .paths import strings_as_paths
 
 BLOCK = 256  # images whose counts with all others are in memory at once
 
 
+@strings_as_paths
 def main(model: Path, output: Path, num_matched: int) -> Path:
     """Write the pairs of every image with the `num_matched` most covisible others.
 

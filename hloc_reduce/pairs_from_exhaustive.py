@@ -9,8 +9,10 @@ from . import cli, logger
 from .cli import InputError
 from .io import list_h5_names
 from .parsers import check_names, image_names, write_pairs
+from .paths import strings_as_paths
 
 
+@strings_as_paths
 def main(
     output: Path,
     image_list: Path | str | Iterable[str] | None = None,
@@ -37,7 +39,6 @@ def main(
         InputError: when neither a list nor a feature file is given, one has no image, or there
             is only one image to pair.
     """
-    output = Path(output)
     names = _names(image_list, features)
     if names is None:
         raise InputError("There is nothing to pair: give a list of images or a feature file.")
@@ -59,7 +60,7 @@ def _names(images: Path | str | Iterable[str] | None, features: Path | None) -> 
         return list(dict.fromkeys(image_names(images)))
     if features is None:
         return None
-    names = check_names(list_h5_names(Path(features)), features)
+    names = check_names(list_h5_names(features), features)
     if not names:
         raise InputError(f"{features} has no image.")
     return names

@@ -5,18 +5,20 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from . import cli, colmap, logger
 from .cli import InputError
 from .io import get_array, list_h5_names, open_h5
 from .parsers import check_names, image_names, parse_retrieval, write_pairs
+from .paths import strings_as_paths
+from .progress import progress
 
 # queries, and images of the database, whose descriptors are in memory at once
 BLOCK, BLOCK_BYTES = 2**14, 2**28
 QUERIES = 1024  # of them so many rows of the similarity matrix
 
 
+@strings_as_paths
 def main(
     descriptors: Path,
     output: Path,
@@ -59,7 +61,7 @@ def main(
     size = max(1, min(BLOCK, BLOCK_BYTES // read_global(descriptors, query_names[:1]).nbytes))
 
     def retrieve() -> Iterator[tuple[str, str]]:
-        with tqdm(total=len(query_names), desc="Retrieving", unit="image") as progress:
+        with progress(None, "Retrieving", "image", len(query_names)) as shown:
             for start in range(0, len(query_names), size):
                 names = query_names[start : start + size]
                 queries = read_global(descriptors, names)
@@ -67,7 +69,7 @@ def main(
                 for name, row in zip(names, ranking, strict=True):
                     others = [db_names[j] for j in row if not same_file or db_names[j] != name]
                     yield from ((name, other) for other in others[:num_matched])
-                progress.update(len(names))
+                shown.update(len(names))
 
     number = write_pairs(retrieve(), output)
     logger.info("Retrieved %d pairs for %d images.", number, len(query_names))
@@ -136,6 +138,7 @@ def _best(similarity: np.ndarray, number: int) -> np.ndarray:
     return np.argsort(-similarity, axis=1, kind="stable")[:, :number]
 
 
+@strings_as_paths
 def select(
     pairs: Path,
     output: Path,

@@ -18,6 +18,7 @@ from .extract_features import list_images
 from .io import list_h5_names, open_h5
 from .pairs_from_retrieval import rank, read_global
 from .parsers import parse_pairs, write_pairs
+from .paths import strings_as_paths
 from .triangulation import read_matches
 
 MIN_INLIERS = 15  # verified matches of a pair that connects its images, COLMAP's min_num_matches
@@ -27,6 +28,7 @@ BLOCK = 256  # images whose similarity to all others is in memory at once
 Pair = tuple[str, str]
 
 
+@strings_as_paths
 def main(
     output: Path,
     image_dir: Path,

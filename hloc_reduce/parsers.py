@@ -1,4 +1,8 @@
-"""Text files: those of hloc, image lists, query lists with intrinsics, pairs, poses; and YAML."""
+"""Text files: those of hloc, image lists, query lists with intrinsics, pairs, poses; and YAML.
+
+The words of a line are separated by spaces, as in hloc. A line of a name that has spaces itself,
+which no list of hloc's can hold, has tabs after its names instead.
+"""
 
 import re
 import sys
@@ -14,7 +18,9 @@ from .cli import InputError, choose, some
 from .io import replacing
 
 CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
-_PART = r"(?!\.\.?(?:/|$))[^\s/\0\ud800-\udfff]+"  # neither . nor .., and what h5 and lists hold
+_ENDS = r"\t\n\v\f\r\x1c-\x1f\x85\u2028\u2029"  # of lines, and of names in them
+_LETTER = rf"[^{_ENDS}/\0\ud800-\udfff]"
+_PART = rf"(?!\.\.?(?:/|$))(?!\s){_LETTER}+(?<!\s)"  # neither . nor .., and what h5 and lists hold
 _NAME = re.compile(rf"(?!#){_PART}(?:/{_PART})*")
 
 
@@ -26,13 +32,14 @@ def check_names(names: list[str], place: Path | str) -> list[str]:
         place: the one that they are from, for the message.
 
     Raises:
-        InputError: for a name that has spaces, or is absolute, or the like.
+        InputError: for a name that is absolute, or begins with a space, or the like.
     """
     wrong = [name for name in names if not _NAME.fullmatch(name)]
     if wrong:
         raise InputError(
             f"{place}: {some(map(repr, wrong), 3)} cannot be names of images: these are relative "
-            "to a folder, without spaces, a # at the beginning, or . or .. as a part. Rename them."
+            "to a folder, without a # or spaces at the beginning, spaces at the end, tabs, or . or "
+            ".. as a part. Rename them."
         )
     return names
 
@@ -45,13 +52,36 @@ def _lines(path: Path, names: int = 1) -> Iterator[tuple[str, list[str]]]:
     try:
         with path.open(encoding="utf-8-sig") as file:  # which Windows likes to mark as such
             for number, line in enumerate(file, 1):
-                words = line.split()
+                words = _words(line, names)
                 if words and not words[0].startswith("#"):
                     place = f"{path}:{number}"
                     check_names(words[:names], place)
                     yield place, words
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"Cannot read {path}: {error}.") from None
+
+
+def _words(line: str, names: int) -> list[str]:
+    """Split a line whose first words, so many, are names of images."""
+    if "\t" not in line:
+        return line.split()
+    *first, rest = line.strip().split("\t", names)
+    if len(first) < names:
+        return [word.strip() for word in (*first, rest)]
+    return [word.strip() for word in first] + rest.split()
+
+
+def to_line(*words: object, names: int = 1) -> str:
+    """Join words to a line of a list.
+
+    Args:
+        words: the words.
+        names: how many of them, the first ones, are names of images.
+    """
+    named, rest = list(map(str, words[:names])), list(map(str, words[names:]))
+    if any(name.split() != [name] for name in named):
+        return "\t".join([*named, *[" ".join(rest)] * bool(rest)]) + "\n"
+    return " ".join([*named, *rest]) + "\n"
 
 
 def read_yaml(path: Path) -> object:
@@ -115,7 +145,8 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
         except (ValueError, TypeError, AttributeError, RuntimeError) as error:
             reason = str(error).strip().splitlines()[0]
             raise InputError(
-                f"{place}: not a query `name MODEL width height params...` ({reason})."
+                f"{place}: not a query `name MODEL width height params...` ({reason}); put a tab "
+                "after a name that has spaces."
             ) from None
         if name in queries:
             raise InputError(f"{place}: query {name} is listed twice.")
@@ -151,7 +182,9 @@ def parse_pairs(path: Path) -> Iterator[tuple[str, str]]:
     """Read pairs, one `name0 name1` a line, as they are drawn: a list may be of any length."""
     for place, words in _lines(path, names=2):
         if len(words) != 2:
-            raise InputError(f"{place}: not a pair `name0 name1`.")
+            raise InputError(
+                f"{place}: not a pair `name0 name1`; put a tab between names that have spaces."
+            )
         yield words[0], words[1]
 
 
@@ -168,7 +201,7 @@ def write_pairs(pairs: Iterable[tuple[str, str]], path: Path) -> int:
     number = 0
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for name0, name1 in pairs:
-            file.write(f"{name0} {name1}\n")
+            file.write(to_line(name0, name1, names=2))
             number += 1
     return number
 
@@ -214,5 +247,5 @@ def write_poses(
         for name, pose in poses.items():
             written = name if name_parts is None else "/".join(name.split("/")[-name_parts:])
             x, y, z, w = pose.rotation.quat
-            numbers = " ".join(repr(float(value)) for value in (w, x, y, z, *pose.translation))
-            file.write(f"{written} {numbers}\n")
+            numbers = (repr(float(value)) for value in (w, x, y, z, *pose.translation))
+            file.write(to_line(written, *numbers))

@@ -11,6 +11,7 @@ from . import cli, colmap, logger, stamps
 from .cli import InputError
 from .extract_features import list_images
 from .io import list_h5_names
+from .paths import strings_as_paths
 from .triangulation import STAMP, read_matches, replacing_map
 
 REGISTRATION = "registration.json"  # which images are in the model, and in other parts
@@ -28,6 +29,7 @@ RELAXED = {
 FEW = 100  # images of which a second attempt takes little time
 
 
+@strings_as_paths
 def main(
     sfm_dir: Path,
     image_dir: Path,
@@ -219,19 +221,14 @@ def shortfall(
     return f"{' '.join(said)} What to try: {'; '.join(tries)}."
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add --camera_mode and --accept_partial."""
+def add_camera_mode(parser: argparse.ArgumentParser) -> None:
+    """Add --camera_mode."""
     modes = ", ".join(mode.lower() for mode in pycolmap.CameraMode.__members__)
     parser.add_argument(
         "--camera_mode",
         default="auto",
         help=f"which photos share a camera, as in COLMAP: {modes}; auto, COLMAP's default: those "
         "of the same make, model, focal length and size by EXIF data",
-    )
-    parser.add_argument(
-        "--accept_partial",
-        action="store_true",
-        help="accept a map that has fewer than half of the photos",
     )
 
 
@@ -248,7 +245,12 @@ def _main() -> None:
     parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
     parser.add_argument("--features", type=Path, required=True, help="feature file")
     parser.add_argument("--matches", type=Path, required=True, help="match file")
-    add_options(parser)
+    add_camera_mode(parser)
+    parser.add_argument(
+        "--accept_partial",
+        action="store_true",
+        help="accept a map that has fewer than half of the photos",
+    )
     parser.add_argument(
         "--skip_geometric_verification", action="store_true", help="take all matches"
     )

@@ -26,9 +26,11 @@ COLUMNS = (
     "num_correspondences",
     "num_inliers",
     "inlier_ratio",
+    "confidence",
     "position_error_m",
     "rotation_error_deg",
     "retrieved",
+    "reason",
 )
 # what a run leaves in its folder, first what says that it is whole; but for lists of pairs, which
 # are always written anew
@@ -231,8 +233,10 @@ def query_table(
                 correspondences,
                 inliers,
                 round(inliers / correspondences, 4) if correspondences else 0.0,
+                record["confidence"],
                 *errors,
                 record["db"],
+                record["reason"],
             )
             rows.append(dict(zip(COLUMNS, values, strict=True)))
     return rows

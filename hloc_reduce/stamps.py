@@ -5,9 +5,8 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from tqdm import tqdm
-
 from .io import replacing
+from .progress import progress
 
 
 def stamp(options: dict, inputs: list[Path]) -> dict:
@@ -52,7 +51,7 @@ def fingerprints(files: Mapping[str, Path], before: Mapping[str, list]) -> dict[
     statuses = {name: path.stat() for name, path in files.items()}
     now = {name: [status.st_size, status.st_mtime_ns] for name, status in statuses.items()}
     changed = [name for name in now if before.get(name, [])[:2] != now[name]]
-    for name in tqdm(changed, desc="Reading files", unit="file"):
+    for name in progress(changed, "Reading files", "file"):
         now[name].append(sha256(files[name]))
     return {name: value if len(value) == 3 else before[name] for name, value in now.items()}
 

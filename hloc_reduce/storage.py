@@ -10,12 +10,13 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from tqdm import tqdm
 
 from . import cli, io, logger
 from .cli import InputError
 from .group_writer import GroupWriter
-from .io import get_array, get_dataset, list_h5_names, open_h5
+from .io import get_array, get_dataset, list_h5_names, open_h5, reading
+from .paths import strings_as_paths
+from .progress import progress
 
 STORAGES = ("float16", "float32", "uint8")  # hloc's `as_half`, without it, and ours
 QUANTIZED = "descriptors_uint8"
@@ -81,9 +82,10 @@ def stored_descriptors(file: h5py.File, name: str) -> h5py.Dataset:
     Raises:
         InputError: when the image is not there or has none, or not as many as keypoints.
     """
-    key = QUANTIZED if f"{name}/{QUANTIZED}" in file else "descriptors"
-    dataset, keypoints = get_dataset(file, name, key), file[name].get("keypoints")
-    shapes = [getattr(part, "shape", None) for part in (dataset, keypoints)]
+    with reading(file.filename):
+        key = QUANTIZED if f"{name}/{QUANTIZED}" in file else "descriptors"
+        dataset, keypoints = get_dataset(file, name, key), file[name].get("keypoints")
+        shapes = [getattr(part, "shape", None) for part in (dataset, keypoints)]
     if all(shapes) and shapes[0][-1] != shapes[1][0]:
         raise InputError(
             f"{file.filename}: the descriptors of {name} are {shapes[0]}, its keypoints "
@@ -102,11 +104,14 @@ def get_descriptors(file: h5py.File, name: str) -> np.ndarray:
     key = dataset.name.rpartition("/")[2]
     array = get_array(file, name, key, (0, 0))
     try:
-        return restore({key: array}, {key: dict(dataset.attrs)})
+        with reading(file.filename):
+            attrs = dict(dataset.attrs)
+        return restore({key: array}, {key: attrs})
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{file.filename}: {name} has no scale and offset.") from None
 
 
+@strings_as_paths
 def main(features: Path, output: Path, storage: str = "float16", overwrite: bool = False) -> Path:
     """Write a feature file with descriptors kept in another way; other data sets are copied.
 
@@ -130,7 +135,7 @@ def main(features: Path, output: Path, storage: str = "float16", overwrite: bool
         made_by = {"converted": io.provenance(file), "storage": storage}
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [name for name in names if name not in writer]
-            for name in tqdm(todo, desc="Converting features", unit="image"):
+            for name in progress(todo, "Converting features", "image"):
                 datasets = {
                     key: dataset
                     for key, dataset in file[name].items()

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from tqdm import tqdm
 
 from . import cli, colmap, logger, stamps
 from .cli import InputError
 from .io import get_colmap_keypoints, get_matches, open_h5
 from .parsers import parse_retrieval
+from .paths import strings_as_paths
+from .progress import progress
 
 MAX_EPIPOLAR_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
 STAMP = "made_from.json"
@@ -21,6 +22,7 @@ PARTS = ("cameras", "frames", "images", "points3D", "rigs")
 MADE_BY_HLOC = {"database.db", *(f"{part}.bin" for part in PARTS)}
 
 
+@strings_as_paths
 def main(
     sfm_dir: Path,
     reference_model: Path,
@@ -163,7 +165,7 @@ def read_matches(
     """
     keypoints, uncertainty, found = {}, {}, {}
     with open_h5(features) as file:
-        for name in tqdm(names, desc="Reading keypoints", unit="image"):
+        for name in progress(names, "Reading keypoints", "image"):
             keypoints[name], uncertainty[name] = get_colmap_keypoints(file, name)
     with open_h5(matches) as file:
         for name0, names1 in parse_retrieval(pairs).items():

@@ -11,6 +11,7 @@ from confs import features as features_confs
 from confs import matchers as matchers_confs
 from hloc_reduce import (
     cli,
+    colmap,
     demo,
     extract_features,
     localize_sfm,
@@ -18,8 +19,11 @@ from hloc_reduce import (
     trace,
     triangulation,
 )
+from hloc_reduce.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.datasets import Aachen, thresholds, true_poses
+from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import SERIAL, Executor
+from hloc_reduce.paths import strings_as_paths
 from hloc_reduce.storage import STORAGES
 
 from . import common
@@ -28,6 +32,7 @@ NUMBERS = {"num_covis": 20, "num_loc": 50}
 Place = Aachen
 
 
+@strings_as_paths
 def main(
     dataset: Path,
     outputs: Path,
@@ -40,21 +45,29 @@ def main(
     overwrite: bool = False,
     projection: Path | None = None,
     storage: str = STORAGES[0],
+    keypoints: str = KEYPOINTS[0],
     executor: Executor = SERIAL,
     features: Path | None = None,
+    strict: bool = False,
+    accept_partial: bool = False,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict:
     """Run all stages and return the summary, as in summary.json.
 
     Takes what the command line takes, and the executor that does the work, and `features`, a file
     of them to use instead of extracting them.
     """
-    feature, feature_conf = features_confs.get(feature, projection, storage)
+    feature, feature_conf = features_confs.get(feature, projection, storage, keypoints)
     matcher_conf = matchers_confs.confs[matcher]
     place = Aachen(dataset)
     map_names = place.map_names()
     lists = {name: [query for query, _ in part] for name, part in place.query_lists().items()}
     query_names = [name for part in lists.values() for name in part]
-    place.check(map_names)
+    place.check([] if accept_partial else map_names)
+    number = len(map_names)
+    map_names = extract_features.keep_present(place.images, map_names, accept_partial)
+    if features is None:
+        common.check_queries(place.images, query_names, strict)
     truth_file = ground_truth or place.ground_truth
     truth = true_poses(query_names, truth_file, bool(ground_truth))
     retrieved = common.retrieval_name(retrieval, num_loc)
@@ -72,23 +85,38 @@ def main(
         with folder.stage("extract_features"):
             names = [*map_names, *query_names]
             features = features or extract_features.main(
-                feature_conf, place.images, outputs, image_list=names, executor=executor
+                *(feature_conf, place.images, outputs),
+                image_list=names,
+                executor=executor,
+                strict=strict,
             )
+            map_names = extract_features.keep_readable(features, map_names, accept_partial)
+            queries = common.readable(features, query_names)
+        reference = place.reference_model
+        if len(map_names) < number:
+            reference = colmap.write_part(reference, set(map_names), outputs / "sfm_reference")
         with folder.stage("pairs_from_covisibility"):
-            pairs_from_covisibility.main(place.reference_model, sfm_pairs, num_covis)
+            pairs_from_covisibility.main(reference, sfm_pairs, num_covis)
         with folder.stage("match_map"):
             sfm_matches = common.match(matcher_conf, sfm_pairs, features, outputs, executor)
         with folder.stage("triangulation"):
             reconstruction = triangulation.main(
-                sfm, place.reference_model, place.images, sfm_pairs, features, sfm_matches
+                sfm, reference, place.images, sfm_pairs, features, sfm_matches
             )
         with folder.stage("retrieval"):
-            common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
+            common.retrieve(retrieval, features, loc_pairs, num_loc, queries, map_names)
         with folder.stage("match_queries"):
             loc_matches = common.match(matcher_conf, loc_pairs, features, outputs, executor)
         with folder.stage("localization"):
             records = localize_sfm.main(
-                sfm, place.queries, loc_pairs, features, loc_matches, poses, executor=executor
+                sfm,
+                place.queries,
+                loc_pairs,
+                features,
+                loc_matches,
+                poses,
+                executor=executor,
+                gate=gate,
             )
 
         summary = {
@@ -158,6 +186,10 @@ def _main() -> None:
             args.overwrite,
             args.projection,
             args.storage,
+            args.keypoints,
+            strict=args.strict,
+            accept_partial=args.accept_partial,
+            gate=Gate(args.min_confidence, args.min_inliers),
         )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)

@@ -15,6 +15,7 @@ from hloc_reduce import cli, executors, io, jobs, logger, results
 from hloc_reduce.cli import InputError
 from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.jobs import Job
+from hloc_reduce.paths import strings_as_paths
 from hloc_reduce.storage import STORAGES
 
 from . import tables
@@ -25,6 +26,7 @@ KEYPOINTS = 5000  # of an image
 FEATURE_BYTES, MATCH_BYTES, MAP_BYTES = 14, 0.75, 67  # of a keypoint but for its descriptor, ...
 
 
+@strings_as_paths
 def main(
     job_file: Path,
     outputs: Path | None = None,
@@ -39,8 +41,9 @@ def main(
         outputs: the folder for the results: jobs.csv, jobs.txt, failures.csv, and for each data
             set a folder with one for each job; default: that of the file.
         overwrite: begin anew.
-        strict: stop the jobs of a data set at an image that cannot be read. Else it counts as one
-            without keypoints, is listed in failures.csv, and read again by a later run.
+        strict: stop the jobs of a data set at an image that cannot be read. Else it is left out
+            of the map, or as a query not localized; it is listed in failures.csv, and read again
+            by a later run.
         executor: does the work.
 
     Returns:
@@ -72,8 +75,11 @@ def main(
                         ground_truth=job.ground_truth,
                         overwrite=overwrite,
                         storage=job.storage,
+                        keypoints=job.keypoints,
                         executor=executor,
                         features=shared.features[job],
+                        strict=strict,
+                        accept_partial=not strict,
                         **job.numbers,
                     )
                 tables.write(done, outputs)
@@ -96,6 +102,7 @@ def folder_of(shared: Shared, job: Job) -> Path:
     return shared.folder.with_name(job.name)
 
 
+@strings_as_paths
 def dry_run(job_file: Path, outputs: Path | None = None, overwrite: bool = False) -> list[str]:
     """Print what `main` would do: the steps, with about how many bytes they write.
 

@@ -1,7 +1,10 @@
 """What the pipelines share: options, retrieval, and what a run leaves behind."""
 
 import argparse
+import glob
+import hashlib
 import os
+import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -22,8 +25,10 @@ from hloc_reduce import (
     stamps,
 )
 from hloc_reduce.cli import InputError
+from hloc_reduce.confidence import add_gate_options
 from hloc_reduce.executors import SERIAL, Executor
-from hloc_reduce.parsers import parse_retrieval
+from hloc_reduce.group_writer import failures
+from hloc_reduce.parsers import parse_pairs, parse_retrieval, write_pairs
 from hloc_reduce.versions import versions
 
 # suffix of a retrieval file -> what makes pairs of it; any other is a text file of pairs
@@ -69,6 +74,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
         help="file of a projection to use with the base descriptor of --feature",
     )
     features_confs.add_storage_option(parser)
+    features_confs.add_keypoints_option(parser)
     parser.add_argument(
         "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
     )
@@ -81,6 +87,18 @@ def add_localization_options(parser: argparse.ArgumentParser, truth: str, num_lo
     parser.add_argument(
         "--ground_truth", type=Path, help=f"true poses of the queries (default: {truth})"
     )
+    parser.add_argument(
+        "--strict",
+        action="store_true",
+        help="fail at a query photo that cannot be read, instead of recording it as not localized",
+    )
+    parser.add_argument(
+        "--accept_partial",
+        action="store_true",
+        help="do without map photos that are missing, cannot be read or, in a map of photos alone, "
+        "could not be reconstructed",
+    )
+    add_gate_options(parser)
     parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
     parser.add_argument(
         "--profile",
@@ -135,6 +153,22 @@ def check_retrieval(
     return sorted({other for others in found for other in others[:num_loc]})
 
 
+def check_queries(image_dir: Path, names: list[str], strict: bool) -> None:
+    """Refuse queries none of which is there, or if `strict` one that is not.
+
+    Raises:
+        InputError: as said.
+    """
+    if strict or not any((image_dir / name).is_file() for name in names):
+        extract_features.list_images(image_dir, names)
+
+
+def readable(features: Path, names: list[str]) -> list[str]:
+    """Return the queries whose photos could be read, as their feature file tells."""
+    failed = failures(features)
+    return [name for name in names if name not in failed]
+
+
 def run_folder(
     outputs: Path,
     dataset: Path,
@@ -170,7 +204,7 @@ def run_folder(
         conf["retrieval"] = _placed(Path(retrieval), outputs)  # which may be moved with it
     if features is not None:
         with io.open_h5(features) as file:
-            conf["features"] = file.attrs.get("id", str(features))
+            conf["features"] = io.get_text(file, "id", str(features))
         before = stamps.read(outputs / "conf.json")
         made_anew = before.get("features") not in (None, conf["features"])
         overwrite |= made_anew and {**before, "features": conf["features"]} == conf
@@ -184,8 +218,10 @@ def run_folder(
 def match(
     conf: dict, pairs: Path, features: Path, outputs: Path, executor: Executor = SERIAL
 ) -> Path:
-    """Match pairs into a file of the outputs folder, which is called as hloc's."""
+    """Match pairs, if there are any, into a file of the outputs folder, named as hloc's."""
     matches = outputs / f"{features.stem}_{conf['output']}_{pairs.stem}.h5"
+    if next(parse_pairs(pairs), None) is None:  # no query could be read
+        return matches
     return match_features.main(conf, pairs, features, matches=matches, executor=executor)
 
 
@@ -198,12 +234,25 @@ def retrieve(
     map_names: list[str],
 ) -> Path:
     """Write the pairs of queries and map images, from a file or by VLAD of `features`."""
-    if retrieval == "vlad":
-        descriptors = aggregate_features.main(aggregate_features.confs["vlad"], features, map_names)
-    else:
-        descriptors = Path(retrieval)
+    if not query_names:
+        write_pairs([], output)
+        return output
+    descriptors = _aggregate(features, map_names) if retrieval == "vlad" else Path(retrieval)
     select = PAIRS_FROM.get(descriptors.suffix, pairs_from_retrieval.select)
     return select(descriptors, output, num_loc, query_list=query_names, db_list=map_names)
+
+
+def _aggregate(features: Path, map_names: list[str]) -> Path:
+    """Compute global descriptors, anew where their vocabulary was learned from other map images."""
+    conf = aggregate_features.confs["vlad"]
+    name = f"{conf['output']}_{features.stem}"
+    stamp = features.with_name(f"{name}.made_from.json")
+    learned_from = {"images": hashlib.sha256("\n".join(map_names).encode()).hexdigest()}
+    if stamps.read(stamp) not in ({}, learned_from):
+        for made in features.parent.glob(f"{glob.escape(name)}*"):
+            shutil.rmtree(made) if made.is_dir() else made.unlink()
+    stamps.write(stamp, learned_from)
+    return aggregate_features.main(conf, features, map_names)
 
 
 def finish(
@@ -236,11 +285,19 @@ def finish(
         The summary.
     """
     rows = results.query_table(lists, records, truth)
+    failed = {name: reason for name, reason in failures(features).items() if name in records}
+    if failed:
+        logger.warning(
+            "%d of %d queries could not be read and are not localized: %s. The same command tries "
+            "them again.",
+            *(len(failed), len(rows), extract_features.with_reasons(failed)),
+        )
     io.write_csv(rows, folder.path / "queries.csv")
     summary = {
         **summary,
         "queries": len(rows),
         "queries_localized": sum(row["status"] == "localized" for row in rows),
+        "queries_unreadable": len(failed),
         "lists": {
             name: results.summarize_list(
                 [row for row in rows if row["list"] == name], thresholds[name]

@@ -15,8 +15,11 @@ from hloc_reduce import (
     localize_inloc,
     trace,
 )
+from hloc_reduce.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
+from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import SERIAL, Executor
+from hloc_reduce.paths import strings_as_paths
 from hloc_reduce.storage import STORAGES
 
 from . import common
@@ -25,6 +28,7 @@ NUMBERS = {"num_loc": 40}
 Place = InLoc
 
 
+@strings_as_paths
 def main(
     dataset: Path,
     outputs: Path,
@@ -36,8 +40,12 @@ def main(
     overwrite: bool = False,
     projection: Path | None = None,
     storage: str = STORAGES[0],
+    keypoints: str = KEYPOINTS[0],
     executor: Executor = SERIAL,
     features: Path | None = None,
+    strict: bool = False,
+    accept_partial: bool = False,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict:
     """Run all stages and return the summary, as in summary.json.
 
@@ -45,7 +53,7 @@ def main(
     of them to use instead of extracting them. What these show is then kept beside it, in
     points3D.h5 of all feature files of that folder, which `overwrite` does not concern.
     """
-    feature, feature_conf = features_confs.get(feature, projection, storage)
+    feature, feature_conf = features_confs.get(feature, projection, storage, keypoints)
     matcher_conf = matchers_confs.confs[matcher]
     place = InLoc(dataset)
     map_names, query_names = place.map_names(), place.query_names()
@@ -54,7 +62,7 @@ def main(
     # what is not retrieved needs neither features nor a scan
     used = common.check_retrieval(retrieval, loc_pairs, num_loc, query_names, map_names)
     if features is None:
-        extract_features.list_images(dataset, [*used, *query_names])
+        common.check_queries(dataset, query_names, strict)
     place.check(used)
     truth_file = ground_truth or place.ground_truth
     truth = true_poses(query_names, truth_file, bool(ground_truth))
@@ -71,10 +79,17 @@ def main(
         with folder.stage("extract_features"):
             names = [*used, *query_names]
             features = features or extract_features.main(
-                feature_conf, dataset, outputs, image_list=names, executor=executor
+                *(feature_conf, dataset, outputs),
+                image_list=names,
+                executor=executor,
+                strict=strict,
             )
+            kept = extract_features.keep_readable(features, used, accept_partial)
+            if len(kept) < len(used):
+                map_names = used = kept
+            queries = common.readable(features, query_names)
         with folder.stage("retrieval"):
-            common.retrieve(retrieval, features, loc_pairs, num_loc, query_names, map_names)
+            common.retrieve(retrieval, features, loc_pairs, num_loc, queries, map_names)
         with folder.stage("match_queries"):
             matches = common.match(matcher_conf, loc_pairs, features, outputs, executor)
         with folder.stage("localization"):
@@ -88,6 +103,7 @@ def main(
                 ransac_thresh=place.ransac_thresh,
                 executor=executor,
                 points=points,
+                gate=gate,
             )
 
         summary = {
@@ -144,6 +160,10 @@ def _main() -> None:
             args.overwrite,
             args.projection,
             args.storage,
+            args.keypoints,
+            strict=args.strict,
+            accept_partial=args.accept_partial,
+            gate=Gate(args.min_confidence, args.min_inliers),
         )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)

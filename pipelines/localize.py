@@ -6,9 +6,13 @@ colmap_sift_sv64 and the matcher NN-ratio, if no other is given or the map is no
 """
 
 import argparse
+import hashlib
+import os
 import re
 from collections import Counter
 from pathlib import Path
+
+import pycolmap
 
 from confs import features as features_confs
 from confs import matchers as matchers_confs
@@ -29,18 +33,24 @@ from hloc_reduce import (
     trace,
 )
 from hloc_reduce.cli import InputError
+from hloc_reduce.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
+from hloc_reduce.detection import KEYPOINTS
+from hloc_reduce.group_writer import failures
 from hloc_reduce.maps import Map
-from hloc_reduce.parsers import parse_query_lists
+from hloc_reduce.parsers import parse_query_lists, write_pairs
+from hloc_reduce.paths import strings_as_paths
 from hloc_reduce.storage import STORAGES
 
 from . import common
 
 FEATURE, MATCHER = features_confs.RECOMMENDED, "NN-ratio"
 MADE_FROM = "made_from.json"  # the map and the photos of queries
+LISTED = "queries_with_intrinsics.txt"  # those of a folder
 NOT_IN_NAMES = r"[^\w.-]+"  # of a glob
 
 
+@strings_as_paths
 def open_map(
     outputs: Path,
     map_images: Path | None = None,
@@ -51,6 +61,7 @@ def open_map(
     num_covis: int = 20,
     overwrite: bool = False,
     storage: str | None = None,
+    keypoints: str | None = None,
     accept_partial: bool = False,
     camera_mode: str | None = None,
 ) -> Map:
@@ -67,8 +78,9 @@ def open_map(
         num_covis: pairs of each map image.
         overwrite: build anew.
         storage: of descriptors; likewise, float16.
-        accept_partial: build a map of photos alone even if fewer than half of them are in it.
-        camera_mode: which of these share a camera, as in COLMAP; default: auto.
+        keypoints: settings of the DoG detector; likewise, adaptive.
+        accept_partial: as of `maps.main`.
+        camera_mode: which photos share a camera, as in COLMAP; default: auto.
     """
     if camera_mode is not None:
         mode = colmap.camera_mode(camera_mode)
@@ -88,6 +100,8 @@ def open_map(
             built.check_feature(feature or FEATURE, projection)
         if storage not in (None, built.storage):
             raise InputError(f"The map {model_or_map} is of --storage {built.storage}.")
+        if keypoints not in (None, built.keypoints):
+            raise InputError(f"The map {model_or_map} is of --keypoints {built.keypoints}.")
         if matcher not in (None, built.matcher):
             raise InputError(f"The map {model_or_map} is of --matcher {built.matcher}.")
         return built
@@ -106,11 +120,13 @@ def open_map(
         num_covis,
         overwrite,
         storage or STORAGES[0],
+        keypoints or KEYPOINTS[0],
         accept_partial,
         mode,
     )
 
 
+@strings_as_paths
 def main(
     built: Map,
     query_images: Path,
@@ -119,25 +135,31 @@ def main(
     num_loc: int = 50,
     ground_truth: Path | None = None,
     overwrite: bool = False,
+    strict: bool = False,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict:
     """Localize queries in a map and return the summary, as in summary.json."""
     matcher_conf = matchers_confs.confs[built.matcher]
-    cameras = {}
-    if queries is None:
+    given, cameras = queries, {}
+    if given is None:
         names = extract_features.list_images(query_images)
         lists = {query_images.resolve().name: names}
-        cameras = {name: intrinsics.infer(query_images / name) for name in names}
-        queries = outputs / "queries_with_intrinsics.txt"
+        cameras = _infer(query_images, names, strict)
+        queries = outputs / LISTED
     else:
         parts = parse_query_lists(queries)
         lists = {stem: [name for name, _ in part] for stem, part in parts.items()}
     names = [name for part in lists.values() for name in part]
-    extract_features.list_images(query_images, names)
+    common.check_queries(query_images, names, strict)
+    map_names = built.names()  # a broken model is to be found before photos are read
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
     made_from = outputs / MADE_FROM
     before = stamps.read(made_from)
     files = {name: query_images / name for name in names}
+    files = {
+        name: file for name, file in files.items() if file.is_file() and os.access(file, os.R_OK)
+    }
     now = {"map": built.id, "queries": stamps.fingerprints(files, before.get("queries", {}))}
     changed = stamps.changed(before.get("queries", {}), now["queries"])
     if before and before.get("map") != now["map"]:
@@ -153,18 +175,18 @@ def main(
             "num_loc": num_loc,
         },
         overwrite,
-        inputs=[query_images] if cameras else [query_images, queries],
+        inputs=[query_images, *([given] if given else [])],
         stale=bool(changed),
     ) as folder:
         if not changed:  # photos that are not in this list may be in the next
             now["queries"] = {**before.get("queries", {}), **now["queries"]}
         stamps.write(made_from, now)
-        sources = dict.fromkeys(names, "list")
+        sources = dict.fromkeys(names, "list") if given else {}
         sources |= {name: source for name, (_, source) in cameras.items()}
-        if cameras:
+        if given is None:
             intrinsics.write_queries(cameras, queries)
         for source, said in (("EXIF", "from EXIF data"), ("guess", "guessed")):
-            if some := [name for name in names if sources[name] == source]:
+            if some := [name for name in names if sources.get(name) == source]:
                 logger.info(
                     "Intrinsics of %d queries are %s; the focal length is refined with the pose: "
                     "%s",
@@ -174,28 +196,39 @@ def main(
         poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
 
         with folder.stage("extract_features"):
-            features = extract_features.main(built.conf, query_images, outputs, image_list=names)
+            features = extract_features.main(
+                built.conf, query_images, outputs, image_list=names, strict=strict
+            )
+            readable = common.readable(features, names)
+        # when another one has been read, what is finished of these stays
+        failed = failures(features)
+        now["queries"] = {name: made for name, made in now["queries"].items() if name not in failed}
+        stamps.write(made_from, now)
         with folder.stage("retrieval"):
             descriptors = aggregate_features.main(
                 maps.RETRIEVAL, features, vocabulary=built.vocabulary
             )
-            pairs_from_retrieval.main(
-                descriptors,
-                loc_pairs,
-                num_loc,
-                query_list=names,
-                db_list=built.names(),
-                db_descriptors=built.descriptors,
-            )
+            if readable:
+                pairs_from_retrieval.main(
+                    descriptors,
+                    loc_pairs,
+                    num_loc,
+                    query_list=readable,
+                    db_list=map_names,
+                    db_descriptors=built.descriptors,
+                )
+            else:
+                write_pairs([], loc_pairs)
         with folder.stage("match_queries"):
             matches = outputs / f"{features.stem}_{matcher_conf['output']}_{loc_pairs.stem}.h5"
-            match_features.main(
-                matcher_conf, loc_pairs, features, matches=matches, features_ref=built.features
-            )
+            if readable:
+                match_features.main(
+                    matcher_conf, loc_pairs, features, matches=matches, features_ref=built.features
+                )
         with folder.stage("localization"):
             records = localize_sfm.main(
                 built.sfm,
-                queries,
+                given or [(name, cameras[name][0] if name in cameras else None) for name in names],
                 loc_pairs,
                 features,
                 matches,
@@ -206,6 +239,7 @@ def main(
                     if source != "list"
                 },
                 full_names=True,
+                gate=gate,
             )
         summary = {
             "feature": built.feature,
@@ -228,6 +262,42 @@ def main(
             "ground_truth": ground_truth,
         }
         return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
+
+
+def _infer(
+    query_images: Path, names: list[str], strict: bool
+) -> dict[str, tuple[pycolmap.Camera, str]]:
+    """Infer the intrinsics of photos, unless `strict` without those that cannot be read."""
+    cameras = {}
+    for name in names:
+        try:
+            cameras[name] = intrinsics.infer(query_images / name)
+        except InputError:
+            if strict:
+                raise
+    return cameras
+
+
+def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> Path:
+    """Return the folder for the results of queries, which is called by their list or folder.
+
+    Where that is of other queries of the same name, a digest of their path follows the name.
+
+    Args:
+        outputs: the folder for it.
+        query_images: folder of the photos.
+        queries: their list, if there is one.
+    """
+    name = (queries or query_images.resolve()).stem
+    name = re.sub(NOT_IN_NAMES, "", name).strip("._-")
+    folder = outputs / f"queries-{name or 'all'}"
+    before = stamps.read(folder / "conf.json")
+    own = {"query_images": str(query_images.resolve())}
+    own["queries"] = str((queries or folder / LISTED).resolve())
+    if any(before.get(key, value) != value for key, value in own.items()):
+        where = f"{own['query_images']}\n{queries and own['queries']}"
+        folder = folder.with_name(f"{folder.name}-{hashlib.sha256(where.encode()).hexdigest()[:8]}")
+    return folder
 
 
 def _main() -> None:
@@ -256,18 +326,21 @@ def _main() -> None:
     parser.add_argument(
         "--outputs",
         type=Path,
-        help="folder for the map, in map, and for the results, in queries-<name>",
+        help="folder for the map, in map, and for the results, in queries-<name of --queries or "
+        "--query_images>; a digest of the path follows if others of that name have that folder",
     )
     parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
-    reconstruction.add_options(parser)
+    reconstruction.add_camera_mode(parser)
     common.add_feature_options(parser)
     common.add_localization_options(parser, "none", 50)
-    # those of a map that was built
-    parser.set_defaults(feature=None, matcher=None, storage=None, camera_mode=None)
+    # None: those of a map that was built
+    parser.set_defaults(feature=None, matcher=None, storage=None, keypoints=None, camera_mode=None)
     args = parser.parse_args()
     common.check_options(args)
     if args.storage is not None:
         cli.choose("storage", args.storage, STORAGES)
+    if args.keypoints is not None:
+        cli.choose("keypoints", args.keypoints, KEYPOINTS)
     if args.outputs is None:
         raise InputError("Give --outputs, a folder.")
     if args.queries is not None and args.query_images is None:
@@ -287,15 +360,14 @@ def _run(args: argparse.Namespace) -> None:
         args.num_covis,
         args.overwrite,
         args.storage,
+        args.keypoints,
         args.accept_partial,
         args.camera_mode,
     )
     if args.query_images is None:
         print(f"The map {built.folder} is there. Localize photos in it with --query_images.")
         return
-    name = (args.queries or args.query_images.resolve()).stem
-    name = re.sub(NOT_IN_NAMES, "", name).strip("._-")
-    outputs = args.outputs / f"queries-{name or 'all'}"
+    outputs = results_folder(args.outputs, args.query_images, args.queries)
     summary = main(
         built,
         args.query_images,
@@ -304,6 +376,8 @@ def _run(args: argparse.Namespace) -> None:
         args.num_loc,
         args.ground_truth,
         args.overwrite,
+        args.strict,
+        Gate(args.min_confidence, args.min_inliers),
     )
     common.print_result(summary, outputs, "The poses, camera from world, are in {}.")
 

@@ -19,6 +19,7 @@ from hloc_reduce import (
 from hloc_reduce.cli import InputError
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.descriptors import DIM
+from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import Executor
 from hloc_reduce.group_writer import GroupWriter
 from hloc_reduce.jobs import Job
@@ -77,11 +78,12 @@ class Shared:
             truth = job.ground_truth or self._place.ground_truth
             true_poses(self.query_names, truth, job.ground_truth is not None)
             self._truths.add(job.ground_truth)
-        _, conf = features_confs.get(job.feature, storage=job.storage)
+        _, conf = features_confs.get(job.feature, None, job.storage, job.keypoints)
         extract_features.provenance(conf)
         project = getattr(extractors.load(conf["model"]), "project", None)
         stored = "" if job.storage == STORAGES[0] else f"-{job.storage}"
-        path = self.folder / f"{conf['output']}{stored}.h5"
+        found = "" if job.keypoints == KEYPOINTS[0] else f"-keypoints_{job.keypoints}"
+        path = self.folder / f"{conf['output']}{stored}{found}.h5"
         if self.confs.setdefault(path, conf) != conf:
             raise InputError(f"{path.name} is that of another feature, too: rename its YAML file.")
         self.features[job] = path
@@ -163,13 +165,19 @@ class Shared:
             self._drop_stale()
             by_vlad = [job for job in self.running() if job.retrieval == "vlad"]
             with folder.stage("retrieval"), self.failing(by_vlad):
-                self._retrieve(by_vlad)
+                self._retrieve(by_vlad, not strict)
 
-    def _retrieve(self, jobs: list[Job]) -> None:
+    def _retrieve(self, jobs: list[Job], accept_partial: bool) -> None:
         """Retrieve by VLAD for jobs."""
-        features, names = self._vlad_features(), (self.query_names, self.map_names)
-        if jobs and features not in {self.features[job] for job in self.running()}:
+        if not jobs:
+            return
+        features = self._vlad_features()
+        if features not in {self.features[job] for job in self.running()}:
             raise InputError(f"Retrieval is by VLAD of {features.stem}, which failed.")
+        names = (
+            common.readable(features, self.query_names),
+            extract_features.keep_readable(features, self.map_names, accept_partial),
+        )
         for pairs, num_loc in {(self.retrieval(j), self.numbers(j)["num_loc"]) for j in jobs}:
             common.retrieve("vlad", features, Path(pairs), num_loc, *names)
 
@@ -186,11 +194,11 @@ class Shared:
             )
 
     def _drop_stale(self) -> None:
-        """Delete what was made of features that changed, as more images can be read now."""
+        """Delete what was made of features that were begun anew."""
         ids = {}
         for path in {self.features[job] for job in self.running()}:
             with io.open_h5(path) as file:
-                ids[path.name] = file.attrs["id"]
+                ids[path.name] = io.get_text(file, "id")
         before = self._record.get("ids", {})
         if any(before.get(name, made) != made for name, made in ids.items()):
             for derived in self.folder.glob(f"{aggregate_features.confs['vlad']['output']}*"):

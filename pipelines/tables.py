@@ -13,7 +13,17 @@ from .shared import Shared
 HEADINGS = ("bytes/descriptor", "bytes/keypoint", "seconds", "localized")
 LIMITS = "thresholds_m_deg"  # of a list in summary.json
 COLUMNS = (
-    *("dataset", "job", "feature", "matcher", "storage", "retrieval", "num_covis", "num_loc"),
+    *(
+        "dataset",
+        "job",
+        "feature",
+        "matcher",
+        "storage",
+        "keypoints",
+        "retrieval",
+        "num_covis",
+        "num_loc",
+    ),
     "error",
     *("descriptor_bytes", "bytes_per_keypoint", "seconds", "shared_seconds"),
     *("list", "queries", "localized", "threshold_m", "threshold_deg", "recall_percent"),
@@ -75,6 +85,7 @@ def job_rows(shared: Shared, summaries: Mapping[Job, dict]) -> Iterator[dict]:
             "feature": Path(job.feature).stem,
             "matcher": job.matcher,
             "storage": job.storage,
+            "keypoints": job.keypoints,
             "retrieval": job.retrieval,
         }
         if job in shared.features:

@@ -56,7 +56,8 @@ def test_plane(aachen_layout, tmp_path, monkeypatch, capsys):
     assert good["status"] == "localized" and float(good["position_error_m"]) < 0.02
     assert 0 < int(good["num_inliers"]) <= int(good["num_matches"])
     assert grey["status"] == "fallback" and grey["num_matches"] == "0"
-    assert grey["retrieved"].startswith("db/")
+    assert grey["retrieved"].startswith("db/") and grey["reason"] == "no keypoints"
+    assert good["reason"] == ""
     poses = outputs / summary["poses"]
     assert [line.split()[0] for line in poses.read_text().splitlines()] == ["a.png", "grey.png"] + [
         "a.png"
@@ -87,7 +88,7 @@ def test_a_run_goes_on_where_it_was_stopped(aachen_layout, tmp_path, monkeypatch
     query = aachen_layout / "images_upright/query/night/a.png"
     content = query.read_bytes()
     query.write_bytes(b"no image")
-    message = refused(monkeypatch, caplog, *arguments)
+    message = refused(monkeypatch, caplog, *arguments, "--strict")
     assert "Cannot read image" in message and "query/night/a.png" in message
     assert list((outputs / "feats-dog-sift.h5.pieces").iterdir())
     query.write_bytes(content)
@@ -148,6 +149,7 @@ def test_retrieval_from_files(aachen_layout, tmp_path, monkeypatch, caplog):
     assert rows["query/night/a.png"]["retrieved"] == "db/2.png"
     grey = rows["query/day/grey.png"]  # for which the file has nothing
     assert grey["status"] == "fallback" and grey["retrieved"] == ""
+    assert grey["reason"] == "no keypoints"
 
     global_descriptors = tmp_path / "netvlad.h5"
     generator = np.random.default_rng(0)
@@ -194,7 +196,7 @@ def test_wrong_input(aachen_layout, tmp_path, monkeypatch, caplog):
 
     (aachen_layout / "images_upright/db/2.png").rename(tmp_path / "2.png")
     message = refused(monkeypatch, caplog, *arguments)
-    assert "1 of 7 images" in message and "db/2.png" in message
+    assert "1 of 4 images" in message and "db/2.png" in message and "--accept_partial" in message
     shutil.move(tmp_path / "2.png", aachen_layout / "images_upright/db/2.png")
 
     queries = aachen_layout / "queries/night_time_queries_with_intrinsics.txt"

@@ -24,6 +24,7 @@ from hloc_reduce import (
     aggregate_features,
     colmap,
     extract_features,
+    group_writer,
     intrinsics,
     io,
     localization,
@@ -44,6 +45,7 @@ from hloc_reduce.evaluation.hpatches.data import test_sequences as sequences
 from hloc_reduce.evaluation.poses import pose_error, read_estimates
 from hloc_reduce.extract_features import list_images, provenance
 from hloc_reduce.extractors.vlad import read_vocabulary
+from hloc_reduce.group_writer import GroupWriter
 from hloc_reduce.io import names_to_pair
 
 fuzzed = settings(
@@ -476,10 +478,91 @@ def test_damaged_data_are_named(scene):
                 read(file, "db/0.jpg")
 
 
+def write_features(path):
+    """Write a feature file: floats, bytes and an image that could not be read."""
+    generator = np.random.default_rng(0)
+    with GroupWriter(path, {}) as writer:
+        for name, kind in (("db/0.jpg", "float16"), ("db/1.jpg", "uint8"), ("db/2.jpg", "float32")):
+            features = {
+                "keypoints": generator.uniform(0, 99, (20, 2)).astype(np.float32),
+                "descriptors": generator.standard_normal((8, 20)).astype(np.float32),
+                "image_size": np.array([100, 100]),
+            }
+            arrays, attrs = storage.store(features, kind)
+            attrs["keypoints"] = {"uncertainty": 1.0}
+            failed = {"": {group_writer.FAILURE: "no image"}} if kind == "float32" else {}
+            writer.add(name, arrays, attrs | failed)
+
+
+def read_features(path):
+    group_writer.failures(path)
+    with io.open_h5(path) as file:
+        io.provenance(file)
+        for name in io.list_h5_names(path):
+            io.get_keypoints(file, name)
+            io.get_image_size(file, name)
+            storage.get_descriptors(file, name)
+
+
+def write_matches(path):
+    generator = np.random.default_rng(0)
+    with GroupWriter(path, {}, compression="gzip") as writer:
+        for name in ("db/0.jpg", "db/1.jpg"):
+            arrays = {
+                "matches0": generator.integers(-1, 20, 20).astype(np.int32),
+                "matching_scores0": generator.random(20).astype(np.float16),
+            }
+            writer.add(names_to_pair("q.jpg", name), arrays)
+
+
+def read_matches(path):
+    GroupWriter(path, {})
+    with io.open_h5(path) as file:
+        for name in ("db/0.jpg", "db/1.jpg"):
+            io.get_matches(file, "q.jpg", name, (20, 20))
+
+
+@pytest.mark.parametrize("old_format", [False, True])  # h5py's default, which hloc's files have
+@pytest.mark.parametrize(
+    "write, read", [(write_features, read_features), (write_matches, read_matches)]
+)
+def test_damaged_h5_files_are_read_or_refused(write, read, old_format, tmp_path):
+    path = tmp_path / "damaged.h5"
+    write(path)
+    if old_format:
+        with h5py.File(path) as file, h5py.File(tmp_path / "old.h5", "w") as old:
+            for name in file:
+                file.copy(name, old)
+        path = tmp_path / "old.h5"
+    content, generator = path.read_bytes(), np.random.default_rng(0)
+    read(path)
+    for _ in range(300):
+        damaged = np.frombuffer(content, np.uint8).copy()
+        start, number = generator.integers(len(content)), generator.choice([1, 4, 64, 512])
+        match generator.integers(4):
+            case 0:
+                damaged[start] ^= 1 << generator.integers(8)
+            case 1:
+                damaged[start : start + number] = 0
+            case 2:
+                damaged[start : start + number] = 255
+            case 3:
+                damaged = damaged[:start]
+        path.write_bytes(damaged.tobytes())
+        refuses_or_reads(read, path)
+
+
+def test_a_damaged_h5_file_is_not_blamed_for_a_bug(scene):
+    with pytest.raises(KeyError, match="no_such"), io.open_h5(scene.features) as file:
+        file["no_such"]
+    with pytest.raises(ZeroDivisionError), io.open_h5(scene.features):
+        1 / 0  # noqa: B018
+
+
 # ------------------------------------------------------------------------------ names
 
 NO_NAMES = ["/etc/x.jpg", "../x.jpg", "a/../x.jpg", "./x.jpg", "a/./x.jpg", "a//x.jpg", "a/", ".."]
-SPACED = ["a b.jpg", " a.jpg", "a\u00a0b.jpg", "#a.jpg", "a/b.jpg "]
+SPACED = [" a.jpg", "a\tb.jpg", "a\u2028b.jpg", "#a.jpg", "a/b.jpg ", "a /b.jpg", "a\nb.jpg"]
 QUERY = "PINHOLE 640 480 500 501 320 240"
 
 
@@ -523,11 +606,11 @@ def test_names_of_models_and_lists_in_memory_are_refused(name, tmp_path):
 def test_names_of_folders_and_h5_files_are_refused(tmp_path):
     path, output = tmp_path / "global.h5", tmp_path / "pairs.txt"
     with h5py.File(path, "w") as file:
-        for name in ("a.jpg", "b c.jpg"):
+        for name in ("a.jpg", "b\tc.jpg"):
             file[f"{name}/global_descriptor"] = np.ones(4)
-    with pytest.raises(InputError, match="global.h5: 'b c.jpg' cannot be"):
+    with pytest.raises(InputError, match=r"global.h5: 'b\\tc.jpg' cannot be"):
         pairs_from_retrieval.main(path, output, 1)
-    for i, name in enumerate((b" a/b.jpg", b"a b.jpg", b"#a.jpg", b"\xe9.jpg")):
+    for i, name in enumerate((b" a/b.jpg", b"a\tb.jpg", b"#a.jpg", b"\xe9.jpg")):
         file = tmp_path / str(i) / os.fsdecode(name)
         file.parent.mkdir(parents=True)
         file.touch()
@@ -829,3 +912,17 @@ def test_no_code_of_features_is_run(tag, tmp_path):
     with pytest.raises(InputError, match="f.yaml cannot be read"):
         features_confs.read(path)
     assert not (tmp_path / "harmed").exists()
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "frames"])
+def test_models_that_are_cut_off_are_refused(name, aachen_layout):
+    """Of some COLMAP would read for ever, or until the memory is full."""
+    model = aachen_layout / "3D-models/aachen_v_1_1"
+    colmap.read_model(model).write(model)  # with frames
+    path = model / f"{name}.bin"
+    content = path.read_bytes()
+    colmap.read_model(model)
+    for length in (0, 7, 8, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:length])
+        with pytest.raises(InputError, match=f"not a COLMAP model .{name}.bin is cut off"):
+            colmap.read_model(model)

@@ -215,7 +215,11 @@ def test_a_report_of_jobs_that_share_points_shows_what_each_retrieved(
     folder = outputs / inloc_layout.name
     jobs_of = [folder / "fewer+num_loc1", folder / "sift_sv16"]
     command.run(monkeypatch, report, *jobs_of, "-o", tmp_path / "report.html")
-    assert "There is no" not in caplog.text
+    page = (tmp_path / "report.html").read_text()
+    for whole in (folder, outputs):  # without what the jobs share
+        command.run(monkeypatch, report, whole, "-o", tmp_path / "whole.html")
+        assert (tmp_path / "whole.html").read_text() == page
+    assert "There is no" not in caplog.text and "Skipping" not in caplog.text
 
 
 def test_a_grid_of_matchers_and_storages_in_both_layouts(aachen_layout, inloc_layout, run_batch):

@@ -1,18 +1,23 @@
 import hashlib
 import io
 import pickle
+import sys
 from dataclasses import replace
 from urllib.error import URLError
 
+import cv2
 import kornia
+import numpy as np
 import pytest
 import torch
 
 from confs import features
-from hloc_reduce import descriptors, downloads
+from hloc_reduce import descriptors, downloads, extract_features, extractors
 from hloc_reduce.cli import InputError
-from hloc_reduce.descriptors import DESCRIPTORS, Descriptor
+from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, Descriptor
 from hloc_reduce.extract_features import provenance
+from hloc_reduce.training import __main__ as training
+from hloc_reduce.training import tracks
 
 
 @pytest.mark.parametrize("name", DESCRIPTORS)
@@ -124,3 +129,62 @@ def test_kornia_looks_for_the_same_files(name):
     )
     listed = [[urls] if isinstance(urls, str) else urls for urls in module.urls.values()]
     assert list(DESCRIPTORS[name].urls) in listed
+
+
+PATCHES = set(DESCRIPTORS)
+PHOTOS = {*DESCRIPTORS, COLMAP}
+
+
+def command_line(*arguments):
+    """Return what runs a training."""
+
+    def run(tmp_path, monkeypatch):
+        given = ["training", "--descriptor", "sfit", *arguments]
+        monkeypatch.setattr(sys, "argv", [str(part).format(tmp_path) for part in given])
+        training._main()
+
+    return run
+
+
+def of_file(read):
+    """Return what reads a YAML file of a feature of an unknown descriptor."""
+
+    def run(tmp_path, monkeypatch):
+        (tmp_path / "mine.yaml").write_text("model: {name: dog, descriptor: sfit}")
+        return read(tmp_path / "mine.yaml", tmp_path)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "act, valid",
+    [
+        (lambda *_: Descriptor("sfit"), PATCHES),
+        (lambda *_: extractors.load(features.base("sfit")), PHOTOS),
+        (
+            lambda *_: extractors.load(
+                {"name": "reduced", "base": features.base("sfit"), "projection": "sift_sv64"}
+            ),
+            PHOTOS,
+        ),
+        (
+            of_file(
+                lambda path, folder: extract_features.main(
+                    features.get(path)[1], folder / "images", folder
+                )
+            ),
+            PHOTOS,
+        ),
+        (of_file(lambda path, _: features.of_patches(path)), PATCHES),
+        (command_line("--map", "{0}/images:{0}"), PHOTOS),
+        (command_line("--phototour", "{0}"), PATCHES),
+        (command_line("--map", "{0}/images:{0}", "--validate", "{0}"), PATCHES),
+        (lambda path, _: tracks.main(path / "images", path, path / "out", "sfit"), PHOTOS),
+    ],
+)
+def test_an_unknown_descriptor_is_answered_by_all_that_are_valid(act, valid, tmp_path, monkeypatch):
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images/a.png"), np.zeros((40, 40), np.uint8))
+    with pytest.raises(InputError, match="Unknown descriptor 'sfit'. There are: ") as error:
+        act(tmp_path, monkeypatch)
+    assert set(str(error.value).partition("There are: ")[2].rstrip(".").split(", ")) == valid

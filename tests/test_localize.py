@@ -151,7 +151,7 @@ def test_what_has_changed_is_noticed(place, aachen_layout, monkeypatch, caplog):
     cv2.imwrite(str(photo), 255 - cv2.imread(str(photo)))
     assert "differs: images (db/2.png)" in refused(monkeypatch, caplog, *build)
     photo.unlink()
-    assert "1 of 4 images are not in" in refused(monkeypatch, caplog, *build)
+    assert "1 of 4 images of the map are not in" in refused(monkeypatch, caplog, *build)
     photo.write_bytes(content)
     model = aachen_layout / "3D-models/aachen_v_1_1"
     reference = pycolmap.Reconstruction(model)
@@ -179,9 +179,25 @@ def test_results_of_another_map_are_kept(place, tmp_path, monkeypatch, caplog):
     run(monkeypatch, *build[:4], "--outputs", other)
     message = refused(monkeypatch, caplog, "--map", other / "map", *new, "--outputs", outputs)
     assert "differs: map. " in message
-    (images / "query/night").rename(tmp_path / "day")  # of the same name
-    message = refused(monkeypatch, caplog, *build, "--query_images", tmp_path / "day")
-    assert "differs: query_images. " in message
+    assert state(outputs / "queries-day") == results
+
+
+def test_queries_of_the_same_name_have_folders_of_their_own(place, tmp_path, monkeypatch):
+    build, images, outputs = place
+    run(monkeypatch, *build, "--query_images", images / "query/day")
+    results = state(outputs / "queries-day")
+    other = shutil.move(images / "query/night", tmp_path / "day")
+    for _ in range(2):
+        run(monkeypatch, *build, "--query_images", other)
+        assert state(outputs / "queries-day") == results
+        (found,) = outputs.glob("queries-day-*")
+        assert list(outcome(found)[1]) == ["a.png"]
+    # a list of that name is another one, too; the first keeps its folder
+    listed = tmp_path / "day.txt"
+    listed.write_text("a.png SIMPLE_PINHOLE 480 360 500 240 180\n")
+    run(monkeypatch, *build, "--query_images", images / "query/day", "--queries", listed)
+    assert len(list(outputs.glob("queries-day-*"))) == 2
+    run(monkeypatch, *build, "--query_images", images / "query/day")
     assert state(outputs / "queries-day") == results
 
 
@@ -269,6 +285,31 @@ def test_a_broken_map_is_refused(place, tmp_path, monkeypatch, caplog):
     file.write_text("[]")
     arguments = ("--map", outputs / "map", "--outputs", tmp_path / "x", "--query_images", images)
     assert "no sound map.json" in refused(monkeypatch, caplog, *arguments)
+
+
+def test_a_map_with_a_broken_file_is_refused_before_any_work(place, tmp_path, monkeypatch, caplog):
+    build, images, outputs = place
+    run(monkeypatch, *build, "--feature", "sift_sv16")
+    folder = outputs / "map"
+    given = ("--map", folder, "--outputs", tmp_path / "x", "--query_images", images / "query/day")
+    stem = "global-feats-vlad_feats-dog-sift_sv16"
+    for name in (
+        *("sfm/cameras.bin", "sfm/images.bin", "sfm/points3D.bin", "feats-dog-sift_sv16.h5"),
+        *(f"{stem}.h5", f"{stem}.vocabulary.safetensors", "sift_sv16.safetensors"),
+    ):
+        file = folder / name
+        content = file.read_bytes()
+        file.unlink()
+        message = refused(monkeypatch, caplog, *given)
+        assert f"The map {folder} is broken: it has no {name}." in message
+        assert "--overwrite" in message
+        for damaged in (content[: len(content) // 2], b""):
+            file.write_bytes(damaged)
+            message = refused(monkeypatch, caplog, *given)
+            assert str(file) in message or str(file.parent) in message, name
+        assert not (tmp_path / "x").exists()
+        file.write_bytes(content)
+    run(monkeypatch, *given)
 
 
 def test_a_build_that_was_stopped_goes_on(place, monkeypatch, caplog):
@@ -391,7 +432,7 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, monkeypat
     small = tmp_path / "small.txt"
     small.write_text("guess.png SIMPLE_PINHOLE 240 180 250 120 90\n")
     run(monkeypatch, *build, "--query_images", photos, "--queries", small)
-    assert "1 queries are for another size" in caplog.text
+    assert "1 queries are not localized, as their intrinsics are for photos of" in caplog.text
     assert "guess.png (240x180, not 480x360)" in caplog.text
     for wrong in (pixels.astype(float), pixels[None], np.zeros((0, 3), np.uint8)):
         with pytest.raises(InputError, match="uint8"):
@@ -411,7 +452,7 @@ def test_wrong_input(place, tmp_path, monkeypatch, caplog):
     assert "Unknown matcher" in refused(monkeypatch, caplog, *build, "--matcher", "NN")
     photos = tmp_path / "photos"
     photos.mkdir()
-    for name in ("IMG 1.png", "#2.png"):
+    for name in ("IMG\t1.png", "#2.png"):
         shutil.copy(images / "db/1.png", photos / name)
         message = refused(monkeypatch, caplog, "--map_images", photos, *build[4:])
         assert repr(name) in message and "Rename" in message
@@ -662,6 +703,46 @@ def test_a_map_of_other_pairs_is_refused(plane, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(maps, "MAX_EXHAUSTIVE", 4)
     message = refused(monkeypatch, caplog, *build)
     assert "differs: num_covis and pairs" in message and "--overwrite" in message
+
+
+@pytest.mark.parametrize("by_model", [True, False])
+def test_names_with_spaces(by_model, plane, tmp_path, monkeypatch):
+    """Of photos and of folders; hloc's lists cannot hold them, ours have tabs."""
+    images, new, outputs = tmp_path / "my photos", tmp_path / "new ones", tmp_path / "my outputs"
+    for folder in (images / "a b", new):
+        folder.mkdir(parents=True)
+    model = pycolmap.Reconstruction(plane / "model")
+    for image in model.images.values():
+        image.name = f"a b/my {image.name}"
+        shutil.copy(plane / "images" / image.name[-5:], images / image.name)
+    shutil.move(images / "a b/my 4.png", new / "I am 4.png")
+    query = model.find_image_with_name("a b/my 4.png")
+    true = query.cam_from_world()
+    model.deregister_frame(query.frame_id)
+    (tmp_path / "my model").mkdir()
+    model.write(tmp_path / "my model")
+    given = ("--map_images", images, "--query_images", new, "--outputs", outputs)
+    given += ("--feature", "sift_sv16")
+    run(monkeypatch, *given, *(("--map", tmp_path / "my model") if by_model else ()))
+    summary, rows = outcome(outputs / "queries-newones")
+    row = rows["I am 4.png"]
+    assert row["status"] == "localized" and row["retrieved"].startswith("a b/my ")
+    assert maps.Map(outputs / "map").names() == [f"a b/my {i}.png" for i in range(4)]
+    poses = parsers.parse_poses(outputs / "queries-newones" / summary["poses"])
+    assert list(poses) == ["I am 4.png"]
+    pose, info = Localizer(outputs / "map").localize(new / "I am 4.png")
+    assert max(pose_error(pose, poses["I am 4.png"])) < 1e-9
+    assert info["retrieved"][0] == row["retrieved"]
+    if by_model:  # and with a list, of the right intrinsics
+        assert pose_error(pose, true)[0] < 0.2
+        camera = "SIMPLE_PINHOLE 480 360 500 240 180"
+        (tmp_path / "my list.txt").write_text(f"I am 4.png\t{camera}\n")
+        run(
+            monkeypatch, *given[2:], "--map", outputs / "map", "--queries", tmp_path / "my list.txt"
+        )
+        summary, rows = outcome(outputs / "queries-mylist")
+        poses = parsers.parse_poses(outputs / "queries-mylist" / summary["poses"])
+        assert pose_error(poses["I am 4.png"], true)[0] < 0.02
 
 
 def test_records_of_failed_queries_have_no_pose():

@@ -85,6 +85,31 @@ def test_pairs_round_trip(file, pairs):
     assert retrieval == expected
 
 
+@pytest.mark.parametrize("name", ["a b.jpg", "a/b c/d e.jpg", "a\u00a0b.jpg"])
+def test_names_with_spaces_are_between_tabs(file, name):
+    pairs = [(name, "c.jpg"), ("c.jpg", name), (name, name), ("c.jpg", "d.jpg")]
+    parsers.write_pairs(pairs, file)
+    assert list(parsers.parse_pairs(file)) == pairs
+    assert file.read_text(encoding="utf-8").splitlines()[-1] == "c.jpg d.jpg"  # as in hloc
+    parsers.write_poses({name: pycolmap.Rigid3d(), "c.jpg": pycolmap.Rigid3d()}, file, None)
+    assert list(parsers.parse_poses(file)) == [name, "c.jpg"]
+    file.write_text(f"{name}\tPINHOLE 640 480 500 501 320 240\n", encoding="utf-8")
+    ((found, camera),) = parsers.parse_query_list(file)
+    assert found == name and camera.width == 640
+    file.write_text(f"{name}\t\nc.jpg\n", encoding="utf-8")
+    assert parsers.parse_image_list(file) == [name, "c.jpg"]
+    file.write_text(f"{name} PINHOLE 640 480 500 501 320 240\n", encoding="utf-8")
+    with pytest.raises(InputError, match="put a tab after a name that has spaces"):
+        parsers.parse_query_list(file)
+
+
+def test_columns_may_be_separated_by_tabs(file):
+    file.write_text("a.jpg \tPINHOLE\t640\t480\t500 501\t320 240\n")
+    assert parsers.parse_query_list(file)[0][0] == "a.jpg"
+    file.write_text("a.jpg\tb.jpg\n")
+    assert list(parsers.parse_pairs(file)) == [("a.jpg", "b.jpg")]
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_poses_round_trip_by_base_name(file, seed):
     generator = np.random.default_rng(seed)

@@ -10,6 +10,7 @@ import h5py
 import pytest
 
 from hloc_reduce import cli, compare, io
+from hloc_reduce.evaluation import published
 from hloc_reduce.report import __main__ as report
 from hloc_reduce.report import runs
 from pipelines import aachen, inloc, localize
@@ -186,7 +187,12 @@ def test_runs_of_one_feature_are_told_apart(compared, tmp_path, monkeypatch):
         assert recall in [row[1:4] for row in rows if row[0] == label and len(row) == 7]
 
 
+# the lists of the plane, as if it were a data set of the paper
+PLANE = {"Plane": {"day": (2, "query/day/"), "night": (1, "query/night/")}}
+
+
 def test_without_true_poses_columns_stay_in_place(compared, tmp_path, monkeypatch, aachen_layout):
+    monkeypatch.setattr(published, "DATASETS", PLANE)
     (aachen_layout / "queries/ground_truth_poses.txt").rename(tmp_path / "truth.txt")
     unknown = tmp_path / "sift_sv16"
     given = ("--dataset", aachen_layout, "--outputs", unknown, "--feature", "sift_sv16")
@@ -198,6 +204,12 @@ def test_without_true_poses_columns_stay_in_place(compared, tmp_path, monkeypatc
         (row, _) = [row for row in rows if row[0] == "sift_sv16"]
         assert row[:6] == ["sift_sv16", "", "", "", "", "1 of 2"]
         assert ["in the paper", "85.9", "91.5", "96.2", "", "", ""] in rows
+    # of another place nothing is known
+    monkeypatch.setattr(published, "DATASETS", {})
+    command.run(monkeypatch, report, unknown, "-o", tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert ["sift_sv16", "", "1 of 2"] in [row[:3] for row in text_of(page) if len(row) == 4]
+    assert "the paper" not in page
     # a comparison keeps what a folder was made with
     for truth in (["--ground_truth", tmp_path / "truth.txt"], []):
         outputs = ("--outputs", tmp_path, "-o", tmp_path / "r.html")
@@ -255,14 +267,24 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_lay
         ["distance [m]", "", "0.25 / 0.5 / 5", "0.5 / 1 / 5"],
         ["orient. [deg]", "", "2 / 5 / 10", "2 / 5 / 10"],
         ["sift_sv16", "32", "50.0 / 50.0 / 50.0", "100.0 / 100.0 / 100.0"],
-        ["in the paper", "", "85.9 / 91.5 / 96.2", "34.6 / 46.1 / 58.6"],
         ["colmap_sift_sv16", "32", "50.0 / 50.0 / 50.0", "100.0 / 100.0 / 100.0"],
     ]
-    assert "colmap_sift_sv16" in (outputs / "report.html").read_text()
+    page = (outputs / "report.html").read_text()
+    assert "colmap_sift_sv16" in page and "the paper" not in page
     with (outputs / "compare.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 2 * 3
-    assert (rows[0]["recall_percent"], rows[0]["paper_percent"]) == ("50.0", "85.9")
+    assert (rows[0]["recall_percent"], rows[0]["paper_percent"]) == ("50.0", "")
+
+    # if it were a data set of the paper
+    with monkeypatch.context() as other:
+        other.setattr(published, "DATASETS", PLANE)
+        command.run(other, compare, *given, *features[:2])
+    paper = "in the paper |       | 85.9 / 91.5 / 96.2 | 34.6 / 46.1 / 58.6"
+    assert re.sub(" +", " ", paper) in re.sub(" +", " ", capsys.readouterr().out)
+    assert "Rows in grey are the paper" in (outputs / "report.html").read_text()
+    with (outputs / "compare.csv").open() as file:
+        assert next(csv.DictReader(file))["paper_percent"] == "85.9"
 
     # what is there is not run again
     times = {path: path.stat().st_mtime_ns for path in (outputs / "sift_sv16").rglob("*")}
@@ -295,12 +317,67 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_lay
     assert compare.pipeline_of(inloc_layout) is inloc
 
 
+@pytest.fixture
+def batch(compared, tmp_path):
+    """Runs in the layout of a batch, with what is beside them; two are not finished."""
+    outputs = tmp_path / "batch"
+    for run, place in zip(compared, ("town", "park"), strict=True):
+        shutil.copytree(run, outputs / place / run.name)
+        for name in ("shared", "begun"):
+            (outputs / place / name).mkdir()
+            (outputs / place / name / "conf.json").write_text("{}")
+    (outputs / "jobs.csv").touch()
+    # not of runs: a map, and a folder of other files
+    (outputs / "park/map").mkdir()
+    for name in ("conf.json", "map.json"):
+        (outputs / "park/map" / name).write_text("{}")
+    (outputs / "park/other").mkdir()
+    shutil.copytree(compared[0], outputs / "too/far/below")
+    return outputs
+
+
+def test_the_finished_runs_of_a_batch(batch, tmp_path, monkeypatch, caplog):
+    output = tmp_path / "r.html"
+    command.run(monkeypatch, report, batch, "-o", output)
+    said = f"Skipping 2 unfinished runs in {batch}: park/begun, town/begun."
+    assert said in [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    found = [run.folder.relative_to(batch).as_posix() for run in runs.load([batch])]
+    assert found == ["park/colmap_sift_sv32", "town/colmap_sift"]
+    assert all(name.rpartition("/")[2] in output.read_text() for name in found)
+
+    # as a shell expands town/*
+    shutil.rmtree(batch / "town/begun")
+    assert [run.folder for run in runs.load(sorted((batch / "town").iterdir()))] == [
+        batch / "town/colmap_sift"
+    ]
+
+    # of one data set; a run that is also named is shown once
+    town = batch / "town"
+    command.run(monkeypatch, report, town, town / "colmap_sift", "-o", output)
+    assert "given twice" in caplog.text
+    assert "sv32" not in re.sub("<script.*?</script>", "", output.read_text(), flags=re.S)
+
+
+def test_a_batch_without_finished_runs_is_refused(batch, tmp_path, monkeypatch, caplog):
+    for file in batch.glob("*/*/summary.json"):
+        file.unlink()
+    said = command.refused(monkeypatch, caplog, report, batch, "-o", tmp_path / "r.html")
+    runs_of = "park/begun, park/colmap_sift_sv32, town/begun, town/colmap_sift"
+    assert f"{batch} is not the outputs folder of a pipeline or a batch, or its runs" in said
+    assert f"are not finished ({runs_of})" in said and "run the pipeline again" in said
+    # named by itself it is not skipped
+    for name in ("begun", "shared"):
+        said = command.refused(monkeypatch, caplog, report, batch / "town" / name)
+        assert "no summary.json" in said
+
+
 def test_wrong_input(compared, tmp_path, monkeypatch, caplog):
     def message(*arguments):
         return command.refused(monkeypatch, caplog, report, "-o", tmp_path / "r.html", *arguments)
 
     assert "There is no folder" in message(tmp_path / "nowhere")
-    assert "not the outputs folder" in message(tmp_path)
+    (tmp_path / "empty").mkdir()
+    assert "or it has no runs" in message(tmp_path / "empty")
     assert "Unknown query 'b.png'" in message(compared[0], "--queries", "b.png")
     assert "is a folder" in message(compared[0], "-o", tmp_path)
     assert "--num_queries 0: at least 1" in message(compared[0], "--num_queries", "0")

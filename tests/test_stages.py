@@ -500,3 +500,26 @@ def test_stamps_notice_changes(tmp_path):
     assert not stamps.is_current(file, stamps.stamp({"x": (1, 3)}, [source]))
     source.write_text("ab")
     assert not stamps.is_current(file, stamps.stamp({"x": (1, 2)}, [source]))
+
+
+def test_a_query_that_cannot_be_localized_says_why(built):
+    """Its photo could not be read, or is of another size; or nothing was retrieved for it."""
+    with h5py.File(built.features, "r+") as file:
+        file["query/6.jpg/image_size"] = np.array([480, 640])
+    records = built.localize()
+    wrong, right = records["query/6.jpg"], records["query/7.jpg"]
+    assert right["localized"] and right["reason"] is None
+    assert wrong["reason"] == "the intrinsics are for 640x480 pixels, the photo has 480x640"
+    assert not wrong["localized"] and wrong["db"] == "db/0.jpg" and wrong["num_inliers"] == 0
+    with h5py.File(built.features, "r+") as file:
+        file["query/6.jpg"].attrs["failure"] = "Cannot read image query/6.jpg: it is empty."
+    records = built.localize()
+    assert records["query/6.jpg"]["reason"] == "Cannot read image query/6.jpg: it is empty."
+    assert records["query/7.jpg"] == right
+    cameras = [("query/6.jpg", None), ("query/7.jpg", None)]
+    records = built.localize(queries=cameras)
+    assert records["query/7.jpg"]["reason"] == "its intrinsics are not known"
+    assert records["query/7.jpg"]["camera"] is None
+    pairs = [("query/6.jpg", "db/0.jpg")]
+    write_pairs(pairs, built.loc_pairs)
+    assert built.localize()["query/7.jpg"]["reason"] == "no map image was retrieved"

@@ -1,6 +1,7 @@
 """Training data from photos with poses: a textured plane seen by five cameras."""
 
 import shutil
+from types import SimpleNamespace
 
 import cv2
 import h5py
@@ -13,7 +14,7 @@ from confs import features
 from hloc_reduce.cli import InputError
 from hloc_reduce.colmap import detect_dog, point3D_ids
 from hloc_reduce.training import tracks
-from hloc_reduce.training.completion import complete
+from hloc_reduce.training.completion import Completion
 
 
 def test_tracks_of_a_plane(plane):
@@ -84,6 +85,47 @@ def test_tracks_are_computed_once_and_the_same(plane):
     assert again.read_bytes() == content
 
 
+@pytest.fixture
+def described(monkeypatch):
+    """The images that were described; a signal comes at that of the number in `stop`."""
+    images, call = SimpleNamespace(count=0, stop=None), tracks.PatchDescriber.__call__
+
+    def counted(*arguments):
+        if images.count == images.stop:
+            raise KeyboardInterrupt
+        images.count += 1
+        return call(*arguments)
+
+    monkeypatch.setattr(tracks.PatchDescriber, "__call__", counted)
+    return images
+
+
+def test_description_goes_on_after_an_interruption(plane, described):
+    """What was described is not described again, and the file is that of an undisturbed run."""
+    arguments = plane / "images", plane / "model", plane / "out"
+    expected = tracks.main(*arguments[:2], plane / "whole").read_bytes()
+    assert described.count == 5
+    for described.stop in (7, 8):
+        with pytest.raises(KeyboardInterrupt):
+            tracks.main(*arguments)
+    described.stop = None
+    path = tracks.main(*arguments)
+    assert described.count == 10
+    assert path.read_bytes() == expected
+    assert not list(path.parent.glob("*.parts*"))
+
+
+def test_what_was_described_with_another_seed_is_not_used(plane, described):
+    arguments = plane / "images", plane / "model", plane / "out"
+    described.stop = 3
+    with pytest.raises(KeyboardInterrupt):
+        tracks.main(*arguments)
+    described.count, described.stop = 0, None
+    path = tracks.main(*arguments, seed=1)
+    assert described.count == 5
+    assert path.read_bytes() == tracks.main(*arguments[:2], plane / "whole", seed=1).read_bytes()
+
+
 def test_a_map_without_tracks_is_refused(plane):
     for path in (plane / "images").iterdir():
         cv2.imwrite(str(path), np.full((360, 480), 100, np.uint8))
@@ -106,7 +148,8 @@ def test_hidden_observations_are_found_again_by_geometry(plane):
     hidden = {name: ids.copy() for name, ids in observed.items()}
     for ids in hidden.values():
         ids[generator.random(len(ids)) < 0.2] = -1
-    completed = complete(reconstruction, keypoints, hidden)
+    find = Completion(reconstruction, keypoints, hidden)
+    completed = {name: find(name) for name in images}
     truth, found = (
         np.concatenate(
             [points[name][(hidden[name] < 0) & (observed[name] >= 0)] for name in images]

@@ -254,6 +254,55 @@ def test_self_supervised_goes_on_with_the_same_clusters(tmp_path, monkeypatch):
         assert torch.equal(value, resumed.state_dict()[key]), key
 
 
+def interrupted(monkeypatch, owner, name, number):
+    """Have a signal come at a call of a function; return the list of its calls."""
+    calls, function = [], getattr(owner, name)
+
+    def counted(*arguments):
+        calls.append(arguments)
+        if len(calls) == number:
+            raise KeyboardInterrupt
+        return function(*arguments)
+
+    monkeypatch.setattr(owner, name, counted)
+    return calls
+
+
+def assert_equal(network, other):
+    for key, value in network.state_dict().items():
+        assert torch.equal(value, other.state_dict()[key]), key
+
+
+def test_clusters_of_finished_maps_are_kept(tmp_path, monkeypatch):
+    pytest.importorskip("faiss")
+    recipe = {**ss.RECIPES["best"], **SMALL, "steps": 2, "per_cluster": 8, "per_cell": 1600}
+    maps = [noisy_tracks(), noisy_tracks(seed=1)]
+    whole = ss.train(maps, 8, recipe, 0, tmp_path / "whole")
+    clusterings = interrupted(monkeypatch, ss, "cluster", 4)  # two a map, one of them in a cell
+    with pytest.raises(KeyboardInterrupt):
+        ss.train(maps, 8, recipe, 0, tmp_path / "c")
+    assert len(clusterings) == 4
+    assert_equal(whole, ss.train(maps, 8, recipe, 0, tmp_path / "c"))
+    assert len(clusterings) == 6
+    ss.train(maps, 8, recipe, 0, tmp_path / "c", "other data")
+    assert len(clusterings) == 10
+
+
+def test_clusters_of_the_projected_are_kept(tmp_path, monkeypatch):
+    """Interrupted in the first step after the second clustering, long before a checkpoint."""
+    pytest.importorskip("faiss")
+    short = {"steps": 6, "cluster_epochs": 1, "batch_size": 800, "per_cluster": 8}
+    recipe = {**ss.RECIPES["paper"], **SMALL, **short}
+    whole = ss.train([noisy_tracks()], 8, recipe, 0, tmp_path / "whole")
+    clusterings = interrupted(monkeypatch, ss, "cluster", None)
+    with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
+        interrupted(stopped, torch.optim.Adam, "step", 3)  # of two an epoch
+        ss.train([noisy_tracks()], 8, recipe, 0, tmp_path / "c")
+    assert len(clusterings) == 2
+    assert_equal(whole, ss.train([noisy_tracks()], 8, recipe, 0, tmp_path / "c"))
+    assert len(clusterings) == 3
+
+
 def test_an_epoch_goes_once_through_all_descriptors():
     data = [noisy_tracks(30), noisy_tracks(20, seed=1)]
     sampler = DescriptorSampler(data, 0.0, mirror=False, balanced=False, seed=0)

@@ -1,5 +1,7 @@
 """PhotoTour sequences, synthesized in the layout of the real ones."""
 
+import shutil
+
 import cv2
 import kornia
 import numpy as np
@@ -58,6 +60,27 @@ def test_patches_of_a_point_are_a_track(sequence, tmp_path):
     first = torch.from_numpy(layout.read_sheet(folder / "patches0000.bmp")[:1, None])
     row = data.descriptors[np.flatnonzero(data.image == 0)[0], 0, 0]
     assert Descriptor("sift")(first)[0].numpy() @ row.astype(np.float32) > 0.999
+
+
+def test_description_goes_on_after_an_interruption(sequence, tmp_path, monkeypatch):
+    folder, _, _ = sequence
+    shutil.copy(folder / "patches0001.bmp", folder / "patches0002.bmp")  # of no listed patch
+    expected = phototour.main(folder, tmp_path / "whole").read_bytes()
+    sheets, read = [], phototour.read_sheet
+
+    def interrupted(path):
+        sheets.append(path.stem)
+        if len(sheets) == 2:
+            raise KeyboardInterrupt
+        return read(path)
+
+    monkeypatch.setattr(phototour, "read_sheet", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        phototour.main(folder, tmp_path / "cache")
+    path = phototour.main(folder, tmp_path / "cache")
+    assert sheets == ["patches0000", "patches0001", "patches0001"]
+    assert path.read_bytes() == expected
+    assert {p.name for p in path.parent.iterdir()} == {path.name, f"{path.stem}.json"}
 
 
 def test_training_and_validation(sequence, tmp_path, monkeypatch, capsys):

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from .. import logger
 from ..cli import InputError
+from ..progress import progress
 from .cameras import DAY, MAP, NIGHT, Photo, list_photos
 from .model import write_model
 from .photo import take
@@ -65,7 +65,7 @@ def main(dataset: Path, seed: int = 0, overwrite: bool = False) -> Path:
     try:
         scene = build_town(seed)
         jobs = [(photo, dataset / IMAGES / photo.name, seed) for photo in missing]
-        list(tqdm(_run(_render, jobs), desc="Rendering the town", total=len(jobs)))
+        list(progress(_run(_render, jobs), "Rendering the town", "photo", len(jobs)))
         _write_lists(dataset, photos)
         map_photos = [photo for photo in photos if photo.kind == MAP]
         buffers = list(_run(_buffers, [(photo, seed) for photo in map_photos]))

@@ -63,6 +63,7 @@ DESCRIPTORS = {
         hidden=(96,),
     ),
 }
+BASES = (*DESCRIPTORS, COLMAP)  # of features of photos
 
 
 class Descriptor(nn.Module):

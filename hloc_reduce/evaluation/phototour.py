@@ -5,14 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from .. import parallel
 from ..cli import InputError
 from ..descriptors import Descriptor
 from ..group_writer import GroupWriter
 from ..io import get_dataset, open_h5
+from ..paths import strings_as_paths
 from ..phototour import SHEET, read_pairs, read_points, read_sheet, sheets
+from ..progress import progress
 
 
 def fpr95(distances: np.ndarray, matches: np.ndarray) -> float:
@@ -36,6 +37,7 @@ def fpr95(distances: np.ndarray, matches: np.ndarray) -> float:
     return float((distances[~matches] <= threshold).mean())
 
 
+@strings_as_paths
 def main(
     folder: Path, outputs: Path, descriptor: str, projects: Mapping[str, torch.nn.Module]
 ) -> dict[str, float]:
@@ -87,8 +89,8 @@ def _describe(folder: Path, path: Path, descriptor: str, patches: np.ndarray) ->
         done = parallel.ordered(
             "describe", describe_sheet, todo, workers=None if device == "cpu" else 1
         )
-        progress = tqdm(done, desc=f"Describing by {descriptor}", unit="sheet", total=len(todo))
-        for name, rows in progress:
+        shown = progress(done, f"Describing by {descriptor}", "sheet", len(todo))
+        for name, rows in shown:
             writer.add(name, {"descriptors": rows})
     sheet, row = np.divmod(patches, SHEET**2)
     with open_h5(path) as file:

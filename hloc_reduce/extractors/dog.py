@@ -5,10 +5,10 @@ import numpy as np
 import torch
 from torch.nn.functional import grid_sample
 
-from .. import colmap
+from .. import colmap, detection
 from ..base_model import BaseModel
-from ..cli import InputError
-from ..descriptors import COLMAP, PATCH_SIZE, Descriptor
+from ..cli import InputError, choose
+from ..descriptors import BASES, COLMAP, PATCH_SIZE, Descriptor
 
 
 def extract_patches(
@@ -75,10 +75,14 @@ class DoG(BaseModel):
     With the descriptor `colmap_sift` these are COLMAP's own, which need no patches. Unlike hloc's
     it stores keypoints with pixel centres at integers whatever pycolmap says, gives each keypoint a
     score, its scale (COLMAP's own ranking), and honours `max_keypoints`.
+
+    Where hloc's `options` find too few keypoints in a photo, others are tried (`detection.detect`),
+    unless `keypoints` is "hloc". Options of one's own are used as they are.
     """
 
     default_conf = {
-        "options": {"first_octave": 0, "peak_threshold": 0.01},
+        "options": detection.HLOC,
+        "keypoints": "adaptive",
         "descriptor": "sift",
         "max_keypoints": -1,
         "mr_size": 12,
@@ -87,8 +91,11 @@ class DoG(BaseModel):
     detection_noise = 1.0
 
     def _init(self, conf: dict) -> None:
-        self.describe = None if conf["descriptor"] == COLMAP else Descriptor(conf["descriptor"])
+        choose("keypoints", conf["keypoints"], detection.KEYPOINTS)
+        descriptor = choose("descriptor", conf["descriptor"], BASES)
+        self.describe = None if descriptor == COLMAP else Descriptor(descriptor)
         colmap.check_dog_options(conf["options"])
+        self.adaptive = conf["keypoints"] == "adaptive" and conf["options"] == detection.HLOC
 
     @property
     def descriptor(self) -> str:
@@ -96,8 +103,8 @@ class DoG(BaseModel):
         return self.conf["descriptor"]
 
     def detect(self, image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Detect keypoints in an image (1, 1, H, W), as `colmap.detect_dog`."""
-        return colmap.detect_dog(image[0, 0].cpu().numpy(), self.conf["options"])
+        """Detect keypoints in an image (1, 1, H, W), as `colmap.detect_dog` returns them."""
+        return detection.detect(image[0, 0].cpu().numpy(), self.conf["options"], self.adaptive)
 
     def _forward(self, data: dict) -> dict:
         """Extract from an image (1, 1, H, W), or describe what was `detected` in it.

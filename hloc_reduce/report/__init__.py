@@ -6,11 +6,11 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
-from tqdm import tqdm
-
 from .. import __version__, cli, logger, plots
 from ..cli import InputError
 from ..io import replacing
+from ..paths import strings_as_paths
+from ..progress import progress
 from . import pictures, runs, scene
 from .runs import ERRORS, Run
 
@@ -19,6 +19,7 @@ NUM_QUERIES = 6
 RECALL, INLIERS = "recall, finest threshold [%]", "mean inliers"
 
 
+@strings_as_paths
 def main(
     folders: list[Path],
     output: Path,
@@ -29,7 +30,7 @@ def main(
     """Write the report of runs.
 
     Args:
-        folders: outputs folders of pipelines.
+        folders: outputs folders of pipelines, or folders of such, as of a batch.
         output: the HTML file.
         queries: those whose matches are shown; default: `num_queries`, evenly from the worst to
             the best.
@@ -40,19 +41,21 @@ def main(
         `output`.
 
     Raises:
-        InputError: for a folder that is no finished run's, an unknown query, or when what draws
+        InputError: for a folder without a finished run, an unknown query, or when what draws
             is not installed.
     """
     check()
     cli.check_file(output, "the HTML file")
-    compared = runs.load(folders)
+    compared = runs.load([Path(folder) for folder in folders])
     ranked = runs.ranked(compared)
     chosen = [cli.choose("query", name, ranked) for name in queries or ()]
     chosen = chosen or runs.spread(ranked, num_queries)
     plotted = _plotted(compared)
+    tables = runs.recall_tables(compared)
     content = {
         "runs": compared,
-        "recall": runs.recall_tables(compared),
+        "recall": tables,
+        "paper": any(row["paper"] for table in tables for row in table["rows"]),
         "charts": {
             key: [plots.svg(plots.figure([panel])) for panel in panels.values()]
             for key, panels in plotted.items()
@@ -80,7 +83,7 @@ def check() -> None:
 
 def _scenes(compared: list[Run]) -> dict[str, dict]:
     scenes = {}
-    for run in tqdm(compared, desc="Reading maps", unit="run"):
+    for run in progress(compared, "Reading maps", "run"):
         try:
             scenes |= scene.scenes(run)
         except InputError as error:
@@ -122,7 +125,7 @@ def _plotted(compared: list[Run]) -> "dict[str, dict[str, plots.Panel]]":
 def _shown(compared: list[Run], chosen: list[str]) -> list[dict]:
     """Return of each chosen query the pictures of the runs."""
     shown = []
-    for name in tqdm(chosen, desc="Drawing matches", unit="query"):
+    for name in progress(chosen, "Drawing matches", "query"):
         drawn = []
         for run in compared:
             if name not in run.rows:

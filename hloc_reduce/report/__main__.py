@@ -13,7 +13,14 @@ def _main() -> None:
         epilog="example: python -m hloc_reduce.report outputs/herz-jesus/sift* -o report.html",
         formatter_class=cli.HelpFormatter,
     )
-    parser.add_argument("folders", type=Path, nargs="+", metavar="OUTPUTS", help="of pipelines")
+    parser.add_argument(
+        "folders",
+        type=Path,
+        nargs="+",
+        metavar="OUTPUTS",
+        help="outputs folders of runs, or a folder with finished runs at most two levels below, as "
+        "of a batch",
+    )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("report.html"), help="the HTML file"
     )

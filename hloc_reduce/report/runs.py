@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -11,16 +12,19 @@ import h5py
 import numpy as np
 import pycolmap
 
-from .. import colmap, localization, localize_inloc, logger, scans
+from .. import cli, colmap, localization, localize_inloc, logger, scans
 from ..cli import InputError
 from ..evaluation import published
 from ..evaluation.poses import FAILED
 from ..io import open_h5
+from ..jobs import SHARED
 from ..localize_sfm import SfmMap
+from ..maps import is_map
 from ..parsers import parse_poses, parse_retrieval
 
 NUMBERS = ("num_matches", "num_correspondences", "num_inliers")
 ERRORS = ("position_error_m", "rotation_error_deg")
+LEVELS = 2  # of folders in that of a batch: data sets and jobs
 
 
 @dataclass
@@ -86,6 +90,14 @@ class Run:
         """The data set, or the map that was localized in."""
         return Path(self.summary.get("dataset") or self.summary["map"])
 
+    @cached_property
+    def published(self) -> str | None:
+        """The data set of the paper that was localized in; None for another place."""
+        lists: dict[str, list[str]] = {}
+        for query, row in self.rows.items():
+            lists.setdefault(row["list"], []).append(query)
+        return published.dataset(lists)
+
     def errors(self, name: str) -> list[tuple[float, float]]:
         """Return the errors of the queries of a list with known truth; of failures infinite."""
         rows = [row for row in self.rows.values() if row["list"] == name]
@@ -132,16 +144,70 @@ class Run:
         return {name: pose for name, pose in parse_poses(path).items() if name in self.rows}
 
 
+def find(folder: Path) -> list[Run]:
+    """Return the run in a folder or, if it is not a run's, the finished runs below it.
+
+    Args:
+        folder: of a run; or with runs at most `LEVELS` below it, such as that of a batch. Runs
+            that are not finished are skipped with a warning.
+
+    Raises:
+        InputError: when the folder is not there, or there is no finished run.
+    """
+    if _is_run(folder) or not folder.is_dir():
+        return [Run(folder)]
+    finished, unfinished = [], []
+    for path in _below(folder, LEVELS):
+        try:
+            finished.append(Run(path))
+        except InputError:
+            unfinished.append(path.relative_to(folder).as_posix())
+    some = cli.some(unfinished)
+    if not finished:
+        why = f"its runs are not finished ({some})" if unfinished else "it has no runs"
+        raise InputError(
+            f"{folder} is not the outputs folder of a pipeline or a batch, or {why}: run the "
+            "pipeline again, which computes only what is missing."
+        )
+    if unfinished:
+        logger.warning("Skipping %d unfinished runs in %s: %s.", len(unfinished), folder, some)
+    return finished
+
+
+def _is_run(folder: Path) -> bool:
+    """Return whether a pipeline has begun a run in a folder."""
+    return any((folder / name).exists() for name in ("conf.json", "summary.json"))
+
+
+def _below(folder: Path, levels: int) -> Iterator[Path]:
+    """Yield the folders of runs below a folder, without what jobs share and without maps."""
+    for path in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if not _is_run(path):
+            yield from _below(path, levels - 1) if levels > 1 else ()
+        elif not _is_shared(path) and not is_map(path):
+            yield path
+
+
+def _is_shared(folder: Path) -> bool:
+    """Return whether a folder has what the jobs of a batch share on a data set."""
+    return folder.name == SHARED and _is_run(folder)
+
+
 def load(folders: list[Path]) -> list[Run]:
     """Load runs, each with a label of its own.
 
+    Args:
+        folders: as of `find`. What jobs share is left out if it is named beside them, as a shell
+            does.
+
     Raises:
-        InputError: for a folder that is no run's.
+        InputError: for a folder without a finished run.
     """
-    different = dict.fromkeys(path.resolve() for path in folders)
-    if len(different) < len(folders):
+    folders = [folder for folder in folders if not _is_shared(folder)] or folders
+    found = [run for folder in folders for run in find(folder.resolve())]
+    runs = list({run.folder: run for run in found}.values())
+    if len(runs) < len(found):
         logger.warning("A folder that is given twice is shown once.")
-    runs = [Run(folder) for folder in different]
     for alike in [[r for r in runs if r.label == label] for label in {run.label for run in runs}]:
         ends = [run.folder.parts for run in alike]
         depth = next(n for n in range(1, 999) if len({parts[-n:] for parts in ends}) == len(ends))
@@ -181,7 +247,7 @@ def recall_tables(runs: list[Run]) -> list[dict]:
         A dict for each list: `list`; `thresholds`, pairs of metres and degrees, those of the paper
         where no true pose is known but the paper has numbers, or none; and `rows`, a dict for each
         run that has the list: `run`, `summary` of it, and as many numbers in percent or None of
-        `recall` and, if the paper has the feature, of `paper`.
+        `recall` and of `paper`, which is None unless the paper has the feature on this data set.
     """
     tables: dict[str, dict] = {}
     for run in runs:
@@ -189,7 +255,7 @@ def recall_tables(runs: list[Run]) -> list[dict]:
             table = tables.setdefault(
                 short(name), {"list": short(name), "thresholds": [], "rows": []}
             )
-            paper = published.recall(run.summary["feature"], name)
+            paper = run.published and published.recall(run.summary["feature"], name)
             limits = summary.get("thresholds_m_deg") or (paper and published.thresholds(name))
             table["thresholds"] = table["thresholds"] or limits or []
             row = {"run": run, "summary": summary, "paper": paper}

@@ -15,21 +15,22 @@ from confs import features as features_confs
 from .. import cli, extractors, logger, projections, stamps
 from .. import phototour as layout
 from ..cli import InputError
-from ..descriptors import COLMAP, DESCRIPTORS, DIM, check_weights
+from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM, check_weights
 from ..evaluation import phototour as verification
 from ..maps import Map, is_map
+from ..paths import strings_as_paths
 from ..versions import versions
 from . import nested, pca, phototour, ss, sv, tracks, us
 
 SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
 RECIPE_NAMES = ("best", "paper", "tune")
-BASES = (*DESCRIPTORS, COLMAP)
 # hidden layers of projections of an extractor's own descriptors; COLMAP's are so soon computed that
 # larger ones would take 5 % of the time
 HIDDEN = {COLMAP: (256, 256)}
 HIDDEN_BY_DEFAULT = (512, 512)
 
 
+@strings_as_paths
 def main(
     maps: dict[str, tuple[Path, Path]],
     sequences: list[Path],
@@ -63,7 +64,7 @@ def main(
     Raises:
         InputError: when a map or a sequence cannot be used, or has descriptors of fewer dimensions.
     """
-    trainer = SCHEMES[scheme]
+    trainer, sequences = SCHEMES[scheme], [Path(folder) for folder in sequences]
     if trainer is nested:
         paths = {nested.PREFIXES[0]: output / f"{descriptor}_nested.safetensors"}
     else:
@@ -127,7 +128,8 @@ def main(
             made_from=json.dumps(metadata, sort_keys=True),
         )
         projections.save(mlp, metadata, path)
-        checkpoint.unlink(missing_ok=True)
+        for file in (checkpoint, ss.clusters_of(checkpoint)):
+            file.unlink(missing_ok=True)
         logger.info("Saved %s.", path)
     return list(paths.values())
 
@@ -270,11 +272,13 @@ def _main() -> None:
             raise InputError("--base describes photos, not the patches of PhotoTour.")
         args.descriptor, conf = [args.base.stem], base_of(features_confs.read(args.base))
         extractors.load_local(conf["model"])  # is wrong before any work is done, if it is
+    of_patches = args.phototour or args.validate
     for descriptor in [] if conf else args.descriptor:
-        if cli.choose("descriptor", descriptor, BASES) in DESCRIPTORS:
-            check_weights(descriptor)
-        elif args.phototour or args.validate:
+        if of_patches and descriptor == COLMAP:
             raise InputError(f"{descriptor} describes photos, not the patches of PhotoTour.")
+        cli.choose("descriptor", descriptor, DESCRIPTORS if of_patches else BASES)
+        if descriptor in DESCRIPTORS:
+            check_weights(descriptor)
     for scheme in args.scheme:
         cli.choose("scheme", scheme, SCHEMES)
     if "ss" in args.scheme:

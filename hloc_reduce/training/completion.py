@@ -16,70 +16,75 @@ MAX_VIEW_ANGLE = 40.0  # degrees between the rays of the known and the new obser
 NEIGHBORS = 8  # keypoints looked at around each place
 
 
-def complete(
-    reconstruction: pycolmap.Reconstruction,
-    keypoints: dict[str, np.ndarray],
-    observed: dict[str, np.ndarray],
-) -> dict[str, np.ndarray]:
-    """Find the keypoints that observe points of a map, matched or not.
+class Completion:
+    """Finds the keypoints of an image that observe points of a map, matched or not.
 
     Args:
         reconstruction: the map.
         keypoints: from image name to (N, 4): x, y (COLMAP's pixels), scale (pixels), orientation
             (degrees).
         observed: from image name to the id of the point of each keypoint (N,), -1 where none.
-
-    Returns:
-        The same as `observed`, with points for some of those that had none.
     """
-    images = {image.name: image for image in reconstruction.images.values()}
-    names = sorted(keypoints)
-    known = [
-        (np.full((observed[name] >= 0).sum(), i), np.flatnonzero(observed[name] >= 0))
-        for i, name in enumerate(names)
-    ]
-    image_index, keypoint_index = (np.concatenate(part) for part in zip(*known, strict=True))
-    point_id = np.concatenate(
-        [observed[name][k] for name, (_, k) in zip(names, known, strict=True)]
-    )
-    points = np.array([reconstruction.points3D[i].xyz for i in point_id]).reshape(-1, 3)
-    centres = np.array([images[name].projection_center() for name in names])
-    rays = centres[image_index] - points
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    # how each point looks from where it is known: two short steps along the keypoint's axes
-    steps = np.concatenate(
-        [
-            _steps(images[name], reconstruction, keypoints[name][k], points[image_index == i])
-            for i, (name, (_, k)) in enumerate(zip(names, known, strict=True))
-        ]
-    )
-    scales = np.concatenate([keypoints[n][k, 2] for n, (_, k) in zip(names, known, strict=True)])
 
-    completed = {}
-    for i, name in enumerate(names):
-        completed[name] = observed[name].copy()
-        free = observed[name] < 0
-        if not free.any() or not len(points):
-            continue
-        view = centres[i] - points
+    def __init__(
+        self,
+        reconstruction: pycolmap.Reconstruction,
+        keypoints: dict[str, np.ndarray],
+        observed: dict[str, np.ndarray],
+    ):
+        self.reconstruction, self.keypoints, self.observed = reconstruction, keypoints, observed
+        self.images = {image.name: image for image in reconstruction.images.values()}
+        names = sorted(keypoints)
+        known = {name: np.flatnonzero(observed[name] >= 0) for name in names}
+        # an entry for each observation
+        image_index = np.repeat(np.arange(len(names)), [len(known[name]) for name in names])
+        self.point_id = np.concatenate([observed[name][known[name]] for name in names])
+        self.points = np.array(
+            [reconstruction.points3D[i].xyz for i in self.point_id],
+        ).reshape(-1, 3)
+        self.centres = {name: self.images[name].projection_center() for name in names}
+        self.rays = np.array([self.centres[name] for name in names])[image_index] - self.points
+        self.rays /= np.linalg.norm(self.rays, axis=1, keepdims=True)
+        # how each point looks from where it is known: two short steps along the keypoint's axes
+        self.steps = np.concatenate(
+            [
+                _steps(
+                    self.images[name],
+                    reconstruction,
+                    keypoints[name][known[name]],
+                    self.points[image_index == i],
+                )
+                for i, name in enumerate(names)
+            ]
+        )
+        self.scales = np.concatenate([keypoints[name][known[name], 2] for name in names])
+
+    def __call__(self, name: str) -> np.ndarray:
+        """Return `observed` (N,) of an image, with points for some keypoints that had none."""
+        image, keypoints, observed = self.images[name], self.keypoints[name], self.observed[name]
+        completed = observed.copy()
+        free = observed < 0
+        if not free.any() or not len(self.points):
+            return completed
+        view = self.centres[name] - self.points
         view /= np.linalg.norm(view, axis=1, keepdims=True)
-        cosine = (view * rays).sum(1)
+        cosine = (view * self.rays).sum(1)
         # of each point that is not seen here yet, the observation from the nearest direction
-        order = np.lexsort((-cosine, point_id))
-        order = order[np.r_[True, np.diff(point_id[order]) > 0]]
-        seen_here = np.isin(point_id[order], observed[name])
+        order = np.lexsort((-cosine, self.point_id))
+        order = order[np.r_[True, np.diff(self.point_id[order]) > 0]]
+        seen_here = np.isin(self.point_id[order], observed)
         order = order[~seen_here & (cosine[order] > np.cos(np.radians(MAX_VIEW_ANGLE)))]
         place, along, across, inside = _project(
-            images[name], reconstruction, points[order], steps[order]
+            image, self.reconstruction, self.points[order], self.steps[order]
         )
         order, place, along, across = (a[inside] for a in (order, place, along, across))
         if not len(order):
-            continue
-        scale = scales[order] * np.sqrt(
+            return completed
+        scale = self.scales[order] * np.sqrt(
             np.linalg.norm(along, axis=1) * np.linalg.norm(across, axis=1)
         )
         orientation = np.degrees(np.arctan2(along[:, 1], along[:, 0]))
-        candidates = keypoints[name][free]
+        candidates = keypoints[free]
         distance, nearest = cKDTree(candidates[:, :2]).query(
             place, k=range(1, NEIGHBORS + 1), distance_upper_bound=MAX_DISTANCE
         )
@@ -94,8 +99,8 @@ def complete(
         # a keypoint that several points want is the nearest's
         row, best = (a[np.argsort(cost[row, best], kind="stable")] for a in (row, best))
         keypoint, first = np.unique(found[row, best], return_index=True)
-        completed[name][np.flatnonzero(free)[keypoint]] = point_id[order[row[first]]]
-    return completed
+        completed[np.flatnonzero(free)[keypoint]] = self.point_id[order[row[first]]]
+        return completed
 
 
 def _steps(

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import torch
 from torch import nn
-from tqdm import trange
 
 from .. import logger
 from ..io import replacing
+from ..progress import progress
 
 CHECKPOINT_STEPS, CHECKPOINT_SECONDS = 500, 30.0  # whichever comes first
 
@@ -40,36 +40,45 @@ def fit(
         checkpoint: file from which a killed training goes on; the caller deletes it.
         made_from: says what the training is made from; a checkpoint of another is not used.
         before: called before each step with its number, may change the network and returns the
-            parameters that were set anew, of which the optimizer knows nothing then.
+            parameters that were set anew, of which the optimizer knows nothing then. As this may
+            take long, a checkpoint follows.
     """
     optimizer = torch.optim.Adam(
         network.parameters(), lr=recipe["lr"], weight_decay=recipe["weight_decay"]
     )
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, recipe["final_lr"], steps)
     parts = {"network": network, "optimizer": optimizer, "schedule": schedule}
-    start = 0
+    start, prepared = 0, None  # the step before which `before` was called already
+
+    def save(step: int, prepared: bool = False) -> None:
+        state = {key: part.state_dict() for key, part in parts.items()}
+        state |= {"step": step, "prepared": prepared, "made_from": made_from}
+        with replacing(checkpoint) as temporary:
+            torch.save(state, temporary)
+
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True, map_location="cpu")
         if state["made_from"] == made_from:
             start = state["step"]
+            prepared = start if state.get("prepared") else None
             for key, part in parts.items():
                 part.load_state_dict(state[key])
             logger.info("Going on from step %d of %s.", start, checkpoint)
     mean_loss, saved = None, time.monotonic()
-    progress = trange(start, steps, initial=start, total=steps, desc="Training", unit="step")
-    for step in progress:
-        for parameter in before(step) if before else ():
-            optimizer.state.pop(parameter, None)
+    shown = progress(range(start, steps), "Training", "step", steps, start)
+    for step in shown:
+        if before and step != prepared and (renewed := list(before(step))):
+            for parameter in renewed:
+                optimizer.state.pop(parameter, None)
+            save(step, prepared=True)
         value = loss(step)
         optimizer.zero_grad()
         value.backward()
         optimizer.step()
         schedule.step()
         mean_loss = value.item() if mean_loss is None else 0.99 * mean_loss + 0.01 * value.item()
-        progress.set_postfix(loss=f"{mean_loss:.4f}", refresh=False)
+        shown.set_postfix(loss=f"{mean_loss:.4f}", refresh=False)
         late = time.monotonic() - saved > CHECKPOINT_SECONDS
         if (step + 1) % CHECKPOINT_STEPS == 0 or late:
-            with replacing(checkpoint) as temporary:
-                state = {key: part.state_dict() for key, part in parts.items()}
-                torch.save({"step": step + 1, "made_from": made_from, **state}, temporary)
+            save(step + 1)
             saved = time.monotonic()

@@ -4,15 +4,25 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from .. import stamps
 from ..descriptors import DIM, Descriptor
+from ..group_writer import resume_or_replace
+from ..paths import strings_as_paths
 from ..phototour import SHEET, read_points, read_sheet, sheets
+from ..progress import progress
 from .loop import device
-from .tracks import VARIANTS, describe_mirrored, photometric_variant, save, stamp
+from .tracks import (
+    VARIANTS,
+    describe_mirrored,
+    parts_of,
+    photometric_variant,
+    save_parts,
+    stamp,
+)
 
 
+@strings_as_paths
 def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) -> Path:
     """Describe the patches of a sequence, labelled by point.
 
@@ -33,27 +43,28 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
     made_from = stamp(descriptor, seed, [folder / "info.txt", *sheets(folder)])
     if path.exists() and stamps.is_current(path.with_suffix(".json"), made_from):
         return path
-    output.mkdir(parents=True, exist_ok=True)
     describe = Descriptor(descriptor).to(device())
-    described = np.empty((len(points), 2, VARIANTS, DIM), np.float16)
-    for number, sheet in enumerate(tqdm(sheets(folder), desc="Describing patches", unit="sheet")):
-        first = number * SHEET**2
-        patches = read_sheet(sheet)[: len(points) - first]
-        generator = np.random.default_rng([seed, number])
-        rows = slice(first, first + len(patches))
-        for variant in range(VARIANTS):
-            views = patches
-            if variant:
-                views = np.stack([photometric_variant(patch, generator) for patch in patches])
-            views = torch.from_numpy(views)[:, None]
-            described[rows, :, variant] = describe_mirrored(views, describe)
-    no_places = np.zeros((len(points), 2), np.float32)
-    return save(
-        path,
-        made_from,
-        described,
-        points,
-        image=np.arange(len(points)),
-        xy=no_places,
-        matched=np.ones(len(points), bool),
-    )
+    files = sheets(folder)[: -(-len(points) // SHEET**2)]  # those with listed patches
+    with resume_or_replace(parts_of(path), made_from) as writer:
+        todo = [number for number, sheet in enumerate(files) if sheet.stem not in writer]
+        done = len(files) - len(todo)
+        for number in progress(todo, "Describing patches", "sheet", len(files), done):
+            rows = np.arange(len(points))[number * SHEET**2 : (number + 1) * SHEET**2]
+            patches = read_sheet(files[number])[: len(rows)]
+            generator = np.random.default_rng([seed, number])
+            described = np.empty((len(rows), 2, VARIANTS, DIM), np.float16)
+            for variant in range(VARIANTS):
+                views = patches
+                if variant:
+                    views = np.stack([photometric_variant(patch, generator) for patch in patches])
+                views = torch.from_numpy(views)[:, None]
+                described[:, :, variant] = describe_mirrored(views, describe)
+            arrays = {
+                "descriptors": described,
+                "points": points[rows],
+                "image": rows,
+                "xy": np.zeros((len(rows), 2), np.float32),
+                "matched": np.ones(len(rows), bool),
+            }
+            writer.add(files[number].stem, arrays)
+    return save_parts(path, made_from, [sheet.stem for sheet in files])

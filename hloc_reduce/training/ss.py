@@ -10,6 +10,8 @@ from torch import nn
 
 from .. import logger
 from ..cli import InputError
+from ..group_writer import resume_or_replace
+from ..io import get_dataset, open_h5
 from ..projections import MLP
 from . import sv
 from .loop import device, fit
@@ -142,23 +144,34 @@ def train(
 def match(
     maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path, made_from: str
 ) -> MLP:
-    """Learn as the supervised scheme does, with clusters of base descriptors for points."""
-    return sv.train(
-        [by_cluster(tracks, recipe, seed) for tracks in maps],
-        dim,
-        recipe,
-        seed,
-        checkpoint,
-        made_from,
-    )
+    """Learn as the supervised scheme does, with clusters of base descriptors for points.
+
+    The clusters of each map are kept in `clusters_of(checkpoint)`.
+    """
+    kept = clusters_of(checkpoint)
+    with resume_or_replace(kept, {"made_from": made_from, "seed": seed}) as writer:
+        for number, tracks in enumerate(maps):
+            if str(number) not in writer:
+                logger.info("Clustering %d descriptors.", len(tracks.track))
+                descriptors = tracks.descriptors[:, 0, 0].astype(np.float32)
+                how = (recipe[key] for key in ("per_cluster", "per_cell", "iterations"))
+                labels = cluster_in_cells(descriptors, *how, seed)
+                writer.add(str(number), {"labels": labels})
+    with open_h5(kept) as file:
+        clustered = [
+            by_cluster(tracks, get_dataset(file, str(number), "labels")[()])
+            for number, tracks in enumerate(maps)
+        ]
+    return sv.train(clustered, dim, recipe, seed, checkpoint, made_from)
 
 
-def by_cluster(tracks: Tracks, recipe: dict, seed: int) -> Tracks:
-    """Take clusters of the observations of a map for its points, whatever they see."""
-    logger.info("Clustering %d descriptors.", len(tracks.track))
-    descriptors = tracks.descriptors[:, 0, 0].astype(np.float32)
-    how = (recipe[key] for key in ("per_cluster", "per_cell", "iterations"))
-    labels = cluster_in_cells(descriptors, *how, seed)
+def clusters_of(checkpoint: Path) -> Path:
+    """Return the h5 file of the clusters beside a checkpoint; the caller deletes both."""
+    return checkpoint.with_name(f"{checkpoint.name}.clusters.h5")
+
+
+def by_cluster(tracks: Tracks, labels: np.ndarray) -> Tracks:
+    """Take clusters (M,) of the observations of a map for its points, whatever they see."""
     order = np.argsort(labels, kind="stable")
     views = np.arange(len(labels))  # each counts as an image of its own
     return replace(tracks.only(order), track=labels[order], image=views)

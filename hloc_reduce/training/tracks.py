@@ -1,5 +1,6 @@
 """Training data: base descriptors of the observations of a map's points, labelled by point."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import pycolmap
 import torch
 from safetensors.numpy import load_file, save_file
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from confs import features as features_confs
 
@@ -23,18 +23,22 @@ from .. import (
     stamps,
     triangulation,
 )
-from ..cli import InputError
+from ..cli import InputError, choose
 from ..colmap import point3D_ids
-from ..descriptors import COLMAP, DESCRIPTORS, DIM, Descriptor
+from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM, Descriptor
 from ..extractors.dog import extract_patches
+from ..group_writer import resume_or_replace
 from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
 from ..maps import Map, is_map
+from ..paths import strings_as_paths
+from ..progress import progress
 from ..storage import get_descriptors
-from .completion import complete
+from .completion import Completion
 from .loop import device
 
 NUM_COVIS = 20
 MATCHED = "sift"  # which descriptor finds the tracks, whatever they are described with
+KEYPOINTS = "hloc"  # settings of DoG, which the projections that ship were trained with
 # The photo as it is and three photometric variants, each as seen and mirrored.
 VARIANTS = 4
 MAX_SHIFT = 1.5  # pixels between a keypoint and the same one of a variant
@@ -70,6 +74,7 @@ class Tracks:
         return Tracks(**{key: value[kept] for key, value in vars(self).items()})
 
 
+@strings_as_paths
 def main(
     images: Path,
     model: Path,
@@ -93,8 +98,10 @@ def main(
         The file of `load`.
 
     Raises:
-        InputError: when the map cannot be read or gives no tracks.
+        InputError: for an unknown descriptor, or when the map cannot be read or gives no tracks.
     """
+    if conf is None:
+        choose("descriptor", descriptor, BASES)
     source = {"images": str(images.resolve()), "model": str(model.resolve())}
     if is_map(model.parent):  # which may have been built anew, of other photos
         source["map"] = Map(model.parent).id
@@ -102,9 +109,9 @@ def main(
         raise InputError(f"{output} holds the tracks of another map. Choose another folder.")
     stamps.write(output / "source.json", source)
     if conf is None and descriptor not in DESCRIPTORS:
-        conf = features_confs.confs[descriptor]
+        conf = features_confs.get(descriptor, keypoints=KEYPOINTS)[1]
     found_by, patches = (descriptor, False) if conf else (MATCHED, True)
-    conf = conf or features_confs.confs[MATCHED]
+    conf = conf or features_confs.get(MATCHED, keypoints=KEYPOINTS)[1]
     pairs = pairs_from_covisibility.main(
         model, output / f"pairs-db-covis{NUM_COVIS}.txt", NUM_COVIS
     )
@@ -120,12 +127,15 @@ def main(
     made_from = stamp(descriptor, seed, [sfm / "points3D.bin", features])
     if tracks.exists() and stamps.is_current(tracks.with_suffix(".json"), made_from):
         return tracks
-    observed, matched, keypoints = _observations(reconstruction, features, names)
+    complete, matched, keypoints = _observations(reconstruction, features, names)
     describe = PatchDescriber(descriptor) if patches else FeatureDescriber(conf["model"])
-    parts = []
-    with open_h5(features) as file:
-        for number, name in enumerate(tqdm(names, desc="Describing tracks", unit="image")):
-            kept = np.flatnonzero(observed[name] >= 0)
+    parts = parts_of(tracks)
+    with resume_or_replace(parts, made_from) as writer, open_h5(features) as file:
+        todo = [(number, name) for number, name in enumerate(names) if name not in writer]
+        done = len(names) - len(todo)
+        for number, name in progress(todo, "Describing tracks", "image", len(names), done):
+            observed = complete(name)
+            kept = np.flatnonzero(observed >= 0)
             if not len(kept):
                 continue
             generator = np.random.default_rng([seed, number])
@@ -135,23 +145,30 @@ def main(
             scaled[:, :2] = (scaled[:, :2] + 0.5) * ratio - 0.5
             scaled[:, 2:3] *= ratio.mean()
             known = get_descriptors(file, name)[kept]
-            described = describe(image, scaled, known, generator)
-            ids, xy = observed[name][kept], keypoints[name][kept, :2]
-            parts.append((described, ids, np.full(len(kept), number), xy, matched[name][kept] >= 0))
-    if not parts:
+            arrays = {
+                "descriptors": describe(image, scaled, known, generator),
+                "points": observed[kept],
+                "image": np.full(len(kept), number),
+                "xy": keypoints[name][kept, :2],
+                "matched": matched[name][kept] >= 0,
+            }
+            writer.add(name, arrays)
+        described = [name for name in names if name in writer]
+    if not described:
         raise InputError(f"The map {model} gives no tracks.")
-    return save(tracks, made_from, *map(np.concatenate, zip(*parts, strict=True)))
+    return save_parts(tracks, made_from, described)
 
 
 def _observations(
     reconstruction: pycolmap.Reconstruction, features: Path, names: list[str]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+) -> tuple[Callable[[str], np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Find which points the keypoints of the images observe.
 
     Returns:
-        From image name to the id of the point of each keypoint, -1 where none (N,), completed and
-        as matched; and to the keypoints (N, 4): x, y, scale (pixels), orientation (degrees), or
-        (N, 2) where they have no more, whose tracks cannot be completed.
+        What completes the tracks: from image name to the id of the point of each keypoint (N,), -1
+        where none; the same as matched; and from image name to the keypoints (N, 4): x, y, scale
+        (pixels), orientation (degrees), or (N, 2) where they have no more, whose tracks cannot be
+        completed.
     """
     images = {image.name: image for image in reconstruction.images.values()}
     matched = {name: point3D_ids(images[name]) for name in names}
@@ -165,9 +182,9 @@ def _observations(
         keypoints = {name: array.astype(np.float32) for name, array in keypoints.items()}
         places = {name: get_colmap_keypoints(file, name)[0] for name in names}
     if not oriented:
-        return matched, matched, keypoints
+        return matched.__getitem__, matched, keypoints
     shaped = {name: np.column_stack([places[name], keypoints[name][:, 2:]]) for name in names}
-    return complete(reconstruction, shaped, matched), matched, keypoints
+    return Completion(reconstruction, shaped, matched), matched, keypoints
 
 
 def stamp(descriptor: str, seed: int, inputs: list[Path]) -> dict:
@@ -206,6 +223,33 @@ def save(
         save_file(vars(tracks), temporary)
     stamps.write(path.with_suffix(".json"), made_from)
     logger.info("%d observations of %d points: %s", len(track), tracks.num_tracks, path)
+    return path
+
+
+def parts_of(path: Path) -> Path:
+    """Return the h5 file of the observations described so far, while the file of `load` is made."""
+    return path.with_suffix(".parts.h5")
+
+
+def save_parts(path: Path, made_from: dict, names: list[str]) -> Path:
+    """Write the file of `load` from the groups of `parts_of`, which is then deleted.
+
+    Args:
+        path: of the file.
+        made_from: its stamp.
+        names: the groups, in order; each has the arrays that `save` takes.
+
+    Returns:
+        The path.
+    """
+    keys = ("descriptors", "points", "image", "xy", "matched")
+    with open_h5(parts_of(path)) as file:
+        arrays = {
+            key: np.concatenate([get_dataset(file, name, key)[()] for name in names])
+            for key in keys
+        }
+    save(path, made_from, **arrays)
+    parts_of(path).unlink()
     return path
 
 

@@ -13,6 +13,7 @@ from confs import features as features_confs
 from ... import cli, io, projections, stamps
 from ...descriptors import check_weights
 from ...io import open_h5
+from ...paths import strings_as_paths
 from .. import published
 from . import data, lists, tasks
 from .data import NOISE, Descriptors
@@ -27,6 +28,7 @@ TASKS = tuple(VARIANTS)
 PAPERS = "a"  # the split that the paper has numbers of
 
 
+@strings_as_paths
 def main(
     root: Path,
     features: Iterable[str],

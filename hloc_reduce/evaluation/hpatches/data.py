@@ -6,13 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from ... import cli, io, parallel
 from ...cli import InputError
 from ...descriptors import PATCH_SIZE, Descriptor
 from ...group_writer import GroupWriter
 from ...io import get_dataset, open_h5
+from ...progress import progress
 
 SIDE = 65
 NOISE = {"e": "easy", "h": "hard", "t": "tough"}
@@ -101,9 +101,7 @@ def describe(root: Path, sequences: list[str], descriptor: str, path: Path) -> N
         todo = [name for name in sequences if name not in writer]
         workers = None if device == "cpu" else 1
         done = parallel.ordered("describe", describe_sequence, todo, workers)
-        for name, described in tqdm(
-            done, desc=f"Describing by {descriptor}", unit="sequence", total=len(todo)
-        ):
+        for name, described in progress(done, f"Describing by {descriptor}", "sequence", len(todo)):
             writer.add(name, described)
 
 
@@ -126,7 +124,7 @@ class Descriptors:
     def __init__(self, path: Path, sequences: list[str], project: torch.nn.Module):
         parts = {kind: [] for kind in TYPES}
         with open_h5(path) as file, torch.no_grad():
-            for name in tqdm(sequences, desc="Projecting", unit="sequence"):
+            for name in progress(sequences, "Projecting", "sequence"):
                 for kind in TYPES:
                     rows = torch.from_numpy(get_dataset(file, name, kind)[()])
                     parts[kind].append(project(rows).numpy())

@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from ...cli import InputError
 from ...io import replacing
+from ...progress import progress
 from .data import IMAGES
 
 SEED = 42
@@ -157,8 +157,8 @@ def draw_pairs(sizes: Mapping[str, int], number: int) -> dict[str, list[tuple]]:
     """Draw pairs of patches: the same in two images, or others of the same or any sequence."""
     random, names = np.random.RandomState(SEED), list(sizes)
     sequences = [names[i] for i in random.choice(len(names), number)]
-    bar = tqdm(sequences, desc="Drawing pairs", unit="pair")
-    patches = [random.permutation(sizes[name])[:2].tolist() for name in bar]
+    shown = progress(sequences, "Drawing pairs", "pair")
+    patches = [random.permutation(sizes[name])[:2].tolist() for name in shown]
     # of the first five images only, as in the published lists
     images = [random.permutation(5)[:2].tolist() for _ in range(number)]
     others = [names[i] for i in random.choice(len(names), number)]

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial.distance import cdist
-from tqdm import tqdm
 
 from ... import parallel
+from ...progress import progress
 from ..ranking import average_precision, roc_area
 from .data import IMAGES, NOISE, TYPES, Descriptors
 
@@ -48,9 +48,7 @@ def matching(descriptors: Descriptors) -> Iterator[tuple[str, str, float]]:
         target = descriptors.of(sequence, f"{noise}{image}")
         return matching_ap(descriptors.of(sequence, "ref"), target)
 
-    scores = tqdm(
-        parallel.ordered("match", match, images), desc="Matching", unit="image", total=len(images)
-    )
+    scores = progress(parallel.ordered("match", match, images), "Matching", "image", len(images))
     for (sequence, noise, image), score in zip(images, scores, strict=True):
         yield noise, f"{sequence} {image}", score
 
@@ -68,7 +66,7 @@ def verification(
         Noise; which negatives and which protocol; and the area under the ROC curve (balanced) or
         the average precision of all negatives and the first fifth of the positives (imbalanced).
     """
-    for noise in tqdm(NOISE, desc="Verification", unit="noise"):
+    for noise in progress(NOISE, "Verification", "noise"):
         right = pair_distances(descriptors, pairs["pos"], noise)
         few = np.sort(right[: int(IMBALANCE * len(right))])
         for kind in ("inter", "intra"):
@@ -121,9 +119,7 @@ def retrieval(
         )
 
     blocks = np.array_split(queries, -(-len(queries) // QUERIES))
-    ranks = tqdm(
-        parallel.ordered("rank", rank, blocks), desc="Retrieval", unit="block", total=len(blocks)
-    )
+    ranks = progress(parallel.ordered("rank", rank, blocks), "Retrieval", "block", len(blocks))
     precision = average_precision(np.concatenate(list(ranks)), OWN).mean(axis=0)
     for noise, row in zip(NOISE, precision, strict=True):
         for size, value in zip(POOLS, row, strict=True):

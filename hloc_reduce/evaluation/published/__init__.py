@@ -1,14 +1,21 @@
 """The paper's own numbers: its tables of localization and the means of its HPatches figures."""
 
 import csv
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from ... import datasets
 from ...datasets import INLOC_THRESHOLDS
 
 FOLDER = Path(__file__).parent
-# how lists of queries and the columns of the table begin
-PREFIXES = {
+# of the lists of queries of each data set: how their names begin, how many queries they have and
+# how the names of these begin
+DATASETS = {
+    "Aachen Day-Night v1.1": {"day": (824, "query/day/"), "night": (191, "query/night/")},
+    "InLoc": {"DUC1": (198, "query/iphone7/"), "DUC2": (131, "query/iphone7/")},
+}
+# how the columns of the table begin
+COLUMNS = {
     "day": "aachen_day_",
     "night": "aachen_night_",
     "DUC1": "inloc_duc1_",
@@ -43,6 +50,27 @@ def localization() -> dict[str, dict[str, float]]:
     return _read("localization_recall.csv")
 
 
+def dataset(lists: Mapping[str, Collection[str]]) -> str | None:
+    """Return which data set of the paper lists of queries are, however its folder is called.
+
+    Args:
+        lists: from the name of each list, such as day_time_queries_with_intrinsics or DUC1, to the
+            names of its queries.
+
+    Returns:
+        A key of `DATASETS`, or None for another place, such as one in the layout of Aachen.
+    """
+
+    def is_list(name: str, number: int, folder: str) -> bool:
+        queries = [q for key, names in lists.items() if key.startswith(name) for q in names]
+        return len(queries) == number and all(query.startswith(folder) for query in queries)
+
+    for known, expected in DATASETS.items():
+        if all(is_list(name, *queries) for name, queries in expected.items()):
+            return known
+    return None
+
+
 def recall(feature: str, query_list: str) -> list[float] | None:
     """Return the recall [%] at three thresholds of a feature on a list of Aachen or InLoc.
 
@@ -50,7 +78,7 @@ def recall(feature: str, query_list: str) -> list[float] | None:
         feature: a name.
         query_list: a list's name, such as day_time_queries_with_intrinsics or DUC1.
     """
-    prefix = next((PREFIXES[key] for key in PREFIXES if query_list.startswith(key)), None)
+    prefix = next((COLUMNS[key] for key in COLUMNS if query_list.startswith(key)), None)
     row = localization().get(feature, {})
     values = [value for column, value in row.items() if prefix and column.startswith(prefix)]
     return values or None

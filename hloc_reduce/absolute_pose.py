@@ -1,0 +1,184 @@
+"""The pose of a query from 2D-3D matches: RANSAC over all of them, and over those of one image."""
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from . import colmap
+from .confidence import (
+    FOCAL_LENGTHS,
+    MAX_POSITION,
+    MAX_ROTATION,
+    REFINED,
+    RIVAL,
+    Gate,
+    confidence,
+    reprojection_errors,
+    uncertainty,
+)
+
+SEED = 0
+MAX_ERROR = 12.0  # pixels, pycolmap's default
+CLEAR = 0.25  # share of inliers, from which on RANSAC over all matches is trusted to find the pose
+MAX_IMAGES = 20  # tried by themselves, those with most matches
+MIN_MATCHES = 6  # of an image that is tried
+ROUNDS = 3  # of estimation from the inliers among all matches
+# two poses that differ by more are rivals
+SAME_ROTATION = 10.0  # degrees
+SAME_POSITION = 0.25  # of the inliers' median depth
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A pose and how the matches agree with it.
+
+    Args:
+        cam_from_world: the pose, None where there is none.
+        camera: intrinsics, refined where the configuration says so.
+        inliers: (M,) bool.
+        confidence: `confidence.confidence`.
+        refusal: why it is not to be trusted, None if it is.
+    """
+
+    cam_from_world: pycolmap.Rigid3d | None
+    camera: pycolmap.Camera
+    inliers: np.ndarray
+    confidence: float = -np.inf
+    refusal: str | None = None
+
+    @property
+    def num_inliers(self) -> int:
+        """The number of inliers."""
+        return int(self.inliers.sum())
+
+
+def estimate(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    images: list[np.ndarray],
+    camera: pycolmap.Camera,
+    config: dict,
+    gate: Gate,
+) -> Pose:
+    """Estimate an absolute pose and judge it.
+
+    Where few of all matches agree with a pose, RANSAC may have missed the right one, so the matches
+    of each image are tried by themselves, too: those of an image that shows the same place agree
+    much more often. The pose of the highest confidence among all matches wins.
+
+    Args:
+        points2D: (M, 2) image points of all matches, COLMAP's pixels.
+        points3D: (M, 3) their world points.
+        images: of each map image the indices of its matches.
+        camera: intrinsics.
+        config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
+        gate: what is trusted.
+    """
+    number = len(points2D)
+    poses = [_estimate(points2D, points3D, np.arange(number), camera, config)]
+    if poses[0].num_inliers < CLEAR * number:
+        by_number = sorted((m for m in images if MIN_MATCHES <= len(m) < number), key=len)
+        for chosen in by_number[::-1][:MAX_IMAGES]:
+            poses.append(_estimate(points2D, points3D, chosen, camera, config))
+    best = max(poses, key=lambda pose: (pose.confidence, pose.num_inliers))
+    refusal = _refusal(best, poses, points2D, points3D, camera, config, gate)
+    return Pose(best.cam_from_world, best.camera, best.inliers, best.confidence, refusal)
+
+
+def _estimate(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    chosen: np.ndarray,
+    camera: pycolmap.Camera,
+    config: dict,
+) -> Pose:
+    """Estimate a pose from chosen matches, then from those of all that agree with it."""
+    number, found = len(points2D), None
+    threshold = _max_error(config)
+    pose = Pose(None, camera, np.zeros(number, bool))
+    for _ in range(1 if len(chosen) == number else ROUNDS):
+        refined = copy.deepcopy(pose.camera)
+        found = colmap.estimate_pose(points2D[chosen], points3D[chosen], refined, config, SEED)
+        if not found:
+            break
+        cam_from_world = found["cam_from_world"]
+        if len(chosen) == number:
+            inliers = np.asarray(found["inlier_mask"], bool)
+        else:
+            errors, _ = reprojection_errors(points2D, points3D, cam_from_world, refined)
+            inliers = errors <= threshold
+        if inliers.sum() <= pose.num_inliers:
+            break
+        pose, chosen = Pose(cam_from_world, refined, inliers), np.flatnonzero(inliers)
+    if pose.cam_from_world is None:
+        return pose
+    arguments = points2D, points3D, pose.cam_from_world, pose.camera
+    freedom = 6 + _is_focal_length_free(config)
+    found = confidence(*arguments, threshold, freedom)
+    return Pose(pose.cam_from_world, pose.camera, pose.inliers, found)
+
+
+def _max_error(config: dict) -> float:
+    """Return RANSAC's inlier threshold in pixels."""
+    return config.get("estimation", {}).get("ransac", {}).get("max_error", MAX_ERROR)
+
+
+def _is_focal_length_free(config: dict) -> bool:
+    return bool(
+        config.get("estimation", {}).get("estimate_focal_length")
+        or config.get("refinement", {}).get("refine_focal_length")
+    )
+
+
+def _refusal(
+    pose: Pose,
+    poses: list[Pose],
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    camera: pycolmap.Camera,
+    config: dict,
+    gate: Gate,
+) -> str | None:
+    """Say why a pose is not to be trusted, if it is not."""
+    number = pose.num_inliers
+    if number < gate.min_inliers:
+        return f"too few inliers: {number}, at least {gate.min_inliers} are needed"
+    if pose.confidence < gate.min_confidence:
+        return (
+            f"{number} inliers of {len(points2D)} matches may be chance: confidence "
+            f"{max(0, pose.confidence):.1f}, at least {gate.min_confidence:g} is needed"
+        )
+    free = _is_focal_length_free(config)
+    focal_length, size = pose.camera.mean_focal_length(), max(camera.width, camera.height)
+    if config.get("estimation", {}).get("estimate_focal_length"):
+        low, high = (factor * size for factor in FOCAL_LENGTHS)
+    else:
+        given = camera.mean_focal_length()
+        low, high = (given / REFINED, given * REFINED) if free else (0, np.inf)
+    if not low <= focal_length <= high:
+        return (
+            f"no plausible focal length: {focal_length:.0f} pixels, {low:.0f} to {high:.0f} were "
+            "expected"
+        )
+    chosen = points2D[pose.inliers], points3D[pose.inliers]
+    position, rotation = uncertainty(*chosen, pose.cam_from_world, pose.camera, free)
+    if position > MAX_POSITION or rotation > MAX_ROTATION:
+        return (
+            f"the inliers do not fix the pose: its position is uncertain by {100 * position:.0f} % "
+            f"of their distance, its rotation by {rotation:.1f} degrees"
+        )
+    for rival in poses:
+        if rival.num_inliers >= RIVAL * number and _differ(pose, rival, points3D):
+            return f"ambiguous: another pose has {rival.num_inliers} inliers, this one {number}"
+    return None
+
+
+def _differ(pose: Pose, other: Pose, points3D: np.ndarray) -> bool:
+    """Tell whether two poses are of different places."""
+    relative = pose.cam_from_world * other.cam_from_world.inverse()
+    inliers = points3D[pose.inliers]
+    depths = inliers @ pose.cam_from_world.rotation.matrix().T + pose.cam_from_world.translation
+    moved = np.linalg.norm(relative.translation) / np.median(depths[:, 2])
+    return np.degrees(relative.rotation.angle()) > SAME_ROTATION or moved > SAME_POSITION

@@ -1,0 +1,222 @@
+"""Tell a pose from chance, and one that is known precisely from one that is not."""
+
+from argparse import ArgumentParser
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from scipy.spatial import cKDTree
+from scipy.special import gammaln
+
+from .cli import InputError
+
+SOLUTIONS = 4  # poses that a minimal sample may have
+THRESHOLDS = 8  # inlier thresholds that are tried, from FINEST to RANSAC's
+FINEST = 1.0  # pixel
+SAME_PLACE = 2.0  # pixels: keypoints of other scales or orientations at one place count once
+NEIGHBORS = 8  # projected points that give the density around a keypoint
+LEAST_NOISE = 0.5  # pixels, the standard deviation of a keypoint at best
+FOCAL_LENGTHS = (0.3, 5.0)  # of an estimated one, times the longer side: 11 to 180 mm on 35 mm film
+REFINED = 2.0  # by what factor a focal length of EXIF data may change
+MAX_POSITION = 0.05  # standard deviation of the position, times the median distance of the inliers
+MAX_ROTATION = 2.0  # standard deviation in degrees
+RIVAL = 0.8  # times its inliers, if another pose has so many they tell nothing
+
+
+def confidence(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    cam_from_world: pycolmap.Rigid3d,
+    camera: pycolmap.Camera,
+    max_error: float,
+    degrees_of_freedom: int = 6,
+) -> float:
+    """Measure how unlikely it is that wrong matches agree with a pose as well as these do.
+
+    An a-contrario test in the manner of AC-RANSAC (Moulon, Monasse and Marlet, ACCV 2012). The
+    number of false alarms is how many poses with as many inliers are expected if all matches are
+    wrong: the number of poses that can be computed from them, times the probability that one has so
+    many inliers. The inlier threshold is the one, up to RANSAC's, that makes it least.
+
+    A wrong match pairs a keypoint with any of the matched points. So the probability that it is an
+    inlier is the density of their projections around the keypoint, or if larger that of points
+    spread evenly over the image: a pose from where all points fall into a small part of the image
+    explains nothing. Keypoints at one place count once, and a keypoint with several matches has as
+    many chances.
+
+    Args:
+        points2D: (M, 2) image points of all matches, COLMAP's pixels.
+        points3D: (M, 3) their world points.
+        cam_from_world: the pose.
+        camera: intrinsics.
+        max_error: RANSAC's inlier threshold in pixels.
+        degrees_of_freedom: 6, or 7 with a focal length that was estimated.
+
+    Returns:
+        Minus the decimal logarithm of the number of false alarms. Above 0 the pose is not expected
+        by chance; at 8 one is expected in a hundred million queries of a wrong place.
+    """
+    errors, projected = reprojection_errors(points2D, points3D, cam_from_world, camera)
+    _, first, place = np.unique(
+        np.round(points2D / SAME_PLACE), axis=0, return_index=True, return_inverse=True
+    )
+    place, number = place.reshape(-1), len(first)
+    sample = -(-degrees_of_freedom // 2)  # matches that fix a pose
+    if number <= sample:
+        return -np.inf
+    chances = np.bincount(place)
+    least = np.full(number, np.inf)
+    np.minimum.at(least, place, errors)
+    density = _density(points2D[first], projected, camera)
+    poses = (
+        _log10_choose(number, sample)
+        + sample * np.log10(chances.mean())
+        + np.log10(SOLUTIONS * THRESHOLDS)
+    )
+
+    def log10_false_alarms(threshold: float) -> float:
+        by_chance = np.minimum(1, chances * np.pi * threshold**2 * density).mean()
+        inliers = (least <= threshold).sum()
+        return poses + _log10_tail(inliers - sample, number - sample, by_chance)
+
+    thresholds = np.geomspace(min(FINEST, max_error), max_error, THRESHOLDS)
+    return float(-min(map(log10_false_alarms, thresholds)))
+
+
+def reprojection_errors(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    cam_from_world: pycolmap.Rigid3d,
+    camera: pycolmap.Camera,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Project world points into an image.
+
+    Args:
+        points2D: (M, 2) image points, COLMAP's pixels.
+        points3D: (M, 3) world points.
+        cam_from_world: the pose.
+        camera: intrinsics.
+
+    Returns:
+        Their distances (M,) in pixels from the image points, infinite behind the camera, and the
+        projections (M, 2), there NaN.
+    """
+    local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
+    projected = np.full((len(local), 2), np.nan)
+    front = local[:, 2] > 0
+    if front.any():
+        projected[front] = camera.img_from_cam(local[front])
+    errors = np.linalg.norm(projected - points2D, axis=1)
+    return np.nan_to_num(errors, nan=np.inf), projected
+
+
+def _density(points2D: np.ndarray, projected: np.ndarray, camera: pycolmap.Camera) -> np.ndarray:
+    """Return the probability (N,), by pixel, that a wrong match projects to image points (N, 2)."""
+    uniform = 1 / (camera.width * camera.height)
+    visible = np.unique(projected[np.isfinite(projected).all(axis=1)].round(), axis=0)
+    if len(visible) <= NEIGHBORS:
+        return np.full(len(points2D), uniform)
+    # the nearest may be the keypoint's own
+    distance = cKDTree(visible).query(points2D, k=[NEIGHBORS + 1])[0][:, 0]
+    share = NEIGHBORS / len(projected)
+    return np.maximum(uniform, share / (np.pi * np.maximum(distance, 1) ** 2))
+
+
+def _log10_choose(n: int, k: int) -> float:
+    return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)) / np.log(10)
+
+
+def _log10_tail(successes: int, trials: int, probability: float) -> float:
+    """Bound the probability of as many successes or more (Hoeffding, 1963), as a logarithm."""
+    rate = successes / trials
+    if rate <= probability:
+        return 0.0
+    divergence = rate * np.log(rate / probability)
+    if rate < 1:
+        divergence += (1 - rate) * np.log((1 - rate) / (1 - probability))
+    return float(-trials * divergence / np.log(10))
+
+
+def uncertainty(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    cam_from_world: pycolmap.Rigid3d,
+    camera: pycolmap.Camera,
+    free_focal_length: bool,
+) -> tuple[float, float]:
+    """Estimate how precisely inliers fix a pose, to first order from their errors.
+
+    Args:
+        points2D: (M, 2) image points of the inliers, COLMAP's pixels.
+        points3D: (M, 3) their world points.
+        cam_from_world: the pose.
+        camera: intrinsics.
+        free_focal_length: the focal length was estimated with the pose.
+
+    Returns:
+        The standard deviations of the position, in units of the inliers' median depth, and of the
+        rotation in degrees; infinite where the inliers do not fix the pose.
+    """
+    local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
+    x, y, z = (local / np.median(local[:, 2])).T
+    u, v, zero = x / z, y / z, np.zeros_like(z)
+    # derivatives by a rotation about x, y, z, a translation along them, and the focal length
+    rows = [
+        np.stack([-u * v, 1 + u * u, -v, 1 / z, zero, -u / z, u], axis=1),
+        np.stack([-1 - v * v, u * v, u, zero, 1 / z, -v / z, v], axis=1),
+    ]
+    jacobian = camera.mean_focal_length() * np.concatenate(rows)[:, : 7 if free_focal_length else 6]
+    equations, unknowns = jacobian.shape
+    if equations <= unknowns:
+        return np.inf, np.inf
+    errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
+    noise = max(LEAST_NOISE**2, (errors**2).sum() / (equations - unknowns))
+    try:
+        variance = noise * np.diag(np.linalg.inv(jacobian.T @ jacobian))
+    except np.linalg.LinAlgError:
+        return np.inf, np.inf
+    if not (variance > 0).all():
+        return np.inf, np.inf
+    return float(np.sqrt(variance[3:6].sum())), float(np.degrees(np.sqrt(variance[:3].sum())))
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What a pose must have for the query to be called localized.
+
+    Args:
+        min_confidence: `confidence`.
+        min_inliers: inliers of RANSAC.
+
+    Raises:
+        InputError: for a confidence that is not finite or a negative number of inliers.
+    """
+
+    min_confidence: float = 8.0
+    min_inliers: int = 8
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.min_confidence):
+            raise InputError(f"min_confidence is {self.min_confidence}: a number is needed.")
+        if self.min_inliers < 0:
+            raise InputError(f"min_inliers is {self.min_inliers}: at least 0.")
+
+
+DEFAULT_GATE = Gate()
+
+
+def add_gate_options(parser: ArgumentParser) -> None:
+    """Add --min_confidence and --min_inliers."""
+    parser.add_argument(
+        "--min_confidence",
+        type=float,
+        default=DEFAULT_GATE.min_confidence,
+        help="confidence that a pose must have for the query to be called localized: minus the "
+        "decimal logarithm of how many such poses are expected by chance",
+    )
+    parser.add_argument(
+        "--min_inliers",
+        type=int,
+        default=DEFAULT_GATE.min_inliers,
+        help="inliers that a pose must have for the query to be called localized",
+    )

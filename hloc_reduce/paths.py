@@ -1,0 +1,34 @@
+"""Strings for paths, as hloc takes them."""
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import ParamSpec, TypeVar, get_args
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+def strings_as_paths(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Let a function take strings for paths.
+
+    A string becomes a path where the annotation has `Path` but not `str`, such as `Path | None`.
+    With `Path | str` the function itself tells them apart.
+    """
+    signature = inspect.signature(function)
+    kinds = {
+        name: get_args(parameter.annotation) or (parameter.annotation,)
+        for name, parameter in signature.parameters.items()
+    }
+    paths = [name for name, kind in kinds.items() if Path in kind and str not in kind]
+
+    @wraps(function)
+    def convert(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        given = signature.bind(*args, **kwargs)
+        for name in paths:
+            if isinstance(given.arguments.get(name), str):
+                given.arguments[name] = Path(given.arguments[name])
+        return function(*given.args, **given.kwargs)
+
+    return convert

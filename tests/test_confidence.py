@@ -1,0 +1,201 @@
+"""Poses that can be trusted, and those that cannot: chance, precision, ambiguity."""
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom
+
+from hloc_reduce import absolute_pose
+from hloc_reduce.cli import InputError
+from hloc_reduce.confidence import (
+    DEFAULT_GATE,
+    Gate,
+    _log10_tail,
+    confidence,
+    reprojection_errors,
+    uncertainty,
+)
+
+CAMERA = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1600, height=1200, params=[1400, 800, 600])
+GUESS = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1600, height=1200, params=[1920, 800, 600])
+FREE = {
+    "estimation": {"estimate_focal_length": True},
+    "refinement": {"refine_focal_length": True},
+}
+
+
+def pose_of(turn: float, translation: tuple[float, float, float]) -> pycolmap.Rigid3d:
+    rotation = Rotation.from_euler("y", turn, degrees=True).as_matrix()
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.array(translation, float))
+
+
+TRUE = pose_of(10, (0.3, 0.1, 8))
+
+
+def matches(
+    right: int, wrong: int, seed: int = 0, pose: pycolmap.Rigid3d = TRUE, noise: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return image points and world points of right matches, then of wrong ones."""
+    generator = np.random.default_rng(seed)
+    points = generator.uniform([-4, -3, -2], [4, 3, 2], (right + wrong, 3))
+    _, projected = reprojection_errors(np.zeros((len(points), 2)), points, pose, CAMERA)
+    projected += noise * generator.standard_normal(projected.shape)
+    projected[right:] = generator.uniform(0, [1600, 1200], (wrong, 2))
+    return projected, points
+
+
+def solve(points2D, points3D, images=(), camera=CAMERA, config=None, gate=DEFAULT_GATE):
+    return absolute_pose.estimate(points2D, points3D, list(images), camera, config or {}, gate)
+
+
+@pytest.mark.parametrize("number", [4, 10, 30, 100, 1000, 5000])
+@pytest.mark.parametrize("config", [{}, FREE], ids=["given", "guessed"])
+def test_wrong_matches_are_never_trusted(number, config):
+    """Whatever pose RANSAC finds among wrong matches, of whatever number."""
+    for seed in range(5 if number < 1000 else 1):
+        images = np.array_split(np.arange(number), 5)
+        found = solve(*matches(0, number, seed), images, GUESS, config)
+        assert found.refusal is not None and found.confidence < 3
+
+
+@pytest.mark.parametrize(("right", "wrong"), [(9, 0), (12, 20), (40, 300), (200, 1000)])
+@pytest.mark.parametrize("config", [{}, FREE], ids=["given", "guessed"])
+def test_right_matches_are_trusted(right, wrong, config):
+    found = solve(*matches(right, wrong), camera=GUESS if config else CAMERA, config=config)
+    assert found.refusal is None and found.confidence > 8
+    assert found.num_inliers >= right - 1
+    moved = found.cam_from_world * TRUE.inverse()
+    assert np.degrees(moved.rotation.angle()) < 1 and np.linalg.norm(moved.translation) < 0.5
+
+
+def test_few_inliers_are_refused():
+    found = solve(*matches(6, 0))
+    assert found.refusal == "too few inliers: 6, at least 8 are needed"
+    assert solve(*matches(6, 0), gate=Gate(0, 6)).refusal is None
+    refusal = solve(*matches(12, 20), gate=Gate(1000, 6)).refusal
+    assert refusal.startswith("12 inliers of 32 matches may be chance: confidence 3")
+    nothing = solve(np.zeros((0, 2)), np.zeros((0, 3)))
+    assert nothing.cam_from_world is None and "too few inliers: 0" in nothing.refusal
+
+
+def test_a_pose_from_far_away_explains_nothing():
+    """Where all points fall into a small part of the image, keypoints there are near one."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-1, 1, (500, 3))
+    far = pose_of(0, (0, 0, 100))
+    keypoints = np.array([800, 600]) + generator.uniform(-14, 14, (500, 2))
+    errors, _ = reprojection_errors(keypoints, points, far, CAMERA)
+    assert (errors < 12).mean() > 0.3
+    assert confidence(keypoints, points, far, CAMERA, 12.0) < 0
+    # the same keypoints in the whole image, the points too
+    near = pose_of(0, (0, 0, 4))
+    _, projected = reprojection_errors(keypoints, points, near, CAMERA)
+    assert confidence(projected, points, near, CAMERA, 12.0) > 100
+
+
+def test_keypoints_at_one_place_count_once():
+    keypoints, points = matches(12, 30)
+    once = confidence(keypoints, points, TRUE, CAMERA, 12.0)
+    repeated = np.repeat(keypoints, 5, axis=0), np.repeat(points, 5, axis=0)
+    assert abs(confidence(*repeated, TRUE, CAMERA, 12.0) - once) < 0.4 * once
+    assert confidence(*repeated, TRUE, CAMERA, 12.0) < once
+
+
+def test_more_chances_and_more_freedom_are_less_confidence():
+    keypoints, points = matches(12, 30)
+    once = confidence(keypoints, points, TRUE, CAMERA, 12.0)
+    assert confidence(keypoints, points, TRUE, CAMERA, 12.0, 7) < once
+    wrong = np.random.default_rng(1).permutation(points)
+    more = np.concatenate([keypoints, keypoints]), np.concatenate([points, wrong])
+    assert confidence(*more, TRUE, CAMERA, 12.0) < once
+
+
+def test_points_behind_the_camera_are_no_inliers():
+    keypoints, points = matches(20, 0)
+    behind = pycolmap.Rigid3d(TRUE.rotation, -TRUE.translation)
+    errors, projected = reprojection_errors(keypoints, points, behind, CAMERA)
+    assert np.isinf(errors).all() and np.isnan(projected).all()
+    assert confidence(keypoints, points, behind, CAMERA, 12.0) < 0
+
+
+@pytest.mark.parametrize("trials", [5, 50, 1000])
+@pytest.mark.parametrize("probability", [1e-4, 0.01, 0.3])
+def test_the_tail_is_a_bound(trials, probability):
+    for successes in range(trials + 1):
+        exact = binom.logsf(successes - 1, trials, probability) / np.log(10)
+        assert _log10_tail(successes, trials, probability) >= exact - 1e-9
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_uncertainty_is_the_spread_of_poses(free):
+    """As measured with keypoints of other noise."""
+    camera, config = (GUESS, FREE) if free else (CAMERA, {})
+    found = [solve(*matches(60, 0, noise=0), camera=camera, config=config)]
+    keypoints, points = matches(60, 0, noise=0)
+    generator = np.random.default_rng(0)
+    for _ in range(60):
+        noisy = keypoints + 2 * generator.standard_normal(keypoints.shape)
+        found.append(solve(noisy, points, camera=camera, config=config))
+    centres = [pose.cam_from_world.inverse().translation for pose in found]
+    depth = 8
+    measured = np.sqrt(np.var(centres[1:], axis=0).sum()) / depth
+    noisy = keypoints + 2 * generator.standard_normal(keypoints.shape)
+    expected, _ = uncertainty(noisy, points, TRUE, CAMERA, free)
+    assert 0.6 < expected / measured < 1.6
+
+
+def test_inliers_that_do_not_fix_the_pose_are_refused():
+    """All of them lie in a narrow band of the image, and nearly in a plane."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform([-0.005, -0.2, -0.005], [0.005, 0.2, 0.005], (20, 3))
+    _, keypoints = reprojection_errors(np.zeros((20, 2)), points, pose_of(0, (0, 0, 2)), CAMERA)
+    keypoints += generator.standard_normal(keypoints.shape)
+    found = solve(keypoints, points)
+    assert "the inliers do not fix the pose" in found.refusal
+    assert uncertainty(keypoints[:3], points[:3], TRUE, CAMERA, False) == (np.inf, np.inf)
+
+
+def test_a_focal_length_that_no_lens_has_is_refused():
+    """Seen from close by with a fisheye's focal length, and from afar with a telescope's."""
+    for focal_length in (150, 20_000):
+        camera = pycolmap.Camera(
+            model="SIMPLE_PINHOLE", width=1600, height=1200, params=[focal_length, 800, 600]
+        )
+        pose = pose_of(10, (0, 0, 6 * focal_length / 1400 + 3))
+        points = np.random.default_rng(0).uniform(-1, 1, (300, 3)) * [1, 1, 0.9]
+        _, keypoints = reprojection_errors(np.zeros((300, 2)), points, pose, camera)
+        found = solve(keypoints, points, camera=GUESS, config=FREE)
+        assert found.refusal.startswith("no plausible focal length") or (
+            "do not fix" in found.refusal
+        )
+
+
+def test_one_image_at_a_time_finds_what_is_rare_among_all():
+    """Of 4,000 matches 40 are right, nearly all of them in one of the images."""
+    keypoints, points = matches(40, 4000)
+    order = np.r_[np.arange(40), 40 + np.arange(4000)]
+    images = [order[:140], *np.array_split(order[140:], 30)]
+    alone = solve(keypoints, points)
+    found = solve(keypoints, points, images)
+    assert alone.refusal is not None
+    assert found.refusal is None and found.num_inliers >= 38
+    moved = found.cam_from_world * TRUE.inverse()
+    assert np.degrees(moved.rotation.angle()) < 1 and np.linalg.norm(moved.translation) < 0.3
+
+
+def test_two_poses_that_fit_as_well_are_ambiguous():
+    """Half of the matches are those of another place that looks the same."""
+    first, second = matches(60, 0), matches(60, 0, pose=pose_of(40, (2, 0, 9)), seed=1)
+    wrong = matches(0, 500, seed=2)
+    keypoints, points = (np.concatenate(part) for part in zip(first, second, wrong, strict=True))
+    images = [np.r_[:60, 120:200], np.r_[60:120, 200:280], np.r_[280:620]]
+    found = solve(keypoints, points, images)
+    assert found.refusal.startswith("ambiguous: another pose has ")
+
+
+def test_a_gate_is_of_numbers():
+    with pytest.raises(InputError, match="min_confidence is nan"):
+        Gate(float("nan"))
+    with pytest.raises(InputError, match="min_inliers is -1"):
+        Gate(min_inliers=-1)
