@@ -16,7 +16,7 @@ from threading import get_ident
 import numpy as np
 import pycolmap
 
-from .cli import InputError
+from .cli import InputError, choose, some
 from .interrupts import interruptible
 from .io import replacing
 from .parsers import CAMERA_MODELS, check_names, parse_pairs, write_pairs
@@ -269,6 +269,16 @@ def _full_disk(path: Path) -> Iterator[None]:
     check()
 
 
+def camera_mode(name: str) -> pycolmap.CameraMode:
+    """Return COLMAP's camera mode of a name in lower or upper case, such as per_folder.
+
+    Raises:
+        InputError: for an unknown name.
+    """
+    modes = {mode.lower(): value for mode, value in pycolmap.CameraMode.__members__.items()}
+    return modes[choose("camera mode", name.lower(), modes)]
+
+
 def import_images(
     database: Path,
     image_dir: Path,
@@ -292,9 +302,12 @@ def import_images(
     with _open(database) as opened:
         imported = {image.name for image in opened.read_all_images()}
     if skipped := [name for name in names if name not in imported]:
+        reason = "they cannot be read"
+        if camera_mode in (pycolmap.CameraMode.SINGLE, pycolmap.CameraMode.PER_FOLDER):
+            reason += " or differ in size from those that they are to share a camera with"
         raise InputError(
-            f"COLMAP takes {len(skipped)} images of {image_dir} not, because they cannot be read "
-            f"or do not share a camera: {', '.join(skipped[:5])}"
+            f"COLMAP skipped {len(skipped)} images in {image_dir}, because {reason}: "
+            f"{some(skipped)}."
         )
 
 
@@ -376,6 +389,21 @@ def _rename(database: Path, images: list[pycolmap.Image], names: dict[int, str])
         for image in images:
             image.name = names[image.image_id]
             opened.update_image(image)
+
+
+def count_cameras(database: Path) -> int:
+    """Count the cameras of a COLMAP database."""
+    with _open(database) as opened:
+        return opened.num_cameras()
+
+
+def count_verified(database: Path) -> dict[tuple[str, str], int]:
+    """Count the verified matches of each pair of images of a database that has any."""
+    with _open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        counts = zip(*opened.read_two_view_geometry_num_inliers(), strict=True)
+    ids = ((pycolmap.pair_id_to_image_pair(pair), int(count)) for pair, count in counts)
+    return {(names[pair[0]], names[pair[1]]): count for pair, count in ids if count}
 
 
 def triangulate_points(

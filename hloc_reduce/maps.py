@@ -6,6 +6,8 @@ import uuid
 from collections.abc import Callable
 from pathlib import Path
 
+import pycolmap
+
 from confs import features as features_confs
 from confs import matchers as matchers_confs
 
@@ -17,7 +19,9 @@ from . import (
     logger,
     match_features,
     pairs_from_covisibility,
+    pairs_from_exhaustive,
     pairs_from_retrieval,
+    pairs_from_verification,
     projections,
     reconstruction,
     stamps,
@@ -36,6 +40,8 @@ FINISHED = "map.json"  # is written when all else is there
 FINGERPRINTS = "fingerprints.json"
 PLACE = "place.txt"  # stays when the map is built anew
 RETRIEVAL = aggregate_features.confs["vlad"]
+MAX_EXHAUSTIVE = 100  # photos without covisibility of which all pairs are matched
+ROUNDS = 3  # in which larger sets get more pairs, where these leave photos unconnected
 
 
 class Map:
@@ -60,6 +66,7 @@ class Map:
             self.images = Path(content["image_dir"])
             self.num_images = int(content["images_with_pose"])
             self.num_points3D = int(content["points3D"])
+            self.camera_mode = content.get("camera_mode")  # None for the cameras of a model
             conf = content["conf"]
             self._conf = {
                 "output": _file_name(conf["output"]),
@@ -175,6 +182,7 @@ def main(
     storage: str = STORAGES[0],
     keypoints: str = KEYPOINTS[0],
     accept_partial: bool = False,
+    camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
 ) -> Map:
     """Build a map, or open one that was made from the same.
 
@@ -186,30 +194,36 @@ def main(
         feature: as in `confs.features.get`.
         projection: likewise.
         matcher: a key of `confs.matchers`.
-        num_covis: pairs of each image: the most covisible of the model, or if it has no points
-            the most similar.
+        num_covis: pairs of each image with the most covisible ones of the model. If the model has
+            no points, or there is none, up to `MAX_EXHAUSTIVE` images are all paired, and of more
+            each is paired with the most similar ones; without a model, pairs are added where
+            these leave images unconnected.
         overwrite: build anew.
         storage: as in `confs.features.get`.
         keypoints: as in `confs.features.get`.
         accept_partial: do without images of the model that are missing, and without images that
-            cannot be read.
+            cannot be read; without a model, build a map even if fewer than half of the images
+            are in it.
+        camera_mode: which images share a camera, without a model.
 
     Returns:
         The map.
 
     Raises:
-        InputError: when the folder has a map that was made from something else, or something is
-            missing or wrong.
+        InputError: when the folder has a map that was made from something else, something is
+            missing or wrong, or fewer than half of the images can be reconstructed; what is
+            finished is kept, for a run with `accept_partial`.
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher_conf = matchers_confs.confs[matcher]
     given, model_files = model, {}
-    names = None
+    names, num_points3D = None, 0
     if model is not None:
         reference = colmap.read_model(model)
         names = sorted(image.name for image in reference.images.values())
         if not names:
             raise InputError(f"The model {model} has no images.")
+        num_points3D = reference.num_points3D()
         model_files = {
             path.name: path
             for path in sorted(model.iterdir())
@@ -230,6 +244,11 @@ def main(
         "images": {name: fingerprints[f"images/{name}"][2] for name in names},
         "model": {name: fingerprints[f"model/{name}"][2] for name in model_files},
     }
+    exhaustive = not num_points3D and len(names) <= MAX_EXHAUSTIVE
+    if exhaustive:
+        made_from |= {"num_covis": None, "pairs": "exhaustive"}
+    elif model is None:
+        made_from |= {"pairs": f"retrieval, {ROUNDS} rounds of verification"}
     before = stamps.read(map_dir / "conf.json")
     if before and before != made_from and not (map_dir / FINISHED).exists():
         logger.info("The map %s, which was not finished, is begun anew.", map_dir)
@@ -241,7 +260,13 @@ def main(
         inputs=[path for path in (image_dir, model, projection) if path is not None],
     ) as folder:
         if (map_dir / FINISHED).exists():
-            return Map(map_dir)
+            built = Map(map_dir)
+            if built.camera_mode not in (None, camera_mode.name.lower()):
+                raise InputError(
+                    f"The map {map_dir} was made with --camera_mode {built.camera_mode}: give it "
+                    "again, choose other --outputs, or --overwrite."
+                )
+            return built
         if not (map_dir / PLACE).exists():
             with replacing(map_dir / PLACE) as temporary:
                 temporary.write_text(uuid.uuid4().hex)
@@ -258,20 +283,45 @@ def main(
             descriptors = aggregate_features.main(RETRIEVAL, features, names)
         if model is not None and len(names) < len(reference.images):
             model = colmap.write_part(model, set(names), map_dir / "sfm_reference")
-        pairs = map_dir / f"pairs-db-{num_covis}.txt"
+        pairs = map_dir / f"pairs-db-{'exhaustive' if exhaustive else num_covis}.txt"
         with folder.stage("pairs"):
-            if model is not None and reference.num_points3D():
+            if num_points3D:
                 pairs_from_covisibility.main(model, pairs, num_covis)
+            elif exhaustive:
+                pairs_from_exhaustive.main(pairs, names)
             else:
                 pairs_from_retrieval.main(descriptors, pairs, num_covis)
         with folder.stage("match_map"):
             matches = match_features.main(matcher_conf, pairs, features.stem, map_dir)
+        for number in range(1, ROUNDS + 1) if model is None and not exhaustive else ():
+            before, pairs = pairs, map_dir / f"pairs-db-{num_covis}-{number}.txt"
+            with folder.stage("verification"):
+                pairs_from_verification.main(
+                    pairs,
+                    image_dir,
+                    before,
+                    features,
+                    matches,
+                    descriptors,
+                    num_covis,
+                    num_covis if number == 1 else 0,
+                    camera_mode,
+                    names,
+                )
+            with folder.stage("match_map"):
+                match_features.main(matcher_conf, pairs, features, matches=matches)
         with folder.stage("triangulation" if model is not None else "reconstruction"):
             inputs = (image_dir, pairs, features, matches)
             if model is not None:
                 sfm = triangulation.main(map_dir / "sfm", model, *inputs)
             else:
-                sfm = reconstruction.main(map_dir / "sfm", *inputs, image_list=names)
+                sfm = reconstruction.main(
+                    map_dir / "sfm",
+                    *inputs,
+                    camera_mode,
+                    image_list=names,
+                    accept_partial=accept_partial,
+                )
         shutil.rmtree(map_dir / "sfm_reference", ignore_errors=True)
         summary = {
             "id": uuid.uuid4().hex,
@@ -279,6 +329,7 @@ def main(
             "matcher": matcher,
             "image_dir": str(image_dir.resolve()),
             "model": str(given.resolve()) if given is not None else None,
+            "camera_mode": camera_mode.name.lower() if given is None else None,
             "conf": _with_projection(conf, lambda path: Path(path).name),
             "images": len(names),
             "images_with_pose": sfm.num_reg_images(),

@@ -14,6 +14,20 @@ from .io import list_h5_names
 from .paths import strings_as_paths
 from .triangulation import STAMP, read_matches, replacing_map
 
+REGISTRATION = "registration.json"  # which images are in the model, and in other parts
+# shares of the images that are in the model, below which it is reported in detail, or refused
+ENOUGH, LEAST = 0.8, 0.5
+NAMED = 10  # images that a message names
+# COLMAP would drop parts of fewer than 10 images, or than 8 of 10
+MAPPER_OPTIONS = {"random_seed": 0, "num_threads": 1, "min_model_size": 3}
+# half of COLMAP's thresholds, where images are missing; a quarter of them gave wrong poses
+RELAXED = {
+    "init_min_num_inliers": 50,
+    "init_min_tri_angle": 8.0,
+    "abs_pose_min_num_inliers": 15,
+}
+FEW = 100  # images of which a second attempt takes little time
+
 
 @strings_as_paths
 def main(
@@ -30,10 +44,13 @@ def main(
     image_options: dict | None = None,
     mapper_options: dict | None = None,
     overwrite: bool = False,
+    accept_partial: bool = False,
 ) -> pycolmap.Reconstruction:
     """Reconstruct poses, intrinsics and points by COLMAP's incremental mapper.
 
-    Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary.
+    Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary. Where
+    images are missing in the model, a second attempt with lower thresholds follows, and the model
+    of more images is kept; of more than 100 images only if fewer than 80 % are in the first.
 
     Args:
         sfm_dir: the folder of the new COLMAP model; one made from the same inputs is read back.
@@ -47,16 +64,19 @@ def main(
         min_match_score: take matches of a higher score only.
         image_list: the images, names or a text file of them; default: those of `features`.
         image_options: of pycolmap's ImageReaderOptions.
-        mapper_options: of pycolmap's IncrementalPipelineOptions.
+        mapper_options: of pycolmap's IncrementalPipelineOptions; with any there is no second
+            attempt.
         overwrite: reconstruct anew.
+        accept_partial: return a model of fewer than half of the images, too.
 
     Returns:
         The model of most images. Its keypoints are those of the feature file, in the same order.
 
     Raises:
-        InputError: when an input is missing or nothing can be reconstructed.
+        InputError: when an input is missing, nothing can be reconstructed, or fewer than half of
+            the images are in the model, which is kept for a run with `accept_partial`.
     """
-    options = {"random_seed": 0, "num_threads": 1, **(mapper_options or {})}
+    options = {**MAPPER_OPTIONS, **(mapper_options or {})}
     mapper = colmap.mapper_options(options)
     for path in (pairs, features, matches):
         if not path.is_file():
@@ -70,15 +90,25 @@ def main(
         "images": names,
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
+        "relaxed": {} if mapper_options else RELAXED,
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
-    if not overwrite and stamps.is_current(sfm_dir / STAMP, made_from):
+    is_whole = (sfm_dir / REGISTRATION).is_file()
+    if not overwrite and is_whole and stamps.is_current(sfm_dir / STAMP, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
+        _check(sfm_dir, accept_partial)
         return colmap.read_model(sfm_dir)
 
     with replacing_map(sfm_dir, made_from) as building:
         database = building / "database.db"
         colmap.import_images(database, image_dir, names, camera_mode, image_options or {})
+        if camera_mode == pycolmap.CameraMode.AUTO and 1 < len(names) == colmap.count_cameras(
+            database
+        ):
+            logger.info(
+                "EXIF data do not say which images share a camera, so each has its own. If one "
+                "camera with a fixed zoom took all, --camera_mode single gives better poses."
+            )
         keypoints, _, found = read_matches(names, pairs, features, matches, min_match_score)
         verified = {
             pair: (indices, indices if skip_geometric_verification else None)
@@ -91,18 +121,115 @@ def main(
         models = colmap.incremental_mapping(
             database, image_dir, building / "models", mapper, verbose
         )
+        registered = models[0].num_reg_images() if models else 0
+        enough = len(names) if len(names) <= FEW else ENOUGH * len(names)
+        if registered < enough and not mapper_options:
+            logger.info("Registered %d of %d images: trying again...", registered, len(names))
+            relaxed = colmap.mapper_options({**options, "mapper": RELAXED})
+            more = colmap.incremental_mapping(
+                database, image_dir, building / "relaxed", relaxed, verbose
+            )
+            if more and more[0].num_reg_images() > registered:
+                models = more
         if not models:
             raise InputError(
                 f"COLMAP could not reconstruct the images of {image_dir} from the matches "
-                f"{matches}. Do enough of them overlap?"
+                f"{matches}. Do enough of them overlap? Take photos from several places, each "
+                "overlapping the one before by about two thirds."
             )
         models[0].write(building)
-        shutil.rmtree(building / "models")
-    missing = sorted(set(names) - {image.name for image in models[0].images.values()})
-    if missing:
-        logger.warning("%d images are not in the map: %s.", len(missing), ", ".join(missing))
+        for folder in ("models", "relaxed"):
+            shutil.rmtree(building / folder, ignore_errors=True)
+        parts = _parts(models)
+        matched = {name for pair in colmap.count_verified(database) for name in pair}
+        state = {
+            "images": len(names),
+            "parts": parts,
+            "missing": sorted(set(names) - set(parts[0])),
+            "unmatched": sorted(set(names) - matched),
+        }
+        stamps.write(building / REGISTRATION, state)
     logger.info("The map %s:\n%s", sfm_dir, models[0].summary())
+    _check(sfm_dir, accept_partial)
     return models[0]
+
+
+def _parts(models: list[pycolmap.Reconstruction]) -> list[list[str]]:
+    """Return the images of each model that no larger one has; COLMAP's models may overlap."""
+    parts, seen = [], set()
+    for model in models:
+        if new := sorted({image.name for image in model.images.values()} - seen):
+            parts.append(new)
+            seen.update(new)
+    return parts
+
+
+def _check(sfm_dir: Path, accept_partial: bool) -> None:
+    """Report what is missing in a model, or raise an InputError if that is more than half."""
+    state = stamps.read(sfm_dir / REGISTRATION)
+    missing, number = state["missing"], state["images"]
+    registered = number - len(missing)
+    if registered >= ENOUGH * number and len(state["parts"]) == 1:
+        if missing:
+            logger.warning(
+                "%d of %d images are not in the map: %s.",
+                *(len(missing), number, cli.some(missing, NAMED)),
+            )
+        return
+    message = shortfall(sfm_dir / REGISTRATION, **state)
+    if registered < LEAST * number and not accept_partial:
+        raise InputError(f"{message} To use the map as it is, run again with --accept_partial.")
+    logger.warning(message)
+
+
+def shortfall(
+    path: Path,
+    images: int,
+    parts: list[list[str]],
+    missing: list[str],
+    unmatched: list[str],
+) -> str:
+    """Say which images are not in a model, why, and what to try.
+
+    Args:
+        path: file with all names.
+        images: number of images.
+        parts: the images of each part that COLMAP reconstructed, the model first.
+        missing: the images that are not in the model.
+        unmatched: those that match no other image.
+    """
+    registered = images - len(missing)
+    only = "Only " if registered < ENOUGH * images else ""
+    said = [
+        f"{only}{registered} of {images} photos are in the map.",
+        f"Missing: {cli.some(missing, NAMED)}{f' (all in {path})' * bool(missing[NAMED:])}.",
+    ]
+    tries = []
+    if len(parts) > 1:
+        sizes = [str(len(part)) for part in parts]
+        said.append(
+            f"COLMAP found {len(parts)} parts that do not connect, of {', '.join(sizes[:-1])} and "
+            f"{sizes[-1]} photos, and the map is the first"
+            + (f"; the second has {cli.some(parts[1], 3)}." if parts[1] != missing else ".")
+        )
+        tries.append("add photos between the parts, each overlapping the one before by two thirds")
+    elif set(missing) - set(unmatched):
+        tries.append("add photos between those in the map and those that are not")
+    if unmatched:
+        said.append(f"No other photo matches {cli.some(unmatched)}.")
+        tries.append("leave out photos of other places, and retake blurred or dark ones")
+    return f"{' '.join(said)} What to try: {'; '.join(tries)}."
+
+
+def add_camera_mode(parser: argparse.ArgumentParser) -> None:
+    """Add --camera_mode."""
+    modes = ", ".join(mode.lower() for mode in pycolmap.CameraMode.__members__)
+    parser.add_argument(
+        "--camera_mode",
+        default="auto",
+        help=f"which photos share a camera, as in COLMAP: {modes}; auto, COLMAP's default: those "
+        "of the same make, model, focal length and size by EXIF data",
+    )
 
 
 def _main() -> None:
@@ -118,9 +245,11 @@ def _main() -> None:
     parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
     parser.add_argument("--features", type=Path, required=True, help="feature file")
     parser.add_argument("--matches", type=Path, required=True, help="match file")
-    modes = list(pycolmap.CameraMode.__members__)
+    add_camera_mode(parser)
     parser.add_argument(
-        "--camera_mode", default="AUTO", help=f"which images share a camera: {', '.join(modes)}"
+        "--accept_partial",
+        action="store_true",
+        help="accept a map that has fewer than half of the photos",
     )
     parser.add_argument(
         "--skip_geometric_verification", action="store_true", help="take all matches"
@@ -130,8 +259,7 @@ def _main() -> None:
     parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
     parser.add_argument("--overwrite", action="store_true", help="reconstruct anew")
     args = parser.parse_args()
-    mode = cli.choose("camera mode", args.camera_mode, modes)
-    main(**{**vars(args), "camera_mode": pycolmap.CameraMode.__members__[mode]})
+    main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})
 
 
 if __name__ == "__main__":

@@ -95,7 +95,8 @@ def add_localization_options(parser: argparse.ArgumentParser, truth: str, num_lo
     parser.add_argument(
         "--accept_partial",
         action="store_true",
-        help="do without map photos that are missing or cannot be read",
+        help="do without map photos that are missing, cannot be read or, in a map of photos alone, "
+        "could not be reconstructed",
     )
     add_gate_options(parser)
     parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")

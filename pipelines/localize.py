@@ -19,6 +19,7 @@ from confs import matchers as matchers_confs
 from hloc_reduce import (
     aggregate_features,
     cli,
+    colmap,
     extract_features,
     intrinsics,
     localize_sfm,
@@ -26,6 +27,7 @@ from hloc_reduce import (
     maps,
     match_features,
     pairs_from_retrieval,
+    reconstruction,
     results,
     stamps,
     trace,
@@ -61,6 +63,7 @@ def open_map(
     storage: str | None = None,
     keypoints: str | None = None,
     accept_partial: bool = False,
+    camera_mode: str | None = None,
 ) -> Map:
     """Build a map in `outputs`, or open one that was built before.
 
@@ -77,7 +80,14 @@ def open_map(
         storage: of descriptors; likewise, float16.
         keypoints: settings of the DoG detector; likewise, adaptive.
         accept_partial: as of `maps.main`.
+        camera_mode: which photos share a camera, as in COLMAP; default: auto.
     """
+    if camera_mode is not None:
+        mode = colmap.camera_mode(camera_mode)
+        if map_images is None or model_or_map is not None:
+            raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
+    else:
+        mode = colmap.camera_mode("auto")
     if map_images is None:
         if model_or_map is None:
             raise InputError("Give --map_images, the folder of the photos to build a map of.")
@@ -111,7 +121,8 @@ def open_map(
         overwrite,
         storage or STORAGES[0],
         keypoints or KEYPOINTS[0],
-        accept_partial=accept_partial,
+        accept_partial,
+        mode,
     )
 
 
@@ -319,10 +330,11 @@ def _main() -> None:
         "--query_images>; a digest of the path follows if others of that name have that folder",
     )
     parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
+    reconstruction.add_camera_mode(parser)
     common.add_feature_options(parser)
     common.add_localization_options(parser, "none", 50)
     # None: those of a map that was built
-    parser.set_defaults(feature=None, matcher=None, storage=None, keypoints=None)
+    parser.set_defaults(feature=None, matcher=None, storage=None, keypoints=None, camera_mode=None)
     args = parser.parse_args()
     common.check_options(args)
     if args.storage is not None:
@@ -349,7 +361,8 @@ def _run(args: argparse.Namespace) -> None:
         args.overwrite,
         args.storage,
         args.keypoints,
-        accept_partial=args.accept_partial,
+        args.accept_partial,
+        args.camera_mode,
     )
     if args.query_images is None:
         print(f"The map {built.folder} is there. Localize photos in it with --query_images.")

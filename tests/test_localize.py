@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import sys
+from pathlib import Path
 
 import command
 import cv2
@@ -21,6 +22,7 @@ from hloc_reduce import (
     localization,
     maps,
     match_features,
+    pairs_from_verification,
     parsers,
     projections,
     reconstruction,
@@ -362,8 +364,10 @@ def test_a_projection_is_kept_with_the_map(place, tmp_path, monkeypatch):
     assert outcome(tmp_path / "other/queries-day")[0]["bytes_per_keypoint"]["descriptor"] == 48
 
 
-def test_a_model_of_poses_only(place, aachen_layout, monkeypatch):
-    """Without points nothing is covisible: similar images are matched."""
+@pytest.mark.parametrize("exhaustive", [4, 3])
+def test_a_model_of_poses_only(place, aachen_layout, monkeypatch, exhaustive):
+    """Without points nothing is covisible: all images are matched, or if many similar ones."""
+    monkeypatch.setattr(maps, "MAX_EXHAUSTIVE", exhaustive)
     build, images, outputs = place
     model = aachen_layout / "3D-models/aachen_v_1_1"
     reference = pycolmap.Reconstruction(model)
@@ -371,7 +375,9 @@ def test_a_model_of_poses_only(place, aachen_layout, monkeypatch):
         reference.delete_point3D(point)
     reference.write(model)
     run(monkeypatch, *build, "--num_covis", 2)
-    assert len(parsers.parse_retrieval(outputs / "map/pairs-db-2.txt")) == 4
+    name = "exhaustive" if exhaustive == 4 else "2"
+    pairs = list(parsers.parse_pairs(outputs / f"map/pairs-db-{name}.txt"))
+    assert len(pairs) == (6 if exhaustive == 4 else 8)
     pose, _ = Localizer(outputs / "map").localize(images / "query/day/a.png")
     assert pose is not None
 
@@ -525,7 +531,7 @@ def test_reconstruction_from_matches_alone(scene, tmp_path):
     assert not (tmp_path / "no").exists()
     cv2.imwrite(str(scene.images / "db/3.jpg"), np.zeros((100, 100), np.uint8))
     parsers.write_pairs([(a, b) for a in names for b in names if a < b], pairs)
-    with pytest.raises(InputError, match="do not share a camera: db/3.jpg"):
+    with pytest.raises(InputError, match="share a camera with: db/3.jpg"):
         reconstruction.main(tmp_path / "no", *arguments, **shared)
 
 
@@ -549,6 +555,154 @@ def test_photos_alone(plane, tmp_path, monkeypatch):
     known = np.array([image.projection_center() for image in true])
     # of 2.2: a plane says little about the focal length
     assert np.linalg.norm(similarity(centres, known), axis=1).max() < 0.2
+
+
+def test_a_second_attempt_where_images_are_missing(scene, tmp_path, monkeypatch):
+    names = [f"db/{i}.jpg" for i in range(6)]
+    pairs, matches = tmp_path / "pairs.txt", tmp_path / "matches.h5"
+    parsers.write_pairs([(a, b) for a in names for b in names if a < b], pairs)
+    match_features.main(match_features.confs["NN-ratio"], pairs, scene.features, matches=matches)
+    attempts, mapping = [], colmap.incremental_mapping
+
+    def fails_first(database, image_dir, output, options, verbose):
+        attempts.append(options.mapper.abs_pose_min_num_inliers)
+        if len(attempts) == 1:
+            return []
+        return mapping(database, image_dir, output, options, verbose)
+
+    monkeypatch.setattr(colmap, "incremental_mapping", fails_first)
+    arguments = (scene.images, pairs, scene.features, matches)
+    model = reconstruction.main(tmp_path / "sfm", *arguments, image_list=names)
+    assert model.num_reg_images() == 6 and attempts == [30, 15]
+    attempts.clear()
+    with pytest.raises(InputError, match="could not reconstruct"):
+        own = {"min_model_size": 5}
+        reconstruction.main(tmp_path / "no", *arguments, image_list=names, mapper_options=own)
+    assert attempts == [30]
+
+
+def draw_noise(folder, numbers):
+    """Write photos that match no other."""
+    generator = np.random.default_rng(1)
+    for number in numbers:
+        noise = cv2.GaussianBlur(generator.standard_normal((360, 480)), (0, 0), 3)
+        cv2.imwrite(str(folder / f"{number}.png"), 128 + 30 * noise / noise.std())
+
+
+def test_fewer_than_half_of_the_photos(plane, tmp_path, monkeypatch, caplog):
+    """Are refused with their names, and accepted on demand without any work."""
+    images, outputs = plane / "images", tmp_path / "outputs"
+    draw_noise(images, range(5, 11))
+    build = ("--map_images", images, "--outputs", outputs)
+    message = refused(monkeypatch, caplog, *build)
+    assert "Only 5 of 11 photos are in the map. Missing: 10.png, 5.png, 6.png" in message
+    assert "No other photo matches 10.png" in message and "retake blurred or dark ones" in message
+    assert "--accept_partial" in message
+    assert not (outputs / "map/map.json").exists()
+    before = {path: time for path, time in state(outputs / "map").items() if "sfm" in str(path)}
+    assert before
+    caplog.clear()
+    run(monkeypatch, *build, "--accept_partial")
+    assert "Only 5 of 11 photos" in caplog.text
+    now = state(outputs / "map")
+    assert all(now[path] == before[path] for path in before)
+    assert len(maps.Map(outputs / "map").names()) == 5
+    run(monkeypatch, *build)  # is accepted for good
+
+
+def test_most_of_the_photos(plane, tmp_path, monkeypatch, caplog):
+    images, outputs = plane / "images", tmp_path / "outputs"
+    draw_noise(images, [5])
+    caplog.set_level("INFO")
+    run(monkeypatch, "--map_images", images, "--outputs", outputs)
+    assert "1 of 6 images are not in the map: 5.png." in caplog.text
+    assert "What to try" not in caplog.text
+    assert "so each has its own" in caplog.text  # PNG files have no EXIF data
+
+
+def test_parts_that_do_not_connect():
+    state = {
+        "images": 10,
+        "parts": [["a", "b", "c", "d", "e"], ["f", "g", "h"]],
+        "missing": ["f", "g", "h", "i", "j"],
+        "unmatched": ["j"],
+    }
+    message = reconstruction.shortfall(Path("x"), **state)
+    assert "Only 5 of 10 photos" in message and "f, g, h, i, j." in message
+    assert "2 parts that do not connect, of 5 and 3 photos" in message
+    assert "the second has f, g, h." in message and "between the parts" in message
+    assert "matches j." in message
+
+
+def test_camera_modes(plane, tmp_path, monkeypatch, caplog):
+    images, outputs = plane / "images", tmp_path / "outputs"
+    build = ("--map_images", images, "--outputs", outputs)
+    assert "Unknown camera mode 'one'" in refused(
+        monkeypatch, caplog, *build, "--camera_mode", "one"
+    )
+    model = ("--map", plane / "model", "--camera_mode", "single")
+    assert "photos alone" in refused(monkeypatch, caplog, *build, *model)
+    caplog.set_level("INFO")
+    run(monkeypatch, *build, "--camera_mode", "single")
+    assert "so each has its own" not in caplog.text
+    assert colmap.read_model(outputs / "map/sfm").num_cameras() == 1
+    assert "--camera_mode single" in refused(monkeypatch, caplog, *build)
+    features = outputs / "map/feats-dog-colmap_sift_sv64.h5"
+    before = features.stat().st_mtime_ns
+    (outputs / "map/map.json").unlink()  # not finished: the features are kept
+    run(monkeypatch, *build, "--camera_mode", "PER_IMAGE")
+    assert colmap.read_model(outputs / "map/sfm").num_cameras() == 5
+    assert features.stat().st_mtime_ns == before
+
+
+def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch):
+    """One retrieved photo each leaves two parts; all are in the map in the end."""
+    monkeypatch.setattr(maps, "MAX_EXHAUSTIVE", 4)
+    outputs = tmp_path / "outputs"
+    build = ("--map_images", plane / "images", "--outputs", outputs, "--num_covis", 1)
+
+    def apart(descriptors, output, num_matched):
+        parsers.write_pairs([("0.png", "1.png"), ("1.png", "2.png"), ("3.png", "4.png")], output)
+
+    monkeypatch.setattr(maps.pairs_from_retrieval, "main", apart)
+    run(monkeypatch, *build)
+    built = maps.Map(outputs / "map")
+    assert len(built.names()) == 5
+    lists = [outputs / f"map/pairs-db-1{end}.txt" for end in ("", "-1", "-2", "-3")]
+    sizes = [len(set(parsers.parse_pairs(path))) for path in lists]
+    assert sizes[0] == 3 < sizes[1] and sizes == sorted(sizes)
+    written = state(outputs / "map")
+    (outputs / "map/map.json").unlink()
+    run(monkeypatch, *build)
+    again = state(outputs / "map")
+    assert all(again[path] == written[path] for path in written if path.suffix in (".h5", ".bin"))
+
+
+def test_which_pairs_are_added():
+    names = [str(i) for i in range(6)]
+    descriptors = np.eye(6, dtype=np.float32)
+    descriptors[4] = descriptors[5] = [0.9, 0.1, 0.2, 0, 0, 0]
+    chain = {("0", "1"): 90, ("1", "2"): 50, ("2", "3"): 40, ("4", "5"): 20}
+    more = pairs_from_verification.more_pairs
+    added = more(names, set(chain), chain, descriptors, 1, 1)
+    # neighbours of neighbours, the most similar of the other component, any of those with few
+    assert {("0", "2"), ("1", "3"), ("0", "4"), ("0", "5")} <= set(added)
+    assert not set(added) & set(chain)
+    assert added == more(names, set(chain), chain, descriptors, 1, 1)
+    everything = {(a, b): 99 for a in names for b in names if a < b}
+    assert more(names, set(everything), everything, descriptors, 1, 1) == []
+    assert more(names, set(), {}, descriptors, 9)  # nothing is verified
+
+
+def test_a_map_of_other_pairs_is_refused(plane, tmp_path, monkeypatch, caplog):
+    outputs = tmp_path / "outputs"
+    build = ("--map_images", plane / "images", "--outputs", outputs)
+    run(monkeypatch, *build)
+    run(monkeypatch, *build, "--num_covis", 3)  # of which all pairs know nothing
+    assert len(list(parsers.parse_pairs(outputs / "map/pairs-db-exhaustive.txt"))) == 10
+    monkeypatch.setattr(maps, "MAX_EXHAUSTIVE", 4)
+    message = refused(monkeypatch, caplog, *build)
+    assert "differs: num_covis and pairs" in message and "--overwrite" in message
 
 
 @pytest.mark.parametrize("by_model", [True, False])

@@ -1,0 +1,202 @@
+"""Compare maps of photos alone with stock pycolmap and with given poses.
+
+Builds a map from the photos of each place, or of consecutive ones by name, and on demand one by
+stock pycolmap: its own SIFT, exhaustive matching and the incremental mapper, all by default. The
+positions of a map are aligned with the given ones by a similarity; their errors are in percent of
+the extent of the given positions, the largest distance between two of them.
+"""
+
+import argparse
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
+
+from confs import features as features_confs
+from hloc_reduce import cli, colmap, maps
+from hloc_reduce.cli import InputError
+from hloc_reduce.training.__main__ import parse_maps
+
+COLUMNS = ("registered", "points", "reprojection error", "positions", "rotations", "seconds")
+ROBUST = 10  # rounds of reweighting
+
+
+def choose_photos(names: list[str], size: int, number: int) -> list[list[str]]:
+    """Return subsets of consecutive names, spread evenly over the list; all if size is 0."""
+    if not size or len(names) <= size:
+        return [names]
+    starts = np.unique(np.linspace(0, len(names) - size, number + 2)[1:-1].astype(int))
+    return [names[start : start + size] for start in starts]
+
+
+def ours(images: Path, folder: Path, feature: str, options: dict) -> pycolmap.Reconstruction:
+    """Build a map of photos alone."""
+    built = maps.main(folder, images, feature=feature, accept_partial=True, **options)
+    return colmap.read_model(built.sfm)
+
+
+def stock(images: Path, folder: Path) -> pycolmap.Reconstruction:
+    """Reconstruct by pycolmap alone, in one thread, and return the model of most images."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    database = folder / "database.db"
+    with pycolmap.Database.open(database):
+        pass
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1)
+    verification = pycolmap.TwoViewGeometryOptions(ransac={"random_seed": 0})
+    cpu = pycolmap.Device.cpu
+    pycolmap.extract_features(database, images, extraction_options=extraction, device=cpu)
+    pycolmap.match_exhaustive(
+        database, matching_options=matching, verification_options=verification, device=cpu
+    )
+    options = colmap.mapper_options({"random_seed": 0, "num_threads": 1})
+    models = pycolmap.incremental_mapping(database, images, folder, options=options)
+    if not models:
+        raise InputError(f"Stock pycolmap could not reconstruct the photos of {images}.")
+    return max(models.values(), key=lambda model: model.num_reg_images())
+
+
+def pose_errors(
+    model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction
+) -> tuple[np.ndarray, np.ndarray]:
+    """Align a model with another by a similarity and compare the poses of its images.
+
+    Args:
+        model: to align.
+        reference: with the same images and perhaps more.
+
+    Returns:
+        Errors of the positions (N,), in percent of the extent of those of the reference, and of
+        the rotations (N,), in degrees.
+    """
+    true = {image.name: image.cam_from_world() for image in reference.images.values()}
+    known = {image.name: image.cam_from_world() for image in model.images.values()}
+    names = sorted(known)
+    source = np.array([known[name].inverse().translation for name in names])
+    target = np.array([true[name].inverse().translation for name in names])
+    # the similarity of least absolute errors, so that one wrong pose does not spoil the others
+    weights = np.ones(len(names))
+    for _ in range(ROBUST):
+        scale, rotation, shift = fit_similarity(source, target, weights)
+        errors = np.linalg.norm(scale * source @ rotation.T + shift - target, axis=1)
+        weights = 1 / np.maximum(errors, max(np.median(errors), 1e-9) / 10)
+    angles = [
+        Rotation.from_matrix(
+            true[name].rotation.matrix().T @ known[name].rotation.matrix() @ rotation.T
+        ).magnitude()
+        for name in names
+    ]
+    return 100 * errors / pdist(target).max(), np.rad2deg(angles)
+
+
+def fit_similarity(
+    source: np.ndarray, target: np.ndarray, weights: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Fit target = scale * rotation @ source + shift by weighted least squares (Umeyama)."""
+    weights = (weights / weights.sum())[:, None]
+    centre, true_centre = (weights * source).sum(0), (weights * target).sum(0)
+    source, target = source - centre, target - true_centre
+    u, s, vt = np.linalg.svd((weights * target).T @ source)
+    flip = np.diag([1, 1, np.linalg.det(u @ vt)])
+    scale = (s * np.diag(flip)).sum() / (weights * source**2).sum()
+    rotation = u @ flip @ vt
+    return scale, rotation, true_centre - scale * rotation @ centre
+
+
+def row(model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction, number: int) -> list:
+    """Return the cells of a model but for the seconds."""
+    positions, rotations = pose_errors(model, reference)
+    return [
+        f"{model.num_reg_images()} of {number}",
+        model.num_points3D(),
+        f"{model.compute_mean_reprojection_error():.2f}",
+        f"{np.median(positions):.2f} / {positions.max():.2f} %",
+        f"{np.median(rotations):.2f} / {rotations.max():.2f}°",
+    ]
+
+
+def main(
+    places: dict[str, tuple[Path, Path]],
+    output: Path,
+    feature: str = features_confs.RECOMMENDED,
+    subset: int = 0,
+    subsets: int = 1,
+    with_stock: bool = False,
+    options: dict | None = None,
+) -> None:
+    """Print a row for each place, subset and method."""
+    print(f"| place | method | {' | '.join(COLUMNS)} |")
+    print(f"| --- | --- |{' ---: |' * len(COLUMNS)}", flush=True)
+    registered = {}
+    for place, (images, model) in places.items():
+        reference = colmap.read_model(model)
+        names = sorted(image.name for image in reference.images.values())
+        for number, chosen in enumerate(choose_photos(names, subset, subsets)):
+            title = f"{place} {len(chosen)}" + (f" ({number + 1})" if subsets > 1 else "")
+            folder = output / title.replace(" ", "-")
+            shutil.rmtree(folder / "photos", ignore_errors=True)
+            for name in chosen:
+                target = folder / "photos" / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.symlink_to((images / name).resolve())
+            photos = folder / "photos"
+            for method in ("ours", "stock") if with_stock else ("ours",):
+                start = time.perf_counter()
+                try:
+                    if method == "ours":
+                        found = ours(photos, folder / "map", feature, options or {})
+                    else:
+                        found = stock(photos, folder / "stock")
+                    cells = row(found, reference, len(chosen))
+                    registered[method] = registered.get(method, 0) + int(cells[0].split()[0])
+                except InputError as error:
+                    cells = [f"0 of {len(chosen)}", *["-"] * 4]
+                    print(f"<!-- {error} -->")
+                cells.append(f"{time.perf_counter() - start:.0f}")
+                print(f"| {title} | {method} | {' | '.join(map(str, cells))} |", flush=True)
+    print()
+    for method, total in registered.items():
+        print(f"{method}: {total} photos registered in all")
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python benchmarks/photos_alone.py --map fox/images:fox/sparse "
+        "--subset 10 --stock --output outputs/photos_alone",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--map", nargs="+", required=True, metavar="IMAGES:MODEL")
+    parser.add_argument("--output", type=Path, required=True, help="folder of the maps")
+    parser.add_argument("--feature", default=features_confs.RECOMMENDED, help="name or YAML file")
+    parser.add_argument("--subset", type=int, default=0, help="photos of each place; 0: all")
+    parser.add_argument("--subsets", type=int, default=1, help="how many such subsets")
+    parser.add_argument("--stock", action="store_true", help="run stock pycolmap too")
+    parser.add_argument("--camera_mode", default="auto", help="which photos share a camera")
+    parser.add_argument("--num_covis", type=int, default=20, help="pairs of a photo, where not all")
+    parser.add_argument(
+        "--max_exhaustive",
+        type=int,
+        default=maps.MAX_EXHAUSTIVE,
+        help="photos of which all pairs are matched",
+    )
+    args = parser.parse_args()
+    maps.MAX_EXHAUSTIVE = args.max_exhaustive
+    main(
+        parse_maps(args.map),
+        args.output,
+        args.feature,
+        args.subset,
+        args.subsets,
+        args.stock,
+        {"num_covis": args.num_covis, "camera_mode": colmap.camera_mode(args.camera_mode)},
+    )
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,221 @@
+"""Add pairs where the verified matches of a list of pairs connect its images poorly."""
+
+import argparse
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from . import cli, colmap, io, logger, stamps
+from .cli import InputError
+from .extract_features import list_images
+from .io import list_h5_names, open_h5
+from .pairs_from_retrieval import rank, read_global
+from .parsers import parse_pairs, write_pairs
+from .paths import strings_as_paths
+from .triangulation import read_matches
+
+MIN_INLIERS = 15  # verified matches of a pair that connects its images, COLMAP's min_num_matches
+MIN_PAIRS = 3  # verified pairs of an image that is connected well
+BLOCK = 256  # images whose similarity to all others is in memory at once
+
+Pair = tuple[str, str]
+
+
+@strings_as_paths
+def main(
+    output: Path,
+    image_dir: Path,
+    pairs: Path,
+    features: Path,
+    matches: Path,
+    descriptors: Path,
+    num_matched: int,
+    num_covis: int = 0,
+    camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
+    image_list: Path | str | Iterable[str] | None = None,
+) -> Path:
+    """Write a list of pairs and more of them where it leaves images unconnected.
+
+    COLMAP verifies the matches by two-view geometry. Images outside the largest connected component
+    are paired with the most similar images of other components, and images with few verified pairs
+    with any similar ones. Images that have verified neighbours in common are likely to see the same
+    points, so they are paired too.
+    `<matches>_verified.json` keeps the results, so that a second call verifies only other pairs.
+
+    Args:
+        output: text file of pairs: those of `pairs`, then the new ones.
+        image_dir: folder of the images.
+        pairs: text file of pairs.
+        features: feature file.
+        matches: match file, with all of `pairs`.
+        descriptors: h5 file of global descriptors.
+        num_matched: new pairs of an image that is connected poorly: at most so many with similar
+            images, and as many with neighbours of its neighbours.
+        num_covis: new pairs of any other image with neighbours of its neighbours, at most.
+        camera_mode: which images share a camera.
+        image_list: the images, names or a text file of them; default: those of `features`.
+
+    Returns:
+        `output`.
+
+    Raises:
+        InputError: when an input is missing or wrong.
+    """
+    if num_matched < 1:
+        raise InputError(f"num_matched is {num_matched}: at least 1.")
+    if num_covis < 0:
+        raise InputError(f"num_covis is {num_covis}: at least 0.")
+    for path in (pairs, features, matches):
+        if not path.is_file():
+            raise InputError(f"There is no file {path}.")
+    names = list_images(image_dir, list_h5_names(features) if image_list is None else image_list)
+    listed = list(dict.fromkeys(tuple(sorted(pair)) for pair in parse_pairs(pairs)))
+    verified = _verify(image_dir, names, listed, features, matches, camera_mode)
+    connected = {pair: verified[pair] for pair in listed if verified[pair] >= MIN_INLIERS}
+    global_descriptors = read_global(descriptors, names)
+    new = more_pairs(names, set(listed), connected, global_descriptors, num_matched, num_covis)
+    write_pairs([*listed, *new], output)
+    logger.info("Added %d pairs to %d.", len(new), len(listed))
+    return output
+
+
+def more_pairs(
+    names: list[str],
+    listed: set[Pair],
+    connected: dict[Pair, int],
+    descriptors: np.ndarray,
+    num_matched: int,
+    num_covis: int = 0,
+) -> list[Pair]:
+    """Find pairs that may connect images better.
+
+    Args:
+        names: the images.
+        listed: pairs that are known, each sorted.
+        connected: numbers of verified matches of those that connect two images.
+        descriptors: (N, G) global descriptors of the images.
+        num_matched: new pairs of an image that is connected poorly, at most, of each kind.
+        num_covis: new pairs of any other image with neighbours of its neighbours, at most.
+
+    Returns:
+        New pairs, each sorted.
+    """
+    index = {name: i for i, name in enumerate(names)}
+    rows, columns = np.array([(index[a], index[b]) for a, b in connected]).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), (len(names),) * 2)
+    _, component = connected_components(graph, directed=False)
+    sizes, degrees = np.bincount(component), Counter(rows.tolist() + columns.tolist())
+    apart = component != sizes.argmax()
+    weak = [i for i in range(len(names)) if apart[i] or degrees[i] < MIN_PAIRS]
+    logger.info(
+        "%d components of verified pairs, the largest of %d of %d images; %d images have fewer "
+        "than %d verified pairs.",
+        *(len(sizes), sizes.max(), len(names), sum(degrees[i] < MIN_PAIRS for i in weak)),
+        MIN_PAIRS,
+    )
+    limits = dict.fromkeys(names, num_covis) | {names[i]: num_matched for i in weak}
+    found = dict.fromkeys(_by_neighbours(limits, listed, connected))
+    for start in range(0, len(weak), BLOCK):
+        block = weak[start : start + BLOCK]
+        ranking = rank(descriptors[block], descriptors, len(names))
+        for i, row in zip(block, ranking, strict=True):
+            others = (
+                tuple(sorted((names[i], names[j])))
+                for j in row
+                if i != j and not (apart[i] and component[i] == component[j])
+            )
+            new = (pair for pair in others if pair not in listed)
+            found |= dict.fromkeys(islice(new, num_matched))
+    return list(found)
+
+
+def _by_neighbours(
+    limits: dict[str, int], listed: set[Pair], connected: dict[Pair, int]
+) -> list[Pair]:
+    """Pair images with neighbours of their neighbours, those of most verified matches first."""
+    neighbours = defaultdict(dict)
+    for (a, b), number in connected.items():
+        neighbours[a][b] = neighbours[b][a] = number
+    found = []
+    for name, limit in limits.items():
+        scores = Counter()
+        for between, number in neighbours[name].items():
+            for other, other_number in neighbours[between].items():
+                pair = tuple(sorted((name, other)))
+                if other != name and pair not in listed:
+                    scores[pair] += min(number, other_number)
+        best = sorted(scores, key=lambda pair: (-scores[pair], pair))
+        found += best[:limit]
+    return found
+
+
+def _verify(
+    image_dir: Path,
+    names: list[str],
+    pairs: list[Pair],
+    features: Path,
+    matches: Path,
+    camera_mode: pycolmap.CameraMode,
+) -> dict[Pair, int]:
+    """Count the verified matches of pairs; those that were verified before are read."""
+    path = matches.with_name(f"{matches.stem}_verified.json")
+    with open_h5(features) as feature_file, open_h5(matches) as match_file:
+        made_from = {
+            "features": io.provenance(feature_file),
+            "matches": io.provenance(match_file),
+            "camera_mode": camera_mode.name,
+        }
+    before = stamps.read(path)
+    known = before.get("pairs", {}) if before.get("made_from") == made_from else {}
+    todo = [pair for pair in pairs if " ".join(pair) not in known]
+    if todo:
+        logger.info("Verifying %d pairs...", len(todo))
+        with TemporaryDirectory(dir=matches.parent, prefix=".", suffix=".tmp") as folder:
+            database, listed = Path(folder, "database.db"), Path(folder, "pairs.txt")
+            write_pairs(todo, listed)
+            images = sorted({name for pair in todo for name in pair})
+            colmap.import_images(database, image_dir, images, camera_mode, {})
+            keypoints, _, found = read_matches(images, listed, features, matches, None)
+            unverified = {pair: (indices, None) for pair, indices in found.items()}
+            colmap.write_matches(database, keypoints, unverified)
+            colmap.verify_matches(database, listed, False)
+            counts = colmap.count_verified(database)
+        counts = {tuple(sorted(pair)): number for pair, number in counts.items()}
+        known = known | {" ".join(pair): counts.get(pair, 0) for pair in todo}
+        stamps.write(path, {"made_from": made_from, "pairs": known})
+    return {pair: known[" ".join(pair)] for pair in pairs}
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.pairs_from_verification --output more.txt "
+        "--image_dir photos --pairs pairs.txt --features features.h5 --matches matches.h5 "
+        "--descriptors global.h5",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
+    parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
+    parser.add_argument("--pairs", type=Path, required=True, help="text file of matched pairs")
+    parser.add_argument("--features", type=Path, required=True, help="feature file")
+    parser.add_argument("--matches", type=Path, required=True, help="match file")
+    parser.add_argument("--descriptors", type=Path, required=True, help="global descriptors")
+    parser.add_argument("--num_matched", type=int, default=20, help="new pairs an image, at most")
+    parser.add_argument(
+        "--num_covis", type=int, default=0, help="new pairs of images that are connected well"
+    )
+    parser.add_argument("--camera_mode", default="auto", help="which photos share a camera")
+    parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
+    args = parser.parse_args()
+    main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})
+
+
+if __name__ == "__main__":
+    cli.run(_main)
