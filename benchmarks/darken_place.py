@@ -9,10 +9,13 @@ prints the table.
 
 import argparse
 import shutil
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 
 from hloc_reduce import cli, colmap
 from hloc_reduce.cli import InputError
@@ -24,10 +27,26 @@ EVERY = 3
 GAIN = (0.06, 0.12)
 BLUR = (0.3, 1.2)  # standard deviation in pixels
 NOISE = 0.003  # standard deviation, of full scale
+Vary = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+
+
+def resize(image: np.ndarray, scale: float) -> np.ndarray:
+    """Resize a photo, smaller or larger."""
+    if scale == 1:
+        return image
+    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=method)
+
+
+def fit(camera: pycolmap.Camera, image: np.ndarray) -> None:
+    """Make intrinsics, which photos may share, those of a photo of another size."""
+    height, width = image.shape[:2]
+    if (camera.width, camera.height) != (width, height):
+        camera.rescale(width, height)
 
 
 def darken(
-    image: np.ndarray, gain: tuple[float, float], generator: np.random.Generator
+    image: np.ndarray, generator: np.random.Generator, gain: tuple[float, float] = GAIN
 ) -> np.ndarray:
     """Darken, blur and add noise to an 8-bit image; the gain is drawn evenly in its logarithm."""
     view = image / 255 * np.exp(generator.uniform(*np.log(gain)))
@@ -36,8 +55,16 @@ def darken(
     return np.round(255 * view.clip(0, 1)).astype(np.uint8)
 
 
-def main(images: Path, model: Path, output: Path, gain: tuple[float, float] = GAIN) -> None:
-    """Write the place."""
+def main(images: Path, model: Path, output: Path, vary: Vary, scale: float = 1.0) -> None:
+    """Write a place whose queries are varied.
+
+    Args:
+        images: folder of the photos.
+        model: COLMAP model of them.
+        output: new folder of the place.
+        vary: makes the query of an 8-bit photo, drawing from a generator.
+        scale: of all photos, those of the map and the queries.
+    """
     reconstruction = colmap.read_model(model)
     photos = sorted(reconstruction.images.values(), key=lambda image: image.name)
     queries = photos[EVERY // 2 :: EVERY]
@@ -47,9 +74,10 @@ def main(images: Path, model: Path, output: Path, gain: tuple[float, float] = GA
         target = output / "images_upright" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         generator = np.random.default_rng(number)
-        view = darken(read_image(images / photo.name), gain, generator)
+        view = vary(resize(read_image(images / photo.name), scale), generator)
         cv2.imwrite(str(target), view[..., ::-1])
         camera, pose = photo.camera, photo.cam_from_world()
+        fit(camera, view)
         size_and_params = (camera.width, camera.height, *camera.params.tolist())
         lines.append(f"{name} {camera.model.name} {' '.join(map(repr, size_and_params))}\n")
         x, y, z, w = pose.rotation.quat.tolist()
@@ -61,7 +89,12 @@ def main(images: Path, model: Path, output: Path, gain: tuple[float, float] = GA
         if photo.has_pose:
             target = output / "images_upright" / "db" / photo.name
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(images / photo.name, target)
+            if scale == 1:
+                shutil.copyfile(images / photo.name, target)
+            else:
+                view = resize(read_image(images / photo.name), scale)
+                cv2.imwrite(str(target), view[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+                fit(photo.camera, view)
             photo.name = f"db/{photo.name}"
     folder = output / "3D-models/aachen_v_1_1"
     folder.mkdir(parents=True, exist_ok=True)
@@ -95,7 +128,7 @@ def _main() -> None:
     if not 0 < args.gain[0] <= args.gain[1]:
         raise InputError("--gain: give two numbers above 0, the smaller first.")
     [(images, model)] = parse_maps([args.map]).values()
-    main(images, model, args.output, tuple(args.gain))
+    main(images, model, args.output, partial(darken, gain=tuple(args.gain)))
 
 
 if __name__ == "__main__":

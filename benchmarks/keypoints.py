@@ -1,0 +1,121 @@
+"""Measure what DoG settings that follow the photo are worth, beside hloc's settings.
+
+Each place is made anew with all photos of another size, or with queries that are darker, blurred or
+noisy, every third photo a query, and run with --keypoints hloc and adaptive. Prints inliers, map
+points, seconds and memory.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import cv2
+import darken_place
+import numpy as np
+
+from hloc_reduce import cli
+from hloc_reduce.detection import KEYPOINTS
+from hloc_reduce.io import read_image
+from hloc_reduce.training.__main__ import parse_maps
+
+MEGAPIXELS = (0.3, 0.5, 1.0, 2.0, 12.0)
+GAINS = (0.06, 0.12, 0.25, 0.5)
+BLURS = (1.5, 3.0)  # standard deviations in pixels
+NOISES = (0.02, 0.05)  # standard deviations, of full scale
+HEADINGS = (
+    *("place", "photos", "--keypoints", "keypoints a photo", "points", "localized", "recall [%]"),
+    *("median error", "mean inliers", "extraction [s]", "all [s]", "memory [MiB]"),
+)
+
+
+def keep(image: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    """Return a photo as it is."""
+    return image
+
+
+def dim(image: np.ndarray, generator: np.random.Generator, gain: float) -> np.ndarray:
+    """Darken a photo as `darken_place.darken` does, by a gain."""
+    return darken_place.darken(image, generator, (gain, gain * 1.0001))
+
+
+def blur(image: np.ndarray, _: np.random.Generator, sigma: float) -> np.ndarray:
+    """Blur a photo."""
+    return cv2.GaussianBlur(image, (0, 0), sigma)
+
+
+def add_noise(image: np.ndarray, generator: np.random.Generator, sigma: float) -> np.ndarray:
+    """Add noise to a photo, of each pixel and channel its own."""
+    view = image / 255 + sigma * generator.standard_normal(image.shape)
+    return np.round(255 * view.clip(0, 1)).astype(np.uint8)
+
+
+def conditions(images: Path) -> dict[str, tuple[Callable, float]]:
+    """Return by name what is done with queries, and the scale of all photos."""
+    height, width = read_image(next(path for path in sorted(images.iterdir()))).shape[:2]
+    sizes = {f"{size:g} MP": (keep, (size * 1e6 / (width * height)) ** 0.5) for size in MEGAPIXELS}
+    varied = {f"gain {gain:g}": (partial(dim, gain=gain), 1.0) for gain in GAINS}
+    varied |= {f"blur {sigma:g} px": (partial(blur, sigma=sigma), 1.0) for sigma in BLURS}
+    varied |= {f"noise {sigma:g}": (partial(add_noise, sigma=sigma), 1.0) for sigma in NOISES}
+    return {**sizes, "as they are": (keep, 1.0), **varied}
+
+
+def run(dataset: Path, outputs: Path, feature: str, keypoints: str) -> tuple[dict, float]:
+    """Run pipelines.aachen, and return its summary and the memory of its process in MiB."""
+    options = {"dataset": dataset, "outputs": outputs, "feature": feature, "keypoints": keypoints}
+    command = [sys.executable, "-m", "pipelines.aachen"]
+    command += [word for key, value in options.items() for word in (f"--{key}", str(value))]
+    quiet = subprocess.DEVNULL
+    process = subprocess.Popen(command, stdout=quiet, stderr=quiet)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise cli.InputError(f"This failed: {' '.join(command)}")
+    return json.loads((outputs / "summary.json").read_text()), usage.ru_maxrss / 1024
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python benchmarks/keypoints.py --map sceaux/images:sceaux/sparse",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--map", action="append", required=True, metavar="IMAGES:MODEL")
+    parser.add_argument("--feature", default="colmap_sift_sv64", help="local feature")
+    parser.add_argument("--output", type=Path, default=Path("outputs/keypoints"))
+    args = parser.parse_args()
+    print(
+        f"| {' | '.join(HEADINGS)} |\n|{' --- |' * 3}{' ---: |' * (len(HEADINGS) - 3)}", flush=True
+    )
+    for place, (images, model) in parse_maps(args.map).items():
+        for name, (vary, scale) in conditions(images).items():
+            dataset = args.output / place / name.replace(" ", "_")
+            if not (dataset / "queries/ground_truth_poses.txt").exists():
+                darken_place.main(images, model, dataset, vary, scale)
+            for keypoints in KEYPOINTS[::-1]:
+                outputs = args.output / "outputs" / place / dataset.name / keypoints
+                summary, memory = run(dataset, outputs, args.feature, keypoints)
+                (found,) = summary["lists"].values()
+                photos = summary["map_images"] + summary["queries"]
+                error = found["median_position_error_m"]
+                values = (
+                    *(place, name, keypoints),
+                    f"{summary['bytes_per_keypoint']['keypoints'] / photos:,.0f}",
+                    f"{summary['map_points3D']:,}",
+                    f"{found['localized']} of {found['queries']}",
+                    " / ".join(f"{value:.0f}" for value in found["recall_percent"]),
+                    f"{error:.4f}" if error is not None else "",
+                    f"{found['mean_inliers']:.0f}",
+                    f"{summary['seconds']['extract_features']:.1f}",
+                    f"{sum(summary['seconds'].values()):.1f}",
+                    f"{memory:.0f}",
+                )
+                print(f"| {' | '.join(values)} |", flush=True)
+
+
+if __name__ == "__main__":
+    cli.run(_main)
