@@ -214,7 +214,7 @@ def main(
         f"{name} ({record['reason']})" for name, record in records.items() if record["reason"]
     ]
     if reasons:
-        logger.info("%d queries are not localized: %s.", len(reasons), cli.some(reasons, SHOWN))
+        logger.warning("Not localized: %s.", cli.some(reasons, SHOWN))
     localized = sum(record["localized"] for record in records.values())
     logger.info("Localized %d of %d queries: %s", localized, len(records), results)
     return records
@@ -314,7 +314,7 @@ def _refused(
     feature_file: h5py.File, queries: list[tuple[str, pycolmap.Camera | None]]
 ) -> dict[str, str]:
     """Return the queries that are not to be localized, and why."""
-    refused, wrong = {}, []
+    refused = {}
     for name, camera in queries:
         if failure := failure_of(feature_file, name):
             refused[name] = failure
@@ -327,12 +327,6 @@ def _refused(
                     f"the intrinsics are for {camera.width}x{camera.height} pixels, the photo has "
                     f"{width}x{height}"
                 )
-                wrong.append(f"{name} ({camera.width}x{camera.height}, not {width}x{height})")
-    if wrong:
-        logger.warning(
-            "%d queries are not localized, as their intrinsics are for photos of another size: %s.",
-            *(len(wrong), cli.some(wrong)),
-        )
     return refused
 
 

@@ -87,6 +87,8 @@ def test_the_same_as_the_pipeline_of_aachen(place, aachen_layout, tmp_path, monk
         row = rows[name]
         for key in ("num_matches", "num_correspondences", "num_inliers"):
             assert info[key] == int(row[key])
+        assert info["confidence"] == float(row["confidence"])
+        assert (info["reason"] or "") == row["reason"]
         assert info["retrieved"][0] == row["retrieved"] and info["intrinsics"] == "given"
         if row["status"] == "localized":
             assert max(pose_error(pose, poses[name])) < 1e-9
