@@ -2,7 +2,7 @@
 
 import argparse
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pycolmap
@@ -27,6 +27,8 @@ RELAXED = {
     "abs_pose_min_num_inliers": 15,
 }
 FEW = 100  # images of which a second attempt takes little time
+VERY_FEW = 30  # images of which some more take little; what comes of them is a matter of luck
+SEEDS = (1, 2, 3)
 
 
 @strings_as_paths
@@ -50,7 +52,8 @@ def main(
 
     Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary. Where
     images are missing in the model, a second attempt with lower thresholds follows, and the model
-    of more images is kept; of more than 100 images only if fewer than 80 % are in the first.
+    of more images is kept; of more than 100 images only if fewer than 80 % are in the first. With
+    up to 30 images further attempts follow, which begin with other pairs of images.
 
     Args:
         sfm_dir: the folder of the new COLMAP model; one made from the same inputs is read back.
@@ -64,8 +67,7 @@ def main(
         min_match_score: take matches of a higher score only.
         image_list: the images, names or a text file of them; default: those of `features`.
         image_options: of pycolmap's ImageReaderOptions.
-        mapper_options: of pycolmap's IncrementalPipelineOptions; with any there is no second
-            attempt.
+        mapper_options: of pycolmap's IncrementalPipelineOptions; with any there is one attempt.
         overwrite: reconstruct anew.
         accept_partial: return a model of fewer than half of the images, too.
 
@@ -77,7 +79,7 @@ def main(
             the images are in the model, which is kept for a run with `accept_partial`.
     """
     options = {**MAPPER_OPTIONS, **(mapper_options or {})}
-    mapper = colmap.mapper_options(options)
+    colmap.mapper_options(options)  # raises for a wrong one
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
@@ -90,7 +92,7 @@ def main(
         "images": names,
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
-        "relaxed": {} if mapper_options else RELAXED,
+        "attempts": list(_attempts(len(names), mapper_options)),
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
     is_whole = (sfm_dir / REGISTRATION).is_file()
@@ -117,20 +119,20 @@ def main(
         colmap.write_matches(database, keypoints, verified)
         if not skip_geometric_verification:
             colmap.verify_matches(database, pairs, verbose)
-        logger.info("Reconstructing...")
-        models = colmap.incremental_mapping(
-            database, image_dir, building / "models", mapper, verbose
-        )
-        registered = models[0].num_reg_images() if models else 0
+        models = []
         enough = len(names) if len(names) <= FEW else ENOUGH * len(names)
-        if registered < enough and not mapper_options:
-            logger.info("Registered %d of %d images: trying again...", registered, len(names))
-            relaxed = colmap.mapper_options({**options, "mapper": RELAXED})
-            more = colmap.incremental_mapping(
-                database, image_dir, building / "relaxed", relaxed, verbose
+        for number, changed in enumerate(_attempts(len(names), mapper_options)):
+            registered = models[0].num_reg_images() if models else 0
+            if number and registered >= enough:
+                break
+            again = f" again: {registered} of {len(names)} images registered" if number else ""
+            logger.info("Reconstructing%s...", again)
+            attempt = colmap.mapper_options({**options, **changed})
+            found = colmap.incremental_mapping(
+                database, image_dir, building / "models", attempt, verbose
             )
-            if more and more[0].num_reg_images() > registered:
-                models = more
+            shutil.rmtree(building / "models")
+            models = max(models, found, key=_size)
         if not models:
             raise InputError(
                 f"COLMAP could not reconstruct the images of {image_dir} from the matches "
@@ -138,8 +140,6 @@ def main(
                 "overlapping the one before by about two thirds."
             )
         models[0].write(building)
-        for folder in ("models", "relaxed"):
-            shutil.rmtree(building / folder, ignore_errors=True)
         parts = _parts(models)
         matched = {name for pair in colmap.count_verified(database) for name in pair}
         state = {
@@ -152,6 +152,23 @@ def main(
     logger.info("The map %s:\n%s", sfm_dir, models[0].summary())
     _check(sfm_dir, accept_partial)
     return models[0]
+
+
+def _attempts(number: int, mapper_options: dict | None) -> Iterator[dict]:
+    """Yield the options of one attempt after the other at a number of images."""
+    yield {}
+    if mapper_options:
+        return
+    yield {"mapper": RELAXED}
+    if number <= VERY_FEW:
+        for seed in SEEDS:
+            yield {"random_seed": seed}
+            yield {"random_seed": seed, "mapper": RELAXED}
+
+
+def _size(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
+    """Return how many images and points the first of some models has."""
+    return (models[0].num_reg_images(), models[0].num_points3D()) if models else (0, 0)
 
 
 def _parts(models: list[pycolmap.Reconstruction]) -> list[list[str]]:
