@@ -34,6 +34,7 @@ from hloc_reduce import (
     projections,
     scans,
 )
+from hloc_reduce.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.datasets import Aachen, InLoc, true_poses
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.io import get_colmap_keypoints, open_h5, read_image, replacing, write_csv
@@ -54,7 +55,7 @@ LEVELS = (0, 2, 4, 6, 8, 10, 15, 20, 30)
 OLD_GATE = 8  # inliers, whatever their number among all
 COLUMNS = (
     *("feature", "map", "place", "photo", "kind", "intrinsics", "matches", "inliers", "confidence"),
-    *("refusal", "position_error", "rotation_error_deg", "outcome"),
+    *("agreement", "refusal", "position_error", "rotation_error_deg", "outcome"),
 )
 
 
@@ -206,7 +207,8 @@ def run(
     place: Place, others: list[Place], output: Path, features: list[str], number: int, matcher: str
 ) -> list[dict]:
     """Try a map with all photos, and return the rows of trials.csv."""
-    ratio_threshold = matchers_confs.confs[matcher]["model"].get("ratio_threshold")
+    model = matchers_confs.confs[matcher]["model"]
+    ratio_threshold, gate = model.get("ratio_threshold"), DEFAULT_GATE.of_matcher(model)
     tried = list(trials(place, others, output, number, np.random.default_rng(0)))
     shown = {}
     with open_h5(place.features) as file:
@@ -229,7 +231,7 @@ def run(
                 matched = found >= 0
                 matches[other] = torch.stack([found[matched], rows_of[matched]], 1).numpy()
             for given in ("given", "guess"):
-                row = localize(place, keypoints, camera, matches, given)
+                row = localize(place, keypoints, camera, matches, given, gate)
                 cam_from_world = row.pop("cam_from_world")
                 row |= outcome(place, row, cam_from_world, truth)
                 known = {"feature": feature, "map": place.name, "place": source.name}
@@ -238,7 +240,12 @@ def run(
 
 
 def localize(
-    place: Place, keypoints: np.ndarray, camera: pycolmap.Camera, matches: dict, given: str
+    place: Place,
+    keypoints: np.ndarray,
+    camera: pycolmap.Camera,
+    matches: dict,
+    given: str,
+    gate: Gate,
 ) -> dict:
     """Localize a query with its intrinsics, or with a guess of them."""
     refinement = {}
@@ -251,7 +258,7 @@ def localize(
         refinement = intrinsics.REFINEMENTS["guess"]
     config = merged({"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}, refinement)
     cam_from_world, info = localization.localize(
-        place.reference, keypoints, camera, matches, config
+        place.reference, keypoints, camera, matches, config, gate
     )
     depths = [np.nan]
     if cam_from_world is not None and info["inliers"].any():
@@ -261,6 +268,7 @@ def localize(
         "matches": info["num_correspondences"],
         "inliers": info["num_inliers"],
         "confidence": info["confidence"],
+        "agreement": info["agreement"],
         "refusal": info["reason"] or "",
         "cam_from_world": cam_from_world,
         "depth": float(np.median(depths)),

@@ -1,7 +1,7 @@
 """The pose of a query from 2D-3D matches: RANSAC over all of them, and over those of one image."""
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -14,6 +14,7 @@ from .confidence import (
     REFINED,
     RIVAL,
     Gate,
+    agreement,
     confidence,
     reprojection_errors,
     uncertainty,
@@ -39,6 +40,7 @@ class Pose:
         camera: intrinsics, refined where the configuration says so.
         inliers: (M,) bool.
         confidence: `confidence.confidence`.
+        agreement: `confidence.agreement`.
         refusal: why it is not to be trusted, None if it is.
     """
 
@@ -46,6 +48,7 @@ class Pose:
     camera: pycolmap.Camera
     inliers: np.ndarray
     confidence: float = -np.inf
+    agreement: float = 0.0
     refusal: str | None = None
 
     @property
@@ -83,8 +86,9 @@ def estimate(
         for chosen in by_number[::-1][:MAX_IMAGES]:
             poses.append(_estimate(points2D, points3D, chosen, camera, config))
     best = max(poses, key=lambda pose: (pose.confidence, pose.num_inliers))
+    best = replace(best, agreement=agreement(best.inliers, images))
     refusal = _refusal(best, poses, points2D, points3D, camera, config, gate)
-    return Pose(best.cam_from_world, best.camera, best.inliers, best.confidence, refusal)
+    return replace(best, refusal=refusal)
 
 
 def _estimate(
@@ -116,8 +120,7 @@ def _estimate(
         return pose
     arguments = points2D, points3D, pose.cam_from_world, pose.camera
     freedom = 6 + _is_focal_length_free(config)
-    found = confidence(*arguments, threshold, freedom)
-    return Pose(pose.cam_from_world, pose.camera, pose.inliers, found)
+    return replace(pose, confidence=confidence(*arguments, threshold, freedom))
 
 
 def _max_error(config: dict) -> float:
@@ -168,6 +171,11 @@ def _refusal(
         return (
             f"the inliers do not fix the pose: its position is uncertain by {100 * position:.0f} % "
             f"of their distance, its rotation by {rotation:.1f} degrees"
+        )
+    if pose.agreement < gate.min_agreement:
+        return (
+            "the matches of no image agree with the pose: agreement "
+            f"{pose.agreement:.2f}, at least {gate.min_agreement:g} is needed"
         )
     for rival in poses:
         if rival.num_inliers >= RIVAL * number and _differ(pose, rival, points3D):

@@ -1,7 +1,7 @@
 """Tell a pose from chance, and one that is known precisely from one that is not."""
 
 from argparse import ArgumentParser
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -20,6 +20,10 @@ FOCAL_LENGTHS = (0.3, 5.0)  # of an estimated one, times the longer side: 11 to 
 REFINED = 2.0  # by what factor a focal length of EXIF data may change
 MAX_POSITION = 0.05  # standard deviation of the position, times the median distance of the inliers
 MAX_ROTATION = 2.0  # standard deviation in degrees
+DISAGREEING = (
+    4  # matches of an image that are taken to disagree with a pose, so that few tell little
+)
+AGREEMENT, AGREEMENT_RATIO = 0.2, 0.65  # least agreement of mutual matches, and with a ratio test
 RIVAL = 0.8  # times its inliers, if another pose has so many they tell nothing
 
 
@@ -180,6 +184,25 @@ def uncertainty(
     return float(np.sqrt(variance[3:6].sum())), float(np.degrees(np.sqrt(variance[:3].sum())))
 
 
+def agreement(inliers: np.ndarray, images: list[np.ndarray]) -> float:
+    """Measure how well the matches of the image that agrees most agree with a pose.
+
+    An image that shows the place of a query has mostly right matches. A pose that symmetric or
+    repeated structure makes up agrees with some matches of several images, but of none with most:
+    that of a mirrored photo of a symmetric facade, for example.
+
+    Args:
+        inliers: (M,) bool, which matches agree with the pose.
+        images: of each map image the indices of its matches.
+
+    Returns:
+        The largest share of inliers among the matches of an image, or among all, each with
+        `DISAGREEING` matches more.
+    """
+    parts = [inliers, *(inliers[matches] for matches in images)]
+    return float(max(part.sum() / (len(part) + DISAGREEING) for part in parts))
+
+
 @dataclass(frozen=True)
 class Gate:
     """What a pose must have for the query to be called localized.
@@ -187,6 +210,7 @@ class Gate:
     Args:
         min_confidence: `confidence`.
         min_inliers: inliers of RANSAC.
+        min_agreement: `agreement`, which depends on the matcher.
 
     Raises:
         InputError: for a confidence that is not finite or a negative number of inliers.
@@ -194,12 +218,18 @@ class Gate:
 
     min_confidence: float = 8.0
     min_inliers: int = 8
+    min_agreement: float = AGREEMENT
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.min_confidence):
             raise InputError(f"min_confidence is {self.min_confidence}: a number is needed.")
         if self.min_inliers < 0:
             raise InputError(f"min_inliers is {self.min_inliers}: at least 0.")
+
+    def of_matcher(self, model: dict) -> "Gate":
+        """Return the gate for matches of a matcher, by its configuration."""
+        least = AGREEMENT_RATIO if model.get("ratio_threshold") else AGREEMENT
+        return replace(self, min_agreement=least)
 
 
 DEFAULT_GATE = Gate()

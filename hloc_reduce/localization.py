@@ -78,7 +78,8 @@ def localize(
 
     Returns:
         The pose (camera from world) or None, and info: `reason`, why the pose is not to be trusted,
-        None if it is; `confidence`, as of `confidence.confidence` and at least 0; `num_inliers`;
+        None if it is; `confidence`, as of `confidence.confidence` and at least 0; `agreement`, as of
+        `confidence.agreement`; `num_inliers`;
         `num_matches`, with a 3D
         point, of `num_correspondences` different ones (M); `num_without_point`, the other
         matches; `camera`, the intrinsics, refined where `config` says so; `db`, the image
@@ -94,6 +95,7 @@ def localize(
         info |= {
             "reason": _reason(len(keypoints), names, info) or found.refusal,
             "confidence": round(max(0.0, found.confidence), 2),
+            "agreement": round(found.agreement, 3),
             "camera": found.camera,
             "num_inliers": found.num_inliers,
             "inliers": found.inliers,
@@ -181,7 +183,7 @@ def main(
 
     Returns:
         A record for each query: `localized`; `reason`, why it is not localized, None where it is;
-        `confidence`; the pose that is written as `qvec` (w, x, y, z) and `tvec`, the fallback where
+        `confidence`; `agreement`; the pose that is written as `qvec` (w, x, y, z) and `tvec`, the fallback where
         the query is not localized, None where there is none; `camera`, the model, width, height and
         parameters in a list, None where not known; `max_error`, the pixels within which inliers
         reproject, None for pycolmap's default; and the numbers and `db` of `localize`.
@@ -385,6 +387,7 @@ def _record(
         "localized": localized,
         "reason": info["reason"],
         "confidence": info["confidence"],
+        "agreement": info["agreement"],
         "qvec": qvec,
         "tvec": tvec,
         "camera": _intrinsics(info["camera"]),

@@ -50,10 +50,11 @@ class Localizer:
         gate: Gate = DEFAULT_GATE,
     ):
         built = Map(map_dir)
-        self.num_loc, self.ransac_thresh, self.gate = num_loc, ransac_thresh, gate
+        self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.preprocessing = built.conf["preprocessing"]
         self.storage = built.storage
-        self.ratio_threshold = matchers_confs.confs[built.matcher]["model"].get("ratio_threshold")
+        matcher = matchers_confs.confs[built.matcher]["model"]
+        self.ratio_threshold, self.gate = matcher.get("ratio_threshold"), gate.of_matcher(matcher)
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
         self.extractor = extractors.load(built.conf["model"]).eval().to(self.device)
         self.vlad = dynamic_load(extractors, RETRIEVAL["model"]["name"])(RETRIEVAL["model"]).eval()

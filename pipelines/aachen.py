@@ -116,7 +116,7 @@ def main(
                 loc_matches,
                 poses,
                 executor=executor,
-                gate=gate,
+                gate=gate.of_matcher(matcher_conf["model"]),
             )
 
         summary = {

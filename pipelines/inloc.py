@@ -103,7 +103,7 @@ def main(
                 ransac_thresh=place.ransac_thresh,
                 executor=executor,
                 points=points,
-                gate=gate,
+                gate=gate.of_matcher(matcher_conf["model"]),
             )
 
         summary = {

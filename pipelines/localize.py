@@ -239,7 +239,7 @@ def main(
                     if source != "list"
                 },
                 full_names=True,
-                gate=gate,
+                gate=gate.of_matcher(matcher_conf["model"]),
             )
         summary = {
             "feature": built.feature,
