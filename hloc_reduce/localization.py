@@ -78,14 +78,12 @@ def localize(
 
     Returns:
         The pose (camera from world) or None, and info: `reason`, why the pose is not to be trusted,
-        None if it is; `confidence`, as of `confidence.confidence` and at least 0; `agreement`, as of
-        `confidence.agreement`; `num_inliers`;
-        `num_matches`, with a 3D
-        point, of `num_correspondences` different ones (M); `num_without_point`, the other
-        matches; `camera`, the intrinsics, refined where `config` says so; `db`, the image
-        retrieved first, of the cluster that was localized in; and of that cluster `keypoints`
-        (M,), indices of the query's, `point3D_ids` (M,), `points3D` (M, 3) and `inliers` (M,)
-        bool.
+        None if it is; `confidence`, as of `confidence.confidence` and at least 0; `agreement`, as
+        of `confidence.agreement`; `num_inliers`; `num_matches`, with a 3D point, of
+        `num_correspondences` different ones (M); `num_without_point`, the other matches; `camera`,
+        the intrinsics, refined where `config` says so; `db`, the image retrieved first, of the
+        cluster that was localized in; and of that cluster `keypoints` (M,), indices of the query's,
+        `point3D_ids` (M,), `points3D` (M, 3) and `inliers` (M,) bool.
     """
     solved = []
     for names in reference.clusters(list(matches)) if matches else [[]]:
@@ -183,10 +181,11 @@ def main(
 
     Returns:
         A record for each query: `localized`; `reason`, why it is not localized, None where it is;
-        `confidence`; `agreement`; the pose that is written as `qvec` (w, x, y, z) and `tvec`, the fallback where
-        the query is not localized, None where there is none; `camera`, the model, width, height and
-        parameters in a list, None where not known; `max_error`, the pixels within which inliers
-        reproject, None for pycolmap's default; and the numbers and `db` of `localize`.
+        `confidence` and `agreement`; the pose that is written as `qvec` (w, x, y, z) and `tvec`,
+        the fallback where the query is not localized, None where there is none; `camera`, the
+        model, width, height and parameters in a list, None where not known; `max_error`, the pixels
+        within which inliers reproject, None for pycolmap's default; and the numbers and `db` of
+        `localize`.
     """
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
     log = _Log(log_file(results), header, overwrite)

@@ -12,6 +12,7 @@ from hloc_reduce.confidence import (
     DEFAULT_GATE,
     Gate,
     _log10_tail,
+    agreement,
     confidence,
     reprojection_errors,
     uncertainty,
@@ -62,7 +63,9 @@ def test_wrong_matches_are_never_trusted(number, config):
 @pytest.mark.parametrize(("right", "wrong"), [(9, 0), (12, 20), (40, 300), (200, 1000)])
 @pytest.mark.parametrize("config", [{}, FREE], ids=["given", "guessed"])
 def test_right_matches_are_trusted(right, wrong, config):
-    found = solve(*matches(right, wrong), camera=GUESS if config else CAMERA, config=config)
+    images = [np.arange(right), np.arange(right, right + wrong)]
+    camera = GUESS if config else CAMERA
+    found = solve(*matches(right, wrong), images, camera, config)
     assert found.refusal is None and found.confidence > 8
     assert found.num_inliers >= right - 1
     moved = found.cam_from_world * TRUE.inverse()
@@ -199,3 +202,18 @@ def test_a_gate_is_of_numbers():
         Gate(float("nan"))
     with pytest.raises(InputError, match="min_inliers is -1"):
         Gate(min_inliers=-1)
+
+
+def test_a_pose_that_no_image_agrees_with_is_refused():
+    """As that of a mirrored photo of a symmetric facade: a third of the matches of each image."""
+    keypoints, points = matches(60, 120)
+    images = np.split(np.random.default_rng(0).permutation(180), 3)
+    gate = DEFAULT_GATE.of_matcher({"ratio_threshold": 0.8})
+    found = solve(keypoints, points, images, gate=gate)
+    assert found.confidence > 100
+    assert found.refusal.startswith("the matches of no image agree with the pose: agreement 0.")
+    # without a ratio test most matches of any image are wrong
+    assert solve(keypoints, points, images, gate=DEFAULT_GATE.of_matcher({})).refusal is None
+    one = [np.arange(60), np.arange(60, 180)]
+    assert solve(keypoints, points, one, gate=gate).refusal is None
+    assert agreement(np.ones(8, bool), [np.arange(8)]) == 8 / 12
