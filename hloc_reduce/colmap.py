@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import shutil
+import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -11,7 +12,6 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from struct import error as struct_error
 from struct import unpack_from
-from threading import get_ident
 
 import numpy as np
 import pycolmap
@@ -36,7 +36,7 @@ def detect_dog(image: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray
         Keypoints (N, 4) float32: x, y with pixel centres at integers, scale in pixels, orientation
         in degrees from x towards y; and COLMAP's descriptors (N, 128) float32 of unit norm.
     """
-    extractor = _sift_extractor(json.dumps(options, sort_keys=True), get_ident())
+    extractor = _sift_extractor(json.dumps(options, sort_keys=True))
     if hasattr(extractor, "extract_from_float32_array"):  # from 4.0 on
         found, described = extractor.extract_from_float32_array(image)
         keypoints = np.array(
@@ -55,14 +55,21 @@ def detect_dog(image: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray
     )
 
 
-@lru_cache(maxsize=256)
-def _sift_extractor(options: str, _: int) -> "pycolmap.FeatureExtractor":
-    """Make the extractor of a thread; COLMAP's has state of its own."""
-    extraction = _extraction_options(json.loads(options))
-    new = hasattr(pycolmap, "FeatureExtractor")  # from 4.0 on
-    return (pycolmap.FeatureExtractor.create if new else pycolmap.Sift)(
-        extraction, pycolmap.Device.cpu
-    )
+_thread = threading.local()
+
+
+def _sift_extractor(options: str) -> "pycolmap.FeatureExtractor":
+    """Return an extractor of this thread's own; COLMAP's has state, and keeps its pyramid.
+
+    Only the last one is kept, as that of an image at twice its size takes half a gigabyte.
+    """
+    if getattr(_thread, "options", None) != options:
+        _thread.extractor = _thread.options = None  # free it before another is made
+        extraction = _extraction_options(json.loads(options))
+        new = hasattr(pycolmap, "FeatureExtractor")  # from 4.0 on
+        make = pycolmap.FeatureExtractor.create if new else pycolmap.Sift
+        _thread.extractor, _thread.options = make(extraction, pycolmap.Device.cpu), options
+    return _thread.extractor
 
 
 def check_dog_options(options: dict) -> None:
