@@ -20,10 +20,8 @@ FOCAL_LENGTHS = (0.3, 5.0)  # of an estimated one, times the longer side: 11 to 
 REFINED = 2.0  # by what factor a focal length of EXIF data may change
 MAX_POSITION = 0.05  # standard deviation of the position, times the median distance of the inliers
 MAX_ROTATION = 2.0  # standard deviation in degrees
-DISAGREEING = (
-    4  # matches of an image that are taken to disagree with a pose, so that few tell little
-)
-AGREEMENT, AGREEMENT_RATIO = 0.2, 0.65  # least agreement of mutual matches, and with a ratio test
+MIN_MATCHES = 6  # of an image whose matches are asked whether they agree with a pose
+AGREEMENT, AGREEMENT_RATIO = 0.17, 0.75  # least agreement of mutual matches, and with a ratio test
 RIVAL = 0.8  # times its inliers, if another pose has so many they tell nothing
 
 
@@ -196,11 +194,20 @@ def agreement(inliers: np.ndarray, images: list[np.ndarray]) -> float:
         images: of each map image the indices of its matches.
 
     Returns:
-        The largest share of inliers among the matches of an image, or among all, each with
-        `DISAGREEING` matches more.
+        The largest share of inliers among the matches of an image that has 6 or more, or among all:
+        its lower bound, by one standard deviation (Wilson, 1927), so that a few tell little.
     """
-    parts = [inliers, *(inliers[matches] for matches in images)]
-    return float(max(part.sum() / (len(part) + DISAGREEING) for part in parts))
+    parts = [inliers, *(inliers[chosen] for chosen in images if len(chosen) >= MIN_MATCHES)]
+    return max(_lower_bound(part.sum(), len(part)) for part in parts)
+
+
+def _lower_bound(successes: int, trials: int) -> float:
+    """Return the lower bound of a rate, by one standard deviation."""
+    if not trials:
+        return 0.0
+    rate = successes / trials
+    deviation = np.sqrt(rate * (1 - rate) / trials + 0.25 / trials**2)
+    return float((rate + 0.5 / trials - deviation) / (1 + 1 / trials))
 
 
 @dataclass(frozen=True)

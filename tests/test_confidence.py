@@ -216,4 +216,8 @@ def test_a_pose_that_no_image_agrees_with_is_refused():
     assert solve(keypoints, points, images, gate=DEFAULT_GATE.of_matcher({})).refusal is None
     one = [np.arange(60), np.arange(60, 180)]
     assert solve(keypoints, points, one, gate=gate).refusal is None
-    assert agreement(np.ones(8, bool), [np.arange(8)]) == 8 / 12
+    assert agreement(np.ones(8, bool), [np.arange(8)]) == pytest.approx(8 / 9)
+    few = np.r_[np.ones(5, bool), np.zeros(15, bool)]
+    assert agreement(few, [np.arange(5)]) < 0.25  # five of an image tell nothing
+    assert agreement(few, []) == agreement(few, [np.arange(5)])
+    assert agreement(np.zeros(0, bool), []) == 0
