@@ -154,8 +154,9 @@ def alter(place: Place, output: Path) -> list[tuple[str, pycolmap.Camera, pycolm
             "noise": lambda photo=photo: generator.integers(0, 256, photo.shape, np.uint8),
         }
         path = output / "altered" / kind / Path(name).with_suffix(".png")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), views[kind]()[..., ::-1])
+        if not path.exists():
+            with replacing(path) as temporary:
+                temporary.write_bytes(cv2.imencode(".png", views[kind]()[..., ::-1])[1].tobytes())
         named = path.relative_to(output / "altered").as_posix()
         altered.append((named, camera, truth if kind == "blurred" else None))
     names = [name for name, _, _ in altered]
