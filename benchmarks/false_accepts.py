@@ -209,7 +209,7 @@ def run(
 ) -> list[dict]:
     """Try a map with all photos, and return the rows of trials.csv."""
     model = matchers_confs.confs[matcher]["model"]
-    ratio_threshold, gate = model.get("ratio_threshold"), DEFAULT_GATE.of_matcher(model)
+    ratio_threshold = model.get("ratio_threshold")
     tried = list(trials(place, others, output, number, np.random.default_rng(0)))
     shown = {}
     with open_h5(place.features) as file:
@@ -222,6 +222,7 @@ def run(
         describe = Described(feature)
         with open_h5(place.features) as file:
             described = {name: describe(file, name) for name in place.names}
+        gate = DEFAULT_GATE.of_matches(model, described[place.names[0]].shape[1])
         for source, name, camera, truth, path, kind in tried:
             with open_h5(path) as file:
                 query, (keypoints, _) = describe(file, name), get_colmap_keypoints(file, name)

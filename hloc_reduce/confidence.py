@@ -21,7 +21,9 @@ REFINED = 2.0  # by what factor a focal length of EXIF data may change
 MAX_POSITION = 0.05  # standard deviation of the position, times the median distance of the inliers
 MAX_ROTATION = 2.0  # standard deviation in degrees
 MIN_MATCHES = 6  # of an image whose matches are asked whether they agree with a pose
-AGREEMENT, AGREEMENT_RATIO = 0.17, 0.75  # least agreement of mutual matches, and with a ratio test
+# least agreement of mutual matches, and of those with a ratio test, of which more are right; with
+# fewer dimensions than FEW fewer are
+AGREEMENT, AGREEMENT_RATIO, AGREEMENT_FEW, FEW = 0.17, 0.7, 0.55, 32
 RIVAL = 0.8  # times its inliers, if another pose has so many they tell nothing
 
 
@@ -217,7 +219,7 @@ class Gate:
     Args:
         min_confidence: `confidence`.
         min_inliers: inliers of RANSAC.
-        min_agreement: `agreement`, which depends on the matcher.
+        min_agreement: `agreement`, which depends on the matcher and the descriptors.
 
     Raises:
         InputError: for a confidence that is not finite or a negative number of inliers.
@@ -233,9 +235,15 @@ class Gate:
         if self.min_inliers < 0:
             raise InputError(f"min_inliers is {self.min_inliers}: at least 0.")
 
-    def of_matcher(self, model: dict) -> "Gate":
-        """Return the gate for matches of a matcher, by its configuration."""
-        least = AGREEMENT_RATIO if model.get("ratio_threshold") else AGREEMENT
+    def of_matches(self, matcher: dict, dim: int) -> "Gate":
+        """Return the gate for matches of descriptors.
+
+        Args:
+            matcher: configuration of the matcher's model.
+            dim: dimension of the descriptors.
+        """
+        with_ratio = AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO
+        least = with_ratio if matcher.get("ratio_threshold") else AGREEMENT
         return replace(self, min_agreement=least)
 
 

@@ -19,7 +19,7 @@ from .localize_sfm import RANSAC_THRESH, SfmMap, merged
 from .maps import RETRIEVAL, Map
 from .matchers.nearest_neighbor import mutual_nearest
 from .pairs_from_retrieval import rank, read_global
-from .storage import get_descriptors, restore, store
+from .storage import dimension, get_descriptors, restore, store
 
 
 class Localizer:
@@ -54,7 +54,8 @@ class Localizer:
         self.preprocessing = built.conf["preprocessing"]
         self.storage = built.storage
         matcher = matchers_confs.confs[built.matcher]["model"]
-        self.ratio_threshold, self.gate = matcher.get("ratio_threshold"), gate.of_matcher(matcher)
+        self.ratio_threshold = matcher.get("ratio_threshold")
+        self.gate = gate.of_matches(matcher, dimension(built.features))
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
         self.extractor = extractors.load(built.conf["model"]).eval().to(self.device)
         self.vlad = dynamic_load(extractors, RETRIEVAL["model"]["name"])(RETRIEVAL["model"]).eval()

@@ -14,7 +14,7 @@ import numpy as np
 from . import cli, io, logger
 from .cli import InputError
 from .group_writer import GroupWriter
-from .io import get_array, get_dataset, list_h5_names, open_h5, reading
+from .io import get_array, get_dataset, iterate_h5_names, list_h5_names, open_h5, reading
 from .paths import strings_as_paths
 from .progress import progress
 
@@ -92,6 +92,13 @@ def stored_descriptors(file: h5py.File, name: str) -> h5py.Dataset:
             f"{shapes[1]}: they are to be (D, N) and (N, 2)."
         )
     return dataset
+
+
+def dimension(features: Path) -> int:
+    """Return the dimension of the descriptors of a feature file, 0 if it has no image."""
+    with open_h5(features) as file:
+        name = next(iterate_h5_names(file.id), None)
+        return stored_descriptors(file, name).shape[0] if name else 0
 
 
 def get_descriptors(file: h5py.File, name: str) -> np.ndarray:

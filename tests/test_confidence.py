@@ -208,12 +208,13 @@ def test_a_pose_that_no_image_agrees_with_is_refused():
     """As that of a mirrored photo of a symmetric facade: a third of the matches of each image."""
     keypoints, points = matches(60, 120)
     images = np.split(np.random.default_rng(0).permutation(180), 3)
-    gate = DEFAULT_GATE.of_matcher({"ratio_threshold": 0.8})
+    gate = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
+    assert gate.min_agreement > DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 16).min_agreement
     found = solve(keypoints, points, images, gate=gate)
     assert found.confidence > 100
     assert found.refusal.startswith("the matches of no image agree with the pose: agreement 0.")
     # without a ratio test most matches of any image are wrong
-    assert solve(keypoints, points, images, gate=DEFAULT_GATE.of_matcher({})).refusal is None
+    assert solve(keypoints, points, images, gate=DEFAULT_GATE.of_matches({}, 64)).refusal is None
     one = [np.arange(60), np.arange(60, 180)]
     assert solve(keypoints, points, one, gate=gate).refusal is None
     assert agreement(np.ones(8, bool), [np.arange(8)]) == pytest.approx(8 / 9)
