@@ -8,6 +8,7 @@ import pycolmap
 
 from . import colmap
 from .confidence import (
+    AGREEMENT,
     FOCAL_LENGTHS,
     MAX_POSITION,
     MAX_ROTATION,
@@ -22,7 +23,7 @@ from .confidence import (
 
 SEED = 0
 MAX_ERROR = 12.0  # pixels, pycolmap's default
-CLEAR = 0.25  # share of inliers, from which on RANSAC over all matches is trusted to find the pose
+CLEAR = 0.25  # inlier ratio above which images are not tried by themselves
 MAX_IMAGES = 20  # tried by themselves, those with most matches
 MIN_MATCHES = 6  # of an image that is tried
 ROUNDS = 3  # of estimation from the inliers among all matches
@@ -82,13 +83,21 @@ def estimate(
     number = len(points2D)
     poses = [_estimate(points2D, points3D, np.arange(number), camera, config)]
     if poses[0].num_inliers < CLEAR * number:
-        by_number = sorted((m for m in images if MIN_MATCHES <= len(m) < number), key=len)
-        for chosen in by_number[::-1][:MAX_IMAGES]:
+        tried = [matches for matches in images if MIN_MATCHES <= len(matches) < number]
+        for chosen in sorted(tried, key=len, reverse=True)[:MAX_IMAGES]:
             poses.append(_estimate(points2D, points3D, chosen, camera, config))
-    best = max(poses, key=lambda pose: (pose.confidence, pose.num_inliers))
+    best = max(poses, key=_quality)
+    if 0 < best.num_inliers < number / (1 + RIVAL):  # then a rival may be among the others
+        others = np.flatnonzero(~best.inliers)
+        poses.append(_estimate(points2D, points3D, others, camera, config))
+        best = max(poses, key=_quality)
     best = replace(best, agreement=agreement(best.inliers, images))
     refusal = _refusal(best, poses, points2D, points3D, camera, config, gate)
     return replace(best, refusal=refusal)
+
+
+def _quality(pose: Pose) -> tuple[float, int]:
+    return pose.confidence, pose.num_inliers
 
 
 def _estimate(
@@ -172,19 +181,26 @@ def _refusal(
             f"the inliers do not fix the pose: its position is uncertain by {100 * position:.0f} % "
             f"of their distance, its rotation by {rotation:.1f} degrees"
         )
-    if pose.agreement < gate.min_agreement:
+    least = AGREEMENT if gate.min_agreement is None else gate.min_agreement
+    if pose.agreement < least:
         return (
             "the matches of no image agree with the pose: agreement "
-            f"{pose.agreement:.2f}, at least {gate.min_agreement:g} is needed"
+            f"{pose.agreement:.2f}, at least {least:g} is needed"
         )
     for rival in poses:
-        if rival.num_inliers >= RIVAL * number and _differ(pose, rival, points3D):
+        if rival.num_inliers >= RIVAL * number and differ(pose, rival, points3D):
             return f"ambiguous: another pose has {rival.num_inliers} inliers, this one {number}"
     return None
 
 
-def _differ(pose: Pose, other: Pose, points3D: np.ndarray) -> bool:
-    """Tell whether two poses are of different places."""
+def differ(pose: Pose, other: Pose, points3D: np.ndarray) -> bool:
+    """Tell whether two poses are of different places.
+
+    Args:
+        pose: one of them.
+        other: the other one.
+        points3D: (M, 3) the points of the first one's matches.
+    """
     relative = pose.cam_from_world * other.cam_from_world.inverse()
     inliers = points3D[pose.inliers]
     depths = inliers @ pose.cam_from_world.rotation.matrix().T + pose.cam_from_world.translation

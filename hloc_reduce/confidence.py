@@ -13,7 +13,8 @@ from .cli import InputError
 SOLUTIONS = 4  # poses that a minimal sample may have
 THRESHOLDS = 8  # inlier thresholds that are tried, from FINEST to RANSAC's
 FINEST = 1.0  # pixel
-SAME_PLACE = 2.0  # pixels: keypoints of other scales or orientations at one place count once
+SAME_PLACE = 2.0  # pixels at least: keypoints of other scales or orientations that count once
+DETECTED = 1600  # the longer side in pixels, to which photos are reduced before detection
 NEIGHBORS = 8  # projected points that give the density around a keypoint
 LEAST_NOISE = 0.5  # pixels, the standard deviation of a keypoint at best
 FOCAL_LENGTHS = (0.3, 5.0)  # of an estimated one, times the longer side: 11 to 180 mm on 35 mm film
@@ -21,10 +22,9 @@ REFINED = 2.0  # by what factor a focal length of EXIF data may change
 MAX_POSITION = 0.05  # standard deviation of the position, times the median distance of the inliers
 MAX_ROTATION = 2.0  # standard deviation in degrees
 MIN_MATCHES = 6  # of an image whose matches are asked whether they agree with a pose
-# least agreement of mutual matches, and of those with a ratio test, of which more are right; with
-# fewer dimensions than FEW fewer are
+# least agreement without a ratio test, with one, and with one below FEW dimensions
 AGREEMENT, AGREEMENT_RATIO, AGREEMENT_FEW, FEW = 0.17, 0.7, 0.55, 32
-RIVAL = 0.8  # times its inliers, if another pose has so many they tell nothing
+RIVAL = 0.8  # a pose is ambiguous if another has this share of its inliers
 
 
 def confidence(
@@ -44,9 +44,9 @@ def confidence(
 
     A wrong match pairs a keypoint with any of the matched points. So the probability that it is an
     inlier is the density of their projections around the keypoint, or if larger that of points
-    spread evenly over the image: a pose from where all points fall into a small part of the image
-    explains nothing. Keypoints at one place count once, and a keypoint with several matches has as
-    many chances.
+    spread evenly over the image: a pose that projects all points into a small part of the image
+    is no evidence. Matches are counted by the places of keypoints, cells of the threshold's size,
+    or by their points, whichever are fewer; a place with several matches has as many chances.
 
     Args:
         points2D: (M, 2) image points of all matches, COLMAP's pixels.
@@ -61,30 +61,34 @@ def confidence(
         by chance; at 8 one is expected in a hundred million queries of a wrong place.
     """
     errors, projected = reprojection_errors(points2D, points3D, cam_from_world, camera)
-    _, first, place = np.unique(
-        np.round(points2D / SAME_PLACE), axis=0, return_index=True, return_inverse=True
-    )
-    place, number = place.reshape(-1), len(first)
+    density = _density(points2D, projected, camera)
+    _, point = np.unique(points3D, axis=0, return_inverse=True)
+    point, scale = point.reshape(-1), photo_scale(camera)
     sample = -(-degrees_of_freedom // 2)  # matches that fix a pose
-    if number <= sample:
-        return -np.inf
-    chances = np.bincount(place)
-    least = np.full(number, np.inf)
-    np.minimum.at(least, place, errors)
-    density = _density(points2D[first], projected, camera)
-    poses = (
-        _log10_choose(number, sample)
-        + sample * np.log10(chances.mean())
-        + np.log10(SOLUTIONS * THRESHOLDS)
-    )
 
     def log10_false_alarms(threshold: float) -> float:
-        by_chance = np.minimum(1, chances * np.pi * threshold**2 * density).mean()
-        inliers = (least <= threshold).sum()
-        return poses + _log10_tail(inliers - sample, number - sample, by_chance)
+        side = max(SAME_PLACE * scale, threshold)
+        _, first, place = np.unique(
+            np.floor(points2D / side), axis=0, return_index=True, return_inverse=True
+        )
+        place, number = place.reshape(-1), len(first)
+        if number <= sample:
+            return np.inf
+        agree = errors <= threshold
+        inliers = min(len(np.unique(place[agree])), len(np.unique(point[agree])))
+        chances = np.bincount(place)
+        by_chance = np.minimum(1, chances * np.pi * threshold**2 * density[first]).mean()
+        tail = _log10_tail(inliers - sample, number - sample, by_chance)
+        poses = _log10_choose(number, sample) + sample * np.log10(chances.mean())
+        return poses + np.log10(SOLUTIONS * THRESHOLDS) + tail
 
-    thresholds = np.geomspace(min(FINEST, max_error), max_error, THRESHOLDS)
+    thresholds = np.geomspace(min(FINEST * scale, max_error), max_error, THRESHOLDS)
     return float(-min(map(log10_false_alarms, thresholds)))
+
+
+def photo_scale(camera: pycolmap.Camera) -> float:
+    """Return how many pixels of a photo are one of those that keypoints are detected in."""
+    return max(1.0, max(camera.width, camera.height) / DETECTED)
 
 
 def reprojection_errors(
@@ -111,7 +115,7 @@ def reprojection_errors(
     if front.any():
         projected[front] = camera.img_from_cam(local[front])
     errors = np.linalg.norm(projected - points2D, axis=1)
-    return np.nan_to_num(errors, nan=np.inf), projected
+    return np.nan_to_num(errors, nan=np.inf, posinf=np.inf), projected
 
 
 def _density(points2D: np.ndarray, projected: np.ndarray, camera: pycolmap.Camera) -> np.ndarray:
@@ -174,7 +178,9 @@ def uncertainty(
     if equations <= unknowns:
         return np.inf, np.inf
     errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
-    noise = max(LEAST_NOISE**2, (errors**2).sum() / (equations - unknowns))
+    noise = max(
+        (LEAST_NOISE * photo_scale(camera)) ** 2, (errors**2).sum() / (equations - unknowns)
+    )
     try:
         variance = noise * np.diag(np.linalg.inv(jacobian.T @ jacobian))
     except np.linalg.LinAlgError:
@@ -219,7 +225,7 @@ class Gate:
     Args:
         min_confidence: `confidence`.
         min_inliers: inliers of RANSAC.
-        min_agreement: `agreement`, which depends on the matcher and the descriptors.
+        min_agreement: `agreement`; default: that of `of_matches`.
 
     Raises:
         InputError: for a confidence that is not finite or a negative number of inliers.
@@ -227,21 +233,23 @@ class Gate:
 
     min_confidence: float = 8.0
     min_inliers: int = 8
-    min_agreement: float = AGREEMENT
+    min_agreement: float | None = None
 
     def __post_init__(self) -> None:
-        if not np.isfinite(self.min_confidence):
-            raise InputError(f"min_confidence is {self.min_confidence}: a number is needed.")
+        if not 0 <= self.min_confidence < np.inf:
+            raise InputError(f"min_confidence is {self.min_confidence}: at least 0.")
         if self.min_inliers < 0:
             raise InputError(f"min_inliers is {self.min_inliers}: at least 0.")
 
     def of_matches(self, matcher: dict, dim: int) -> "Gate":
-        """Return the gate for matches of descriptors.
+        """Return the gate for matches of descriptors, whose agreement differs.
 
         Args:
             matcher: configuration of the matcher's model.
             dim: dimension of the descriptors.
         """
+        if self.min_agreement is not None:
+            return self
         with_ratio = AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO
         least = with_ratio if matcher.get("ratio_threshold") else AGREEMENT
         return replace(self, min_agreement=least)

@@ -14,7 +14,7 @@ import pycolmap
 
 from . import absolute_pose, cli, logger, parallel
 from .cli import InputError
-from .confidence import DEFAULT_GATE, Gate
+from .confidence import DEFAULT_GATE, RIVAL, Gate
 from .executors import SERIAL, Executor
 from .group_writer import failure_of
 from .io import (
@@ -31,7 +31,7 @@ from .progress import progress
 
 CHUNK = 8  # queries
 SHOWN = 3  # queries that a message gives the reason of
-RECORDS = 5  # the version of what a record holds
+RECORDS = 6  # the version of what a record holds
 
 
 class Reference(Protocol):
@@ -99,8 +99,21 @@ def localize(
             "inliers": found.inliers,
             "db": names[0] if names else None,
         }
-        solved.append((found.cam_from_world, info))
-    return max(solved, key=lambda found: (found[1]["confidence"], found[1]["num_inliers"]))
+        solved.append((found, info))
+    best, info = max(solved, key=lambda both: _quality(both[1]))
+    for other, its_info in solved:
+        if info["reason"] is None is its_info["reason"] and other is not best:
+            rivals = other.num_inliers >= RIVAL * best.num_inliers
+            if rivals and absolute_pose.differ(best, other, info["points3D"]):
+                info["reason"] = (
+                    f"ambiguous: a pose by other images has {other.num_inliers} inliers, this one "
+                    f"{best.num_inliers}"
+                )
+    return best.cam_from_world, info
+
+
+def _quality(info: dict) -> tuple[bool, float, int]:
+    return info["reason"] is None, info["confidence"], info["num_inliers"]
 
 
 def _reason(num_keypoints: int, names: list[str], info: dict) -> str | None:

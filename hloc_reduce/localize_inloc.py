@@ -281,7 +281,8 @@ def _main() -> None:
     add_gate_options(parser)
     parser.add_argument("--overwrite", action="store_true", help="localize anew what is there")
     args = vars(parser.parse_args())
-    main(**args, gate=Gate(args.pop("min_confidence"), args.pop("min_inliers")))
+    gate = Gate(args.pop("min_confidence"), args.pop("min_inliers"))
+    main(**args, gate=gate)
 
 
 if __name__ == "__main__":

@@ -174,7 +174,7 @@ def _verify(
         }
     before = stamps.read(path)
     known = before.get("pairs", {}) if before.get("made_from") == made_from else {}
-    todo = [pair for pair in pairs if " ".join(pair) not in known]
+    todo = [pair for pair in pairs if "\t".join(pair) not in known]
     if todo:
         logger.info("Verifying %d pairs...", len(todo))
         with TemporaryDirectory(dir=matches.parent, prefix=".", suffix=".tmp") as folder:
@@ -188,9 +188,9 @@ def _verify(
             colmap.verify_matches(database, listed, False)
             counts = colmap.count_verified(database)
         counts = {tuple(sorted(pair)): number for pair, number in counts.items()}
-        known = known | {" ".join(pair): counts.get(pair, 0) for pair in todo}
+        known = known | {"\t".join(pair): counts.get(pair, 0) for pair in todo}
         stamps.write(path, {"made_from": made_from, "pairs": known})
-    return {pair: known[" ".join(pair)] for pair in pairs}
+    return {pair: known["\t".join(pair)] for pair in pairs}
 
 
 def _main() -> None:

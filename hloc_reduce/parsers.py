@@ -21,6 +21,7 @@ CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != 
 _ENDS = r"\t\n\v\f\r\x1c-\x1f\x85\u2028\u2029"  # of lines, and of names in them
 _LETTER = rf"[^{_ENDS}/\0\ud800-\udfff]"
 _PART = rf"(?!\.\.?(?:/|$))(?!\s){_LETTER}+(?<!\s)"  # neither . nor .., and what h5 and lists hold
+_NUMBER = re.compile(r"[-+]?\d+\.\d+(e[-+]?\d+)?")
 _NAME = re.compile(rf"(?!#){_PART}(?:/{_PART})*")
 
 
@@ -63,12 +64,19 @@ def _lines(path: Path, names: int = 1) -> Iterator[tuple[str, list[str]]]:
 
 def _words(line: str, names: int) -> list[str]:
     """Split a line whose first words, so many, are names of images."""
-    if "\t" not in line:
+    # columns of one's own may be separated by spaces and tabs
+    after = line.partition("\t")[0].split()[1:]
+    if "\t" not in line or any(map(_is_value, after)):
         return line.split()
     *first, rest = line.strip().split("\t", names)
     if len(first) < names:
         return [word.strip() for word in (*first, rest)]
     return [word.strip() for word in first] + rest.split()
+
+
+def _is_value(word: str) -> bool:
+    """Tell whether a word is none of a name: a camera model, or a number of a pose."""
+    return word in CAMERA_MODELS or _NUMBER.fullmatch(word) is not None
 
 
 def to_line(*words: object, names: int = 1) -> str:

@@ -95,7 +95,7 @@ def main(
         "attempts": list(_attempts(len(names), mapper_options)),
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
-    is_whole = (sfm_dir / REGISTRATION).is_file()
+    is_whole = bool(stamps.read(sfm_dir / REGISTRATION))
     if not overwrite and is_whole and stamps.is_current(sfm_dir / STAMP, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
         _check(sfm_dir, accept_partial)
@@ -131,7 +131,7 @@ def main(
             found = colmap.incremental_mapping(
                 database, image_dir, building / "models", attempt, verbose
             )
-            shutil.rmtree(building / "models")
+            shutil.rmtree(building / "models", ignore_errors=True)
             models = max(models, found, key=_size)
         if not models:
             raise InputError(

@@ -222,3 +222,40 @@ def test_a_pose_that_no_image_agrees_with_is_refused():
     assert agreement(few, [np.arange(5)]) < 0.25  # five of an image tell nothing
     assert agreement(few, []) == agreement(few, [np.arange(5)])
     assert agreement(np.zeros(0, bool), []) == 0
+
+
+@pytest.mark.parametrize(("number", "repeated"), [(3, 8), (3, 12), (5, 3), (8, 4)])
+def test_clusters_of_matches_of_few_points_are_refused(number, repeated):
+    """Three points fit a pose always, however many keypoints beside each other match them."""
+    for seed in range(3):
+        generator = np.random.default_rng(seed)
+        points = generator.uniform([-4, -3, -2], [4, 3, 2], (number, 3))
+        spots = generator.uniform(0, [1600, 1200], (number, 2))
+        around = np.repeat(spots, repeated, axis=0)
+        around += generator.uniform(-3, 3, around.shape)
+        noise = matches(0, 20, seed)
+        keypoints = np.concatenate([around, noise[0]])
+        world = np.concatenate([np.repeat(points, repeated, axis=0), noise[1]])
+        assert solve(keypoints, world, [np.arange(len(world))]).refusal is not None
+
+
+def test_a_rival_is_looked_for_where_half_of_the_matches_agree():
+    """Of two places that look the same the matches are divided between both."""
+    first, second = matches(51, 0), matches(49, 0, pose=pose_of(0, (50, 0, 8)), seed=1)
+    keypoints, points = (np.concatenate(part) for part in zip(first, second, strict=True))
+    found = solve(keypoints, points, [np.arange(0, 100, 2), np.arange(1, 100, 2)])
+    assert found.refusal == "ambiguous: another pose has 49 inliers, this one 51"
+
+
+def test_a_gate_of_ones_own_is_kept():
+    own = Gate(min_agreement=0.3)
+    assert own.of_matches({"ratio_threshold": 0.8}, 64) == own
+
+
+def test_the_size_of_a_photo_changes_nothing():
+    keypoints, points = matches(12, 30)
+    large = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=4800, height=3600, params=[4200, 2400, 1800]
+    )
+    at_once = confidence(keypoints, points, TRUE, CAMERA, 12.0)
+    assert abs(confidence(3 * keypoints, points, TRUE, large, 36.0) - at_once) < 0.5

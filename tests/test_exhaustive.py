@@ -75,7 +75,7 @@ def test_nothing_to_pair_is_refused(tmp_path, monkeypatch, caplog):
     with pytest.raises(InputError, match="f.h5 has no image"):
         pairs(output, features=described(tmp_path / "f.h5", []))
     with pytest.raises(InputError, match="cannot be names of images"):
-        pairs(output, image_list=["a b.jpg", "c.jpg"])
+        pairs(output, image_list=["a\tb.jpg", "c.jpg"])
     for references in (None, NAMES[:1]):
         with pytest.raises(InputError, match="db/b.jpg is the only image"):
             pairs(output, image_list=NAMES[:1], ref_list=references)

@@ -434,8 +434,8 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, monkeypat
     small = tmp_path / "small.txt"
     small.write_text("guess.png SIMPLE_PINHOLE 240 180 250 120 90\n")
     run(monkeypatch, *build, "--query_images", photos, "--queries", small)
-    assert "1 queries are not localized, as their intrinsics are for photos of" in caplog.text
-    assert "guess.png (240x180, not 480x360)" in caplog.text
+    reason = "the intrinsics are for 240x180 pixels, the photo has 480x360"
+    assert f"Not localized: guess.png ({reason})." in caplog.text
     for wrong in (pixels.astype(float), pixels[None], np.zeros((0, 3), np.uint8)):
         with pytest.raises(InputError, match="uint8"):
             localizer.localize(wrong)

@@ -1,6 +1,7 @@
 """The stages on a scene whose answers are known: pairs, matches, map, poses."""
 
 import shutil
+import sys
 
 import h5py
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from command import refused
 
 from hloc_reduce import (
+    cli,
     colmap,
     localization,
     localize_sfm,
@@ -523,3 +525,23 @@ def test_a_query_that_cannot_be_localized_says_why(built):
     pairs = [("query/6.jpg", "db/0.jpg")]
     write_pairs(pairs, built.loc_pairs)
     assert built.localize()["query/7.jpg"]["reason"] == "no map image was retrieved"
+
+
+def test_the_command_line_of_localization(built, monkeypatch):
+    """Its options reach the stage."""
+    options = {
+        "reference_sfm": built.sfm,
+        "queries": built.queries,
+        "retrieval": built.loc_pairs,
+        "features": built.features,
+        "matches": built.loc_matches,
+        "results": built.root / "by_command.txt",
+        "min_inliers": 301,
+    }
+    words = [word for key, value in options.items() for word in (f"--{key}", str(value))]
+    monkeypatch.setattr(sys, "argv", ["localize_sfm", *words])
+    cli.run(localize_sfm._main)
+    records = localization.read_records(localization.log_file(options["results"]))
+    assert {record["reason"] for record in records.values()} == {
+        "too few inliers: 300, at least 301 are needed"
+    }

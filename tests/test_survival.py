@@ -238,15 +238,15 @@ def start(place, outputs, workers=None):
     "stage, free, file",
     [
         # of tiny photos: pieces of 30 KB, matches of 2 KB, a database of 0.2 MB that grows twofold
-        ("extract_features", 300_000, "feats-dog-"),
+        ("extract_features", 750_000, "feats-dog-"),
         ("triangulation", 250_000, "database.db"),
         *(
             pytest.param(*case, marks=pytest.mark.long)
             for case in (
                 ("extract_features", 5_000, ""),
                 ("extract_features", 100_000, ".h5.pieces/"),
-                ("extract_features", 400_000, "feats-dog-"),
-                ("extract_features", 600_000, "database.db"),
+                ("extract_features", 900_000, "feats-dog-"),
+                ("extract_features", 1_100_000, "feats-dog-"),
                 ("pairs_from_covisibility", 0, ""),
                 ("match_map", 5_000, ".h5.pieces/"),
                 ("match_map", 30_000, "_matches-"),
@@ -296,7 +296,7 @@ def test_a_full_disk_is_one_clear_error_and_the_run_goes_on_after_it(
     assert "No space left on device" in error and f"'{folder}" in error and file in error
     done = survival.on_disk(outputs)
     assert before <= done
-    if (stage, free) == ("extract_features", 300_000):
+    if (stage, free) == ("extract_features", 750_000):
         assert len(done) == 7  # all pieces, which were to be merged
 
     set_free(2**24)

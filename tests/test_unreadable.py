@@ -125,7 +125,7 @@ def test_intrinsics_of_another_size(place, monkeypatch, caplog):
     assert row["status"] != "localized" and row["num_inliers"] == "0"
     assert row["reason"] == "the intrinsics are for 100x100 pixels, the photo has 480x360"
     reason = "the intrinsics are for 100x100 pixels, the photo has 480x360"
-    assert f"Not localized: {name} ({reason})." in caplog.text
+    assert "Not localized: " in caplog.text and f"{name} ({reason})" in caplog.text
     path.write_text("\n".join(lines))
     command.run(monkeypatch, pipeline, *arguments)
     assert outcome(outputs)[1][name]["status"] == "localized"
