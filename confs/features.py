@@ -75,7 +75,7 @@ def get(
     if storage != STORAGES[0]:
         conf = {**conf, "storage": storage}
     if keypoints != KEYPOINTS[0]:
-        conf = {**conf, "model": _with_keypoints(conf["model"], keypoints)}
+        conf = {**conf, "model": with_keypoints(conf["model"], keypoints)}
     if projection is None:
         return name, conf
     model = {
@@ -88,10 +88,10 @@ def get(
     return name, {**conf, "output": feature(name, model)["output"], "model": model}
 
 
-def _with_keypoints(model: dict, keypoints: str) -> dict:
-    """Return the configuration of a model with other settings of DoG, if it is one."""
+def with_keypoints(model: dict, keypoints: str) -> dict:
+    """Return the configuration of a model with other settings of DoG, if it has that detector."""
     if "base" in model:
-        return {**model, "base": _with_keypoints(model["base"], keypoints)}
+        return {**model, "base": with_keypoints(model["base"], keypoints)}
     return {**model, "keypoints": keypoints} if model["name"] == "dog" else model
 
 
@@ -146,6 +146,9 @@ def read(path: Path) -> dict:
     projection = model.get("projection", "" if model["name"] == "reduced" else None)
     if projection is not None and not (isinstance(projection, str) and projection):
         raise InputError(f"{path}: the {model['name']} model names no projection.")
+    base = model.get("base", model)
+    if base["name"] == "dog" and "keypoints" not in base:
+        model = with_keypoints(model, KEYPOINTS[0])
     if projection and Path(projections.split_prefix(projection)[0]).suffix:
         model = {**model, "projection": str(Path(projection).absolute())}  # other machines read it
     given = content.get("preprocessing") or {}

@@ -62,16 +62,15 @@ def confidence(
     """
     errors, projected = reprojection_errors(points2D, points3D, cam_from_world, camera)
     density = _density(points2D, projected, camera)
-    _, point = np.unique(points3D, axis=0, return_inverse=True)
-    point, scale = point.reshape(-1), photo_scale(camera)
+    # equal points have equal projections, and hardly ever do others
+    point, scale = points3D @ [1, np.sqrt(2), np.sqrt(3)], photo_scale(camera)
     sample = -(-degrees_of_freedom // 2)  # matches that fix a pose
 
     def log10_false_alarms(threshold: float) -> float:
         side = max(SAME_PLACE * scale, threshold)
-        _, first, place = np.unique(
-            np.floor(points2D / side), axis=0, return_index=True, return_inverse=True
-        )
-        place, number = place.reshape(-1), len(first)
+        column, row = np.floor(points2D / side).astype(np.int64).T
+        _, first, place = np.unique((column << 32) + row, return_index=True, return_inverse=True)
+        number = len(first)
         if number <= sample:
             return np.inf
         agree = errors <= threshold

@@ -23,7 +23,7 @@ LADDERS = {
     "large": ((0, 0.005), (0, 0.0025), (0, 0.001), (-1, 0.0033)),
 }
 
-BLUR = 4.0  # standard deviation in pixels, of what leaves of noise next to nothing
+BLUR = 4.0  # pixels, standard deviation of the blur that suppresses noise
 LEAST_SIGNAL = 5.0  # times what noise alone leaves after such a blur
 
 

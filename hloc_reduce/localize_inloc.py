@@ -45,7 +45,7 @@ def main(
     """Localize queries in a data set of InLoc's layout.
 
     Takes what hloc's `localize_inloc.main` takes. Each floor has a frame of its own, so the
-    cutouts of each floor are matched together, and the pose with the most inliers is kept.
+    cutouts of each floor are matched together, and the pose of the highest confidence is kept.
 
     Args:
         dataset_dir: the folder that image names are relative to.

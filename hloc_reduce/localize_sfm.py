@@ -52,7 +52,7 @@ def main(
         results: text file of poses, one line for every query.
         ransac_thresh: inliers reproject within so many pixels.
         covisibility_clustering: solve each cluster of retrieved images that see common points by
-            itself and keep the pose with the most inliers.
+            itself and keep the pose of the highest confidence.
         prepend_camera_name: write `folder/basename` instead of `basename`.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
         overwrite: localize anew what is there.
@@ -62,7 +62,7 @@ def main(
         gate: what a pose must have for the query to be called localized.
 
     Returns:
-        A record for each query, as `localization.main`. A query that PnP could not solve is not
+        A record for each query, as `localization.main`. A query without a trusted pose is not
         localized, and its pose is that of `db`, its best retrieved map image.
 
         The same is kept in `<results>_logs.jsonl`, from which a later run goes on.

@@ -73,6 +73,9 @@ class Map:
                 "model": dict(conf["model"]),
                 "preprocessing": dict(conf["preprocessing"]),
             }
+            base = conf["model"].get("base", conf["model"])
+            if base["name"] == "dog" and "keypoints" not in base:  # made before these could adapt
+                self._conf["model"] = features_confs.with_keypoints(conf["model"], "hloc")
             if "storage" in conf:
                 self._conf["storage"] = choose("storage", conf["storage"], STORAGES)
             _with_projection(self._conf, _file_name)
