@@ -151,12 +151,10 @@ def _skip_frame(data: mmap, start: int) -> int:
 @lru_cache
 def _num_params() -> dict[int, int]:
     """Return how many parameters a camera has, by the number of its model."""
-    return {
-        int(pycolmap.CameraModelId.__members__[name]): len(
-            pycolmap.Camera.create_from_model_name(1, name, 1.0, 1, 1).params
-        )
-        for name in CAMERA_MODELS
-    }
+    models = [pycolmap.CameraModelId.__members__[name] for name in CAMERA_MODELS]
+    new = hasattr(pycolmap.Camera, "create_from_model_id")  # from 4.0 on
+    make = pycolmap.Camera.create_from_model_id if new else pycolmap.Camera.create
+    return {int(model): len(make(1, model, 1.0, 1, 1).params) for model in models}
 
 
 # from a file of a binary COLMAP model to what finds the end of a record in it
