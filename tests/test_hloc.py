@@ -193,7 +193,8 @@ def test_features_of_files_are_registered_by_their_names(double, tmp_path):
     (tmp_path / "mine.yaml").write_text("model: {name: dog, max_keypoints: 7}")
     assert "mine" in hloc_reduce.register([tmp_path / "mine.yaml"])
     conf = importlib.import_module("hloc.extract_features").confs["mine"]
-    assert conf["model"] == {"name": "reduced", "base": {"name": "dog", "max_keypoints": 7}}
+    base = {"name": "dog", "max_keypoints": 7, "keypoints": "adaptive"}
+    assert conf["model"] == {"name": "reduced", "base": base}
     assert hloc_reduce.register([tmp_path / "mine.yaml"]) == []
     (tmp_path / "sift.yaml").write_text("model: {name: dog, max_keypoints: 7}")
     with pytest.raises(InputError, match="has a feature sift already: rename .*sift.yaml"):
