@@ -57,7 +57,7 @@ def main(
         feature_path: the h5 file itself, instead of `export_dir`.
         overwrite: extract anew what is there.
         executor: does the work.
-        strict: as of `extract_several`.
+        strict: stop at an image that cannot be read, instead of recording the failure.
 
     Returns:
         The feature file; images it holds already are skipped.

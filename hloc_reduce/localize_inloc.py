@@ -56,7 +56,7 @@ def main(
         skip_matches: leave out cutouts with fewer matches.
         queries: names and intrinsics, or the list of them, or a glob of lists; default: all
             queries of the pairs, with the intrinsics of `by_iphone7`.
-        ransac_thresh: inliers reproject within so many pixels of a photo of 4032 pixels, of others
+        ransac_thresh: RANSAC inlier threshold in pixels of a photo of 4032 pixels, of others
             in proportion.
         overwrite: localize anew what is there.
         executor: does the work.
@@ -275,8 +275,7 @@ def _main() -> None:
         "--ransac_thresh",
         type=float,
         default=RANSAC_THRESH,
-        help="inliers reproject within so many pixels of a photo of 4032 pixels, of others in "
-        "proportion",
+        help="RANSAC inlier threshold in pixels of a photo of 4032 pixels, of others in proportion",
     )
     add_gate_options(parser)
     parser.add_argument("--overwrite", action="store_true", help="localize anew what is there")

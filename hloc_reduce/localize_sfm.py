@@ -50,7 +50,7 @@ def main(
         features: feature file of the queries.
         matches: match file of the pairs.
         results: text file of poses, one line for every query.
-        ransac_thresh: inliers reproject within so many pixels.
+        ransac_thresh: RANSAC inlier threshold in pixels.
         covisibility_clustering: solve each cluster of retrieved images that see common points by
             itself and keep the pose of the highest confidence.
         prepend_camera_name: write `folder/basename` instead of `basename`.
@@ -216,7 +216,7 @@ def _main() -> None:
         "--ransac_thresh",
         type=float,
         default=RANSAC_THRESH,
-        help="inliers reproject within so many pixels",
+        help="RANSAC inlier threshold in pixels",
     )
     parser.add_argument(
         "--covisibility_clustering",

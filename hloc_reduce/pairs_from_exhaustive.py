@@ -28,9 +28,9 @@ def main(
         output: text file of pairs.
         image_list: names, or a text file of them ...
         features: ... or the feature file with the images.
-        ref_list: likewise for the reference images; default: the images themselves, where each
+        ref_list: names of the reference images, or a text file of them; default: the images, each
             unordered pair is written once.
-        ref_features: likewise for the reference images.
+        ref_features: feature file with the reference images, instead of `ref_list`.
 
     Returns:
         `output`.

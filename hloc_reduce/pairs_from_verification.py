@@ -56,8 +56,8 @@ def main(
         features: feature file.
         matches: match file, with all of `pairs`.
         descriptors: h5 file of global descriptors.
-        num_matched: new pairs of an image that is connected poorly: at most so many with similar
-            images, and as many with neighbours of its neighbours.
+        num_matched: maximum number of new pairs of a poorly connected image with similar images,
+            and again with neighbours of its neighbours.
         num_covis: new pairs of any other image with neighbours of its neighbours, at most.
         camera_mode: which images share a camera.
         image_list: the images, names or a text file of them; default: those of `features`.
@@ -77,6 +77,8 @@ def main(
             raise InputError(f"There is no file {path}.")
     names = list_images(image_dir, list_h5_names(features) if image_list is None else image_list)
     listed = list(dict.fromkeys(tuple(sorted(pair)) for pair in parse_pairs(pairs)))
+    if unknown := {name for pair in listed for name in pair}.difference(names):
+        raise InputError(f"{pairs}: {min(unknown)} is not in the list of images.")
     verified = _verify(image_dir, names, listed, features, matches, camera_mode)
     connected = {pair: verified[pair] for pair in listed if verified[pair] >= MIN_INLIERS}
     global_descriptors = read_global(descriptors, names)

@@ -63,8 +63,8 @@ def _lines(path: Path, names: int = 1) -> Iterator[tuple[str, list[str]]]:
 
 
 def _words(line: str, names: int) -> list[str]:
-    """Split a line whose first words, so many, are names of images."""
-    # columns of one's own may be separated by spaces and tabs
+    """Split a line that begins with a number of image names."""
+    # lists of other programs may mix spaces and tabs
     after = line.partition("\t")[0].split()[1:]
     if "\t" not in line or any(map(_is_value, after)):
         return line.split()

@@ -65,7 +65,7 @@ class Lines:
         pass
 
     def update(self, number: int = 1) -> None:
-        """Count so many more as done."""
+        """Advance by a number of items."""
         self.number += number
         if time.monotonic() - self.said >= INTERVAL:
             self.said = time.monotonic()
@@ -76,7 +76,7 @@ class Lines:
         self.postfix = "".join(f", {key} {value}" for key, value in values.items())
 
     def line(self, elapsed: float) -> str:
-        """Say how far the loop is after so many seconds."""
+        """Report the progress after a number of seconds."""
         units = PLURALS.get(self.unit, f"{self.unit}s")
         if not self.total:
             return f"{self.desc}: {self.number:,} {units}{self.postfix}"

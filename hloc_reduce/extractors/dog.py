@@ -77,7 +77,7 @@ class DoG(BaseModel):
     score, its scale (COLMAP's own ranking), and honours `max_keypoints`.
 
     Where hloc's `options` find too few keypoints in a photo, others are tried (`detection.detect`),
-    unless `keypoints` is "hloc". Options of one's own are used as they are.
+    unless `keypoints` is "hloc". Other options than hloc's are used for every photo.
     """
 
     default_conf = {
