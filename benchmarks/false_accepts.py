@@ -2,9 +2,10 @@
 
 Every map is tried with photos of its own that it was not built from, with photos of all other
 places, and with its own blurred, mirrored, black and noisy; each with its intrinsics and without.
-Of a COLMAP model every third photo is kept out of the map. Keypoints and maps are those of the
-first feature, whatever descriptors are matched. Results go to trials.csv, and as a curve to
-false_accepts.svg; a run that was stopped goes on with the next place.
+Of a COLMAP model every third photo is kept out of the map. Keypoints and maps are those of
+colmap_sift_sv64, whatever descriptors are matched. Another --seed keeps out other photos, builds
+other maps, and draws other photos of other places. Results go to trials.csv, and as a curve to
+false_accepts.svg; an interrupted run resumes with the next place.
 """
 
 import argparse
@@ -70,7 +71,7 @@ class Place:
         reference: the map, and `names`, its images.
         features: of the photos of the map and of the queries, by the base descriptor.
         metric: whether units are metres.
-        thresh: RANSAC's inlier threshold by the longer side of a photo in pixels.
+        extent: of the positions of its images, the norm of their standard deviations.
     """
 
     name: str
@@ -83,11 +84,11 @@ class Place:
     extent: float
 
 
-def split(name: str, images: Path, model: Path, output: Path) -> Place:
+def split(name: str, images: Path, model: Path, output: Path, seed: int) -> Place:
     """Build a map of two thirds of the photos of a COLMAP model."""
     reconstruction = colmap.read_model(model)
     photos = sorted(reconstruction.images.values(), key=lambda image: image.name)
-    held_out = photos[EVERY // 2 :: EVERY]
+    held_out = photos[(EVERY // 2 + seed) % EVERY :: EVERY]
     # copies, as the originals end with the model
     queries = [
         (photo.name, copy.deepcopy(photo.camera), photo.cam_from_world()) for photo in held_out
@@ -100,7 +101,7 @@ def split(name: str, images: Path, model: Path, output: Path) -> Place:
     return _of_model(name, images, reduced, queries, output, metric=False)
 
 
-def of_dataset(root: Path, output: Path) -> Place:
+def of_dataset(root: Path, output: Path, _seed: int) -> Place:
     """Take a place in the layout of Aachen Day-Night or of InLoc, and its queries."""
     if (root / "database/cutouts").is_dir():
         return _of_scans(InLoc(root), output)
@@ -140,9 +141,11 @@ def _extract(images: Path, output: Path, names: list[str]) -> Path:
     return extract_features.main(conf, images, output, image_list=sorted(set(names)))
 
 
-def alter(place: Place, output: Path) -> list[tuple[str, pycolmap.Camera, pycolmap.Rigid3d | None]]:
+def alter(
+    place: Place, output: Path, seed: int
+) -> list[tuple[str, pycolmap.Camera, pycolmap.Rigid3d | None]]:
     """Write altered photos of a place's queries, and extract their features."""
-    generator = np.random.default_rng(0)
+    noise = np.random.default_rng(seed)
     altered = []
     for i, (name, camera, truth) in enumerate(place.queries):
         kind = ALTERED[i % 2] if i > 1 else ALTERED[2 + i]
@@ -151,7 +154,7 @@ def alter(place: Place, output: Path) -> list[tuple[str, pycolmap.Camera, pycolm
             "blurred": lambda photo=photo: cv2.GaussianBlur(photo, (0, 0), BLUR),
             "mirrored": lambda photo=photo: photo[:, ::-1],
             "black": lambda photo=photo: np.zeros_like(photo),
-            "noise": lambda photo=photo: generator.integers(0, 256, photo.shape, np.uint8),
+            "noise": lambda photo=photo: noise.integers(0, 256, photo.shape, np.uint8),
         }
         path = output / "altered" / kind / Path(name).with_suffix(".png")
         if not path.exists():
@@ -191,26 +194,32 @@ class Described:
 
 
 def trials(
-    place: Place, others: list[Place], output: Path, number: int, generator: np.random.Generator
+    place: Place, others: list[Place], output: Path, number: int, seed: int
 ) -> Iterator[tuple]:
     """Yield the photos to try a map with: place, photo, camera, truth or None, features, kind."""
     for name, camera, truth in place.queries:
         yield place, name, camera, truth, place.features, "own"
-    for name, camera, truth in alter(place, output):
+    for name, camera, truth in alter(place, output, seed):
         yield place, name, camera, truth, output / "altered.h5", name.split("/")[0]
     pool = [(other, *query[:2]) for other in others for query in other.queries]
-    chosen = generator.choice(len(pool), min(number, len(pool)), replace=False)
+    chosen = np.random.default_rng(seed).choice(len(pool), min(number, len(pool)), replace=False)
     for other, name, camera in (pool[i] for i in sorted(chosen)):
         yield other, name, camera, None, other.features, "other"
 
 
 def run(
-    place: Place, others: list[Place], output: Path, features: list[str], number: int, matcher: str
+    place: Place,
+    others: list[Place],
+    output: Path,
+    feature: str,
+    number: int,
+    matcher: str,
+    seed: int,
 ) -> list[dict]:
     """Try a map with all photos, and return the rows of trials.csv."""
     model = matchers_confs.confs[matcher]["model"]
     ratio_threshold = model.get("ratio_threshold")
-    tried = list(trials(place, others, output, number, np.random.default_rng(0)))
+    tried = list(trials(place, others, output, number, seed))
     shown = {}
     with open_h5(place.features) as file:
         for name in place.names:
@@ -218,26 +227,25 @@ def run(
             ids, _ = place.reference.lift(name, np.arange(count))
             shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
     rows = []
-    for feature in features:
-        describe = Described(feature)
-        with open_h5(place.features) as file:
-            described = {name: describe(file, name) for name in place.names}
-        gate = DEFAULT_GATE.of_matches(model, described[place.names[0]].shape[1])
-        for source, name, camera, truth, path, kind in tried:
-            with open_h5(path) as file:
-                query, (keypoints, _) = describe(file, name), get_colmap_keypoints(file, name)
-            matches = {}
-            for other in place.names:
-                rows_of = shown[other]
-                found, _ = mutual_nearest(described[other], query, ratio_threshold, rows_of)
-                matched = found >= 0
-                matches[other] = torch.stack([found[matched], rows_of[matched]], 1).numpy()
-            for given in ("given", "guess"):
-                row = localize(place, keypoints, camera, matches, given, gate)
-                cam_from_world = row.pop("cam_from_world")
-                row |= outcome(place, row, cam_from_world, truth)
-                known = {"feature": feature, "map": place.name, "place": source.name}
-                rows.append(known | {"photo": name, "kind": kind, "intrinsics": given} | row)
+    describe = Described(feature)
+    with open_h5(place.features) as file:
+        described = {name: describe(file, name) for name in place.names}
+    gate = DEFAULT_GATE.of_matches(model, described[place.names[0]].shape[1])
+    for source, name, camera, truth, path, kind in tried:
+        with open_h5(path) as file:
+            query, (keypoints, _) = describe(file, name), get_colmap_keypoints(file, name)
+        matches = {}
+        for other in place.names:
+            rows_of = shown[other]
+            found, _ = mutual_nearest(described[other], query, ratio_threshold, rows_of)
+            matched = found >= 0
+            matches[other] = torch.stack([found[matched], rows_of[matched]], 1).numpy()
+        for given in ("given", "guess"):
+            row = localize(place, keypoints, camera, matches, given, gate)
+            cam_from_world = row.pop("cam_from_world")
+            row |= outcome(place, row, cam_from_world, truth)
+            known = {"feature": feature, "map": place.name, "place": source.name}
+            rows.append(known | {"photo": name, "kind": kind, "intrinsics": given} | row)
     return rows
 
 
@@ -398,6 +406,7 @@ def _main() -> None:
     )
     parser.add_argument("--matcher", default="NN-ratio", help="how to match")
     parser.add_argument("--trials", type=int, default=85, help="photos of other places, a map")
+    parser.add_argument("--seed", type=int, default=0, help="of the maps and the photos drawn")
     parser.add_argument(
         "--same",
         nargs="+",
@@ -411,14 +420,19 @@ def _main() -> None:
     torch.set_num_threads(1)
     sources = [(root.name, of_dataset, (root,)) for root in args.dataset]
     sources += [(name, split, (name, *both)) for name, both in parse_maps(args.map).items()]
-    places = {name: make(*arguments, args.output / name) for name, make, arguments in sources}
+    places = {
+        name: make(*arguments, args.output / name, args.seed) for name, make, arguments in sources
+    }
     rows = []
     for name, place in places.items():
         others = [other for other in places.values() if other is not place]
         for feature in args.feature:
             file = args.output / name / f"trials_{feature.replace(':', '-')}_{args.matcher}.csv"
             if not file.exists():
-                found = run(place, others, args.output / name, [feature], args.trials, args.matcher)
+                found = run(
+                    *(place, others, args.output / name),
+                    *(feature, args.trials, args.matcher, args.seed),
+                )
                 write_csv(found, file, COLUMNS)
             with file.open(newline="") as opened:
                 rows += csv.DictReader(opened)
