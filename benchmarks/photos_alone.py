@@ -174,6 +174,7 @@ def _main() -> None:
     parser.add_argument("--map", nargs="+", required=True, metavar="IMAGES:MODEL")
     parser.add_argument("--output", type=Path, required=True, help="folder of the maps")
     parser.add_argument("--feature", default=features_confs.RECOMMENDED, help="name or YAML file")
+    features_confs.add_keypoints_option(parser)
     parser.add_argument("--subset", type=int, default=0, help="photos of each place; 0: all")
     parser.add_argument("--subsets", type=int, default=1, help="how many such subsets")
     parser.add_argument("--stock", action="store_true", help="run stock pycolmap too")
@@ -194,7 +195,11 @@ def _main() -> None:
         args.subset,
         args.subsets,
         args.stock,
-        {"num_covis": args.num_covis, "camera_mode": colmap.camera_mode(args.camera_mode)},
+        {
+            "num_covis": args.num_covis,
+            "keypoints": args.keypoints,
+            "camera_mode": colmap.camera_mode(args.camera_mode),
+        },
     )
 
 

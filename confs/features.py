@@ -95,6 +95,11 @@ def with_keypoints(model: dict, keypoints: str) -> dict:
     return {**model, "keypoints": keypoints} if model["name"] == "dog" else model
 
 
+def keypoints_of(model: dict) -> str | None:
+    """Return the name of the settings of DoG of a model, None if it does not say."""
+    return model.get("base", model).get("keypoints")
+
+
 def of_patches(name: str) -> tuple[str, str | None]:
     """Return the base descriptor and the projection, if any, of a feature that describes patches.
 
@@ -128,7 +133,8 @@ def add_keypoints_option(parser: ArgumentParser) -> None:
         "--keypoints",
         default=KEYPOINTS[0],
         help=f"settings of the DoG detector, one of {', '.join(KEYPOINTS)}: adaptive finds more "
-        "keypoints in small, dark and hazy photos; hloc uses hloc's settings for every photo",
+        "keypoints in small, dark and hazy photos; colmap finds several times as many in every "
+        "photo; hloc uses hloc's settings for every photo",
     )
 
 

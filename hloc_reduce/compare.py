@@ -14,6 +14,7 @@ from pipelines.layouts import pipeline_of
 
 from . import cli, io, logger, report, results, stamps
 from .cli import InputError
+from .confidence import DEFAULT_GATE, Gate, add_gate_options
 from .paths import strings_as_paths
 from .report import runs
 
@@ -26,6 +27,7 @@ def main(
     page: Path | None = None,
     retrieval: str = "vlad",
     ground_truth: Path | None = None,
+    gate: Gate = DEFAULT_GATE,
 ) -> dict[str, str]:
     """Localize the queries of a data set with several features, print their table and report.
 
@@ -36,6 +38,7 @@ def main(
         page: the report; default: `<outputs>/report.html`.
         retrieval: as of the pipelines.
         ground_truth: as of the pipelines; default: what a folder was made with, or theirs.
+        gate: what a pose must have for a query to be called localized.
 
     Returns:
         From each feature that failed to what was wrong.
@@ -56,7 +59,7 @@ def main(
         before = stamps.read(folder / "summary.json").get("files", {}).get("ground_truth")
         truth = ground_truth or (before and folder / before)
         try:
-            pipeline(dataset, folder, feature, retrieval=retrieval, ground_truth=truth)
+            pipeline(dataset, folder, feature, retrieval=retrieval, ground_truth=truth, gate=gate)
         except (InputError, OSError) as error:
             logger.error("%s failed: %s", name, error)
             failed[name] = str(error)
@@ -151,10 +154,17 @@ def _main() -> None:
         type=Path,
         help="true poses of the queries (default: what was given before, or that of the data set)",
     )
+    add_gate_options(parser)
     args = parser.parse_args()
     outputs = args.outputs or Path("outputs") / args.dataset.resolve().name
     failed = main(
-        args.dataset, args.features, outputs, args.output, args.retrieval, args.ground_truth
+        args.dataset,
+        args.features,
+        outputs,
+        args.output,
+        args.retrieval,
+        args.ground_truth,
+        Gate(args.min_confidence, args.min_inliers),
     )
     if failed:
         raise InputError(f"These failed, see above: {', '.join(failed)}. The others are reported.")

@@ -11,7 +11,11 @@ import numpy as np
 from . import colmap
 
 HLOC = {"first_octave": 0, "peak_threshold": 0.01}
-KEYPOINTS = ("adaptive", "hloc")  # settings that follow the photo, or hloc's for every photo
+COLMAP = {"first_octave": -1, "peak_threshold": 0.0067}
+# from the name of settings to those that are tried first, and whether others are where they find
+# too few keypoints
+SETTINGS = {"adaptive": (HLOC, True), "colmap": (COLMAP, True), "hloc": (HLOC, False)}
+KEYPOINTS = tuple(SETTINGS)
 
 ENOUGH = 2500  # keypoints of a photo, and in small ones
 PIXELS = 200  # for each of them

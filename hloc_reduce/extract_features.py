@@ -201,7 +201,7 @@ def extract_all(
         def detect(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             try:
                 with span("detect"):
-                    arguments = image, base.conf["options"], base.adaptive
+                    arguments = image, *base.settings
                     return pool.submit(detection.detect, *arguments).result()
             except BrokenExecutor:
                 raise InputError(

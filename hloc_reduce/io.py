@@ -4,6 +4,7 @@ import csv
 import fcntl
 import filecmp
 import io
+import json
 import os
 import platform
 import shutil
@@ -353,6 +354,15 @@ def provenance(file: h5py.File) -> str:
     """Return what tells an open h5 file from others: what made it and when, or its name."""
     conf = get_text(file, "conf", Path(file.filename).name)
     return f"{conf} {get_text(file, 'id', '')}".strip()
+
+
+def get_matcher(match_file: h5py.File) -> dict:
+    """Return the configuration of the matcher's model of a match file, {} if it does not say."""
+    try:
+        model = json.loads(get_text(match_file, "conf", "{}"))["model"]
+    except (ValueError, TypeError, KeyError):
+        return {}
+    return model if isinstance(model, dict) else {}
 
 
 def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:

@@ -24,12 +24,20 @@ from confs import matchers as matchers_confs
 
 from . import cli
 from .cli import InputError
+from .confidence import Gate
 from .detection import KEYPOINTS
 from .parsers import read_yaml
 from .storage import STORAGES
 
 SHIPPED = Path(confs.__file__).parent / "jobs"
 SHARED = "shared"  # the folder of what the jobs of a data set have in common
+# from options that are numbers to their types, and what a message calls these
+NUMBERS = {
+    "num_covis": (int, "an integer"),
+    "num_loc": (int, "an integer"),
+    "min_confidence": ((int, float), "a number"),
+    "min_inliers": (int, "an integer"),
+}
 NAME_PARTS = ("descriptor", "scheme", "dim")  # of the name of a feature
 
 
@@ -47,6 +55,7 @@ class Job:
         ground_truth: true poses of the queries; default: those of the data set.
         num_covis: pairs of each map image; default: that of the pipeline.
         num_loc: map images of each query; default: that of the pipeline.
+        min_confidence, min_inliers: what makes a query localized; default: those of the gate.
     """
 
     dataset: Path
@@ -58,6 +67,8 @@ class Job:
     ground_truth: Path | None = None
     num_covis: int | None = None
     num_loc: int | None = None
+    min_confidence: float | None = None
+    min_inliers: int | None = None
 
     @property
     def name(self) -> str:
@@ -66,9 +77,10 @@ class Job:
         for field in fields(self)[2:]:
             value = getattr(self, field.name)
             if value != field.default and field.name != "ground_truth":
-                named = isinstance(value, int) or field.name == "keypoints"
+                named = field.name in NUMBERS or field.name == "keypoints"
                 prefix = field.name if named else ""
-                parts.append(prefix + Path(str(value)).stem.removeprefix("pairs-query-"))
+                text = f"{value:g}" if field.name in NUMBERS else Path(value).stem
+                parts.append(prefix + text.removeprefix("pairs-query-"))
         return "+".join(parts)
 
     @property
@@ -76,6 +88,12 @@ class Job:
         """The numbers that are given."""
         given = {"num_covis": self.num_covis, "num_loc": self.num_loc}
         return {name: number for name, number in given.items() if number is not None}
+
+    @property
+    def gate(self) -> Gate:
+        """What a pose must have for a query to be called localized."""
+        given = {"min_confidence": self.min_confidence, "min_inliers": self.min_inliers}
+        return Gate(**{name: least for name, least in given.items() if least is not None})
 
 
 OPTIONS = tuple(field.name for field in fields(Job))
@@ -152,10 +170,10 @@ def _features(item: object) -> list[str]:
 def _job(options: dict) -> Job:
     """Make a job of options of the right types."""
     for name, value in options.items():
-        number = name.startswith("num_")
-        if not isinstance(value, int if number else str) or isinstance(value, bool):
-            raise InputError(f"{name} is {value!r}: a {'number' if number else 'name'} is needed.")
-        if number and value < 1:
+        kind, called = NUMBERS.get(name, (str, "a name"))
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise InputError(f"{name} is {value!r}: {called} is needed.")
+        if name.startswith("num_") and value < 1:
             raise InputError(f"{name} is {value}: at least 1.")
     paths = {
         name: Path(os.path.normpath(options[name]))
@@ -163,6 +181,7 @@ def _job(options: dict) -> Job:
         if name in options
     }
     job = Job(**options | paths)
+    _ = job.gate  # is wrong now
     features_confs.get(job.feature, storage=job.storage, keypoints=job.keypoints)
     cli.choose("matcher", job.matcher, matchers_confs.confs)
     return job

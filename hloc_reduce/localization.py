@@ -21,6 +21,7 @@ from .io import (
     find_pair,
     get_colmap_keypoints,
     get_image_size,
+    get_matcher,
     get_matches,
     naming,
     open_h5,
@@ -28,6 +29,7 @@ from .io import (
 )
 from .parsers import write_poses
 from .progress import progress
+from .storage import dimension
 
 CHUNK = 8  # queries
 SHOWN = 3  # queries that a message gives the reason of
@@ -190,7 +192,8 @@ def main(
         skip_matches: leave out retrieved images with fewer matches.
         name_parts: as of `parsers.write_poses`.
         executor: does the work; unless in this process, `load_reference` and `config` are pickled.
-        gate: what a pose must have for the query to be called localized.
+        gate: what a pose must have for the query to be called localized; its agreement, if not
+            given, is that for the matcher and the dimension that the files tell.
 
     Returns:
         A record for each query: `localized`; `reason`, why it is not localized, None where it is;
@@ -200,6 +203,8 @@ def main(
         within which inliers reproject, None for pycolmap's default; and the numbers and `db` of
         `localize`.
     """
+    with open_h5(matches) as match_file:
+        gate = gate.of_matches(get_matcher(match_file), dimension(features))
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
     log = _Log(log_file(results), header, overwrite)
     todo = [query for query in queries if query[0] not in log.records]

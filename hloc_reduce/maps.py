@@ -1,9 +1,11 @@
 """Maps to localize in: the points, features and global descriptors of photos, kept in a folder."""
 
+import glob
 import json
 import shutil
 import uuid
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
@@ -76,6 +78,8 @@ class Map:
             base = conf["model"].get("base", conf["model"])
             if base["name"] == "dog" and "keypoints" not in base:  # made before these could adapt
                 self._conf["model"] = features_confs.with_keypoints(conf["model"], "hloc")
+            found = features_confs.keypoints_of(self._conf["model"]) or KEYPOINTS[0]
+            self._keypoints = choose("keypoints", content.get("keypoints", found), KEYPOINTS)
             if "storage" in conf:
                 self._conf["storage"] = choose("storage", conf["storage"], STORAGES)
             _with_projection(self._conf, _file_name)
@@ -143,9 +147,11 @@ class Map:
 
     @property
     def keypoints(self) -> str:
-        """The settings of the DoG detector, as in `confs.features.get`."""
-        model = self._conf["model"]
-        return model.get("base", model).get("keypoints", KEYPOINTS[0])
+        """The settings of the DoG detector that were asked for, as in `confs.features.get`.
+
+        `conf` may have others, which found more keypoints.
+        """
+        return self._keypoints
 
     @property
     def sfm(self) -> Path:
@@ -219,7 +225,7 @@ def main(
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher_conf = matchers_confs.confs[matcher]
-    given, model_files = model, {}
+    model_files = {}
     names, num_points3D = None, 0
     if model is not None:
         reference = colmap.read_model(model)
@@ -277,64 +283,24 @@ def main(
         logger.info("Building the map %s of %d images.", map_dir, len(names))
         stamps.write(map_dir / FINGERPRINTS, fingerprints)
         conf = _keep_projection(conf, map_dir)
-        with folder.stage("extract_features"):
-            features = extract_features.main(
-                conf, image_dir, map_dir, image_list=names, strict=not accept_partial
-            )
-            names = keep_readable(features, names, accept_partial)
-        with folder.stage("retrieval"):
-            descriptors = aggregate_features.main(RETRIEVAL, features, names)
-        if model is not None and len(names) < len(reference.images):
-            model = colmap.write_part(model, set(names), map_dir / "sfm_reference")
-        pairs = map_dir / f"pairs-db-{'exhaustive' if exhaustive else num_covis}.txt"
-        with folder.stage("pairs"):
-            if num_points3D:
-                pairs_from_covisibility.main(model, pairs, num_covis)
-            elif exhaustive:
-                pairs_from_exhaustive.main(pairs, names)
-            else:
-                pairs_from_retrieval.main(descriptors, pairs, num_covis)
-        with folder.stage("match_map"):
-            matches = match_features.main(matcher_conf, pairs, features.stem, map_dir)
-        for number in range(1, ROUNDS + 1) if model is None and not exhaustive else ():
-            before, pairs = pairs, map_dir / f"pairs-db-{num_covis}-{number}.txt"
-            with folder.stage("verification"):
-                pairs_from_verification.main(
-                    pairs,
-                    image_dir,
-                    before,
-                    features,
-                    matches,
-                    descriptors,
-                    num_covis,
-                    num_covis if number == 1 else 0,
-                    camera_mode,
-                    names,
-                )
-            with folder.stage("match_map"):
-                match_features.main(matcher_conf, pairs, features, matches=matches)
-        with folder.stage("triangulation" if model is not None else "reconstruction"):
-            inputs = (image_dir, pairs, features, matches)
-            if model is not None:
-                sfm = triangulation.main(map_dir / "sfm", model, *inputs)
-            else:
-                sfm = reconstruction.main(
-                    map_dir / "sfm",
-                    *inputs,
-                    camera_mode,
-                    image_list=names,
-                    accept_partial=accept_partial,
-                )
-        shutil.rmtree(map_dir / "sfm_reference", ignore_errors=True)
+        building = _Building(
+            *(folder, map_dir, image_dir, names, matcher_conf),
+            *(num_covis, exhaustive, accept_partial, camera_mode),
+        )
+        if model is not None:
+            sfm = building.of_model(conf, model, reference)
+        else:
+            conf, sfm = building.of_photos_alone(conf)
         summary = {
             "id": uuid.uuid4().hex,
             "feature": feature,
             "matcher": matcher,
             "image_dir": str(image_dir.resolve()),
-            "model": str(given.resolve()) if given is not None else None,
-            "camera_mode": camera_mode.name.lower() if given is None else None,
+            "model": str(model.resolve()) if model is not None else None,
+            "camera_mode": camera_mode.name.lower() if model is None else None,
             "conf": _with_projection(conf, lambda path: Path(path).name),
-            "images": len(names),
+            "keypoints": keypoints,
+            "images": len(building.names),
             "images_with_pose": sfm.num_reg_images(),
             "points3D": sfm.num_points3D(),
             "seconds": folder.seconds(),
@@ -342,6 +308,148 @@ def main(
         }
         stamps.write(map_dir / FINISHED, summary)
         return Map(map_dir)
+
+
+@dataclass
+class _Building:
+    """A map that is being built.
+
+    Args:
+        folder: its run.
+        map_dir: its folder.
+        image_dir: folder of the images.
+        names: its images; those that cannot be read are dropped.
+        matcher_conf: configuration of the matcher.
+        num_covis: as in `main`.
+        exhaustive: pair all images, unless by covisibility.
+        accept_partial: as in `main`.
+        camera_mode: likewise.
+    """
+
+    folder: RunFolder
+    map_dir: Path
+    image_dir: Path
+    names: list[str]
+    matcher_conf: dict
+    num_covis: int
+    exhaustive: bool
+    accept_partial: bool
+    camera_mode: pycolmap.CameraMode
+
+    def of_model(
+        self, conf: dict, model: Path, reference: pycolmap.Reconstruction
+    ) -> pycolmap.Reconstruction:
+        """Triangulate a map with the poses of a model, which is read already."""
+        features, descriptors = self._describe(conf)
+        if len(self.names) < len(reference.images):
+            model = colmap.write_part(model, set(self.names), self.map_dir / "sfm_reference")
+        if reference.num_points3D():
+            pairs = self.map_dir / f"pairs-db-{self.num_covis}.txt"
+            with self.folder.stage("pairs"):
+                pairs_from_covisibility.main(model, pairs, self.num_covis)
+        else:
+            pairs = self._pairs(descriptors)
+        matches = self._match(pairs, features)
+        with self.folder.stage("triangulation"):
+            sfm = triangulation.main(
+                self.map_dir / "sfm", model, self.image_dir, pairs, features, matches
+            )
+        shutil.rmtree(self.map_dir / "sfm_reference", ignore_errors=True)
+        return sfm
+
+    def of_photos_alone(self, conf: dict) -> tuple[dict, pycolmap.Reconstruction]:
+        """Reconstruct poses and points; again with more keypoints where photos are missing.
+
+        Returns:
+            The configuration of the features of the map, and the map of most images.
+        """
+        attempts = {self.map_dir / "sfm": conf}
+        adaptive = features_confs.keypoints_of(conf["model"]) == "adaptive"
+        if adaptive and len(self.names) <= reconstruction.VERY_FEW:
+            model = features_confs.with_keypoints(conf["model"], "colmap")
+            output = f"{conf['output']}-keypoints_colmap"
+            attempts[self.map_dir / "sfm-more"] = {**conf, "output": output, "model": model}
+        models: dict[Path, pycolmap.Reconstruction] = {}
+        for number, (sfm_dir, attempted) in enumerate(attempts.items(), start=1):
+            last = number == len(attempts)
+            registered = 0
+            try:
+                models[sfm_dir] = self._reconstruct(attempted, sfm_dir, once=not last)
+                registered = models[sfm_dir].num_reg_images()
+            except reconstruction.NoModelError:
+                if last and not models:
+                    raise
+            if registered == len(self.names):
+                break
+            if not last:
+                logger.info(
+                    "%d of %d photos are in the map: trying again with more keypoints.",
+                    *(registered, len(self.names)),
+                )
+        best = max(models, key=lambda sfm_dir: reconstruction.size(models[sfm_dir]))
+        reconstruction.check(best, self.accept_partial)
+        self._keep(best, attempts)
+        return attempts[best], models[best]
+
+    def _keep(self, best: Path, attempts: dict[Path, dict]) -> None:
+        """Delete all attempts but one, which becomes the map."""
+        for sfm_dir, conf in attempts.items():
+            if sfm_dir != best:
+                shutil.rmtree(sfm_dir, ignore_errors=True)
+                for path in self.map_dir.glob(f"*{glob.escape(conf['output'])}[._]*"):
+                    path.unlink()
+        if best != self.map_dir / "sfm":
+            best.rename(self.map_dir / "sfm")
+
+    def _reconstruct(
+        self, conf: dict, sfm_dir: Path, once: bool = False
+    ) -> pycolmap.Reconstruction:
+        features, descriptors = self._describe(conf)
+        pairs = self._pairs(descriptors)
+        matches = self._match(pairs, features)
+        for number in () if self.exhaustive else range(1, ROUNDS + 1):
+            before, pairs = pairs, self.map_dir / f"pairs-db-{self.num_covis}-{number}.txt"
+            with self.folder.stage("verification"):
+                pairs_from_verification.main(
+                    *(pairs, self.image_dir, before, features, matches, descriptors),
+                    *(self.num_covis, self.num_covis if number == 1 else 0),
+                    *(self.camera_mode, self.names),
+                )
+            with self.folder.stage("match_map"):
+                match_features.main(self.matcher_conf, pairs, features, matches=matches)
+        with self.folder.stage("reconstruction"):
+            return reconstruction.reconstruct(
+                *(sfm_dir, self.image_dir, pairs, features, matches, self.camera_mode),
+                image_list=self.names,
+                once=once,
+            )
+
+    def _describe(self, conf: dict) -> tuple[Path, Path]:
+        """Return the files of the features and of the global descriptors."""
+        with self.folder.stage("extract_features"):
+            features = extract_features.main(
+                *(conf, self.image_dir, self.map_dir),
+                image_list=self.names,
+                strict=not self.accept_partial,
+            )
+            self.names = keep_readable(features, self.names, self.accept_partial)
+        with self.folder.stage("retrieval"):
+            return features, aggregate_features.main(RETRIEVAL, features, self.names)
+
+    def _pairs(self, descriptors: Path) -> Path:
+        """Pair all images, or of many each with the most similar ones."""
+        with self.folder.stage("pairs"):
+            if self.exhaustive:
+                pairs = self.map_dir / "pairs-db-exhaustive.txt"
+                pairs_from_exhaustive.main(pairs, self.names)
+            else:
+                pairs = self.map_dir / f"pairs-db-{self.num_covis}.txt"
+                pairs_from_retrieval.main(descriptors, pairs, self.num_covis)
+        return pairs
+
+    def _match(self, pairs: Path, features: Path) -> Path:
+        with self.folder.stage("match_map"):
+            return match_features.main(self.matcher_conf, pairs, features.stem, self.map_dir)
 
 
 def _file_name(name: str) -> str:

@@ -31,6 +31,10 @@ VERY_FEW = 30  # images of which some more take little; what comes of them is a 
 SEEDS = (1, 2, 3)
 
 
+class NoModelError(InputError):
+    """No two images could be reconstructed."""
+
+
 @strings_as_paths
 def main(
     sfm_dir: Path,
@@ -48,7 +52,7 @@ def main(
     overwrite: bool = False,
     accept_partial: bool = False,
 ) -> pycolmap.Reconstruction:
-    """Reconstruct poses, intrinsics and points by COLMAP's incremental mapper.
+    """Reconstruct poses, intrinsics and points by COLMAP's incremental mapper, and check the model.
 
     Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary. Where
     images are missing in the model, a second attempt with lower thresholds follows, and the model
@@ -78,6 +82,37 @@ def main(
         InputError: when an input is missing, nothing can be reconstructed, or fewer than half of
             the images are in the model, which is kept for a run with `accept_partial`.
     """
+    sfm = reconstruct(
+        *(sfm_dir, image_dir, pairs, features, matches, camera_mode, verbose),
+        *(skip_geometric_verification, min_match_score, image_list, image_options),
+        *(mapper_options, overwrite),
+    )
+    check(sfm_dir, accept_partial)
+    return sfm
+
+
+def reconstruct(
+    sfm_dir: Path,
+    image_dir: Path,
+    pairs: Path,
+    features: Path,
+    matches: Path,
+    camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
+    verbose: bool = False,
+    skip_geometric_verification: bool = False,
+    min_match_score: float | None = None,
+    image_list: Path | str | Iterable[str] | None = None,
+    image_options: dict | None = None,
+    mapper_options: dict | None = None,
+    overwrite: bool = False,
+    once: bool = False,
+) -> pycolmap.Reconstruction:
+    """Reconstruct as `main` does, however few images the model has; if `once`, in one attempt.
+
+    Raises:
+        InputError: when an input is missing.
+        NoModelError: when nothing can be reconstructed.
+    """
     options = {**MAPPER_OPTIONS, **(mapper_options or {})}
     colmap.mapper_options(options)  # raises for a wrong one
     for path in (pairs, features, matches):
@@ -86,19 +121,19 @@ def main(
     if image_list is None:
         image_list = list_h5_names(features)
     names = list_images(image_dir, image_list)
+    attempts = [{}] if once or mapper_options else list(_attempts(len(names)))
     chosen = {
         "camera_mode": camera_mode.name,
         "image_options": image_options or {},
         "images": names,
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
-        "attempts": list(_attempts(len(names), mapper_options)),
+        "attempts": attempts,
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
     is_whole = bool(stamps.read(sfm_dir / REGISTRATION))
     if not overwrite and is_whole and stamps.is_current(sfm_dir / STAMP, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
-        _check(sfm_dir, accept_partial)
         return colmap.read_model(sfm_dir)
 
     with replacing_map(sfm_dir, made_from) as building:
@@ -121,7 +156,7 @@ def main(
             colmap.verify_matches(database, pairs, verbose)
         models = []
         enough = len(names) if len(names) <= FEW else ENOUGH * len(names)
-        for number, changed in enumerate(_attempts(len(names), mapper_options)):
+        for number, changed in enumerate(attempts):
             registered = models[0].num_reg_images() if models else 0
             if number and registered >= enough:
                 break
@@ -132,9 +167,9 @@ def main(
                 database, image_dir, building / "models", attempt, verbose
             )
             shutil.rmtree(building / "models", ignore_errors=True)
-            models = max(models, found, key=_size)
+            models = max(models, found, key=lambda some: size(some[0]) if some else (0, 0))
         if not models:
-            raise InputError(
+            raise NoModelError(
                 f"COLMAP could not reconstruct the images of {image_dir} from the matches "
                 f"{matches}. Do enough of them overlap? Take photos from several places, each "
                 "overlapping the one before by about two thirds."
@@ -150,15 +185,12 @@ def main(
         }
         stamps.write(building / REGISTRATION, state)
     logger.info("The map %s:\n%s", sfm_dir, models[0].summary())
-    _check(sfm_dir, accept_partial)
     return models[0]
 
 
-def _attempts(number: int, mapper_options: dict | None) -> Iterator[dict]:
+def _attempts(number: int) -> Iterator[dict]:
     """Yield the options of one attempt after the other at a number of images."""
     yield {}
-    if mapper_options:
-        return
     yield {"mapper": RELAXED}
     if number <= VERY_FEW:
         for seed in SEEDS:
@@ -166,9 +198,9 @@ def _attempts(number: int, mapper_options: dict | None) -> Iterator[dict]:
             yield {"random_seed": seed, "mapper": RELAXED}
 
 
-def _size(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
-    """Return how many images and points the first of some models has."""
-    return (models[0].num_reg_images(), models[0].num_points3D()) if models else (0, 0)
+def size(model: pycolmap.Reconstruction) -> tuple[int, int]:
+    """Return how many images and points a model has; the larger of two models is the better."""
+    return model.num_reg_images(), model.num_points3D()
 
 
 def _parts(models: list[pycolmap.Reconstruction]) -> list[list[str]]:
@@ -181,8 +213,12 @@ def _parts(models: list[pycolmap.Reconstruction]) -> list[list[str]]:
     return parts
 
 
-def _check(sfm_dir: Path, accept_partial: bool) -> None:
-    """Report what is missing in a model, or raise an InputError if that is more than half."""
+def check(sfm_dir: Path, accept_partial: bool) -> None:
+    """Report which images are missing in a model.
+
+    Raises:
+        InputError: if it has fewer than half of them, unless `accept_partial`.
+    """
     state = stamps.read(sfm_dir / REGISTRATION)
     missing, number = state["missing"], state["images"]
     registered = number - len(missing)

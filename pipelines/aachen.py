@@ -24,7 +24,7 @@ from hloc_reduce.datasets import Aachen, thresholds, true_poses
 from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.paths import strings_as_paths
-from hloc_reduce.storage import STORAGES, dimension
+from hloc_reduce.storage import STORAGES
 
 from . import common
 
@@ -116,7 +116,7 @@ def main(
                 loc_matches,
                 poses,
                 executor=executor,
-                gate=gate.of_matches(matcher_conf["model"], dimension(features)),
+                gate=gate,
             )
 
         summary = {

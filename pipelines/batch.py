@@ -80,6 +80,7 @@ def main(
                         features=shared.features[job],
                         strict=strict,
                         accept_partial=not strict,
+                        gate=job.gate,
                         **job.numbers,
                     )
                 tables.write(done, outputs)

@@ -20,7 +20,7 @@ from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
 from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.executors import SERIAL, Executor
 from hloc_reduce.paths import strings_as_paths
-from hloc_reduce.storage import STORAGES, dimension
+from hloc_reduce.storage import STORAGES
 
 from . import common
 
@@ -103,7 +103,7 @@ def main(
                 ransac_thresh=place.ransac_thresh,
                 executor=executor,
                 points=points,
-                gate=gate.of_matches(matcher_conf["model"], dimension(features)),
+                gate=gate,
             )
 
         summary = {

@@ -40,7 +40,7 @@ from hloc_reduce.group_writer import failures
 from hloc_reduce.maps import Map
 from hloc_reduce.parsers import parse_query_lists, write_pairs
 from hloc_reduce.paths import strings_as_paths
-from hloc_reduce.storage import STORAGES, dimension
+from hloc_reduce.storage import STORAGES
 
 from . import common
 
@@ -239,7 +239,7 @@ def main(
                     if source != "list"
                 },
                 full_names=True,
-                gate=gate.of_matches(matcher_conf["model"], dimension(features)),
+                gate=gate,
             )
         summary = {
             "feature": built.feature,

@@ -17,6 +17,7 @@ import pytest
 
 from hloc_reduce import aggregate_features, cli, detection, extract_features, jobs, scans
 from hloc_reduce.cli import InputError
+from hloc_reduce.confidence import Gate
 from hloc_reduce.descriptors import Descriptor
 from hloc_reduce.evaluation import published
 from hloc_reduce.jobs import Job
@@ -61,6 +62,14 @@ def test_a_grid_with_exclusions(tmp_path):
     assert list(jobs.by_dataset(found)) == [Path("data/a").absolute(), Path("data/b").absolute()]
 
 
+def test_the_gate_of_jobs(tmp_path):
+    text = "jobs: [{dataset: a, feature: sift, min_confidence: [8, 12.5], min_inliers: [8, 20]}]"
+    found = jobs.read(write(tmp_path / "a.yaml", text))[1]
+    assert names(found)[3] == "a/sift+min_confidence12.5+min_inliers20"
+    assert found[3].gate == Gate(12.5, 20)
+    assert jobs.read(write(tmp_path / "a.yaml", "jobs: [{dataset: a}]"))[1][0].gate == Gate()
+
+
 def test_a_job_that_is_listed_twice_is_one(tmp_path):
     text = "jobs: [{dataset: a, feature: [sift, sift]}, {dataset: [a], feature: sift}]"
     assert names(jobs.read(write(tmp_path / "a.yaml", text))[1]) == ["a/sift"]
@@ -78,7 +87,9 @@ def test_a_job_that_is_listed_twice_is_one(tmp_path):
         ("jobs: [{dataset: a, matcher: NN}]", "Unknown matcher 'NN'"),
         ("jobs: [{dataset: a, storage: int4}]", "Unknown storage 'int4'"),
         ("jobs: [{dataset: a, num_loc: 0}]", "num_loc is 0: at least 1"),
-        ("jobs: [{dataset: a, num_loc: many}]", "num_loc is 'many': a number is needed"),
+        ("jobs: [{dataset: a, num_loc: many}]", "num_loc is 'many': an integer is needed"),
+        ("jobs: [{dataset: a, min_inliers: 8.5}]", "min_inliers is 8.5: an integer is needed"),
+        ("jobs: [{dataset: a, min_confidence: -1}]", "min_confidence is -1: at least 0"),
         ("jobs: [{dataset: 3}]", "dataset is 3: a name is needed"),
         ("jobs: [{dataset: a}]\nexclude: [{job: a}]", "Unknown key of what is excluded 'job'"),
         ("jobs: [{dataset: [x/a, y/a]}]", "y/a and .*x/a would have the same folder"),

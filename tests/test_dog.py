@@ -267,5 +267,11 @@ def test_options_of_ones_own_are_used_as_they_are(textured):
     np.testing.assert_array_equal(
         hloc, colmap.detect_dog(image[0, 0].numpy(), detection.HLOC)[0][:, :2]
     )
-    with pytest.raises(InputError, match="Unknown keypoints 'many'. There are: adaptive, hloc"):
+    colmaps = DoG({"keypoints": "colmap"})({"image": image})["keypoints"][0].numpy()
+    np.testing.assert_array_equal(
+        colmaps, colmap.detect_dog(image[0, 0].numpy(), detection.COLMAP)[0][:, :2]
+    )
+    with pytest.raises(
+        InputError, match="Unknown keypoints 'many'. There are: colmap, adaptive, hloc"
+    ):
         DoG({"keypoints": "many"})

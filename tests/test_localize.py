@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 from command import outcome
 
+from confs import features as features_confs
 from hloc_reduce import (
     Localizer,
     cli,
@@ -601,13 +602,10 @@ def test_fewer_than_half_of_the_photos(plane, tmp_path, monkeypatch, caplog):
     assert "No other photo matches 10.png" in message and "retake blurred or dark ones" in message
     assert "--accept_partial" in message
     assert not (outputs / "map/map.json").exists()
-    before = {path: time for path, time in state(outputs / "map").items() if "sfm" in str(path)}
-    assert before
     caplog.clear()
+    monkeypatch.setattr(colmap, "incremental_mapping", None)
     run(monkeypatch, *build, "--accept_partial")
     assert "Only 5 of 11 photos" in caplog.text
-    now = state(outputs / "map")
-    assert all(now[path] == before[path] for path in before)
     assert len(maps.Map(outputs / "map").names()) == 5
     run(monkeypatch, *build)  # is accepted for good
 
@@ -655,6 +653,62 @@ def test_camera_modes(plane, tmp_path, monkeypatch, caplog):
     run(monkeypatch, *build, "--camera_mode", "PER_IMAGE")
     assert colmap.read_model(outputs / "map/sfm").num_cameras() == 5
     assert features.stat().st_mtime_ns == before
+
+
+def files_of(folder, keypoints):
+    """Return the files of a map that are of features with other keypoints than hloc's."""
+    return sorted(folder.glob(f"*feats-dog-colmap_sift_sv64{keypoints}[._]*"))
+
+
+def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeypatch, caplog):
+    """And queries get them, too; the map is the same command's."""
+    caplog.set_level("INFO")
+    reconstruct = maps.reconstruction.reconstruct
+
+    def fails_once(*args, once, **options):
+        if once:
+            raise maps.reconstruction.NoModelError("COLMAP could not reconstruct the images.")
+        return reconstruct(*args, once=once, **options)
+
+    monkeypatch.setattr(maps.reconstruction, "reconstruct", fails_once)
+    outputs = tmp_path / "outputs"
+    build = ("--map_images", plane / "images", "--outputs", outputs)
+    run(monkeypatch, *build)
+    assert "0 of 5 photos are in the map: trying again with more keypoints." in caplog.text
+    built = maps.Map(outputs / "map")
+    assert len(built.names()) == 5 and built.keypoints == "adaptive"
+    assert features_confs.keypoints_of(built.conf["model"]) == "colmap"
+    assert len(files_of(built.folder, "-keypoints_colmap")) == 4
+    assert not files_of(built.folder, "") and not (built.folder / "sfm-more").exists()
+    written = state(built.folder)
+    run(monkeypatch, *build, "--query_images", plane / "images", "--feature", "colmap_sift_sv64")
+    assert state(built.folder) == written
+    rows = outcome(outputs / "queries-images")[1]
+    _, info = Localizer(built.folder).localize(plane / "images/0.png")
+    assert rows["0.png"]["status"] == "localized" and info["reason"] is None
+    assert float(rows["0.png"]["confidence"]) == info["confidence"]
+
+
+def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO")
+    draw_noise(plane / "images", ["other"])
+    reconstruct = maps.reconstruction.reconstruct
+
+    def fails_again(*args, once, **options):
+        if once:
+            return reconstruct(*args, once=once, **options)
+        raise maps.reconstruction.NoModelError("COLMAP could not reconstruct the images.")
+
+    monkeypatch.setattr(maps.reconstruction, "reconstruct", fails_again)
+    outputs = tmp_path / "outputs"
+    run(monkeypatch, "--map_images", plane / "images", "--outputs", outputs)
+    assert "5 of 6 photos are in the map: trying again" in caplog.text
+    assert "1 of 6 images are not in the map: other.png." in caplog.text
+    built = maps.Map(outputs / "map")
+    assert features_confs.keypoints_of(built.conf["model"]) == "adaptive"
+    assert len(files_of(built.folder, "")) == 4
+    assert not files_of(built.folder, "-keypoints_colmap")
+    assert not (built.folder / "sfm-more").exists()
 
 
 def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch):

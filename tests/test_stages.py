@@ -1,5 +1,6 @@
 """The stages on a scene whose answers are known: pairs, matches, map, poses."""
 
+import json
 import shutil
 import sys
 
@@ -22,6 +23,7 @@ from hloc_reduce import (
     triangulation,
 )
 from hloc_reduce.cli import InputError
+from hloc_reduce.confidence import AGREEMENT, AGREEMENT_RATIO
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.group_writer import GroupWriter
 from hloc_reduce.io import get_matches, list_h5_names
@@ -403,9 +405,11 @@ def test_overflowed_matches_are_refused(built):
 def test_matches_of_other_features_are_refused(built):
     with h5py.File(built.features, "a") as file:
         for name in ("query/6.jpg", "db/0.jpg"):
-            keypoints = file[name]["keypoints"][:200]
-            del file[name]["keypoints"]
-            file[name]["keypoints"] = keypoints
+            kept = {"keypoints": file[name]["keypoints"][:200]}
+            kept["descriptors"] = file[name]["descriptors"][:, :200]
+            for key, array in kept.items():
+                del file[name][key]
+                file[name][key] = array
     with pytest.raises(InputError, match="made of other features: query/6.jpg has 200"):
         built.localize()
     with pytest.raises(InputError, match="made of other features: db/0.jpg has 200"):
@@ -545,3 +549,23 @@ def test_the_command_line_of_localization(built, monkeypatch):
     assert {record["reason"] for record in records.values()} == {
         "too few inliers: 300, at least 301 are needed"
     }
+
+
+@pytest.mark.parametrize(
+    ("conf", "agreement"),
+    [("NN-ratio", AGREEMENT_RATIO), ("NN-mutual", AGREEMENT), (None, AGREEMENT)],
+)
+def test_the_gate_knows_the_matcher_by_its_file(built, conf, agreement):
+    """Match files of hloc do not say which matcher made them."""
+    if conf is None:
+        with h5py.File(built.loc_matches, "r+") as file:
+            del file.attrs["conf"]
+    else:
+        conf = match_features.confs[conf]
+        match_features.main(
+            conf, built.loc_pairs, built.features, matches=built.loc_matches, overwrite=True
+        )
+    built.localize()
+    log = localization.log_file(built.root / "poses.txt")
+    header = json.loads(log.read_text().splitlines()[0])
+    assert header["gate"]["min_agreement"] == agreement

@@ -76,8 +76,10 @@ class DoG(BaseModel):
     it stores keypoints with pixel centres at integers whatever pycolmap says, gives each keypoint a
     score, its scale (COLMAP's own ranking), and honours `max_keypoints`.
 
-    Where hloc's `options` find too few keypoints in a photo, others are tried (`detection.detect`),
-    unless `keypoints` is "hloc". Other options than hloc's are used for every photo.
+    `keypoints` names the settings of DoG: "adaptive" are hloc's, and others in photos where these
+    find too few (`detection.detect`); "colmap" are COLMAP's, which find several times as many, and
+    likewise others; "hloc" are hloc's for every photo. Other `options` than hloc's are used for
+    every photo, whatever `keypoints` says.
     """
 
     default_conf = {
@@ -91,11 +93,12 @@ class DoG(BaseModel):
     detection_noise = 1.0
 
     def _init(self, conf: dict) -> None:
-        choose("keypoints", conf["keypoints"], detection.KEYPOINTS)
+        name = choose("keypoints", conf["keypoints"], detection.KEYPOINTS)
         descriptor = choose("descriptor", conf["descriptor"], BASES)
         self.describe = None if descriptor == COLMAP else Descriptor(descriptor)
         colmap.check_dog_options(conf["options"])
-        self.adaptive = conf["keypoints"] == "adaptive" and conf["options"] == detection.HLOC
+        own = conf["options"] != detection.HLOC
+        self.settings = (conf["options"], False) if own else detection.SETTINGS[name]
 
     @property
     def descriptor(self) -> str:
@@ -104,7 +107,7 @@ class DoG(BaseModel):
 
     def detect(self, image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
         """Detect keypoints in an image (1, 1, H, W), as `colmap.detect_dog` returns them."""
-        return detection.detect(image[0, 0].cpu().numpy(), self.conf["options"], self.adaptive)
+        return detection.detect(image[0, 0].cpu().numpy(), *self.settings)
 
     def _forward(self, data: dict) -> dict:
         """Extract from an image (1, 1, H, W), or describe what was `detected` in it.
