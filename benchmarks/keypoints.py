@@ -1,8 +1,8 @@
 """Measure what DoG settings that follow the photo are worth, beside hloc's settings.
 
 Each place is made anew with all photos of another size, or with queries that are darker, blurred or
-noisy, every third photo a query, and run with --keypoints hloc and adaptive. Prints inliers, map
-points, seconds and memory.
+noisy, every third photo a query, and run with --keypoints hloc and adaptive; data sets are run as
+they are. Prints inliers, map points, seconds and memory.
 """
 
 import argparse
@@ -10,7 +10,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -19,14 +19,16 @@ import darken_place
 import numpy as np
 
 from hloc_reduce import cli
-from hloc_reduce.detection import KEYPOINTS
 from hloc_reduce.io import read_image
 from hloc_reduce.training.__main__ import parse_maps
+from pipelines.layouts import pipeline_of
 
 MEGAPIXELS = (0.3, 0.5, 1.0, 2.0, 12.0)
 GAINS = (0.06, 0.12, 0.25, 0.5)
 BLURS = (1.5, 3.0)  # standard deviations in pixels
 NOISES = (0.02, 0.05)  # standard deviations, of full scale
+COMPARED = ("hloc", "adaptive")
+KEPT = "as they are"
 HEADINGS = (
     *("place", "photos", "--keypoints", "keypoints a photo", "points", "localized", "recall [%]"),
     *("median error", "mean inliers", "extraction [s]", "all [s]", "memory [MiB]"),
@@ -61,13 +63,27 @@ def conditions(images: Path) -> dict[str, tuple[Callable, float]]:
     varied = {f"gain {gain:g}": (partial(dim, gain=gain), 1.0) for gain in GAINS}
     varied |= {f"blur {sigma:g} px": (partial(blur, sigma=sigma), 1.0) for sigma in BLURS}
     varied |= {f"noise {sigma:g}": (partial(add_noise, sigma=sigma), 1.0) for sigma in NOISES}
-    return {**sizes, "as they are": (keep, 1.0), **varied}
+    return {**sizes, KEPT: (keep, 1.0), **varied}
+
+
+def datasets(
+    maps: dict[str, tuple[Path, Path]], given: list[Path], output: Path
+) -> Iterator[tuple[str, str, Path]]:
+    """Yield the place, the condition and the folder of each data set, made where it is missing."""
+    for place, (images, model) in maps.items():
+        for name, (vary, scale) in conditions(images).items():
+            dataset = output / place / name.replace(" ", "_")
+            if not (dataset / "queries/ground_truth_poses.txt").exists():
+                darken_place.main(images, model, dataset, vary, scale)
+            yield place, name, dataset
+    for dataset in given:
+        yield dataset.name, KEPT, dataset
 
 
 def run(dataset: Path, outputs: Path, feature: str, keypoints: str) -> tuple[dict, float]:
-    """Run pipelines.aachen, and return its summary and the memory of its process in MiB."""
+    """Run a place's pipeline, and return its summary and the memory of its process in MiB."""
     options = {"dataset": dataset, "outputs": outputs, "feature": feature, "keypoints": keypoints}
-    command = [sys.executable, "-m", "pipelines.aachen"]
+    command = [sys.executable, "-m", pipeline_of(dataset).__name__]
     command += [word for key, value in options.items() for word in (f"--{key}", str(value))]
     quiet = subprocess.DEVNULL
     process = subprocess.Popen(command, stdout=quiet, stderr=quiet)
@@ -84,28 +100,28 @@ def _main() -> None:
         epilog="example: python benchmarks/keypoints.py --map sceaux/images:sceaux/sparse",
         formatter_class=cli.HelpFormatter,
     )
-    parser.add_argument("--map", action="append", required=True, metavar="IMAGES:MODEL")
+    parser.add_argument("--map", action="append", default=[], metavar="IMAGES:MODEL")
+    parser.add_argument(
+        "--dataset", type=Path, action="append", default=[], help="in Aachen's or InLoc's layout"
+    )
     parser.add_argument("--feature", default="colmap_sift_sv64", help="local feature")
     parser.add_argument("--output", type=Path, default=Path("outputs/keypoints"))
     args = parser.parse_args()
     print(
         f"| {' | '.join(HEADINGS)} |\n|{' --- |' * 3}{' ---: |' * (len(HEADINGS) - 3)}", flush=True
     )
-    for place, (images, model) in parse_maps(args.map).items():
-        for name, (vary, scale) in conditions(images).items():
-            dataset = args.output / place / name.replace(" ", "_")
-            if not (dataset / "queries/ground_truth_poses.txt").exists():
-                darken_place.main(images, model, dataset, vary, scale)
-            for keypoints in KEYPOINTS[::-1]:
-                outputs = args.output / "outputs" / place / dataset.name / keypoints
-                summary, memory = run(dataset, outputs, args.feature, keypoints)
-                (found,) = summary["lists"].values()
-                photos = summary["map_images"] + summary["queries"]
+    for place, name, dataset in datasets(parse_maps(args.map), args.dataset, args.output):
+        for keypoints in COMPARED:
+            outputs = args.output / "outputs" / place / dataset.name / keypoints
+            summary, memory = run(dataset, outputs, args.feature, keypoints)
+            photos = summary["map_images"] + summary["queries"]
+            for part, found in summary["lists"].items():
                 error = found["median_position_error_m"]
+                listed = part.removesuffix("_time_queries_with_intrinsics")
                 values = (
-                    *(place, name, keypoints),
+                    *(place, name if len(summary["lists"]) == 1 else listed, keypoints),
                     f"{summary['bytes_per_keypoint']['keypoints'] / photos:,.0f}",
-                    f"{summary['map_points3D']:,}",
+                    f"{summary.get('map_points3D', 0):,}",
                     f"{found['localized']} of {found['queries']}",
                     " / ".join(f"{value:.0f}" for value in found["recall_percent"]),
                     f"{error:.4f}" if error is not None else "",
