@@ -9,14 +9,13 @@ import pycolmap
 from . import colmap
 from .confidence import (
     AGREEMENT,
-    FOCAL_LENGTHS,
     MAX_POSITION,
     MAX_ROTATION,
-    REFINED,
     RIVAL,
     Gate,
     agreement,
     confidence,
+    focal_lengths,
     reprojection_errors,
     uncertainty,
 )
@@ -163,13 +162,10 @@ def _refusal(
             f"{max(0, pose.confidence):.1f}, at least {gate.min_confidence:g} is needed"
         )
     free = _is_focal_length_free(config)
-    focal_length, size = pose.camera.mean_focal_length(), max(camera.width, camera.height)
-    if config.get("estimation", {}).get("estimate_focal_length"):
-        low, high = (factor * size for factor in FOCAL_LENGTHS)
-    else:
-        given = camera.mean_focal_length()
-        low, high = (given / REFINED, given * REFINED) if free else (0, np.inf)
-    if not low <= focal_length <= high:
+    focal_length = pose.camera.mean_focal_length()
+    guessed = bool(config.get("estimation", {}).get("estimate_focal_length"))
+    low, high = focal_lengths(camera, guessed)
+    if free and not low <= focal_length <= high:
         return (
             f"no plausible focal length: {focal_length:.0f} pixels, {low:.0f} to {high:.0f} were "
             "expected"

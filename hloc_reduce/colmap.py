@@ -396,10 +396,10 @@ def _rename(database: Path, images: list[pycolmap.Image], names: dict[int, str])
             opened.update_image(image)
 
 
-def count_cameras(database: Path) -> int:
-    """Count the cameras of a COLMAP database."""
+def read_cameras(database: Path) -> dict[int, pycolmap.Camera]:
+    """Read the cameras of a COLMAP database, by their ids."""
     with _open(database) as opened:
-        return opened.num_cameras()
+        return {camera.camera_id: camera for camera in opened.read_all_cameras()}
 
 
 def count_verified(database: Path) -> dict[tuple[str, str], int]:

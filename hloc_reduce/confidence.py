@@ -90,6 +90,18 @@ def photo_scale(camera: pycolmap.Camera) -> float:
     return max(1.0, max(camera.width, camera.height) / DETECTED)
 
 
+def focal_lengths(camera: pycolmap.Camera, guessed: bool) -> tuple[float, float]:
+    """Return between which focal lengths in pixels an estimated one is plausible.
+
+    Args:
+        camera: intrinsics before the estimation.
+        guessed: they say nothing about the focal length; else it is known roughly.
+    """
+    size, given = max(camera.width, camera.height), camera.mean_focal_length()
+    low, high = FOCAL_LENGTHS
+    return (low * size, high * size) if guessed else (given / REFINED, given * REFINED)
+
+
 def reprojection_errors(
     points2D: np.ndarray,
     points3D: np.ndarray,

@@ -3,12 +3,14 @@
 import argparse
 import shutil
 from collections.abc import Iterable, Iterator
+from itertools import product
 from pathlib import Path
 
 import pycolmap
 
 from . import cli, colmap, logger, stamps
 from .cli import InputError
+from .confidence import focal_lengths
 from .extract_features import list_images
 from .io import list_h5_names
 from .paths import strings_as_paths
@@ -54,10 +56,12 @@ def main(
 ) -> pycolmap.Reconstruction:
     """Reconstruct poses, intrinsics and points by COLMAP's incremental mapper, and check the model.
 
-    Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary. Where
-    images are missing in the model, a second attempt with lower thresholds follows, and the model
-    of more images is kept; of more than 100 images only if fewer than 80 % are in the first. With
-    up to 30 images further attempts follow, which begin with other pairs of images.
+    Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary. Images
+    whose focal length no lens has, or is far from that of EXIF data, are not in the model. Where
+    images are missing, and of more than 100 images more than a fifth, further attempts follow, and
+    the model of most images is kept: with one camera for all, where `camera_mode` is AUTO and
+    nothing speaks against it; with lower thresholds; and with up to 30 images with other pairs to
+    begin with.
 
     Args:
         sfm_dir: the folder of the new COLMAP model; one made from the same inputs is read back.
@@ -121,14 +125,15 @@ def reconstruct(
     if image_list is None:
         image_list = list_h5_names(features)
     names = list_images(image_dir, image_list)
-    attempts = [{}] if once or mapper_options else list(_attempts(len(names)))
+    attempts = [] if once or mapper_options else list(_attempts(len(names)))
     chosen = {
         "camera_mode": camera_mode.name,
         "image_options": image_options or {},
         "images": names,
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
-        "attempts": attempts,
+        "attempts": [{}, *attempts],
+        "cameras": "plausible, one if all may be the same",
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
     is_whole = bool(stamps.read(sfm_dir / REGISTRATION))
@@ -137,37 +142,50 @@ def reconstruct(
         return colmap.read_model(sfm_dir)
 
     with replacing_map(sfm_dir, made_from) as building:
-        database = building / "database.db"
-        colmap.import_images(database, image_dir, names, camera_mode, image_options or {})
-        if camera_mode == pycolmap.CameraMode.AUTO and 1 < len(names) == colmap.count_cameras(
-            database
-        ):
-            logger.info(
-                "EXIF data do not say which images share a camera, so each has its own. If one "
-                "camera with a fixed zoom took all, --camera_mode single gives better poses."
-            )
         keypoints, _, found = read_matches(names, pairs, features, matches, min_match_score)
         verified = {
             pair: (indices, indices if skip_geometric_verification else None)
             for pair, indices in found.items()
         }
-        colmap.write_matches(database, keypoints, verified)
-        if not skip_geometric_verification:
-            colmap.verify_matches(database, pairs, verbose)
-        models = []
-        enough = len(names) if len(names) <= FEW else ENOUGH * len(names)
-        for number, changed in enumerate(attempts):
-            registered = models[0].num_reg_images() if models else 0
-            if number and registered >= enough:
-                break
-            again = f" again: {registered} of {len(names)} images registered" if number else ""
-            logger.info("Reconstructing%s...", again)
-            attempt = colmap.mapper_options({**options, **changed})
-            found = colmap.incremental_mapping(
-                database, image_dir, building / "models", attempt, verbose
+
+        def write_database(mode: pycolmap.CameraMode) -> Path:
+            database = building / f"database-{mode.name}.db"
+            colmap.import_images(database, image_dir, names, mode, image_options or {})
+            colmap.write_matches(database, keypoints, verified)
+            if not skip_geometric_verification:
+                colmap.verify_matches(database, pairs, verbose)
+            return database
+
+        def attempt(database: Path, changed: dict) -> list[pycolmap.Reconstruction]:
+            own = colmap.mapper_options({**options, **changed})
+            models_dir = building / "models"
+            found = colmap.incremental_mapping(database, image_dir, models_dir, own, verbose)
+            shutil.rmtree(models_dir, ignore_errors=True)
+            return _plausible(found, colmap.read_cameras(database))
+
+        mode = camera_mode
+        databases = {mode: write_database(mode)}
+        cameras = colmap.read_cameras(databases[mode])
+        if mode == pycolmap.CameraMode.AUTO and 1 < len(names) == len(cameras):
+            logger.info(
+                "EXIF data do not say which images share a camera, so each has its own. If one "
+                "camera with a fixed zoom took all, --camera_mode single gives better poses."
             )
-            shutil.rmtree(building / "models", ignore_errors=True)
-            models = max(models, found, key=lambda some: size(some[0]) if some else (0, 0))
+        modes = [mode]
+        if not mapper_options and mode == pycolmap.CameraMode.AUTO and _are_alike(cameras):
+            modes.append(pycolmap.CameraMode.SINGLE)
+        models: list[pycolmap.Reconstruction] = []
+        enough = len(names) if len(names) <= FEW else ENOUGH * len(names)
+        for changed, tried in product([{}, *attempts], modes):
+            if _size(models)[0] >= enough:
+                break
+            if tried not in databases:
+                databases[tried] = write_database(tried)
+            found = attempt(databases[tried], changed)
+            said = "" if tried == camera_mode else ", with one camera for all"
+            logger.info("Reconstructed %d of %d images%s.", _size(found)[0], len(names), said)
+            if _size(found) > _size(models):
+                models, mode = found, tried
         if not models:
             raise NoModelError(
                 f"COLMAP could not reconstruct the images of {image_dir} from the matches "
@@ -176,7 +194,7 @@ def reconstruct(
             )
         models[0].write(building)
         parts = _parts(models)
-        matched = {name for pair in colmap.count_verified(database) for name in pair}
+        matched = {name for pair in colmap.count_verified(databases[mode]) for name in pair}
         state = {
             "images": len(names),
             "parts": parts,
@@ -184,13 +202,16 @@ def reconstruct(
             "unmatched": sorted(set(names) - matched),
         }
         stamps.write(building / REGISTRATION, state)
-    logger.info("The map %s:\n%s", sfm_dir, models[0].summary())
-    return models[0]
+        databases.pop(mode).rename(building / "database.db")
+        for database in databases.values():
+            database.unlink()
+    sfm = colmap.read_model(sfm_dir)
+    logger.info("The map %s:\n%s", sfm_dir, sfm.summary())
+    return sfm
 
 
 def _attempts(number: int) -> Iterator[dict]:
-    """Yield the options of one attempt after the other at a number of images."""
-    yield {}
+    """Yield the options of further attempts at a number of images."""
     yield {"mapper": RELAXED}
     if number <= VERY_FEW:
         for seed in SEEDS:
@@ -198,16 +219,45 @@ def _attempts(number: int) -> Iterator[dict]:
             yield {"random_seed": seed, "mapper": RELAXED}
 
 
+def _are_alike(cameras: dict[int, pycolmap.Camera]) -> bool:
+    """Tell whether one camera may have taken all images, though each was given its own."""
+    alike = {(camera.width, camera.height, *camera.params) for camera in cameras.values()}
+    return len(cameras) > len(alike) == 1
+
+
+def _plausible(
+    models: list[pycolmap.Reconstruction], cameras: dict[int, pycolmap.Camera]
+) -> list[pycolmap.Reconstruction]:
+    """Remove images of implausible focal lengths from models, and sort these by size.
+
+    Args:
+        models: of COLMAP's mapper.
+        cameras: from their ids to those that the mapper began with.
+    """
+    for model in models:
+        for image in [model.images[i] for i in model.reg_image_ids()]:
+            given = cameras[image.camera_id]
+            low, high = focal_lengths(given, not given.has_prior_focal_length)
+            if not low <= image.camera.mean_focal_length() <= high:
+                model.deregister_frame(image.frame_id)
+    return sorted((m for m in models if m.num_reg_images() > 1), key=size, reverse=True)
+
+
 def size(model: pycolmap.Reconstruction) -> tuple[int, int]:
     """Return how many images and points a model has; the larger of two models is the better."""
     return model.num_reg_images(), model.num_points3D()
+
+
+def _size(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
+    """Return the size of the first of some models."""
+    return size(models[0]) if models else (0, 0)
 
 
 def _parts(models: list[pycolmap.Reconstruction]) -> list[list[str]]:
     """Return the images of each model that no larger one has; COLMAP's models may overlap."""
     parts, seen = [], set()
     for model in models:
-        if new := sorted({image.name for image in model.images.values()} - seen):
+        if new := sorted({model.images[i].name for i in model.reg_image_ids()} - seen):
             parts.append(new)
             seen.update(new)
     return parts
