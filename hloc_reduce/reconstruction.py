@@ -3,7 +3,6 @@
 import argparse
 import shutil
 from collections.abc import Iterable, Iterator
-from itertools import product
 from pathlib import Path
 
 import pycolmap
@@ -31,6 +30,7 @@ RELAXED = {
 FEW = 100  # images of which a second attempt takes little time
 VERY_FEW = 30  # images of which some more take little; what comes of them is a matter of luck
 SEEDS = (1, 2, 3)
+MORE = 1.5  # times as many images tell that one camera took all
 
 
 class NoModelError(InputError):
@@ -59,9 +59,9 @@ def main(
     Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary. Images
     whose focal length no lens has, or is far from that of EXIF data, are not in the model. Where
     images are missing, and of more than 100 images more than a fifth, further attempts follow, and
-    the model of most images is kept: with one camera for all, where `camera_mode` is AUTO and
-    nothing speaks against it; with lower thresholds; and with up to 30 images with other pairs to
-    begin with.
+    the model of most images is kept: with lower thresholds, and with up to 30 images with other
+    pairs to begin with. If still fewer than two thirds are in it, although `camera_mode` is AUTO
+    and all images may be by one camera, this is tried, and kept if half as many again are.
 
     Args:
         sfm_dir: the folder of the new COLMAP model; one made from the same inputs is read back.
@@ -133,7 +133,7 @@ def reconstruct(
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
         "attempts": [{}, *attempts],
-        "cameras": "plausible, one if all may be the same",
+        "cameras": f"plausible, one for {MORE} times as many images",
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
     is_whole = bool(stamps.read(sfm_dir / REGISTRATION))
@@ -156,36 +156,36 @@ def reconstruct(
                 colmap.verify_matches(database, pairs, verbose)
             return database
 
-        def attempt(database: Path, changed: dict) -> list[pycolmap.Reconstruction]:
-            own = colmap.mapper_options({**options, **changed})
-            models_dir = building / "models"
-            found = colmap.incremental_mapping(database, image_dir, models_dir, own, verbose)
-            shutil.rmtree(models_dir, ignore_errors=True)
-            return _plausible(found, colmap.read_cameras(database))
-
-        mode = camera_mode
-        databases = {mode: write_database(mode)}
-        cameras = colmap.read_cameras(databases[mode])
-        if mode == pycolmap.CameraMode.AUTO and 1 < len(names) == len(cameras):
+        database = write_database(camera_mode)
+        cameras = colmap.read_cameras(database)
+        if camera_mode == pycolmap.CameraMode.AUTO and 1 < len(names) == len(cameras):
             logger.info(
                 "EXIF data do not say which images share a camera, so each has its own. If one "
                 "camera with a fixed zoom took all, --camera_mode single gives better poses."
             )
-        modes = [mode]
-        if not mapper_options and mode == pycolmap.CameraMode.AUTO and _are_alike(cameras):
-            modes.append(pycolmap.CameraMode.SINGLE)
-        models: list[pycolmap.Reconstruction] = []
         enough = len(names) if len(names) <= FEW else ENOUGH * len(names)
-        for changed, tried in product([{}, *attempts], modes):
-            if _size(models)[0] >= enough:
-                break
-            if tried not in databases:
-                databases[tried] = write_database(tried)
-            found = attempt(databases[tried], changed)
-            said = "" if tried == camera_mode else ", with one camera for all"
-            logger.info("Reconstructed %d of %d images%s.", _size(found)[0], len(names), said)
-            if _size(found) > _size(models):
-                models, mode = found, tried
+
+        def reconstruct_from(database: Path) -> list[pycolmap.Reconstruction]:
+            given, best = colmap.read_cameras(database), []
+            for changed in [{}, *attempts]:
+                own, models_dir = colmap.mapper_options({**options, **changed}), building / "models"
+                found = colmap.incremental_mapping(database, image_dir, models_dir, own, verbose)
+                shutil.rmtree(models_dir, ignore_errors=True)
+                best = max(best, _plausible(found, given), key=_size)
+                logger.info("Reconstructed %d of %d images.", _size(best)[0], len(names))
+                if _size(best)[0] >= enough:
+                    break
+            return best
+
+        models = reconstruct_from(database)
+        registered = _size(models)[0]
+        alike = camera_mode == pycolmap.CameraMode.AUTO and _are_alike(cameras)
+        if alike and not mapper_options and MORE * registered <= len(names):
+            logger.info("Trying again with one camera for all images.")
+            shared = write_database(pycolmap.CameraMode.SINGLE)
+            found = reconstruct_from(shared)
+            if _size(found)[0] >= MORE * registered:
+                models, database = found, shared
         if not models:
             raise NoModelError(
                 f"COLMAP could not reconstruct the images of {image_dir} from the matches "
@@ -194,7 +194,7 @@ def reconstruct(
             )
         models[0].write(building)
         parts = _parts(models)
-        matched = {name for pair in colmap.count_verified(databases[mode]) for name in pair}
+        matched = {name for pair in colmap.count_verified(database) for name in pair}
         state = {
             "images": len(names),
             "parts": parts,
@@ -202,9 +202,9 @@ def reconstruct(
             "unmatched": sorted(set(names) - matched),
         }
         stamps.write(building / REGISTRATION, state)
-        databases.pop(mode).rename(building / "database.db")
-        for database in databases.values():
-            database.unlink()
+        database.rename(building / "database.db")
+        for other in building.glob("database-*"):
+            other.unlink()
     sfm = colmap.read_model(sfm_dir)
     logger.info("The map %s:\n%s", sfm_dir, sfm.summary())
     return sfm

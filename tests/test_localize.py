@@ -1,5 +1,6 @@
 """A map of one's own: built once, localized in by files and in memory; reconstruction."""
 
+import copy
 import json
 import os
 import shutil
@@ -560,7 +561,8 @@ def test_photos_alone(plane, tmp_path, monkeypatch):
     assert np.linalg.norm(similarity(centres, known), axis=1).max() < 0.2
 
 
-def test_a_second_attempt_where_images_are_missing(scene, tmp_path, monkeypatch):
+def test_further_attempts_where_images_are_missing(scene, tmp_path, monkeypatch):
+    """With one camera for all, which the scene has, and with lower thresholds."""
     names = [f"db/{i}.jpg" for i in range(6)]
     pairs, matches = tmp_path / "pairs.txt", tmp_path / "matches.h5"
     parsers.write_pairs([(a, b) for a in names for b in names if a < b], pairs)
@@ -568,20 +570,59 @@ def test_a_second_attempt_where_images_are_missing(scene, tmp_path, monkeypatch)
     attempts, mapping = [], colmap.incremental_mapping
 
     def fails_first(database, image_dir, output, options, verbose):
-        attempts.append(options.mapper.abs_pose_min_num_inliers)
-        if len(attempts) == 1:
+        cameras = len(colmap.read_cameras(database))
+        attempts.append((cameras, options.mapper.abs_pose_min_num_inliers))
+        if len(attempts) < succeeds:
             return []
         return mapping(database, image_dir, output, options, verbose)
 
     monkeypatch.setattr(colmap, "incremental_mapping", fails_first)
     arguments = (scene.images, pairs, scene.features, matches)
-    model = reconstruction.main(tmp_path / "sfm", *arguments, image_list=names)
-    assert model.num_reg_images() == 6 and attempts == [30, 15]
+    seeds = 3 * [(6, 30), (6, 15)]
+    tried = [(6, 30), (6, 15), *seeds, (1, 30), (1, 15)]
+    for succeeds in (1, 2, 9, 10):
+        model = reconstruction.main(tmp_path / f"{succeeds}", *arguments, image_list=names)
+        assert model.num_reg_images() == 6
+        assert model.num_cameras() == (6 if succeeds < 9 else 1)
+        assert attempts == tried[:succeeds]
+        assert len(list((tmp_path / f"{succeeds}").glob("*.db"))) == 1
+        attempts.clear()
+    per_image = pycolmap.CameraMode.PER_IMAGE
+    with pytest.raises(InputError, match="could not reconstruct"):
+        reconstruction.main(tmp_path / "each", *arguments, per_image, image_list=names)
+    assert attempts == tried[:8]
     attempts.clear()
     with pytest.raises(InputError, match="could not reconstruct"):
         own = {"min_model_size": 5}
         reconstruction.main(tmp_path / "no", *arguments, image_list=names, mapper_options=own)
-    assert attempts == [30]
+    assert attempts == [(6, 30)]
+
+
+@pytest.mark.parametrize(
+    ("focal_length", "is_prior", "is_kept"),
+    [
+        (50.0, False, False),
+        (-500.0, False, False),
+        (1e6, False, False),
+        (1500.0, False, True),
+        (1500.0, True, False),
+        (700.0, True, True),
+    ],
+)
+def test_focal_lengths_that_no_lens_has(scene, tmp_path, focal_length, is_prior, is_kept):
+    """Of 500 pixels at first, exact or guessed."""
+    model = pycolmap.Reconstruction(scene.model)
+    names = sorted(image.name for image in model.images.values())
+    own = model.find_image_with_name(names[0])
+    cameras = {}
+    for image in model.images.values():
+        cameras[image.camera_id] = copy.deepcopy(image.camera)
+        cameras[image.camera_id].has_prior_focal_length = is_prior
+    own.camera.focal_length = focal_length
+    shared = sum(image.camera_id == own.camera_id for image in model.images.values())
+    found = reconstruction._plausible([model], cameras)
+    kept = [model.images[i].name for part in found for i in part.reg_image_ids()]
+    assert len(kept) == len(names) - (0 if is_kept else shared)
 
 
 def draw_noise(folder, numbers):
