@@ -96,8 +96,9 @@ def with_keypoints(model: dict, keypoints: str) -> dict:
 
 
 def keypoints_of(model: dict) -> str | None:
-    """Return the name of the settings of DoG of a model, None if it does not say."""
-    return model.get("base", model).get("keypoints")
+    """Return the name of the settings of DoG of a model, None if it has options of its own."""
+    base = model.get("base", model)
+    return None if "options" in base else base.get("keypoints")
 
 
 def of_patches(name: str) -> tuple[str, str | None]:
