@@ -203,8 +203,6 @@ def main(
         within which inliers reproject, None for pycolmap's default; and the numbers and `db` of
         `localize`.
     """
-    with open_h5(matches) as match_file:
-        gate = gate.of_matches(get_matcher(match_file), dimension(features))
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
     log = _Log(log_file(results), header, overwrite)
     todo = [query for query in queries if query[0] not in log.records]
@@ -218,6 +216,7 @@ def main(
     if todo:
         with open_h5(matches) as match_file:
             _check_some_matched(match_file, queries, retrieved)
+            gate = gate.of_matches(get_matcher(match_file), dimension(features))
         work = partial(_localize_all, load_reference, features, matches, config, skip_matches, gate)
         tasks = ((name, camera, retrieved.get(name, [])) for name, camera in todo)
         with log, closing(executor.map(work, tasks, CHUNK)) as found:

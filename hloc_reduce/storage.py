@@ -6,6 +6,7 @@ which would take the steps for numbers, misses it and says so.
 """
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -95,10 +96,14 @@ def stored_descriptors(file: h5py.File, name: str) -> h5py.Dataset:
 
 
 def dimension(features: Path) -> int:
-    """Return the dimension of the descriptors of a feature file, 0 if it has no image."""
+    """Return the dimension of the descriptors of a feature file, 0 if no image has sound ones."""
     with open_h5(features) as file:
-        name = next(iterate_h5_names(file.id), None)
-        return stored_descriptors(file, name).shape[0] if name else 0
+        for name in iterate_h5_names(file.id):
+            with suppress(InputError):
+                shape = stored_descriptors(file, name).shape
+                if len(shape) == 2:
+                    return shape[0]
+    return 0
 
 
 def get_descriptors(file: h5py.File, name: str) -> np.ndarray:

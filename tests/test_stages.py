@@ -1,6 +1,5 @@
 """The stages on a scene whose answers are known: pairs, matches, map, poses."""
 
-import json
 import shutil
 import sys
 
@@ -20,6 +19,7 @@ from hloc_reduce import (
     pairs_from_covisibility,
     pairs_from_retrieval,
     stamps,
+    storage,
     triangulation,
 )
 from hloc_reduce.cli import InputError
@@ -555,7 +555,7 @@ def test_the_command_line_of_localization(built, monkeypatch):
     ("conf", "agreement"),
     [("NN-ratio", AGREEMENT_RATIO), ("NN-mutual", AGREEMENT), (None, AGREEMENT)],
 )
-def test_the_gate_knows_the_matcher_by_its_file(built, conf, agreement):
+def test_the_gate_knows_the_matcher_by_its_file(built, conf, agreement, monkeypatch):
     """Match files of hloc do not say which matcher made them."""
     if conf is None:
         with h5py.File(built.loc_matches, "r+") as file:
@@ -565,7 +565,20 @@ def test_the_gate_knows_the_matcher_by_its_file(built, conf, agreement):
         match_features.main(
             conf, built.loc_pairs, built.features, matches=built.loc_matches, overwrite=True
         )
-    built.localize()
-    log = localization.log_file(built.root / "poses.txt")
-    header = json.loads(log.read_text().splitlines()[0])
-    assert header["gate"]["min_agreement"] == agreement
+    gates, localize = [], localization.localize
+    monkeypatch.setattr(localization, "localize", lambda *a: gates.append(a[-1]) or localize(*a))
+    assert built.localize()["query/6.jpg"]["localized"]
+    assert {gate.min_agreement for gate in gates} == {agreement}
+
+
+def test_the_gate_skips_images_without_descriptors(built, monkeypatch):
+    """As those that could not be read, or those of features that are matched otherwise."""
+    with h5py.File(built.features, "r+") as file:
+        del file["db/0.jpg/descriptors"]
+        file["db/1.jpg"].attrs["failure"] = "Cannot read it."
+    assert storage.dimension(built.features) == 64
+    assert built.localize()["query/6.jpg"]["localized"]
+    with h5py.File(built.features, "r+") as file:
+        for name in list_h5_names(built.features):
+            file[name].pop("descriptors", None)
+    assert storage.dimension(built.features) == 0
