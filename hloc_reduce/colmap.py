@@ -440,7 +440,8 @@ def incremental_mapping(
 ) -> list[pycolmap.Reconstruction]:
     """Reconstruct the images of a database of verified matches, the largest model first."""
     output.mkdir()
-    with _log(verbose), _full_disk(output):
+    # of what fails in an attempt the mapper warns many times
+    with _log(verbose, pycolmap.logging.Level.FATAL), _full_disk(output):
         inputs = database, image_dir, output
         models = interruptible(pycolmap.incremental_mapping, *inputs, options=options)
     return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
@@ -464,11 +465,12 @@ def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
 
 
 @contextmanager
-def _log(verbose: bool) -> Iterator[None]:
-    """Show COLMAP's log of a block, or not."""
+def _log(
+    verbose: bool, least: pycolmap.logging.Level = pycolmap.logging.Level.WARNING
+) -> Iterator[None]:
+    """Show COLMAP's log of a block, or only that of the least level."""
     level = pycolmap.logging.minloglevel
-    if verbose:
-        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.INFO)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.INFO if verbose else least)
     try:
         yield
     finally:

@@ -167,13 +167,18 @@ def reconstruct(
 
         def reconstruct_from(database: Path) -> list[pycolmap.Reconstruction]:
             given, best = colmap.read_cameras(database), []
-            for changed in [{}, *attempts]:
+            # no attempt brings in an image that matches no other
+            possible = min(enough, len(_matched(database)))
+            for number, changed in enumerate([{}, *attempts], start=1):
                 own, models_dir = colmap.mapper_options({**options, **changed}), building / "models"
                 found = colmap.incremental_mapping(database, image_dir, models_dir, own, verbose)
                 shutil.rmtree(models_dir, ignore_errors=True)
                 best = max(best, _plausible(found, given), key=_size)
-                logger.info("Reconstructed %d of %d images.", _size(best)[0], len(names))
-                if _size(best)[0] >= enough:
+                logger.info(
+                    "Reconstructed %d of %d images in %d of up to %d attempts.",
+                    *(_size(best)[0], len(names), number, 1 + len(attempts)),
+                )
+                if _size(best)[0] >= possible:
                     break
             return best
 
@@ -194,12 +199,11 @@ def reconstruct(
             )
         models[0].write(building)
         parts = _parts(models)
-        matched = {name for pair in colmap.count_verified(database) for name in pair}
         state = {
             "images": len(names),
             "parts": parts,
             "missing": sorted(set(names) - set(parts[0])),
-            "unmatched": sorted(set(names) - matched),
+            "unmatched": sorted(set(names) - _matched(database)),
         }
         stamps.write(building / REGISTRATION, state)
         database.rename(building / "database.db")
@@ -217,6 +221,11 @@ def _attempts(number: int) -> Iterator[dict]:
         for seed in SEEDS:
             yield {"random_seed": seed}
             yield {"random_seed": seed, "mapper": RELAXED}
+
+
+def _matched(database: Path) -> set[str]:
+    """Return the images of a database that have verified matches with another."""
+    return {name for pair in colmap.count_verified(database) for name in pair}
 
 
 def _are_alike(cameras: dict[int, pycolmap.Camera]) -> bool:
