@@ -418,19 +418,18 @@ def _main() -> None:
     parser.add_argument("--output", type=Path, default=Path("outputs/false_accepts"))
     args = parser.parse_args()
     torch.set_num_threads(1)
+    output = args.output / f"seed{args.seed}"
     sources = [(root.name, of_dataset, (root,)) for root in args.dataset]
     sources += [(name, split, (name, *both)) for name, both in parse_maps(args.map).items()]
-    places = {
-        name: make(*arguments, args.output / name, args.seed) for name, make, arguments in sources
-    }
+    places = {name: make(*arguments, output / name, args.seed) for name, make, arguments in sources}
     rows = []
     for name, place in places.items():
         others = [other for other in places.values() if other is not place]
         for feature in args.feature:
-            file = args.output / name / f"trials_{feature.replace(':', '-')}_{args.matcher}.csv"
+            file = output / name / f"trials_{feature.replace(':', '-')}_{args.matcher}.csv"
             if not file.exists():
                 found = run(
-                    *(place, others, args.output / name),
+                    *(place, others, output / name),
                     *(feature, args.trials, args.matcher, args.seed),
                 )
                 write_csv(found, file, COLUMNS)
@@ -438,11 +437,11 @@ def _main() -> None:
                 rows += csv.DictReader(opened)
         print(f"{name}: {len(rows):,} trials", flush=True)
     same = [set(names) for names in args.same]
-    write_csv(rows, args.output / "trials.csv", COLUMNS)
+    write_csv(rows, output / "trials.csv", COLUMNS)
     print(table(sorted(rows, key=lambda row: args.feature.index(row["feature"])), same))
     print()
     print(levels(rows, same))
-    plot(rows, same, args.output / "false_accepts.svg")
+    plot(rows, same, output / "false_accepts.svg")
 
 
 if __name__ == "__main__":

@@ -116,14 +116,14 @@ def _main() -> None:
             summary, memory = run(dataset, outputs, args.feature, keypoints)
             photos = summary["map_images"] + summary["queries"]
             for part, found in summary["lists"].items():
-                error = found["median_position_error_m"]
+                error = found.get("median_position_error_m")
                 listed = part.removesuffix("_time_queries_with_intrinsics")
                 values = (
                     *(place, name if len(summary["lists"]) == 1 else listed, keypoints),
                     f"{summary['bytes_per_keypoint']['keypoints'] / photos:,.0f}",
                     f"{summary.get('map_points3D', 0):,}",
                     f"{found['localized']} of {found['queries']}",
-                    " / ".join(f"{value:.0f}" for value in found["recall_percent"]),
+                    " / ".join(f"{value:.0f}" for value in found.get("recall_percent", ())),
                     f"{error:.4f}" if error is not None else "",
                     f"{found['mean_inliers']:.0f}",
                     f"{summary['seconds']['extract_features']:.1f}",

@@ -10,7 +10,7 @@ from pathlib import Path
 from hloc_reduce import projections
 from hloc_reduce.cli import InputError, choose
 from hloc_reduce.descriptors import COLMAP, DESCRIPTORS
-from hloc_reduce.detection import KEYPOINTS
+from hloc_reduce.detection import HLOC, KEYPOINTS
 from hloc_reduce.parsers import read_yaml
 from hloc_reduce.storage import STORAGES
 
@@ -98,7 +98,7 @@ def with_keypoints(model: dict, keypoints: str) -> dict:
 def keypoints_of(model: dict) -> str | None:
     """Return the name of the settings of DoG of a model, None if it has options of its own."""
     base = model.get("base", model)
-    return None if "options" in base else base.get("keypoints")
+    return base.get("keypoints") if base.get("options", HLOC) == HLOC else None
 
 
 def of_patches(name: str) -> tuple[str, str | None]:

@@ -440,7 +440,7 @@ def incremental_mapping(
 ) -> list[pycolmap.Reconstruction]:
     """Reconstruct the images of a database of verified matches, the largest model first."""
     output.mkdir()
-    # of what fails in an attempt the mapper warns many times
+    # the mapper repeats warnings for failed attempts
     with _log(verbose, pycolmap.logging.Level.FATAL), _full_disk(output):
         inputs = database, image_dir, output
         models = interruptible(pycolmap.incremental_mapping, *inputs, options=options)
@@ -468,7 +468,7 @@ def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
 def _log(
     verbose: bool, least: pycolmap.logging.Level = pycolmap.logging.Level.WARNING
 ) -> Iterator[None]:
-    """Show COLMAP's log of a block, or only that of the least level."""
+    """Show COLMAP's log of a block, otherwise only messages of at least the level `least`."""
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.INFO if verbose else least)
     try:

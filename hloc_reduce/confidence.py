@@ -248,7 +248,9 @@ class Gate:
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
-            raise InputError(f"min_confidence is {self.min_confidence}: at least 0.")
+            raise InputError(
+                f"min_confidence is {self.min_confidence}: it must be finite and at least 0."
+            )
         if self.min_inliers < 0:
             raise InputError(f"min_inliers is {self.min_inliers}: at least 0.")
 

@@ -12,8 +12,7 @@ from . import colmap
 
 HLOC = {"first_octave": 0, "peak_threshold": 0.01}
 COLMAP = {"first_octave": -1, "peak_threshold": 0.0067}
-# from the name of settings to those that are tried first, and whether others are where they find
-# too few keypoints
+# name -> the settings that are tried first, and whether finer ones are where these find too few
 SETTINGS = {"adaptive": (HLOC, True), "colmap": (COLMAP, True), "hloc": (HLOC, False)}
 KEYPOINTS = tuple(SETTINGS)
 
@@ -54,6 +53,8 @@ def detect(
     ladder = LADDERS["small" if max(image.shape) <= SMALL else "large"]
     for first_octave, peak_threshold in ladder:
         settings = {"first_octave": first_octave, "peak_threshold": peak_threshold}
+        if first_octave > options["first_octave"] or peak_threshold >= options["peak_threshold"]:
+            continue
         more = colmap.detect_dog(image, {**options, **settings})
         found = more if len(more[0]) > len(found[0]) else found
         if len(found[0]) >= enough:

@@ -181,7 +181,7 @@ def _job(options: dict) -> Job:
         if name in options
     }
     job = Job(**options | paths)
-    _ = job.gate  # is wrong now
+    _ = job.gate  # raises for bad values
     features_confs.get(job.feature, storage=job.storage, keypoints=job.keypoints)
     cli.choose("matcher", job.matcher, matchers_confs.confs)
     return job
@@ -190,9 +190,13 @@ def _job(options: dict) -> Job:
 def _agrees(job: Job, excluded: dict) -> bool:
     """Return whether a job has one of the named values of each named option."""
     return all(
-        any(fnmatchcase(str(getattr(job, name)), str(value)) for value in _list(values))
+        any(fnmatchcase(_text(getattr(job, name)), _text(value)) for value in _list(values))
         for name, values in excluded.items()
     )
+
+
+def _text(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _check(jobs: list[Job]) -> None:

@@ -5,6 +5,7 @@ import json
 import shutil
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +41,8 @@ from .storage import STORAGES
 
 FINISHED = "map.json"  # is written when all else is there
 FINGERPRINTS = "fingerprints.json"
+SFM = "sfm"  # the folder of the COLMAP model
+MORE = "-keypoints_colmap"  # is added to the names of what a second attempt makes
 PLACE = "place.txt"  # stays when the map is built anew
 RETRIEVAL = aggregate_features.confs["vlad"]
 MAX_EXHAUSTIVE = 100  # photos without covisibility of which all pairs are matched
@@ -78,8 +81,10 @@ class Map:
             base = conf["model"].get("base", conf["model"])
             if base["name"] == "dog" and "keypoints" not in base:  # made before these could adapt
                 self._conf["model"] = features_confs.with_keypoints(conf["model"], "hloc")
-            found = features_confs.keypoints_of(self._conf["model"]) or KEYPOINTS[0]
+            model = self._conf["model"]
+            found = model.get("base", model).get("keypoints", KEYPOINTS[0])
             self._keypoints = choose("keypoints", content.get("keypoints", found), KEYPOINTS)
+            self._sfm = _file_name(content.get("sfm", SFM))
             if "storage" in conf:
                 self._conf["storage"] = choose("storage", conf["storage"], STORAGES)
             _with_projection(self._conf, _file_name)
@@ -156,7 +161,20 @@ class Map:
     @property
     def sfm(self) -> Path:
         """The folder of the COLMAP model."""
-        return self.folder / "sfm"
+        return self.folder / self._sfm
+
+    def drop_others(self) -> None:
+        """Delete what other attempts to build the map left."""
+        kept = self._conf["output"]
+        for name in {kept, kept.removesuffix(MORE), f"{kept.removesuffix(MORE)}{MORE}"} - {kept}:
+            escaped = glob.escape(name)
+            others = [f"{escaped}.h5*", f"{escaped}_matches*"]
+            others.append(f"{RETRIEVAL['output']}_{escaped}.*")
+            for path in [path for pattern in others for path in self.folder.glob(pattern)]:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for path in self.folder.glob(f"{SFM}*"):
+            if path.name != self._sfm:
+                shutil.rmtree(path)
 
     @property
     def features(self) -> Path:
@@ -275,6 +293,7 @@ def main(
                     f"The map {map_dir} was made with --camera_mode {built.camera_mode}: give it "
                     "again, choose other --outputs, or --overwrite."
                 )
+            built.drop_others()  # which a killed run left
             return built
         if not (map_dir / PLACE).exists():
             with replacing(map_dir / PLACE) as temporary:
@@ -288,9 +307,9 @@ def main(
             *(num_covis, exhaustive, accept_partial, camera_mode),
         )
         if model is not None:
-            sfm = building.of_model(conf, model, reference)
+            name, sfm = SFM, building.of_model(conf, model, reference)
         else:
-            conf, sfm = building.of_photos_alone(conf)
+            name, conf, sfm = building.of_photos_alone(conf)
         summary = {
             "id": uuid.uuid4().hex,
             "feature": feature,
@@ -300,14 +319,17 @@ def main(
             "camera_mode": camera_mode.name.lower() if model is None else None,
             "conf": _with_projection(conf, lambda path: Path(path).name),
             "keypoints": keypoints,
+            "sfm": name,
             "images": len(building.names),
             "images_with_pose": sfm.num_reg_images(),
             "points3D": sfm.num_points3D(),
             "seconds": folder.seconds(),
-            "bytes": folder.bytes(),
         }
         stamps.write(map_dir / FINISHED, summary)
-        return Map(map_dir)
+        built = Map(map_dir)
+        built.drop_others()
+        stamps.write(map_dir / FINISHED, {**summary, "bytes": folder.bytes()})
+        return built
 
 
 @dataclass
@@ -352,58 +374,48 @@ class _Building:
         matches = self._match(pairs, features)
         with self.folder.stage("triangulation"):
             sfm = triangulation.main(
-                self.map_dir / "sfm", model, self.image_dir, pairs, features, matches
+                self.map_dir / SFM, model, self.image_dir, pairs, features, matches
             )
         shutil.rmtree(self.map_dir / "sfm_reference", ignore_errors=True)
         return sfm
 
-    def of_photos_alone(self, conf: dict) -> tuple[dict, pycolmap.Reconstruction]:
+    def of_photos_alone(self, conf: dict) -> tuple[str, dict, pycolmap.Reconstruction]:
         """Reconstruct poses and points; again with more keypoints where photos are missing.
 
         Returns:
-            The configuration of the features of the map, and the map of most images.
+            The name of the folder of the map with the most images, the configuration of its
+            features, and the map.
         """
-        attempts = {self.map_dir / "sfm": conf}
         adaptive = features_confs.keypoints_of(conf["model"]) == "adaptive"
-        if adaptive and len(self.names) <= reconstruction.VERY_FEW:
-            model = features_confs.with_keypoints(conf["model"], "colmap")
-            output = f"{conf['output']}-keypoints_colmap"
-            attempts[self.map_dir / "sfm-more"] = {**conf, "output": output, "model": model}
-        models: dict[Path, pycolmap.Reconstruction] = {}
-        for number, (sfm_dir, attempted) in enumerate(attempts.items(), start=1):
-            last = number == len(attempts)
-            registered = 0
-            try:
-                models[sfm_dir] = self._reconstruct(attempted, sfm_dir, once=not last)
-                registered = models[sfm_dir].num_reg_images()
-            except reconstruction.NoModelError:
-                if last and not models:
-                    raise
-            if registered == len(self.names):
-                break
-            if not last:
-                logger.info(
-                    "%d of %d photos are in the map: trying again with more keypoints.",
-                    *(registered, len(self.names)),
-                )
-        best = max(models, key=lambda sfm_dir: reconstruction.size(models[sfm_dir]))
-        reconstruction.check(best, self.accept_partial)
-        self._keep(best, attempts)
-        return attempts[best], models[best]
+        if not adaptive or len(self.names) > reconstruction.VERY_FEW:
+            sfm = self._reconstruct(conf, SFM)
+            reconstruction.check(self.map_dir / SFM, self.accept_partial)
+            return SFM, conf, sfm
+        model = features_confs.with_keypoints(conf["model"], "colmap")
+        more = {**conf, "output": f"{conf['output']}{MORE}", "model": model}
+        found: list[tuple[pycolmap.Reconstruction, str, dict]] = []
 
-    def _keep(self, best: Path, attempts: dict[Path, dict]) -> None:
-        """Delete all attempts but one, which becomes the map."""
-        for sfm_dir, conf in attempts.items():
-            if sfm_dir != best:
-                shutil.rmtree(sfm_dir, ignore_errors=True)
-                for path in self.map_dir.glob(f"*{glob.escape(conf['output'])}[._]*"):
-                    path.unlink()
-        if best != self.map_dir / "sfm":
-            best.rename(self.map_dir / "sfm")
+        def attempt(sfm: str, conf: dict, once: bool = False) -> bool:
+            """Return whether all photos are in the best map so far."""
+            with suppress(reconstruction.NoModelError):
+                found.append((self._reconstruct(conf, sfm, once), sfm, conf))
+            found.sort(key=lambda one: reconstruction.size(one[0]), reverse=True)
+            registered = found[0][0].num_reg_images() if found else 0
+            logger.info("%d of %d photos are in the map.", registered, len(self.names))
+            return registered == len(self.names)
 
-    def _reconstruct(
-        self, conf: dict, sfm_dir: Path, once: bool = False
-    ) -> pycolmap.Reconstruction:
+        if not attempt(SFM, conf, once=True):
+            logger.info("Trying again with more keypoints.")
+            attempt(f"{SFM}{MORE}", more)
+            if not found or found[0][1] == SFM:
+                attempt(f"{SFM}-further", conf)
+        if not found:
+            raise reconstruction.NoModelError(reconstruction.nothing(self.image_dir))
+        best, sfm, conf = found[0]
+        reconstruction.check(self.map_dir / sfm, self.accept_partial)
+        return sfm, conf, best
+
+    def _reconstruct(self, conf: dict, sfm: str, once: bool = False) -> pycolmap.Reconstruction:
         features, descriptors = self._describe(conf)
         pairs = self._pairs(descriptors)
         matches = self._match(pairs, features)
@@ -419,7 +431,7 @@ class _Building:
                 match_features.main(self.matcher_conf, pairs, features, matches=matches)
         with self.folder.stage("reconstruction"):
             return reconstruction.reconstruct(
-                *(sfm_dir, self.image_dir, pairs, features, matches, self.camera_mode),
+                *(self.map_dir / sfm, self.image_dir, pairs, features, matches, self.camera_mode),
                 image_list=self.names,
                 once=once,
             )

@@ -2,10 +2,14 @@
 
 import argparse
 import shutil
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from . import cli, colmap, logger, stamps
 from .cli import InputError
@@ -31,6 +35,7 @@ FEW = 100  # images of which a second attempt takes little time
 VERY_FEW = 30  # images of which some more take little; what comes of them is a matter of luck
 SEEDS = (1, 2, 3)
 MORE = 1.5  # times as many images tell that one camera took all
+WELL_KNOWN = 3  # images of a camera from which on EXIF data do not bound its focal length
 
 
 class NoModelError(InputError):
@@ -57,11 +62,12 @@ def main(
     """Reconstruct poses, intrinsics and points by COLMAP's incremental mapper, and check the model.
 
     Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary. Images
-    whose focal length no lens has, or is far from that of EXIF data, are not in the model. Where
-    images are missing, and of more than 100 images more than a fifth, further attempts follow, and
-    the model of most images is kept: with lower thresholds, and with up to 30 images with other
-    pairs to begin with. If still fewer than two thirds are in it, although `camera_mode` is AUTO
-    and all images may be by one camera, this is tried, and kept if half as many again are.
+    whose focal length no lens has, or is far from that of EXIF data, are dropped from the model.
+    Where images are missing, and of more than 100 images more than a fifth, further attempts
+    follow, and the model with the most images is kept: with lower thresholds, and with up to 30
+    images with other pairs to begin with. With `camera_mode` AUTO, if at most two thirds are in the
+    model and one camera may have taken all images, the mapper is run with one shared camera; that
+    model is kept if it has at least 1.5 times as many images.
 
     Args:
         sfm_dir: the folder of the new COLMAP model; one made from the same inputs is read back.
@@ -80,7 +86,8 @@ def main(
         accept_partial: return a model of fewer than half of the images, too.
 
     Returns:
-        The model of most images. Its keypoints are those of the feature file, in the same order.
+        The model with the most images. Its keypoints are those of the feature file, in the same
+        order.
 
     Raises:
         InputError: when an input is missing, nothing can be reconstructed, or fewer than half of
@@ -134,6 +141,7 @@ def reconstruct(
         "min_match_score": min_match_score,
         "attempts": [{}, *attempts],
         "cameras": f"plausible, one for {MORE} times as many images",
+        "once": once,
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
     is_whole = bool(stamps.read(sfm_dir / REGISTRATION))
@@ -157,53 +165,47 @@ def reconstruct(
             return database
 
         database = write_database(camera_mode)
-        cameras = colmap.read_cameras(database)
-        if camera_mode == pycolmap.CameraMode.AUTO and 1 < len(names) == len(cameras):
-            logger.info(
-                "EXIF data do not say which images share a camera, so each has its own. If one "
-                "camera with a fixed zoom took all, --camera_mode single gives better poses."
-            )
         enough = len(names) if len(names) <= FEW else ENOUGH * len(names)
 
-        def reconstruct_from(database: Path) -> list[pycolmap.Reconstruction]:
-            given, best = colmap.read_cameras(database), []
+        def reconstruct_from(database: Path) -> tuple[list[pycolmap.Reconstruction], dict]:
+            """Return the largest models of all attempts, and what was dropped from them."""
+            given, best = colmap.read_cameras(database), ([], {})
             # no attempt brings in an image that matches no other
             possible = min(enough, len(_matched(database)))
             for number, changed in enumerate([{}, *attempts], start=1):
                 own, models_dir = colmap.mapper_options({**options, **changed}), building / "models"
                 found = colmap.incremental_mapping(database, image_dir, models_dir, own, verbose)
                 shutil.rmtree(models_dir, ignore_errors=True)
-                best = max(best, _plausible(found, given), key=_size)
+                best = max(best, _plausible(found, given), key=lambda both: _size(both[0]))
                 logger.info(
-                    "Reconstructed %d of %d images in %d of up to %d attempts.",
-                    *(_size(best)[0], len(names), number, 1 + len(attempts)),
+                    "Attempt %d of up to %d: %d of %d images reconstructed.",
+                    *(number, 1 + len(attempts), _size(best[0])[0], len(names)),
                 )
-                if _size(best)[0] >= possible:
+                if _size(best[0])[0] >= possible:
                     break
             return best
 
-        models = reconstruct_from(database)
-        registered = _size(models)[0]
+        models, dropped = reconstruct_from(database)
+        registered, cameras = _size(models)[0], colmap.read_cameras(database)
         alike = camera_mode == pycolmap.CameraMode.AUTO and _are_alike(cameras)
-        if alike and not mapper_options and MORE * registered <= len(names):
+        if alike and attempts and MORE * registered <= len(_matched(database)):
             logger.info("Trying again with one camera for all images.")
             shared = write_database(pycolmap.CameraMode.SINGLE)
-            found = reconstruct_from(shared)
-            if _size(found)[0] >= MORE * registered:
-                models, database = found, shared
+            one, one_dropped = reconstruct_from(shared)
+            if one and _size(one)[0] >= MORE * registered:
+                models, dropped, database, alike = one, one_dropped, shared, False
         if not models:
-            raise NoModelError(
-                f"COLMAP could not reconstruct the images of {image_dir} from the matches "
-                f"{matches}. Do enough of them overlap? Take photos from several places, each "
-                "overlapping the one before by about two thirds."
-            )
+            raise NoModelError(nothing(image_dir, dropped))
         models[0].write(building)
         parts = _parts(models)
+        missing = sorted(set(names) - set(parts[0]))
         state = {
             "images": len(names),
             "parts": parts,
-            "missing": sorted(set(names) - set(parts[0])),
+            "missing": missing,
             "unmatched": sorted(set(names) - _matched(database)),
+            "focal_lengths": {name: focal for name, focal in dropped.items() if name in missing},
+            "alike": alike,
         }
         stamps.write(building / REGISTRATION, state)
         database.rename(building / "database.db")
@@ -236,20 +238,73 @@ def _are_alike(cameras: dict[int, pycolmap.Camera]) -> bool:
 
 def _plausible(
     models: list[pycolmap.Reconstruction], cameras: dict[int, pycolmap.Camera]
-) -> list[pycolmap.Reconstruction]:
-    """Remove images of implausible focal lengths from models, and sort these by size.
+) -> tuple[list[pycolmap.Reconstruction], dict[str, float]]:
+    """Drop images of implausible focal lengths from models, and what only these connect.
 
     Args:
         models: of COLMAP's mapper.
         cameras: from their ids to those that the mapper began with.
+
+    Returns:
+        The models that have points, by size; and from the names of images to their focal lengths
+        in pixels that are implausible.
     """
+    dropped = {}
     for model in models:
-        for image in [model.images[i] for i in model.reg_image_ids()]:
+        images = [model.images[i] for i in model.reg_image_ids()]
+        shared = Counter(image.camera_id for image in images)
+        for image in images:
             given = cameras[image.camera_id]
-            low, high = focal_lengths(given, not given.has_prior_focal_length)
+            # many images tell the focal length of their camera better than EXIF data do
+            unknown = not given.has_prior_focal_length or shared[image.camera_id] >= WELL_KNOWN
+            low, high = focal_lengths(given, unknown)
             if not low <= image.camera.mean_focal_length() <= high:
+                dropped[image.name] = round(image.camera.mean_focal_length())
                 model.deregister_frame(image.frame_id)
-    return sorted((m for m in models if m.num_reg_images() > 1), key=size, reverse=True)
+        if dropped:
+            _keep_connected(model)
+    whole = [model for model in models if min(size(model)) > 1]
+    return sorted(whole, key=size, reverse=True), dropped
+
+
+def _keep_connected(model: pycolmap.Reconstruction) -> None:
+    """Drop all images but those of the largest part that is connected by common points."""
+    ids = sorted(model.reg_image_ids())
+    row = {image_id: number for number, image_id in enumerate(ids)}
+    seen = [
+        (row[element.image_id], number)
+        for number, point in enumerate(model.points3D.values())
+        for element in point.track.elements
+    ]
+    if not seen:
+        return
+    image, point = np.array(seen).T
+    sees = coo_array((np.ones(len(image)), (image, point)), shape=(len(ids), point.max() + 1))
+    sees = sees.tocsr()
+    _, label = connected_components(sees @ sees.T, directed=False)
+    largest = np.bincount(label).argmax()
+    for image_id, part in zip(ids, label, strict=True):
+        if part != largest:
+            model.deregister_frame(model.images[image_id].frame_id)
+
+
+def nothing(image_dir: Path, dropped: dict[str, float] | None = None) -> str:
+    """Say that no image could be reconstructed, and what to try."""
+    if dropped:
+        return f"COLMAP could not reconstruct the images of {image_dir}. {_said(dropped)}"
+    return (
+        f"COLMAP could not reconstruct the images of {image_dir}. Do enough of them overlap? Take "
+        "photos from several places, each overlapping the one before by about two thirds."
+    )
+
+
+def _said(dropped: dict[str, float]) -> str:
+    """Say which images have implausible focal lengths."""
+    lengths = [f"{name} ({length:.0f})" for name, length in dropped.items()]
+    return (
+        "These have focal lengths in pixels that no lens has, or that are far from their EXIF "
+        f"data, so their poses are wrong: {cli.some(lengths, NAMED)}."
+    )
 
 
 def size(model: pycolmap.Reconstruction) -> tuple[int, int]:
@@ -281,6 +336,11 @@ def check(sfm_dir: Path, accept_partial: bool) -> None:
     state = stamps.read(sfm_dir / REGISTRATION)
     missing, number = state["missing"], state["images"]
     registered = number - len(missing)
+    if state["alike"]:
+        logger.info(
+            "EXIF data do not say which images share a camera, so each has its own. If one camera "
+            "with a fixed zoom took all, --camera_mode single gives better poses."
+        )
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
         if missing:
             logger.warning(
@@ -300,6 +360,8 @@ def shortfall(
     parts: list[list[str]],
     missing: list[str],
     unmatched: list[str],
+    focal_lengths: dict[str, float],
+    alike: bool,
 ) -> str:
     """Say which images are not in a model, why, and what to try.
 
@@ -309,6 +371,8 @@ def shortfall(
         parts: the images of each part that COLMAP reconstructed, the model first.
         missing: the images that are not in the model.
         unmatched: those that match no other image.
+        focal_lengths: from images that were dropped to their implausible focal lengths.
+        alike: each image has a camera of its own, but one may have taken all.
     """
     registered = images - len(missing)
     only = "Only " if registered < ENOUGH * images else ""
@@ -325,11 +389,15 @@ def shortfall(
             + (f"; the second has {cli.some(parts[1], 3)}." if parts[1] != missing else ".")
         )
         tries.append("add photos between the parts, each overlapping the one before by two thirds")
-    elif set(missing) - set(unmatched):
+    elif set(missing) - set(unmatched) - set(focal_lengths):
         tries.append("add photos between those in the map and those that are not")
     if unmatched:
         said.append(f"No other photo matches {cli.some(unmatched)}.")
         tries.append("leave out photos of other places, and retake blurred or dark ones")
+    if focal_lengths:
+        said.append(_said(focal_lengths))
+    if alike:
+        tries.append("--camera_mode single, if one camera with a fixed zoom took all photos")
     return f"{' '.join(said)} What to try: {'; '.join(tries)}."
 
 

@@ -68,6 +68,8 @@ def test_the_gate_of_jobs(tmp_path):
     assert names(found)[3] == "a/sift+min_confidence12.5+min_inliers20"
     assert found[3].gate == Gate(12.5, 20)
     assert jobs.read(write(tmp_path / "a.yaml", "jobs: [{dataset: a}]"))[1][0].gate == Gate()
+    text = "jobs: [{dataset: a, min_confidence: [8.0, 9]}]\nexclude: [{min_confidence: 8}]"
+    assert len(jobs.read(write(tmp_path / "a.yaml", text))[1]) == 1
 
 
 def test_a_job_that_is_listed_twice_is_one(tmp_path):
@@ -89,7 +91,7 @@ def test_a_job_that_is_listed_twice_is_one(tmp_path):
         ("jobs: [{dataset: a, num_loc: 0}]", "num_loc is 0: at least 1"),
         ("jobs: [{dataset: a, num_loc: many}]", "num_loc is 'many': an integer is needed"),
         ("jobs: [{dataset: a, min_inliers: 8.5}]", "min_inliers is 8.5: an integer is needed"),
-        ("jobs: [{dataset: a, min_confidence: -1}]", "min_confidence is -1: at least 0"),
+        ("jobs: [{dataset: a, min_confidence: -1}]", "must be finite and at least 0"),
         ("jobs: [{dataset: 3}]", "dataset is 3: a name is needed"),
         ("jobs: [{dataset: a}]\nexclude: [{job: a}]", "Unknown key of what is excluded 'job'"),
         ("jobs: [{dataset: [x/a, y/a]}]", "y/a and .*x/a would have the same folder"),

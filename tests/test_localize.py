@@ -1,6 +1,5 @@
 """A map of one's own: built once, localized in by files and in memory; reconstruction."""
 
-import copy
 import json
 import os
 import shutil
@@ -598,6 +597,28 @@ def test_further_attempts_where_images_are_missing(scene, tmp_path, monkeypatch)
     assert attempts == [(6, 30)]
 
 
+def chain(cameras):
+    """Return a model of images that see points with the next one only, of cameras by number."""
+    model = pycolmap.Reconstruction()
+    for i, number in enumerate(cameras):
+        camera = pycolmap.Camera(
+            model="SIMPLE_PINHOLE", width=640, height=480, params=[500, 320, 240], camera_id=number
+        )
+        pixels = np.random.default_rng(i).uniform(0, 400, (20, 2))
+        image = pycolmap.Image(name=f"{i}.jpg", keypoints=pixels, camera_id=number, image_id=i + 1)
+        colmap.add_image(model, camera, image, pycolmap.Rigid3d())
+    for i in range(1, len(cameras)):
+        for j in range(10):
+            elements = [pycolmap.TrackElement(i, 10 + j), pycolmap.TrackElement(i + 1, j)]
+            model.add_point3D(np.zeros(3), pycolmap.Track(elements))
+    given = {key: pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
+    return model, given
+
+
+def names_of(models):
+    return [{model.images[i].name for i in model.reg_image_ids()} for model in models]
+
+
 @pytest.mark.parametrize(
     ("focal_length", "is_prior", "is_kept"),
     [
@@ -609,20 +630,41 @@ def test_further_attempts_where_images_are_missing(scene, tmp_path, monkeypatch)
         (700.0, True, True),
     ],
 )
-def test_focal_lengths_that_no_lens_has(scene, tmp_path, focal_length, is_prior, is_kept):
-    """Of 500 pixels at first, exact or guessed."""
-    model = pycolmap.Reconstruction(scene.model)
-    names = sorted(image.name for image in model.images.values())
-    own = model.find_image_with_name(names[0])
-    cameras = {}
-    for image in model.images.values():
-        cameras[image.camera_id] = copy.deepcopy(image.camera)
-        cameras[image.camera_id].has_prior_focal_length = is_prior
-    own.camera.focal_length = focal_length
-    shared = sum(image.camera_id == own.camera_id for image in model.images.values())
-    found = reconstruction._plausible([model], cameras)
-    kept = [model.images[i].name for part in found for i in part.reg_image_ids()]
-    assert len(kept) == len(names) - (0 if is_kept else shared)
+def test_focal_lengths_that_no_lens_has(focal_length, is_prior, is_kept):
+    """Of 500 pixels at first, by EXIF data or guessed."""
+    model, given = chain([1, 2, 3, 4])
+    for camera in given.values():
+        camera.has_prior_focal_length = is_prior
+    model.cameras[4].focal_length = focal_length
+    found, dropped = reconstruction._plausible([model], given)
+    everything = {f"{i}.jpg" for i in range(4)}
+    assert names_of(found) == [everything if is_kept else everything - {"3.jpg"}]
+    assert dropped == ({} if is_kept else {"3.jpg": focal_length})
+
+
+def test_what_only_an_implausible_image_connects_is_dropped():
+    model, given = chain([1, 2, 3, 4, 5, 6])
+    model.cameras[3].focal_length = 1e6
+    found, dropped = reconstruction._plausible([model], given)
+    assert names_of(found) == [{"3.jpg", "4.jpg", "5.jpg"}] and set(dropped) == {"2.jpg"}
+    model, given = chain([1, 2, 3])
+    model.cameras[2].focal_length = 1e6
+    assert reconstruction._plausible([model], given)[0] == []
+
+
+def test_a_camera_of_many_photos_is_known_better_than_by_exif():
+    """As of photos that were cropped and kept their EXIF data."""
+    for cameras, is_kept in (([1, 1, 1, 1], True), ([1, 1, 2, 2], False)):
+        model, given = chain(cameras)
+        for camera in given.values():
+            camera.focal_length, camera.has_prior_focal_length = 200, True
+        found, dropped = reconstruction._plausible([model], given)
+        assert bool(found) == is_kept and bool(dropped) != is_kept
+
+
+def test_no_plausible_image_at_all_is_said():
+    message = reconstruction.nothing(Path("photos"), {"a.jpg": 12345})
+    assert "no lens has" in message and "a.jpg (12345)" in message and "overlap" not in message
 
 
 def draw_noise(folder, numbers):
@@ -715,12 +757,22 @@ def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeyp
     outputs = tmp_path / "outputs"
     build = ("--map_images", plane / "images", "--outputs", outputs)
     run(monkeypatch, *build)
-    assert "0 of 5 photos are in the map: trying again with more keypoints." in caplog.text
+    assert "0 of 5 photos are in the map." in caplog.text
+    assert "Trying again with more keypoints." in caplog.text
     built = maps.Map(outputs / "map")
     assert len(built.names()) == 5 and built.keypoints == "adaptive"
     assert features_confs.keypoints_of(built.conf["model"]) == "colmap"
     assert len(files_of(built.folder, "-keypoints_colmap")) == 4
-    assert not files_of(built.folder, "") and not (built.folder / "sfm-more").exists()
+    assert not files_of(built.folder, "")
+    assert [path.name for path in built.folder.glob("sfm*")] == ["sfm-keypoints_colmap"]
+    # what a killed run left is deleted by the next one, but no projection of one's own name
+    name = "feats-dog-colmap_sift_sv64"
+    (built.folder / f"{name}.h5.pieces").mkdir()
+    (built.folder / f"{name}_matches-NN.h5").touch()
+    (built.folder / f"{name}.safetensors").touch()
+    run(monkeypatch, *build)
+    assert [path.name for path in files_of(built.folder, "")] == [f"{name}.safetensors"]
+    (built.folder / f"{name}.safetensors").unlink()
     written = state(built.folder)
     run(monkeypatch, *build, "--query_images", plane / "images", "--feature", "colmap_sift_sv64")
     assert state(built.folder) == written
@@ -743,13 +795,13 @@ def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatc
     monkeypatch.setattr(maps.reconstruction, "reconstruct", fails_again)
     outputs = tmp_path / "outputs"
     run(monkeypatch, "--map_images", plane / "images", "--outputs", outputs)
-    assert "5 of 6 photos are in the map: trying again" in caplog.text
+    assert caplog.text.count("5 of 6 photos are in the map.") == 3
     assert "1 of 6 images are not in the map: other.png." in caplog.text
     built = maps.Map(outputs / "map")
     assert features_confs.keypoints_of(built.conf["model"]) == "adaptive"
     assert len(files_of(built.folder, "")) == 4
     assert not files_of(built.folder, "-keypoints_colmap")
-    assert not (built.folder / "sfm-more").exists()
+    assert [path.name for path in built.folder.glob("sfm*")] == ["sfm"]
 
 
 def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch):

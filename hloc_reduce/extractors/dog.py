@@ -77,9 +77,9 @@ class DoG(BaseModel):
     score, its scale (COLMAP's own ranking), and honours `max_keypoints`.
 
     `keypoints` names the settings of DoG: "adaptive" are hloc's, and others in photos where these
-    find too few (`detection.detect`); "colmap" are COLMAP's, which find several times as many, and
-    likewise others; "hloc" are hloc's for every photo. Other `options` than hloc's are used for
-    every photo, whatever `keypoints` says.
+    find too few (`detection.detect`); "colmap" are COLMAP's, which find several times as many,
+    with the same fallback; "hloc" are hloc's for every photo. Other `options` than hloc's are used
+    for every photo, whatever `keypoints` says.
     """
 
     default_conf = {
