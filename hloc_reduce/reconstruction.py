@@ -343,9 +343,11 @@ def check(sfm_dir: Path, accept_partial: bool) -> None:
         )
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
         if missing:
+            focal_lengths = state["focal_lengths"]
             logger.warning(
-                "%d of %d images are not in the map: %s.",
+                "%d of %d images are not in the map: %s.%s",
                 *(len(missing), number, cli.some(missing, NAMED)),
+                f" {_said(focal_lengths)}" if focal_lengths else "",
             )
         return
     message = shortfall(sfm_dir / REGISTRATION, **state)
