@@ -336,12 +336,12 @@ def check(sfm_dir: Path, accept_partial: bool) -> None:
     state = stamps.read(sfm_dir / REGISTRATION)
     missing, number = state["missing"], state["images"]
     registered = number - len(missing)
-    if state["alike"]:
-        logger.info(
-            "EXIF data do not say which images share a camera, so each has its own. If one camera "
-            "with a fixed zoom took all, --camera_mode single gives better poses."
-        )
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
+        if state["alike"]:
+            logger.info(
+                "EXIF data do not say which images share a camera, so each has its own. If one "
+                "camera with a fixed zoom took all, --camera_mode single gives better poses."
+            )
         if missing:
             focal_lengths = state["focal_lengths"]
             logger.warning(

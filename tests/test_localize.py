@@ -709,12 +709,18 @@ def test_parts_that_do_not_connect():
         "parts": [["a", "b", "c", "d", "e"], ["f", "g", "h"]],
         "missing": ["f", "g", "h", "i", "j"],
         "unmatched": ["j"],
+        "focal_lengths": {},
+        "alike": False,
     }
     message = reconstruction.shortfall(Path("x"), **state)
     assert "Only 5 of 10 photos" in message and "f, g, h, i, j." in message
     assert "2 parts that do not connect, of 5 and 3 photos" in message
     assert "the second has f, g, h." in message and "between the parts" in message
-    assert "matches j." in message
+    assert "matches j." in message and "--camera_mode" not in message
+    state |= {"focal_lengths": {"i": 12345}, "alike": True}
+    message = reconstruction.shortfall(Path("x"), **state)
+    assert "no lens has" in message and "i (12345)." in message
+    assert "--camera_mode single, if one camera" in message
 
 
 def test_camera_modes(plane, tmp_path, monkeypatch, caplog):
