@@ -42,7 +42,8 @@ from .storage import STORAGES
 FINISHED = "map.json"  # is written when all else is there
 FINGERPRINTS = "fingerprints.json"
 SFM = "sfm"  # the folder of the COLMAP model
-MORE = "-keypoints_colmap"  # is added to the names of what a second attempt makes
+# what is added to the names of what later attempts make: with more keypoints, or without these
+MORE, FURTHER = "-keypoints_colmap", "-further"
 PLACE = "place.txt"  # stays when the map is built anew
 RETRIEVAL = aggregate_features.confs["vlad"]
 MAX_EXHAUSTIVE = 100  # photos without covisibility of which all pairs are matched
@@ -166,15 +167,15 @@ class Map:
     def drop_others(self) -> None:
         """Delete what other attempts to build the map left."""
         kept = self._conf["output"]
-        for name in {kept, kept.removesuffix(MORE), f"{kept.removesuffix(MORE)}{MORE}"} - {kept}:
+        plain = kept.removesuffix(MORE)
+        for name in {plain, f"{plain}{MORE}"} - {kept}:
             escaped = glob.escape(name)
             others = [f"{escaped}.h5*", f"{escaped}_matches*"]
             others.append(f"{RETRIEVAL['output']}_{escaped}.*")
             for path in [path for pattern in others for path in self.folder.glob(pattern)]:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
-        for path in self.folder.glob(f"{SFM}*"):
-            if path.name != self._sfm:
-                shutil.rmtree(path)
+        for name in {SFM, f"{SFM}{MORE}", f"{SFM}{FURTHER}"} - {self._sfm}:
+            shutil.rmtree(self.folder / name, ignore_errors=True)
 
     @property
     def features(self) -> Path:
@@ -408,7 +409,7 @@ class _Building:
             logger.info("Trying again with more keypoints.")
             attempt(f"{SFM}{MORE}", more)
             if not found or found[0][1] == SFM:
-                attempt(f"{SFM}-further", conf)
+                attempt(f"{SFM}{FURTHER}", conf)
         if not found:
             raise reconstruction.NoModelError(reconstruction.nothing(self.image_dir))
         best, sfm, conf = found[0]

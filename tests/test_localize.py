@@ -776,8 +776,10 @@ def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeyp
     (built.folder / f"{name}.h5.pieces").mkdir()
     (built.folder / f"{name}_matches-NN.h5").touch()
     (built.folder / f"{name}.safetensors").touch()
+    (built.folder / "sfm_notes.txt").touch()
     run(monkeypatch, *build)
     assert [path.name for path in files_of(built.folder, "")] == [f"{name}.safetensors"]
+    assert (built.folder / "sfm_notes.txt").exists()
     (built.folder / f"{name}.safetensors").unlink()
     written = state(built.folder)
     run(monkeypatch, *build, "--query_images", plane / "images", "--feature", "colmap_sift_sv64")
