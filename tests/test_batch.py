@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -493,10 +494,12 @@ def test_a_batch_that_is_killed_again_and_again_goes_on(aachen_layout, tmp_path)
             process.communicate()
         return process.returncode
 
+    start = time.perf_counter()
     assert run(tmp_path / "whole") == 0
+    seconds = time.perf_counter() - start
     draw, kills = random.Random(0), 0
     for _ in range(20):
-        code = run(tmp_path / "killed", draw.uniform(3, 12))
+        code = run(tmp_path / "killed", seconds * draw.uniform(0.2, 0.6))
         kills += code == -signal.SIGKILL
         if code == 0:
             shutil.rmtree(tmp_path / "killed")
