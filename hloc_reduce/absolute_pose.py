@@ -8,7 +8,6 @@ import pycolmap
 
 from . import colmap
 from .confidence import (
-    AGREEMENT,
     MAX_POSITION,
     MAX_ROTATION,
     RIVAL,
@@ -177,7 +176,7 @@ def _refusal(
             f"the inliers do not fix the pose: its position is uncertain by {100 * position:.0f} % "
             f"of their distance, its rotation by {rotation:.1f} degrees"
         )
-    least = AGREEMENT if gate.min_agreement is None else gate.min_agreement
+    least = gate.least_agreement(pose.confidence)
     if pose.agreement < least:
         return (
             "the matches of no image agree with the pose: agreement "

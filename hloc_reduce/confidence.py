@@ -22,8 +22,11 @@ REFINED = 2.0  # by what factor a focal length of EXIF data may change
 MAX_POSITION = 0.05  # standard deviation of the position, times the median distance of the inliers
 MAX_ROTATION = 2.0  # standard deviation in degrees
 MIN_MATCHES = 6  # of an image whose matches are asked whether they agree with a pose
-# least agreement without a ratio test, with one, and with one below FEW dimensions
-AGREEMENT, AGREEMENT_RATIO, AGREEMENT_FEW, FEW = 0.17, 0.7, 0.55, 32
+# least agreement without a ratio test, with one, and with one below FEW dimensions; the second
+# number of each is for confidences in DOUBTFUL, which copies of repeated structure reach: of fewer
+# matches the share is known less well, and with more confidence it was lower in noisy scans only
+AGREEMENT, AGREEMENT_RATIO, AGREEMENT_FEW, FEW = (0.17, 0.17), (0.7, 0.86), (0.55, 0.72), 32
+DOUBTFUL = (50.0, 300.0)
 RIVAL = 0.8  # a pose is ambiguous if another has this share of its inliers
 
 
@@ -236,7 +239,8 @@ class Gate:
     Args:
         min_confidence: `confidence`.
         min_inliers: inliers of RANSAC.
-        min_agreement: `agreement`; default: that of `of_matches`.
+        min_agreement: `agreement`, in general and where the confidence is doubtful; default: that
+            of `of_matches`.
 
     Raises:
         InputError: for a confidence that is not finite or a negative number of inliers.
@@ -244,7 +248,7 @@ class Gate:
 
     min_confidence: float = 8.0
     min_inliers: int = 8
-    min_agreement: float | None = None
+    min_agreement: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
@@ -266,6 +270,12 @@ class Gate:
         with_ratio = AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO
         least = with_ratio if matcher.get("ratio_threshold") else AGREEMENT
         return replace(self, min_agreement=least)
+
+    def least_agreement(self, confidence: float) -> float:
+        """Return the agreement that a pose of a confidence must have."""
+        general, doubtful = self.min_agreement or AGREEMENT
+        low, high = DOUBTFUL
+        return doubtful if low <= confidence < high else general
 
 
 DEFAULT_GATE = Gate()

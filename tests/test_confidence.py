@@ -224,6 +224,17 @@ def test_a_pose_that_no_image_agrees_with_is_refused():
     assert agreement(np.zeros(0, bool), []) == 0
 
 
+def test_doubtful_poses_must_agree_with_more_matches():
+    """As those at another copy of a repeated pattern, of confidences of 50 to 300."""
+    gate = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
+    assert gate.least_agreement(40) == gate.least_agreement(300) < gate.least_agreement(120)
+    assert DEFAULT_GATE.least_agreement(120) == DEFAULT_GATE.least_agreement(40)
+    keypoints, points = matches(60, 18)
+    found = solve(keypoints, points, [np.arange(78)], gate=gate)
+    assert 50 < found.confidence < 300 and 0.7 < found.agreement < 0.86
+    assert found.refusal.startswith("the matches of no image agree")
+
+
 @pytest.mark.parametrize(("number", "repeated"), [(3, 8), (3, 12), (5, 3), (8, 4)])
 def test_clusters_of_matches_of_few_points_are_refused(number, repeated):
     """Three points fit a pose always, however many keypoints beside each other match them."""
@@ -248,7 +259,7 @@ def test_a_rival_is_looked_for_where_half_of_the_matches_agree():
 
 
 def test_a_gate_of_ones_own_is_kept():
-    own = Gate(min_agreement=0.3)
+    own = Gate(min_agreement=(0.3, 0.4))
     assert own.of_matches({"ratio_threshold": 0.8}, 64) == own
 
 
