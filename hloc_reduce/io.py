@@ -122,7 +122,7 @@ def read_image(path: Path, grayscale: bool = False) -> np.ndarray:
     try:
         data = np.fromfile(path, np.uint8)
         image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
-        reason = "it is no image, or a part of one" if data.size else "it is empty"
+        reason = "it is not an image, or it is truncated" if data.size else "it is empty"
     except OSError as error:
         image, reason = None, error.strerror
     except cv2.error as error:

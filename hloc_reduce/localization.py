@@ -33,7 +33,7 @@ from .storage import dimension
 
 CHUNK = 8  # queries
 SHOWN = 3  # queries that a message gives the reason of
-RECORDS = 6  # the version of what a record holds
+RECORDS = 7  # the version of what a record holds, and of the gate
 
 
 class Reference(Protocol):

@@ -321,7 +321,7 @@ def test_unreadable_images(layout, request, run_batch, tmp_path, caplog):
         outputs = run_batch(grid)
         rows = table(outputs / "failures.csv")
         assert {(row["image"], row["reason"].rpartition(": ")[2]) for row in rows} == {
-            (broken.relative_to(images).as_posix(), "it is no image, or a part of one."),
+            (broken.relative_to(images).as_posix(), "it is not an image, or it is truncated."),
             (absent.relative_to(images).as_posix(), "No such file or directory."),
         }
     summary, queries = command.outcome(outputs / place.name / "sift_sv16")

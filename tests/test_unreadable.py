@@ -72,7 +72,9 @@ def test_a_query_that_cannot_be_read_does_not_stop_the_others(
     assert list(rows) == list(expected) and summary["queries_unreadable"] == 1
     row = rows.pop(name)
     assert row["status"] == ("failed" if pipeline is inloc else "fallback")
-    why = {"absent": "No such file or directory"}.get(kind, "it is no image, or a part of one")
+    why = {"absent": "No such file or directory"}.get(
+        kind, "it is not an image, or it is truncated"
+    )
     assert row["reason"] == f"Cannot read image {photo}: {why}."
     assert rows == {other: row for other, row in expected.items() if other != name}
     logs = localization.log_file(outputs / summary["poses"])
