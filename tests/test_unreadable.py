@@ -193,7 +193,7 @@ def test_a_cutout_that_cannot_be_read(inloc_layout, tmp_path, monkeypatch, caplo
     name = "database/cutouts/PLA1/001/PLA_cutout_001_0_0.jpg"
     harm(inloc_layout / name, b"no image")
     message = command.refused(monkeypatch, caplog, inloc, *arguments)
-    assert f"1 of 4 images of the map cannot be read: {name} (it is no image" in message
+    assert f"1 of 4 images of the map cannot be read: {name} (it is not an image" in message
     command.run(monkeypatch, inloc, *arguments, "--accept_partial")
     summary, rows = outcome(tmp_path / "o")
     assert summary["map_images"] == 3 and summary["queries_localized"] == 2
