@@ -458,9 +458,9 @@ def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
     """
     try:
         camera = pycolmap.infer_camera_from_image(image)
-    except Exception as error:  # RuntimeError, ValueError, by version
-        absent = "No such file or directory"
-        reason = f"({str(error).strip().splitlines()[0]})" if Path(image).exists() else absent
+    except Exception:  # RuntimeError, ValueError, by version
+        broken, absent = "it is not an image, or it is truncated", "No such file or directory"
+        reason = broken if Path(image).exists() else absent
         raise InputError(f"Cannot read image {image}: {reason}.") from None
     return camera, camera.has_prior_focal_length
 

@@ -345,8 +345,8 @@ class _Building:
         matcher_conf: configuration of the matcher.
         num_covis: as in `main`.
         exhaustive: pair all images, unless by covisibility.
-        accept_partial: as in `main`.
-        camera_mode: likewise.
+        accept_partial: do without images that are missing, unreadable or not reconstructed.
+        camera_mode: which images share a camera, without a model.
     """
 
     folder: RunFolder

@@ -253,16 +253,18 @@ def _plausible(
     for model in models:
         images = [model.images[i] for i in model.reg_image_ids()]
         shared = Counter(image.camera_id for image in images)
+        implausible = {}
         for image in images:
             given = cameras[image.camera_id]
             # many images tell the focal length of their camera better than EXIF data do
             unknown = not given.has_prior_focal_length or shared[image.camera_id] >= WELL_KNOWN
             low, high = focal_lengths(given, unknown)
             if not low <= image.camera.mean_focal_length() <= high:
-                dropped[image.name] = round(image.camera.mean_focal_length())
+                implausible[image.name] = round(image.camera.mean_focal_length())
                 model.deregister_frame(image.frame_id)
-        if dropped:
+        if implausible:
             _keep_connected(model)
+        dropped |= implausible
     whole = [model for model in models if min(size(model)) > 1]
     return sorted(whole, key=size, reverse=True), dropped
 

@@ -771,7 +771,7 @@ def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeyp
     assert len(files_of(built.folder, "-keypoints_colmap")) == 4
     assert not files_of(built.folder, "")
     assert [path.name for path in built.folder.glob("sfm*")] == ["sfm-keypoints_colmap"]
-    # what a killed run left is deleted by the next one, but no projection of one's own name
+    # the next run deletes what a killed run left, but not the user's own files
     name = "feats-dog-colmap_sift_sv64"
     (built.folder / f"{name}.h5.pieces").mkdir()
     (built.folder / f"{name}_matches-NN.h5").touch()
