@@ -167,7 +167,9 @@ def _main() -> None:
     )
     args = parser.parse_args()
     common.check_options(args)
-    feature, _ = features_confs.get(args.feature, args.projection)
+    # raise for wrong options before the demo is rendered
+    feature, _ = features_confs.get(args.feature, args.projection, args.storage, args.keypoints)
+    gate = Gate(args.min_confidence, args.min_inliers)
     default = "datasets/demo_town" if args.demo else "datasets/aachen_v1.1"
     dataset = args.dataset or Path(default)
     outputs = args.outputs or Path("outputs") / dataset.name / feature
@@ -189,7 +191,7 @@ def _main() -> None:
             args.keypoints,
             strict=args.strict,
             accept_partial=args.accept_partial,
-            gate=Gate(args.min_confidence, args.min_inliers),
+            gate=gate,
         )
     submit = "For recall, submit {} to https://www.visuallocalization.net."
     common.print_result(summary, outputs, submit)
