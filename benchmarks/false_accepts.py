@@ -1,9 +1,10 @@
 """Count wrong poses that are called localized, and true ones that are refused.
 
 Every map is tried with photos of its own that it was not built from, with photos of all other
-places, and with its own blurred, mirrored, black and noisy; each with its intrinsics and without.
-Of a COLMAP model every third photo is kept out of the map. Keypoints and maps are those of
-colmap_sift_sv64, whatever descriptors are matched. Another --seed keeps out other photos, builds
+places, and with its own blurred, mirrored, black and noisy; each with its intrinsics and without,
+its own also with a wrong focal length. Its own are cropped and squeezed, too, and tried without
+intrinsics. Of a COLMAP model every third photo is kept out of the map. Keypoints and maps are those
+of colmap_sift_sv64, whatever descriptors are matched. Another --seed keeps out other photos, builds
 other maps, and draws other photos of other places. Results go to trials.csv, and as a curve to
 false_accepts.svg; an interrupted run resumes with the next place.
 """
@@ -38,7 +39,14 @@ from hloc_reduce import (
 from hloc_reduce.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.datasets import Aachen, InLoc, true_poses
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.io import get_colmap_keypoints, open_h5, read_image, replacing, write_csv
+from hloc_reduce.io import (
+    get_colmap_keypoints,
+    get_image_size,
+    open_h5,
+    read_image,
+    replacing,
+    write_csv,
+)
 from hloc_reduce.localize_sfm import RANSAC_THRESH, SfmMap, merged
 from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
 from hloc_reduce.storage import get_descriptors, restore, store
@@ -48,6 +56,9 @@ BASE, MAP_FEATURE = "colmap_sift", "colmap_sift_sv64"
 EVERY = 3
 ALTERED = ("blurred", "mirrored", "black", "noise")
 BLUR = 6.0  # standard deviation in pixels
+RESHAPED = ("cropped", "squeezed")
+CROPPED, SQUEEZED = 0.7, 0.75  # a corner of width and height, and what remains of the height
+OFF = 1.15  # times the focal length
 # a pose is true within both, or the second one within a share of the extent of the cameras
 TRUE_METRES, TRUE_EXTENT, TRUE_DEGREES = 0.25, 0.01, 2.0
 # a pose that is neither true nor farther off than this share of the distance is left out
@@ -143,25 +154,38 @@ def _extract(images: Path, output: Path, names: list[str]) -> Path:
 
 def alter(
     place: Place, output: Path, seed: int
-) -> list[tuple[str, pycolmap.Camera, pycolmap.Rigid3d | None]]:
-    """Write altered photos of a place's queries, and extract their features."""
+) -> list[tuple[str, pycolmap.Camera | None, pycolmap.Rigid3d | None]]:
+    """Write altered photos of a place's queries, and extract their features.
+
+    Returns:
+        Names, intrinsics, of cropped and squeezed ones None, and true poses, if there are any.
+    """
     noise = np.random.default_rng(seed)
     altered = []
     for i, (name, camera, truth) in enumerate(place.queries):
         kind = ALTERED[i % 2] if i > 1 else ALTERED[2 + i]
         photo = read_image(place.images / name)
+        height, width = photo.shape[:2]
+        cut, kept = int((1 - CROPPED) * height), int(CROPPED * width)
         views = {
             "blurred": lambda photo=photo: cv2.GaussianBlur(photo, (0, 0), BLUR),
             "mirrored": lambda photo=photo: photo[:, ::-1],
             "black": lambda photo=photo: np.zeros_like(photo),
             "noise": lambda photo=photo: noise.integers(0, 256, photo.shape, np.uint8),
+            "cropped": lambda photo=photo, cut=cut, kept=kept: photo[cut:, :kept],
+            "squeezed": lambda photo=photo: cv2.resize(
+                photo, None, fx=1, fy=SQUEEZED, interpolation=cv2.INTER_AREA
+            ),
         }
-        path = output / "altered" / kind / Path(name).with_suffix(".png")
-        if not path.exists():
-            with replacing(path) as temporary:
-                temporary.write_bytes(cv2.imencode(".png", views[kind]()[..., ::-1])[1].tobytes())
-        named = path.relative_to(output / "altered").as_posix()
-        altered.append((named, camera, truth if kind == "blurred" else None))
+        for view in (kind, *RESHAPED):
+            path = output / "altered" / view / Path(name).with_suffix(".png")
+            if not path.exists():
+                with replacing(path) as temporary:
+                    encoded = cv2.imencode(".png", views[view]()[..., ::-1])[1]
+                    temporary.write_bytes(encoded.tobytes())
+            named = path.relative_to(output / "altered").as_posix()
+            here = truth if view in ("blurred", *RESHAPED) else None
+            altered.append((named, None if view in RESHAPED else camera, here))
     names = [name for name, _, _ in altered]
     extract_features.main(
         features_confs.confs[BASE],
@@ -234,38 +258,49 @@ def run(
     for source, name, camera, truth, path, kind in tried:
         with open_h5(path) as file:
             query, (keypoints, _) = describe(file, name), get_colmap_keypoints(file, name)
+            size = get_image_size(file, name)
         matches = {}
         for other in place.names:
             rows_of = shown[other]
             found, _ = mutual_nearest(described[other], query, ratio_threshold, rows_of)
             matched = found >= 0
             matches[other] = torch.stack([found[matched], rows_of[matched]], 1).numpy()
-        for given in ("given", "guess"):
-            row = localize(place, keypoints, camera, matches, given, gate)
+        known = ("given", "off", "guess") if kind == "own" else ("given", "guess")
+        for given in known if camera else ("guess",):
+            row = localize(place, keypoints, intrinsics_of(camera, size, given), matches, gate)
             cam_from_world = row.pop("cam_from_world")
             row |= outcome(place, row, cam_from_world, truth)
-            known = {"feature": feature, "map": place.name, "place": source.name}
-            rows.append(known | {"photo": name, "kind": kind, "intrinsics": given} | row)
+            first = {"feature": feature, "map": place.name, "place": source.name}
+            rows.append(first | {"photo": name, "kind": kind, "intrinsics": given} | row)
     return rows
+
+
+def intrinsics_of(
+    camera: pycolmap.Camera | None, size: tuple[int, int], given: str
+) -> tuple[pycolmap.Camera, dict]:
+    """Return intrinsics of a photo of a width and height, and how they are refined."""
+    if given == "guess":
+        width, height = size
+        params = [intrinsics.GUESSED_FOCAL * max(size), width / 2, height / 2, 0]
+        guess = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
+        return guess, intrinsics.REFINEMENTS["guess"]
+    camera = copy.deepcopy(camera)
+    if given == "off":
+        params = camera.params.copy()
+        params[list(camera.focal_length_idxs())] *= OFF
+        camera.params = params
+    return camera, {}
 
 
 def localize(
     place: Place,
     keypoints: np.ndarray,
-    camera: pycolmap.Camera,
+    camera: tuple[pycolmap.Camera, dict],
     matches: dict,
-    given: str,
     gate: Gate,
 ) -> dict:
-    """Localize a query with its intrinsics, or with a guess of them."""
-    refinement = {}
-    if given == "guess":
-        size = max(camera.width, camera.height)
-        params = [intrinsics.GUESSED_FOCAL * size, camera.width / 2, camera.height / 2, 0]
-        camera = pycolmap.Camera(
-            model="SIMPLE_RADIAL", width=camera.width, height=camera.height, params=params
-        )
-        refinement = intrinsics.REFINEMENTS["guess"]
+    """Localize a query with intrinsics that are refined in a way."""
+    camera, refinement = camera
     config = merged({"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}, refinement)
     cam_from_world, info = localization.localize(
         place.reference, keypoints, camera, matches, config, gate
@@ -320,10 +355,8 @@ def table(rows: list[dict], same: list[set[str]]) -> str:
     for feature in dict.fromkeys(row["feature"] for row in rows):
         of_feature = [row for row in rows if row["feature"] == feature]
         away = [r for r in of_feature if is_away(r, same)]
-        wrong = [
-            r for r in of_feature if r["kind"] in ("own", "blurred") and r["outcome"] == "wrong"
-        ]
-        true = [r for r in of_feature if r["outcome"] == "true"]
+        wrong = [r for r in of_feature if is_plain(r) and r["outcome"] == "wrong"]
+        true = [r for r in of_feature if is_true(r)]
         lines.append(
             f"| {feature} | {len(away):,} | {_accepted(away)} | "
             f"{sum(int(r['inliers']) >= OLD_GATE for r in away)} | "
@@ -332,6 +365,39 @@ def table(rows: list[dict], same: list[set[str]]) -> str:
             f"{min(float(r['confidence']) for r in true):.1f} |"
         )
     return "\n".join(lines)
+
+
+def own_table(rows: list[dict]) -> str:
+    """Format what becomes of photos of the place itself."""
+    lines = [
+        "| feature | photo | intrinsics | number | right | near | wrong | true pose refused |",
+        "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    seen = dict.fromkeys((row["feature"], row["kind"], row["intrinsics"]) for row in rows)
+    for feature, kind, given in seen:
+        if kind not in ("own", "blurred", *RESHAPED):
+            continue
+        part = [
+            r for r in rows if (r["feature"], r["kind"], r["intrinsics"]) == (feature, kind, given)
+        ]
+        found = {
+            outcome: _accepted([row for row in part if row["outcome"] == outcome])
+            for outcome in ("true", "near", "wrong")
+        }
+        refused = sum(row["outcome"] == "true" for row in part) - found["true"]
+        counts = " | ".join(f"{count:,}" for count in (len(part), *found.values(), refused))
+        lines.append(f"| {feature} | {kind} | {given} | {counts} |")
+    return "\n".join(lines)
+
+
+def is_plain(row: dict) -> bool:
+    """Tell whether a photo is of the place, in its own shape, and its focal length not wrong."""
+    return row["kind"] in ("own", "blurred") and row["intrinsics"] != "off"
+
+
+def is_true(row: dict) -> bool:
+    """Tell whether a trial is one of `is_plain` that found the true pose."""
+    return is_plain(row) and row["outcome"] == "true"
 
 
 def is_away(row: dict, same: list[set[str]]) -> bool:
@@ -348,7 +414,7 @@ def _accepted(rows: list[dict]) -> int:
 def levels(rows: list[dict], same: list[set[str]]) -> str:
     """Format what each --min_confidence would accept and refuse, all features together."""
     away = np.array([float(r["confidence"]) for r in rows if is_away(r, same)])
-    true = np.array([float(r["confidence"]) for r in rows if r["outcome"] == "true"])
+    true = np.array([float(r["confidence"]) for r in rows if is_true(r)])
     lines = [
         f"| confidence | false accepts of {len(away):,} | true poses refused of {len(true):,} |",
         "| ---: | ---: | ---: |",
@@ -367,7 +433,7 @@ def plot(rows: list[dict], same: list[set[str]], path: Path) -> None:
 
     figure, axes = pyplot.subplots(figsize=(6, 4))
     away = [row for row in rows if is_away(row, same)]
-    true = [row for row in rows if row["outcome"] == "true"]
+    true = [row for row in rows if is_true(row)]
     for key, label in (("confidence", "confidence"), ("inliers", "number of inliers")):
         wrong, right = (np.array([float(row[key]) for row in part]) for part in (away, true))
         at = np.unique(np.concatenate([wrong, right]))
@@ -439,6 +505,8 @@ def _main() -> None:
     same = [set(names) for names in args.same]
     write_csv(rows, output / "trials.csv", COLUMNS)
     print(table(sorted(rows, key=lambda row: args.feature.index(row["feature"])), same))
+    print()
+    print(own_table(rows))
     print()
     print(levels(rows, same))
     plot(rows, same, output / "false_accepts.svg")

@@ -1,4 +1,4 @@
-"""The pose of a query from 2D-3D matches: RANSAC over all of them, and over those of one image."""
+"""The pose of a query from 2D-3D matches: RANSAC, other intrinsics, and whether to trust it."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from . import colmap
+from . import colmap, resection
 from .confidence import (
     MAX_POSITION,
     MAX_ROTATION,
@@ -28,6 +28,10 @@ ROUNDS = 3  # of estimation from the inliers among all matches
 # two poses that differ by more are rivals
 SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the inliers' median depth
+# confidence with other intrinsics, times that with the assumed ones, above which they are right,
+# and above which nobody knows
+RIGHT, DOUBTFUL = 1.1, 1.02
+STRICT = 0.5  # times the limits of uncertainty, where all intrinsics are estimated
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,7 @@ class Pose:
         confidence: `confidence.confidence`.
         agreement: `confidence.agreement`.
         refusal: why it is not to be trusted, None if it is.
+        degrees_of_freedom: of what was estimated, as of `resection`.
     """
 
     cam_from_world: pycolmap.Rigid3d | None
@@ -49,6 +54,7 @@ class Pose:
     confidence: float = -np.inf
     agreement: float = 0.0
     refusal: str | None = None
+    degrees_of_freedom: int = 6
 
     @property
     def num_inliers(self) -> int:
@@ -89,8 +95,10 @@ def estimate(
         others = np.flatnonzero(~best.inliers)
         poses.append(_estimate(points2D, points3D, others, camera, config))
         best = max(poses, key=_quality)
+    rivals = [pose for pose in poses if differ(best, pose, points3D)]
+    best, doubt = _calibrate(best, points2D, points3D, config)
     best = replace(best, agreement=agreement(best.inliers, images))
-    refusal = _refusal(best, poses, points2D, points3D, camera, config, gate)
+    refusal = _refusal(best, rivals, points2D, points3D, camera, config, gate) or doubt
     return replace(best, refusal=refusal)
 
 
@@ -127,7 +135,56 @@ def _estimate(
         return pose
     arguments = points2D, points3D, pose.cam_from_world, pose.camera
     freedom = 6 + _is_focal_length_free(config)
-    return replace(pose, confidence=confidence(*arguments, threshold, freedom))
+    value = confidence(*arguments, threshold, freedom)
+    return replace(pose, confidence=value, degrees_of_freedom=freedom)
+
+
+def _calibrate(
+    pose: Pose, points2D: np.ndarray, points3D: np.ndarray, config: dict
+) -> tuple[Pose, str | None]:
+    """Look whether other intrinsics than those of a pose fit the matches better.
+
+    Where the focal length is not known, a distortion is estimated, too, and if that fits much
+    better aspect ratio and principal point: the photo was cropped or stretched. Where it is known,
+    such a fit contradicts it.
+
+    Returns:
+        The pose that is likelier, and a reason not to trust it, if any.
+    """
+    if pose.num_inliers < resection.ALL:
+        return pose, None
+    threshold = _max_error(config)
+    image, pinhole = resection.undistort(points2D, pose.camera)
+
+    def fit(start: Pose, freedom: int) -> Pose:
+        begin = start.cam_from_world, start.camera, threshold
+        found = resection.resect(image, points3D, *begin, freedom)
+        if found is None:
+            return start
+        value = confidence(image, points3D, *found[:2], threshold, freedom)
+        return Pose(*found, value, degrees_of_freedom=freedom)
+
+    free = _is_focal_length_free(config) and not resection.is_distorted(pose.camera)
+    start = replace(pose, camera=pinhole)
+    radial, aspect = fit(start, resection.RADIAL), fit(start, resection.ASPECT)
+    assumed = max(pose, radial, key=_quality) if free else pose
+    # that many parameters are found from near only
+    other = max((fit(near, resection.ALL) for near in (start, radial, aspect)), key=_quality)
+    if other.confidence <= (DOUBTFUL if free else RIGHT) * assumed.confidence:
+        return assumed, None
+    if free and other.confidence > RIGHT * assumed.confidence:
+        return other, None
+    if not differ(assumed, other, points3D, MAX_POSITION, MAX_ROTATION):
+        return assumed, None
+    if free:
+        return assumed, (
+            "it may be cropped or stretched: another principal point and aspect ratio fit about as "
+            "well, and the pose differs"
+        )
+    return assumed, (
+        "its intrinsics contradict the map: others fit better, with focal lengths of "
+        "{:.0f} and {:.0f} pixels, and the pose differs".format(*other.camera.params[:2])
+    )
 
 
 def _max_error(config: dict) -> float:
@@ -144,7 +201,7 @@ def _is_focal_length_free(config: dict) -> bool:
 
 def _refusal(
     pose: Pose,
-    poses: list[Pose],
+    rivals: list[Pose],
     points2D: np.ndarray,
     points3D: np.ndarray,
     camera: pycolmap.Camera,
@@ -160,18 +217,19 @@ def _refusal(
             f"{number} inliers of {len(points2D)} matches may be chance: confidence "
             f"{max(0, pose.confidence):.1f}, at least {gate.min_confidence:g} is needed"
         )
-    free = _is_focal_length_free(config)
     focal_length = pose.camera.mean_focal_length()
     guessed = bool(config.get("estimation", {}).get("estimate_focal_length"))
     low, high = focal_lengths(camera, guessed)
-    if free and not low <= focal_length <= high:
+    if _is_focal_length_free(config) and not low <= focal_length <= high:
         return (
             f"no plausible focal length: {focal_length:.0f} pixels, {low:.0f} to {high:.0f} were "
             "expected"
         )
     chosen = points2D[pose.inliers], points3D[pose.inliers]
-    position, rotation = uncertainty(*chosen, pose.cam_from_world, pose.camera, free)
-    if position > MAX_POSITION or rotation > MAX_ROTATION:
+    freedom = pose.degrees_of_freedom
+    position, rotation = uncertainty(*chosen, pose.cam_from_world, pose.camera, freedom)
+    limit = STRICT if freedom == resection.ALL else 1
+    if position > limit * MAX_POSITION or rotation > limit * MAX_ROTATION:
         return (
             f"the inliers do not fix the pose: its position is uncertain by {100 * position:.0f} % "
             f"of their distance, its rotation by {rotation:.1f} degrees"
@@ -182,22 +240,32 @@ def _refusal(
             "the matches of no image agree with the pose: agreement "
             f"{pose.agreement:.2f}, at least {least:g} is needed"
         )
-    for rival in poses:
+    for rival in rivals:
         if rival.num_inliers >= RIVAL * number and differ(pose, rival, points3D):
             return f"ambiguous: another pose has {rival.num_inliers} inliers, this one {number}"
     return None
 
 
-def differ(pose: Pose, other: Pose, points3D: np.ndarray) -> bool:
-    """Tell whether two poses are of different places.
+def differ(
+    pose: Pose,
+    other: Pose,
+    points3D: np.ndarray,
+    position: float = SAME_POSITION,
+    rotation: float = SAME_ROTATION,
+) -> bool:
+    """Tell whether two poses differ by more than a position or a rotation.
 
     Args:
         pose: one of them.
         other: the other one.
         points3D: (M, 3) the points of the first one's matches.
+        position: in units of the median depth of the first one's inliers.
+        rotation: in degrees.
     """
+    if pose.cam_from_world is None or other.cam_from_world is None:
+        return False
     relative = pose.cam_from_world * other.cam_from_world.inverse()
     inliers = points3D[pose.inliers]
     depths = inliers @ pose.cam_from_world.rotation.matrix().T + pose.cam_from_world.translation
     moved = np.linalg.norm(relative.translation) / np.median(depths[:, 2])
-    return np.degrees(relative.rotation.angle()) > SAME_ROTATION or moved > SAME_POSITION
+    return np.degrees(relative.rotation.angle()) > rotation or moved > position

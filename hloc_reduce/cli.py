@@ -54,6 +54,13 @@ def check_positive(args: argparse.Namespace, *names: str) -> None:
             raise InputError(f"--{name} {getattr(args, name)}: at least 1.")
 
 
+def no_folder(path: Path) -> InputError:
+    """Return the error that a folder is not there."""
+    return InputError(
+        f"{path} is a file, not a folder." if path.exists() else f"There is no folder {path}."
+    )
+
+
 def check_folder(path: Path) -> None:
     """Raise an InputError if a folder for results cannot be made, as a file has its name."""
     for part in (path, *path.parents):

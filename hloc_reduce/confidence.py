@@ -25,7 +25,7 @@ MIN_MATCHES = 6  # of an image whose matches are asked whether they agree with a
 # least agreement without a ratio test, with one, and with one below FEW dimensions; the second
 # number of each is for confidences in DOUBTFUL, which copies of repeated structure reach: of fewer
 # matches the share is known less well, and with more confidence it was lower in noisy scans only
-AGREEMENT, AGREEMENT_RATIO, AGREEMENT_FEW, FEW = (0.17, 0.17), (0.7, 0.86), (0.55, 0.72), 32
+AGREEMENT, AGREEMENT_RATIO, AGREEMENT_FEW, FEW = (0.17, 0.17), (0.76, 0.86), (0.55, 0.72), 32
 DOUBTFUL = (50.0, 300.0)
 RIVAL = 0.8  # a pose is ambiguous if another has this share of its inliers
 
@@ -57,7 +57,7 @@ def confidence(
         cam_from_world: the pose.
         camera: intrinsics.
         max_error: RANSAC's inlier threshold in pixels.
-        degrees_of_freedom: 6, or 7 with a focal length that was estimated.
+        degrees_of_freedom: 6, or more where intrinsics were estimated, as of `resection`.
 
     Returns:
         Minus the decimal logarithm of the number of false alarms. Above 0 the pose is not expected
@@ -164,7 +164,7 @@ def uncertainty(
     points3D: np.ndarray,
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
-    free_focal_length: bool,
+    degrees_of_freedom: int = 6,
 ) -> tuple[float, float]:
     """Estimate how precisely inliers fix a pose, to first order from their errors.
 
@@ -173,7 +173,7 @@ def uncertainty(
         points3D: (M, 3) their world points.
         cam_from_world: the pose.
         camera: intrinsics.
-        free_focal_length: the focal length was estimated with the pose.
+        degrees_of_freedom: 6, or more where intrinsics were estimated, as of `resection`.
 
     Returns:
         The standard deviations of the position, in units of the inliers' median depth, and of the
@@ -181,13 +181,15 @@ def uncertainty(
     """
     local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
     x, y, z = (local / np.median(local[:, 2])).T
-    u, v, zero = x / z, y / z, np.zeros_like(z)
-    # derivatives by a rotation about x, y, z, a translation along them, and the focal length
+    u, v, zero, one = x / z, y / z, np.zeros_like(z), np.ones_like(z)
+    r2 = u * u + v * v
+    # derivatives by a rotation about x, y, z, a translation along them, the focal length, the
+    # distortion, the aspect ratio, and the principal point
     rows = [
-        np.stack([-u * v, 1 + u * u, -v, 1 / z, zero, -u / z, u], axis=1),
-        np.stack([-1 - v * v, u * v, u, zero, 1 / z, -v / z, v], axis=1),
+        [-u * v, 1 + u * u, -v, 1 / z, zero, -u / z, u, u * r2, zero, one, zero],
+        [-1 - v * v, u * v, u, zero, 1 / z, -v / z, v, v * r2, v, zero, one],
     ]
-    jacobian = camera.mean_focal_length() * np.concatenate(rows)[:, : 7 if free_focal_length else 6]
+    jacobian = camera.mean_focal_length() * np.concatenate(rows, axis=1)[:degrees_of_freedom].T
     equations, unknowns = jacobian.shape
     if equations <= unknowns:
         return np.inf, np.inf

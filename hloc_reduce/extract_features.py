@@ -15,7 +15,7 @@ import torch
 from confs import features as features_confs
 
 from . import cli, detection, extractors, logger, parallel, processes, projections
-from .cli import InputError
+from .cli import InputError, no_folder
 from .descriptors import DESCRIPTORS, check_weights
 from .executors import SERIAL, Executor
 from .extractors.dog import DoG
@@ -246,7 +246,7 @@ def list_images(
     """
     within = Path(image_dir, folder)
     if not within.is_dir():
-        raise InputError(f"There is no folder {within}.")
+        raise no_folder(within)
     if image_list is None:
         names = sorted(
             path.relative_to(image_dir).as_posix()

@@ -33,7 +33,7 @@ from .storage import dimension
 
 CHUNK = 8  # queries
 SHOWN = 3  # queries that a message gives the reason of
-RECORDS = 7  # the version of what a record holds, and of the gate
+RECORDS = 8  # the version of what a record holds, and of the gate
 
 
 class Reference(Protocol):
@@ -233,6 +233,8 @@ def main(
     ]
     if reasons:
         logger.warning("Not localized: %s.", cli.some(reasons, SHOWN))
+    if len(reasons) > SHOWN:
+        logger.warning("The reasons of all %d are in %s.", len(reasons), log.path)
     localized = sum(record["localized"] for record in records.values())
     logger.info("Localized %d of %d queries: %s", localized, len(records), results)
     return records

@@ -30,7 +30,7 @@ from . import (
     stamps,
     triangulation,
 )
-from .cli import InputError, choose
+from .cli import InputError, choose, no_folder
 from .detection import KEYPOINTS
 from .extract_features import keep_present, keep_readable, list_images
 from .extractors.vlad import read_vocabulary
@@ -90,10 +90,10 @@ class Map:
                 self._conf["storage"] = choose("storage", conf["storage"], STORAGES)
             _with_projection(self._conf, _file_name)
         except (OSError, ValueError, KeyError, TypeError):
+            if not folder.is_dir():
+                raise no_folder(folder) from None
             raise InputError(
-                f"There is no folder {folder}."
-                if not folder.is_dir()
-                else f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}."
+                f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}."
             ) from None
         self._check()
 
@@ -259,6 +259,8 @@ def main(
         }
         names = keep_present(image_dir, names, accept_partial)
     names = list_images(image_dir, names)
+    if model is None and len(names) == 1:
+        raise InputError(f"A map of photos alone needs two or more: {image_dir} has one.")
     made_by = extract_features.provenance(conf)
     if overwrite or not (map_dir / "conf.json").exists():
         extractors.load(conf["model"])  # is wrong before anything is deleted, if it is

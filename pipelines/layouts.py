@@ -3,7 +3,7 @@
 from pathlib import Path
 from types import ModuleType
 
-from hloc_reduce.cli import InputError
+from hloc_reduce.cli import InputError, no_folder
 
 from . import aachen, inloc
 
@@ -17,7 +17,7 @@ def pipeline_of(dataset: Path) -> ModuleType:
         InputError: when it has no layout that is known.
     """
     if not dataset.is_dir():
-        raise InputError(f"There is no folder {dataset}.")
+        raise no_folder(dataset)
     for folder, pipeline in PIPELINES.items():
         if (dataset / folder).is_dir():
             return pipeline

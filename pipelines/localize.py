@@ -289,7 +289,7 @@ def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> P
         queries: their list, if there is one.
     """
     name = (queries or query_images.resolve()).stem
-    name = re.sub(NOT_IN_NAMES, "", name).strip("._-")
+    name = re.sub(NOT_IN_NAMES, "_", name).strip("._-")
     folder = outputs / f"queries-{name or 'all'}"
     before = stamps.read(folder / "conf.json")
     own = {"query_images": str(query_images.resolve())}

@@ -881,11 +881,11 @@ def test_names_with_spaces(by_model, plane, tmp_path, monkeypatch):
     given = ("--map_images", images, "--query_images", new, "--outputs", outputs)
     given += ("--feature", "sift_sv16")
     run(monkeypatch, *given, *(("--map", tmp_path / "my model") if by_model else ()))
-    summary, rows = outcome(outputs / "queries-newones")
+    summary, rows = outcome(outputs / "queries-new_ones")
     row = rows["I am 4.png"]
     assert row["status"] == "localized" and row["retrieved"].startswith("a b/my ")
     assert maps.Map(outputs / "map").names() == [f"a b/my {i}.png" for i in range(4)]
-    poses = parsers.parse_poses(outputs / "queries-newones" / summary["poses"])
+    poses = parsers.parse_poses(outputs / "queries-new_ones" / summary["poses"])
     assert list(poses) == ["I am 4.png"]
     pose, info = Localizer(outputs / "map").localize(new / "I am 4.png")
     assert max(pose_error(pose, poses["I am 4.png"])) < 1e-9

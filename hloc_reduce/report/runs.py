@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from .. import cli, colmap, localization, localize_inloc, logger, scans
-from ..cli import InputError
+from ..cli import InputError, no_folder
 from ..evaluation import published
 from ..evaluation.poses import FAILED
 from ..io import open_h5
@@ -65,7 +65,7 @@ class Run:
             self.seconds = float(sum(self.summary["seconds"].values()))
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             if not self.folder.is_dir():
-                raise InputError(f"There is no folder {self.folder}.") from None
+                raise no_folder(self.folder) from None
             why = "a broken file"
             if isinstance(error, FileNotFoundError):
                 why = f"no {Path(error.filename).name}"

@@ -1,0 +1,129 @@
+"""Camera resectioning: a pose together with the intrinsics that fit its matches.
+
+The parameters have an order, and the first ones are free: the pose (6), the focal length (7), a
+radial distortion (8), the aspect ratio (9), the principal point (11). So the number of degrees of
+freedom says which they are.
+"""
+
+import numpy as np
+import pycolmap
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from .colmap import cam_from_img
+from .confidence import photo_scale, reprojection_errors
+
+RADIAL, ASPECT, ALL = 8, 9, 11  # degrees of freedom
+# of the logarithms of the changes of focal length and aspect ratio, the distortion, and the shift
+# of the principal point in focal lengths
+BOUNDS = np.array([np.inf] * 6 + [2.0, 1.0, 1.0, 1.0, 1.0])
+ROUNDS = 10  # of refinement, from the inliers of the one before
+NOISE = 2.0  # pixels, scale of the Cauchy loss
+EVALUATIONS = 30  # of the errors, a round
+FAR = 1e6  # pixels
+
+
+def is_distorted(camera: pycolmap.Camera) -> bool:
+    """Tell whether intrinsics have a distortion."""
+    return bool(np.any(camera.params[list(camera.extra_params_idxs())]))
+
+
+def undistort(points2D: np.ndarray, camera: pycolmap.Camera) -> tuple[np.ndarray, pycolmap.Camera]:
+    """Undistort image points.
+
+    Args:
+        points2D: (M, 2) image points, COLMAP's pixels.
+        camera: intrinsics.
+
+    Returns:
+        The points (M, 2) as a camera without distortion would have them, at most FAR pixels away,
+        and this camera, PINHOLE.
+    """
+    (fx, _, cx), (_, fy, cy), _ = camera.calibration_matrix()
+    pinhole = pycolmap.Camera(
+        model="PINHOLE", width=camera.width, height=camera.height, params=[fx, fy, cx, cy]
+    )
+    return np.clip(cam_from_img(camera, points2D) * [fx, fy] + [cx, cy], -FAR, FAR), pinhole
+
+
+def resect(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    cam_from_world: pycolmap.Rigid3d,
+    camera: pycolmap.Camera,
+    max_error: float,
+    degrees_of_freedom: int,
+) -> tuple[pycolmap.Rigid3d, pycolmap.Camera, np.ndarray] | None:
+    """Refine a pose and intrinsics to the matches that agree, as long as more and more do.
+
+    Args:
+        points2D: (M, 2) image points of all matches, COLMAP's pixels.
+        points3D: (M, 3) their world points.
+        cam_from_world: the pose to begin with.
+        camera: the intrinsics to begin with, PINHOLE or of a `resect` before.
+        max_error: inlier threshold in pixels.
+        degrees_of_freedom: 7 to 11.
+
+    Returns:
+        The pose, the intrinsics as an OPENCV camera, and the inliers (M,) bool, of which there are
+        as many as degrees of freedom; or None.
+    """
+    errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
+    inliers, found = errors <= max_error, None
+    rotation, translation = cam_from_world.rotation.matrix(), cam_from_world.translation
+    depth = np.median((points3D @ rotation.T + translation)[inliers, 2]) if inliers.any() else 1.0
+    fx, fy, cx, cy, *coefficients = camera.params
+    before = coefficients[0] if coefficients else 0.0
+
+    def pose(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        turned = Rotation.from_rotvec(free[:3]).as_matrix() @ rotation
+        return turned, translation + depth * free[3:6]
+
+    def intrinsics(free: np.ndarray) -> list[float]:
+        """Return the parameters of an OPENCV camera with one coefficient of distortion."""
+        change, distortion, aspect, x, y = np.pad(free[6:], (0, ALL - len(free)))
+        change = np.exp(change)
+        return [
+            fx * change,
+            fy * change * np.exp(aspect),
+            cx + fx * x,
+            cy + fx * y,
+            before + distortion,
+        ]
+
+    def residuals(free: np.ndarray, image: np.ndarray, world: np.ndarray) -> np.ndarray:
+        turned, moved = pose(free)
+        local = world @ turned.T + moved
+        ray = local[:, :2] / np.maximum(local[:, 2:], 1e-6 * depth)
+        *matrix, distortion = intrinsics(free)
+        ray *= 1 + distortion * (ray**2).sum(axis=1, keepdims=True)
+        return (ray * matrix[:2] + matrix[2:] - image).ravel()
+
+    free, bounds = np.zeros(degrees_of_freedom), BOUNDS[:degrees_of_freedom]
+    for _ in range(ROUNDS):
+        if inliers.sum() < degrees_of_freedom:
+            break
+        free = least_squares(
+            residuals,
+            free,
+            bounds=(-bounds, bounds),
+            x_scale="jac",
+            loss="cauchy",
+            f_scale=NOISE * photo_scale(camera),
+            max_nfev=EVALUATIONS,
+            args=(points2D[inliers], points3D[inliers]),
+        ).x
+        turned, moved = pose(free)
+        refined = pycolmap.Rigid3d(pycolmap.Rotation3d(turned), moved)
+        lens = pycolmap.Camera(
+            model="OPENCV",
+            width=camera.width,
+            height=camera.height,
+            params=[*intrinsics(free), 0, 0, 0],
+        )
+        errors, _ = reprojection_errors(points2D, points3D, refined, lens)
+        if found is not None and (errors <= max_error).sum() <= found[2].sum():
+            break
+        inliers = errors <= max_error
+        found = refined, lens, inliers
+    return found

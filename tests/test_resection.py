@@ -1,0 +1,147 @@
+"""Photos whose intrinsics are not what they seem: distorted, cropped, stretched, wrongly listed."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hloc_reduce import absolute_pose
+from hloc_reduce.absolute_pose import Pose
+from hloc_reduce.confidence import DEFAULT_GATE, reprojection_errors, uncertainty
+from hloc_reduce.intrinsics import REFINEMENTS
+from hloc_reduce.resection import ALL, RADIAL, resect, undistort
+
+POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.05, 0.1, 0.02, 0.99])), [0.3, 0.1, 8.0])
+GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
+
+
+def camera_of(width: int, height: int, params: list[float], model: str) -> pycolmap.Camera:
+    return pycolmap.Camera(model=model, width=width, height=height, params=params)
+
+
+def guessed(width: int, height: int) -> pycolmap.Camera:
+    params = [1.2 * max(width, height), width / 2, height / 2, 0]
+    return camera_of(width, height, params, "SIMPLE_RADIAL")
+
+
+# a camera of 1600 x 1200 pixels, and what becomes of its photos
+WHOLE = camera_of(1600, 1200, [1400, 800, 600, 0], "SIMPLE_RADIAL")
+PHOTOS = {
+    "whole": WHOLE,
+    "distorted": camera_of(1600, 1200, [1400, 800, 600, -0.2], "SIMPLE_RADIAL"),
+    "left two thirds": camera_of(1066, 1200, [1400, 1400, 800, 600], "PINHOLE"),
+    "corner": camera_of(1100, 800, [1400, 1400, 300, 200], "PINHOLE"),
+    "squeezed": camera_of(1600, 720, [1400, 840, 800, 360], "PINHOLE"),
+}
+
+
+def matches(
+    camera: pycolmap.Camera, number: int, deep: bool = True, noise: float = 1.0, wrong: int = 20
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return image points inside a photo and their world points, the last of them wrong."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform([-5, -4, -3], [5, 4, 3 if deep else -2.9], (20 * number, 3))
+    _, projected = reprojection_errors(np.zeros((len(points), 2)), points, POSE, camera)
+    inside = ((projected > 0) & (projected < [camera.width, camera.height])).all(axis=1)
+    chosen = np.flatnonzero(inside)[: number + wrong]
+    image = projected[chosen] + noise * generator.standard_normal((number + wrong, 2))
+    image[number:] = generator.uniform(0, [camera.width, camera.height], (wrong, 2))
+    return image, points[chosen]
+
+
+def solve(points2D: np.ndarray, points3D: np.ndarray, camera, source: str) -> Pose:
+    images = [np.arange(len(points2D))]
+    return absolute_pose.estimate(points2D, points3D, images, camera, REFINEMENTS[source], GATE)
+
+
+def error(pose: Pose) -> tuple[float, float]:
+    """Return how far off a pose is, in units of the distance of 8, and in degrees."""
+    moved = pose.cam_from_world * POSE.inverse()
+    return np.linalg.norm(moved.translation) / 8, np.degrees(moved.rotation.angle())
+
+
+@pytest.mark.parametrize("source", ["guess", "EXIF"])
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_photos_are_localized_though_cropped_or_stretched(photo, source):
+    """Off-centre crops were called localized, 5 to 20 degrees off."""
+    camera = PHOTOS[photo]
+    assumed = guessed(camera.width, camera.height)
+    found = solve(*matches(camera, 300), assumed, source)
+    assert found.refusal is None
+    position, rotation = error(found)
+    assert position < 0.02 and rotation < 0.5
+    freedom = {"whole": (7, RADIAL), "distorted": (RADIAL,)}.get(photo, (ALL,))
+    assert found.degrees_of_freedom in freedom
+    if found.degrees_of_freedom == ALL:
+        expected = camera.calibration_matrix()
+        assert np.abs(found.camera.calibration_matrix() - expected).max() < 0.05 * expected[0, 0]
+
+
+@pytest.mark.parametrize("photo", ["left two thirds", "corner", "squeezed"])
+@pytest.mark.parametrize("number", [15, 40, 300])
+def test_few_matches_of_a_cropped_photo_are_refused_or_right(photo, number):
+    camera = PHOTOS[photo]
+    found = solve(*matches(camera, number, wrong=5), guessed(camera.width, camera.height), "guess")
+    if found.refusal is None:
+        position, rotation = error(found)
+        assert position < 0.05 and rotation < 2
+
+
+def test_the_principal_point_of_a_flat_scene_is_not_made_up():
+    """A plane does not tell it, so it stays in the middle."""
+    found = solve(*matches(WHOLE, 300, deep=False), guessed(1600, 1200), "guess")
+    assert found.degrees_of_freedom < ALL
+    assert found.camera.principal_point_x == 800 and found.camera.principal_point_y == 600
+
+
+WRONG = {
+    "focal length": [1800, 800, 600, 0],
+    "distortion": [1400, 800, 600, 0.4],
+    "principal point": [1400, 1000, 500, 0],
+    "both": [1150, 800, 600, 0.2],
+}
+
+
+@pytest.mark.parametrize("params", WRONG.values(), ids=WRONG)
+def test_intrinsics_that_contradict_the_map_are_refused(params):
+    """Lists with a wrong focal length put cameras 15 % nearer or farther, called localized."""
+    found = solve(*matches(WHOLE, 300), camera_of(1600, 1200, params, "SIMPLE_RADIAL"), "list")
+    assert found.refusal is not None
+    assert solve(*matches(WHOLE, 300), WHOLE, "list").refusal is None
+
+
+def test_given_intrinsics_stay_as_they_are():
+    """Small errors, and distortions, of listed intrinsics are no contradiction."""
+    lens = [1400, 1400, 800, 600, -0.2, 0.03, 0.001, 0]
+    camera = camera_of(1600, 1200, lens, "OPENCV")
+    for factor in (1, 1.01):
+        listed = camera_of(1600, 1200, [factor * lens[0], *lens[1:]], "OPENCV")
+        found = solve(*matches(camera, 300), listed, "list")
+        assert found.refusal is None and found.degrees_of_freedom == 6
+        assert found.camera.params.tolist() == listed.params.tolist()
+
+
+def test_a_pose_of_all_parameters_is_as_precise_as_measured():
+    camera = PHOTOS["corner"]
+    start, centres = guessed(1100, 800), []
+    for seed in range(30):
+        points2D, points3D = matches(camera, 200, noise=0, wrong=0)
+        points2D += 2 * np.random.default_rng(seed).standard_normal(points2D.shape)
+        # the right one first, so that all are of the same inliers
+        pose, lens, inliers = resect(points2D, points3D, POSE, camera, 12.0, ALL)
+        centres.append(pose.inverse().translation)
+        assert inliers.all() and lens.width == start.width
+    measured = np.sqrt(np.var(centres, axis=0).sum()) / 8
+    expected, _ = uncertainty(points2D, points3D, pose, lens, ALL)
+    assert 0.6 < expected / measured < 1.6
+    assert resect(points2D[:9], points3D[:9], POSE, camera, 12.0, ALL) is None
+
+
+def test_undistorted_points_are_those_of_a_pinhole():
+    camera = PHOTOS["distorted"]
+    points2D, points3D = matches(camera, 50, noise=0, wrong=0)
+    image, pinhole = undistort(points2D, camera)
+    errors, _ = reprojection_errors(image, points3D, POSE, pinhole)
+    assert errors.max() < 1e-3
+    beyond = camera_of(1600, 1200, [300, 800, 600, -5.0], "SIMPLE_RADIAL")  # undoes only the middle
+    image, _ = undistort(points2D, beyond)
+    assert np.isfinite(image).all() and np.abs(image).max() == 1e6
