@@ -28,9 +28,9 @@ ROUNDS = 3  # of estimation from the inliers among all matches
 # two poses that differ by more are rivals
 SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the inliers' median depth
-# confidence with other intrinsics, times that with the assumed ones, above which they are right,
-# and above which nobody knows
-RIGHT, DOUBTFUL = 1.1, 1.02
+# confidence with other intrinsics, by that with the assumed ones: above these a distortion is right,
+# all others may be, and all others are
+DISTORTED, DOUBTFUL, RIGHT = 1.02, 1.05, 1.1
 STRICT = 0.5  # times the limits of uncertainty, where all intrinsics are estimated
 
 
@@ -156,20 +156,21 @@ def _calibrate(
     threshold = _max_error(config)
     image, pinhole = resection.undistort(points2D, pose.camera)
 
-    def fit(start: Pose, freedom: int) -> Pose:
-        begin = start.cam_from_world, start.camera, threshold
-        found = resection.resect(image, points3D, *begin, freedom)
+    start = image, points3D, pose.cam_from_world, pinhole, threshold
+
+    def judged(found: tuple | None, freedom: int) -> Pose:
         if found is None:
-            return start
+            return pose
         value = confidence(image, points3D, *found[:2], threshold, freedom)
         return Pose(*found, value, degrees_of_freedom=freedom)
 
     free = _is_focal_length_free(config) and not resection.is_distorted(pose.camera)
-    start = replace(pose, camera=pinhole)
-    radial, aspect = fit(start, resection.RADIAL), fit(start, resection.ASPECT)
-    assumed = max(pose, radial, key=_quality) if free else pose
-    # that many parameters are found from near only
-    other = max((fit(near, resection.ALL) for near in (start, radial, aspect)), key=_quality)
+    assumed = pose
+    if free:
+        radial = judged(resection.resect(*start, resection.RADIAL), resection.RADIAL)
+        if radial.confidence > DISTORTED * pose.confidence:
+            assumed = radial
+    other = judged(resection.resect_anew(*start), resection.ALL)
     if other.confidence <= (DOUBTFUL if free else RIGHT) * assumed.confidence:
         return assumed, None
     if free and other.confidence > RIGHT * assumed.confidence:

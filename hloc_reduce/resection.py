@@ -21,6 +21,10 @@ ROUNDS = 10  # of refinement, from the inliers of the one before
 NOISE = 2.0  # pixels, scale of the Cauchy loss
 EVALUATIONS = 30  # of the errors, a round
 FAR = 1e6  # pixels
+# where all parameters are searched for: in a sample of the matches with errors of a few times the
+# threshold, with the principal point in the middle of the photo and near its corners
+SAMPLE, NEAR = 400, 5
+CORNER = 0.4  # of width and height from the middle
 
 
 def is_distorted(camera: pycolmap.Camera) -> bool:
@@ -53,6 +57,7 @@ def resect(
     camera: pycolmap.Camera,
     max_error: float,
     degrees_of_freedom: int,
+    chosen: np.ndarray | None = None,
 ) -> tuple[pycolmap.Rigid3d, pycolmap.Camera, np.ndarray] | None:
     """Refine a pose and intrinsics to the matches that agree, as long as more and more do.
 
@@ -63,13 +68,15 @@ def resect(
         camera: the intrinsics to begin with, PINHOLE or of a `resect` before.
         max_error: inlier threshold in pixels.
         degrees_of_freedom: 7 to 11.
+        chosen: (M,) bool, the matches to begin with; default: those that agree.
 
     Returns:
         The pose, the intrinsics as an OPENCV camera, and the inliers (M,) bool, of which there are
         as many as degrees of freedom; or None.
     """
-    errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
-    inliers, found = errors <= max_error, None
+    if chosen is None:
+        chosen = reprojection_errors(points2D, points3D, cam_from_world, camera)[0] <= max_error
+    inliers, found = chosen, None
     rotation, translation = cam_from_world.rotation.matrix(), cam_from_world.translation
     depth = np.median((points3D @ rotation.T + translation)[inliers, 2]) if inliers.any() else 1.0
     fx, fy, cx, cy, *coefficients = camera.params
@@ -127,3 +134,60 @@ def resect(
         inliers = errors <= max_error
         found = refined, lens, inliers
     return found
+
+
+def resect_anew(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    cam_from_world: pycolmap.Rigid3d,
+    camera: pycolmap.Camera,
+    max_error: float,
+) -> tuple[pycolmap.Rigid3d, pycolmap.Camera, np.ndarray] | None:
+    """Find all intrinsics, and the pose, though those to begin with are far off.
+
+    That many parameters have local optima. So the principal point is looked for in the middle and
+    near the corners, where the camera is turned there.
+
+    Args:
+        points2D: (M, 2) image points of all matches, COLMAP's pixels.
+        points3D: (M, 3) their world points.
+        cam_from_world: the pose to begin with.
+        camera: PINHOLE intrinsics to begin with.
+        max_error: inlier threshold in pixels.
+
+    Returns:
+        As `resect`.
+    """
+    errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
+    near = np.flatnonzero(errors <= NEAR * max_error)
+    near = near[:: -(-len(near) // SAMPLE) or 1]
+    matches, all_of_them = (points2D[near], points3D[near]), np.ones(len(near), bool)
+    starts = [(cam_from_world, camera)]
+    starts += [_turned(*starts[0], x, y) for x in (-CORNER, CORNER) for y in (-CORNER, CORNER)]
+    if stretched := resect(*matches, *starts[0], max_error, ASPECT):
+        starts.append(stretched[:2])
+    found = [resect(*matches, *start, max_error, ALL, all_of_them) for start in starts]
+    found = [pose_and_camera[:2] for pose_and_camera in found if pose_and_camera is not None]
+
+    def loss(start: tuple[pycolmap.Rigid3d, pycolmap.Camera]) -> float:
+        errors, _ = reprojection_errors(*matches, *start)
+        return float(np.log1p((errors / (NOISE * photo_scale(camera))) ** 2).sum())
+
+    return resect(points2D, points3D, *min(found, key=loss), max_error, ALL) if found else None
+
+
+def _turned(
+    cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera, x: float, y: float
+) -> tuple[pycolmap.Rigid3d, pycolmap.Camera]:
+    """Move the principal point by shares of width and height, and turn the camera there."""
+    fx, fy, cx, cy = camera.params
+    x, y = x * camera.width, y * camera.height
+    turn, _ = Rotation.align_vectors([[0, 0, 1]], [[x / fx, y / fy, 1]])
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(turn.as_matrix()), np.zeros(3))
+    moved = pycolmap.Camera(
+        model="PINHOLE",
+        width=camera.width,
+        height=camera.height,
+        params=[fx, fy, cx + x, cy + y],
+    )
+    return turn * cam_from_world, moved

@@ -452,6 +452,13 @@ def test_wrong_input(place, tmp_path, monkeypatch, caplog):
     assert "is a COLMAP model: give its photos" in message
     message = refused(monkeypatch, caplog, "--map_images", tmp_path / "nowhere", *build[4:])
     assert "no folder" in message and "nowhere" in message
+    message = refused(monkeypatch, caplog, "--map_images", images / "db/1.png", *build[4:])
+    assert message.endswith("1.png is a file, not a folder.")
+    one = tmp_path / "one"
+    one.mkdir()
+    shutil.copy(images / "db/1.png", one)
+    message = refused(monkeypatch, caplog, "--map_images", one, *build[4:])
+    assert "needs two or more" in message and not (outputs / "map").exists()
     assert "Unknown matcher" in refused(monkeypatch, caplog, *build, "--matcher", "NN")
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -897,8 +904,8 @@ def test_names_with_spaces(by_model, plane, tmp_path, monkeypatch):
         run(
             monkeypatch, *given[2:], "--map", outputs / "map", "--queries", tmp_path / "my list.txt"
         )
-        summary, rows = outcome(outputs / "queries-mylist")
-        poses = parsers.parse_poses(outputs / "queries-mylist" / summary["poses"])
+        summary, rows = outcome(outputs / "queries-my_list")
+        poses = parsers.parse_poses(outputs / "queries-my_list" / summary["poses"])
         assert pose_error(poses["I am 4.png"], true)[0] < 0.02
 
 
