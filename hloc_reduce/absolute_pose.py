@@ -28,8 +28,8 @@ ROUNDS = 3  # of estimation from the inliers among all matches
 # two poses that differ by more are rivals
 SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the inliers' median depth
-# confidence with other intrinsics, by that with the assumed ones: above these a distortion is right,
-# all others may be, and all others are
+# confidence with other intrinsics, by that with the assumed ones: above these a distortion is
+# right, all others may be, and all others are
 DISTORTED, DOUBTFUL, RIGHT = 1.02, 1.05, 1.1
 STRICT = 0.5  # times the limits of uncertainty, where all intrinsics are estimated
 

@@ -16,7 +16,7 @@ from . import absolute_pose, cli, logger, parallel
 from .cli import InputError
 from .confidence import DEFAULT_GATE, RIVAL, Gate
 from .executors import SERIAL, Executor
-from .group_writer import failure_of
+from .group_writer import failure_of, failures
 from .io import (
     find_pair,
     get_colmap_keypoints,
@@ -228,8 +228,11 @@ def main(
     write_poses(submitted, results, name_parts)
     if failed := [name for name in poses if name not in submitted]:
         logger.warning("%d queries have no pose: %s.", len(failed), cli.some(failed))
+    unreadable = failures(features)  # the extraction has named them
     reasons = [
-        f"{name} ({record['reason']})" for name, record in records.items() if record["reason"]
+        f"{name} ({record['reason']})"
+        for name, record in records.items()
+        if record["reason"] and name not in unreadable
     ]
     if reasons:
         logger.warning("Not localized: %s.", cli.some(reasons, SHOWN))

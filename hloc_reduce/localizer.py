@@ -78,8 +78,8 @@ class Localizer:
 
         Args:
             image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-            camera: its intrinsics; default: from the EXIF data of the file, or guessed, and the
-                focal length is estimated with the pose.
+            camera: its intrinsics; default: from the EXIF data of the file, or guessed, and
+                estimated with the pose.
 
         Returns:
             The pose, camera from world, in the units of the map, or None if the photo cannot be

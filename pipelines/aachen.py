@@ -157,7 +157,10 @@ def _main() -> None:
         "(default --dataset: datasets/demo_town)",
     )
     parser.add_argument(
-        "--num_covis", type=int, default=NUMBERS["num_covis"], help="pairs of each map image"
+        "--num_covis",
+        type=int,
+        default=NUMBERS["num_covis"],
+        help="other images that each map image is matched with",
     )
     common.add_dataset_options(
         parser,

@@ -1,8 +1,8 @@
 """Localize photos in a map of one's own.
 
 Builds the map from photos and a COLMAP model of them, or from photos alone, once; later runs
-localize other photos in it. Without --query_images only the map is built. The feature is
-colmap_sift_sv64 and the matcher NN-ratio, if no other is given or the map is not of another.
+localize other photos in it. Without --query_images only the map is built. A new map is of the
+feature colmap_sift_sv64 and the matcher NN-ratio if no others are given.
 """
 
 import argparse
@@ -188,8 +188,7 @@ def main(
         for source, said in (("EXIF", "from EXIF data"), ("guess", "guessed")):
             if some := [name for name in names if sources.get(name) == source]:
                 logger.info(
-                    "Intrinsics of %d queries are %s; the focal length is refined with the pose: "
-                    "%s",
+                    "Intrinsics of %d queries are %s and refined with the pose: %s",
                     *(len(some), said, cli.some(some)),
                 )
         loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
@@ -327,9 +326,11 @@ def _main() -> None:
         "--outputs",
         type=Path,
         help="folder for the map, in map, and for the results, in queries-<name of --queries or "
-        "--query_images>; a digest of the path follows if others of that name have that folder",
+        "--query_images>, and some letters where the queries of another folder have that name",
     )
-    parser.add_argument("--num_covis", type=int, default=20, help="pairs of each map image")
+    parser.add_argument(
+        "--num_covis", type=int, default=20, help="other images that each map image is matched with"
+    )
     reconstruction.add_camera_mode(parser)
     common.add_feature_options(parser)
     common.add_localization_options(parser, "none", 50)
