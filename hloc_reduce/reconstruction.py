@@ -35,6 +35,7 @@ FEW = 100  # images of which a second attempt takes little time
 VERY_FEW = 30  # images of which some more take little; what comes of them is a matter of luck
 SEEDS = (1, 2, 3)
 MORE = 1.5  # times as many images tell that one camera took all
+MAX_DISTORTION = 1.0  # as COLMAP has it for images that it registers
 WELL_KNOWN = 3  # images of a camera from which on EXIF data do not bound its focal length
 
 
@@ -62,7 +63,8 @@ def main(
     """Reconstruct poses, intrinsics and points by COLMAP's incremental mapper, and check the model.
 
     Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary. Images
-    whose focal length no lens has, or is far from that of EXIF data, are dropped from the model.
+    whose focal length or distortion no lens has, or whose focal length is far from that of EXIF
+    data, are dropped from the model.
     Where images are missing, and of more than 100 images more than a fifth, further attempts
     follow, and the model with the most images is kept: with lower thresholds, and with up to 30
     images with other pairs to begin with. With `camera_mode` AUTO, if at most two thirds are in the
@@ -140,7 +142,7 @@ def reconstruct(
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
         "attempts": [{}, *attempts],
-        "cameras": f"plausible, one for {MORE} times as many images",
+        "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
         "once": once,
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
@@ -204,7 +206,7 @@ def reconstruct(
             "parts": parts,
             "missing": missing,
             "unmatched": sorted(set(names) - _matched(database)),
-            "focal_lengths": {name: focal for name, focal in dropped.items() if name in missing},
+            "implausible": {name: lens for name, lens in dropped.items() if name in missing},
             "alike": alike,
         }
         stamps.write(building / REGISTRATION, state)
@@ -238,16 +240,15 @@ def _are_alike(cameras: dict[int, pycolmap.Camera]) -> bool:
 
 def _plausible(
     models: list[pycolmap.Reconstruction], cameras: dict[int, pycolmap.Camera]
-) -> tuple[list[pycolmap.Reconstruction], dict[str, float]]:
-    """Drop images of implausible focal lengths from models, and what only these connect.
+) -> tuple[list[pycolmap.Reconstruction], dict[str, str]]:
+    """Drop images of implausible lenses from models, and what only these connect.
 
     Args:
         models: of COLMAP's mapper.
         cameras: from their ids to those that the mapper began with.
 
     Returns:
-        The models that have points, by size; and from the names of images to their focal lengths
-        in pixels that are implausible.
+        The models that have points, by size; and from the names of images to what is implausible.
     """
     dropped = {}
     for model in models:
@@ -259,9 +260,17 @@ def _plausible(
             # many images tell the focal length of their camera better than EXIF data do
             unknown = not given.has_prior_focal_length or shared[image.camera_id] >= WELL_KNOWN
             low, high = focal_lengths(given, unknown)
-            if not low <= image.camera.mean_focal_length() <= high:
-                implausible[image.name] = round(image.camera.mean_focal_length())
-                model.deregister_frame(image.frame_id)
+            focal_length = image.camera.mean_focal_length()
+            distortion = image.camera.params[list(image.camera.extra_params_idxs())]
+            if not low <= focal_length <= high:
+                implausible[image.name] = f"focal length {focal_length:.0f}"
+            elif np.abs(distortion).max(initial=0) > MAX_DISTORTION:
+                implausible[image.name] = (
+                    f"distortion {distortion[np.abs(distortion).argmax()]:.1f}"
+                )
+            else:
+                continue
+            model.deregister_frame(image.frame_id)
         if implausible:
             _keep_connected(model)
         dropped |= implausible
@@ -290,7 +299,7 @@ def _keep_connected(model: pycolmap.Reconstruction) -> None:
             model.deregister_frame(model.images[image_id].frame_id)
 
 
-def nothing(image_dir: Path, dropped: dict[str, float] | None = None) -> str:
+def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
     """Say that no image could be reconstructed, and what to try."""
     if dropped:
         return f"COLMAP could not reconstruct the images of {image_dir}. {_said(dropped)}"
@@ -300,12 +309,12 @@ def nothing(image_dir: Path, dropped: dict[str, float] | None = None) -> str:
     )
 
 
-def _said(dropped: dict[str, float]) -> str:
-    """Say which images have implausible focal lengths."""
-    lengths = [f"{name} ({length:.0f})" for name, length in dropped.items()]
+def _said(dropped: dict[str, str]) -> str:
+    """Say which images have implausible lenses."""
+    lenses = [f"{name} ({lens})" for name, lens in dropped.items()]
     return (
-        "These have focal lengths in pixels that no lens has, or that are far from their EXIF "
-        f"data, so their poses are wrong: {cli.some(lengths, NAMED)}."
+        "These have focal lengths in pixels or distortions that no lens has, or focal lengths far "
+        f"from their EXIF data, so their poses are wrong: {cli.some(lenses, NAMED)}."
     )
 
 
@@ -345,11 +354,11 @@ def check(sfm_dir: Path, accept_partial: bool) -> None:
                 "camera with a fixed zoom took all, --camera_mode single gives better poses."
             )
         if missing:
-            focal_lengths = state["focal_lengths"]
+            implausible = state["implausible"]
             logger.warning(
                 "%d of %d images are not in the map: %s.%s",
                 *(len(missing), number, cli.some(missing, NAMED)),
-                f" {_said(focal_lengths)}" if focal_lengths else "",
+                f" {_said(implausible)}" if implausible else "",
             )
         return
     message = shortfall(sfm_dir / REGISTRATION, **state)
@@ -364,7 +373,7 @@ def shortfall(
     parts: list[list[str]],
     missing: list[str],
     unmatched: list[str],
-    focal_lengths: dict[str, float],
+    implausible: dict[str, str],
     alike: bool,
 ) -> str:
     """Say which images are not in a model, why, and what to try.
@@ -375,7 +384,7 @@ def shortfall(
         parts: the images of each part that COLMAP reconstructed, the model first.
         missing: the images that are not in the model.
         unmatched: those that match no other image.
-        focal_lengths: from images that were dropped to their implausible focal lengths.
+        implausible: from images that were dropped to what is implausible of their lenses.
         alike: each image has a camera of its own, but one may have taken all.
     """
     registered = images - len(missing)
@@ -393,13 +402,13 @@ def shortfall(
             + (f"; the second has {cli.some(parts[1], 3)}." if parts[1] != missing else ".")
         )
         tries.append("add photos between the parts, each overlapping the one before by two thirds")
-    elif set(missing) - set(unmatched) - set(focal_lengths):
+    elif set(missing) - set(unmatched) - set(implausible):
         tries.append("add photos between those in the map and those that are not")
     if unmatched:
         said.append(f"No other photo matches {cli.some(unmatched)}.")
         tries.append("leave out photos of other places, and retake blurred or dark ones")
-    if focal_lengths:
-        said.append(_said(focal_lengths))
+    if implausible:
+        said.append(_said(implausible))
     if alike:
         tries.append("--camera_mode single, if one camera with a fixed zoom took all photos")
     return f"{' '.join(said)} What to try: {'; '.join(tries)}."

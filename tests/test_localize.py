@@ -646,7 +646,17 @@ def test_focal_lengths_that_no_lens_has(focal_length, is_prior, is_kept):
     found, dropped = reconstruction._plausible([model], given)
     everything = {f"{i}.jpg" for i in range(4)}
     assert names_of(found) == [everything if is_kept else everything - {"3.jpg"}]
-    assert dropped == ({} if is_kept else {"3.jpg": focal_length})
+    assert dropped == ({} if is_kept else {"3.jpg": f"focal length {focal_length:.0f}"})
+
+
+@pytest.mark.parametrize(("distortion", "is_kept"), [(-0.6, True), (4.56, False), (-5.9, False)])
+def test_distortions_that_no_lens_has(distortion, is_kept):
+    """Of photos of a flat wall, each with a camera of its own."""
+    model, given = chain([1, 2, 3, 4])
+    params = [500, 320, 240, distortion]
+    model.cameras[4].model, model.cameras[4].params = "SIMPLE_RADIAL", params
+    _, dropped = reconstruction._plausible([model], given)
+    assert dropped == ({} if is_kept else {"3.jpg": f"distortion {distortion:.1f}"})
 
 
 def test_what_only_an_implausible_image_connects_is_dropped():
@@ -670,8 +680,12 @@ def test_a_camera_of_many_photos_is_known_better_than_by_exif():
 
 
 def test_no_plausible_image_at_all_is_said():
-    message = reconstruction.nothing(Path("photos"), {"a.jpg": 12345})
-    assert "no lens has" in message and "a.jpg (12345)" in message and "overlap" not in message
+    message = reconstruction.nothing(Path("photos"), {"a.jpg": "focal length 12345"})
+    assert (
+        "no lens has" in message
+        and "a.jpg (focal length 12345)" in message
+        and "overlap" not in message
+    )
 
 
 def draw_noise(folder, numbers):
@@ -716,7 +730,7 @@ def test_parts_that_do_not_connect():
         "parts": [["a", "b", "c", "d", "e"], ["f", "g", "h"]],
         "missing": ["f", "g", "h", "i", "j"],
         "unmatched": ["j"],
-        "focal_lengths": {},
+        "implausible": {},
         "alike": False,
     }
     message = reconstruction.shortfall(Path("x"), **state)
@@ -724,9 +738,9 @@ def test_parts_that_do_not_connect():
     assert "2 parts that do not connect, of 5 and 3 photos" in message
     assert "the second has f, g, h." in message and "between the parts" in message
     assert "matches j." in message and "--camera_mode" not in message
-    state |= {"focal_lengths": {"i": 12345}, "alike": True}
+    state |= {"implausible": {"i": "distortion 4.6"}, "alike": True}
     message = reconstruction.shortfall(Path("x"), **state)
-    assert "no lens has" in message and "i (12345)." in message
+    assert "no lens has" in message and "i (distortion 4.6)." in message
     assert "--camera_mode single, if one camera" in message
 
 
