@@ -146,7 +146,7 @@ def _calibrate(
 
     Where the focal length is not known, a distortion is estimated, too, and if that fits much
     better aspect ratio and principal point: the photo was cropped or stretched. Where it is known,
-    such a fit contradicts it.
+    such a fit contradicts it. A skew, which no lens has, tells a photo that shows a picture.
 
     Returns:
         The pose that is likelier, and a reason not to trust it, if any.
@@ -156,21 +156,29 @@ def _calibrate(
     threshold = _max_error(config)
     image, pinhole = resection.undistort(points2D, pose.camera)
 
-    start = image, points3D, pose.cam_from_world, pinhole, threshold
+    matches, start = (image, points3D), (pose.cam_from_world, pinhole, threshold)
 
-    def judged(found: tuple | None, freedom: int) -> Pose:
+    def judged(found: resection.Resection | None, freedom: int) -> Pose:
         if found is None:
-            return pose
-        value = confidence(image, points3D, *found[:2], threshold, freedom)
-        return Pose(*found, value, degrees_of_freedom=freedom)
+            return replace(pose, camera=pinhole)
+        cam_from_world, lens, inliers, points = found
+        value = confidence(points, points3D, cam_from_world, lens, threshold, freedom)
+        return Pose(cam_from_world, lens, inliers, value, degrees_of_freedom=freedom)
 
     free = _is_focal_length_free(config) and not resection.is_distorted(pose.camera)
     assumed = pose
     if free:
-        radial = judged(resection.resect(*start, resection.RADIAL), resection.RADIAL)
+        radial = judged(resection.resect(*matches, *start, resection.RADIAL), resection.RADIAL)
         if radial.confidence > DISTORTED * pose.confidence:
             assumed = radial
-    other = judged(resection.resect_anew(*start), resection.ALL)
+    other = judged(resection.resect_anew(*matches, *start), resection.ALL)
+    near = other.cam_from_world, other.camera, threshold
+    skewed = judged(resection.resect(*matches, *near, resection.SKEW), resection.SKEW)
+    likelier = max(assumed, other, key=_quality)
+    if skewed.confidence > RIGHT * likelier.confidence and differ(
+        skewed, likelier, points3D, MAX_POSITION, MAX_ROTATION
+    ):
+        return likelier, "it was warped, or is a photo of a picture: a skew fits much better"
     if other.confidence <= (DOUBTFUL if free else RIGHT) * assumed.confidence:
         return assumed, None
     if free and other.confidence > RIGHT * assumed.confidence:

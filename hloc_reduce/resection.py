@@ -1,9 +1,12 @@
 """Camera resectioning: a pose together with the intrinsics that fit its matches.
 
 The parameters have an order, and the first ones are free: the pose (6), the focal length (7), a
-radial distortion (8), the aspect ratio (9), the principal point (11). So the number of degrees of
-freedom says which they are.
+radial distortion (8), the aspect ratio (9), the principal point (11), the skew (12). So the number
+of degrees of freedom says which they are. With all twelve any homography of a photo can be undone:
+a lens has no skew, but the photo of a picture has.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -13,10 +16,10 @@ from scipy.spatial.transform import Rotation
 from .colmap import cam_from_img
 from .confidence import photo_scale, reprojection_errors
 
-RADIAL, ASPECT, ALL = 8, 9, 11  # degrees of freedom
-# of the logarithms of the changes of focal length and aspect ratio, the distortion, and the shift
-# of the principal point in focal lengths
-BOUNDS = np.array([np.inf] * 6 + [2.0, 1.0, 1.0, 1.0, 1.0])
+RADIAL, ASPECT, ALL, SKEW = 8, 9, 11, 12  # degrees of freedom
+# of the logarithms of the changes of focal length and aspect ratio, the distortion, the shift of
+# the principal point in focal lengths, and the skew as a tangent
+BOUNDS = np.array([np.inf] * 6 + [2.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 ROUNDS = 10  # of refinement, from the inliers of the one before
 NOISE = 2.0  # pixels, scale of the Cauchy loss
 EVALUATIONS = 30  # of the errors, a round
@@ -25,6 +28,22 @@ FAR = 1e6  # pixels
 # threshold, with the principal point in the middle of the photo and near its corners
 SAMPLE, NEAR = 400, 5
 CORNER = 0.4  # of width and height from the middle
+
+
+class Resection(NamedTuple):
+    """A pose and intrinsics.
+
+    Args:
+        cam_from_world: the pose.
+        camera: OPENCV intrinsics, with one coefficient of distortion.
+        inliers: (M,) bool, which matches agree.
+        points2D: (M, 2) the image points without skew.
+    """
+
+    cam_from_world: pycolmap.Rigid3d
+    camera: pycolmap.Camera
+    inliers: np.ndarray
+    points2D: np.ndarray
 
 
 def is_distorted(camera: pycolmap.Camera) -> bool:
@@ -58,7 +77,7 @@ def resect(
     max_error: float,
     degrees_of_freedom: int,
     chosen: np.ndarray | None = None,
-) -> tuple[pycolmap.Rigid3d, pycolmap.Camera, np.ndarray] | None:
+) -> Resection | None:
     """Refine a pose and intrinsics to the matches that agree, as long as more and more do.
 
     Args:
@@ -67,12 +86,11 @@ def resect(
         cam_from_world: the pose to begin with.
         camera: the intrinsics to begin with, PINHOLE or of a `resect` before.
         max_error: inlier threshold in pixels.
-        degrees_of_freedom: 7 to 11.
+        degrees_of_freedom: 7 to 12.
         chosen: (M,) bool, the matches to begin with; default: those that agree.
 
     Returns:
-        The pose, the intrinsics as an OPENCV camera, and the inliers (M,) bool, of which there are
-        as many as degrees of freedom; or None.
+        What was found; None where fewer matches agree than there are degrees of freedom.
     """
     if chosen is None:
         chosen = reprojection_errors(points2D, points3D, cam_from_world, camera)[0] <= max_error
@@ -88,7 +106,7 @@ def resect(
 
     def intrinsics(free: np.ndarray) -> list[float]:
         """Return the parameters of an OPENCV camera with one coefficient of distortion."""
-        change, distortion, aspect, x, y = np.pad(free[6:], (0, ALL - len(free)))
+        change, distortion, aspect, x, y, _ = np.pad(free[6:], (0, SKEW - len(free)))
         change = np.exp(change)
         return [
             fx * change,
@@ -98,13 +116,18 @@ def resect(
             before + distortion,
         ]
 
+    def unskewed(free: np.ndarray, image: np.ndarray) -> np.ndarray:
+        if len(free) < SKEW:
+            return image
+        return image - free[-1] * np.stack([image[:, 1] - cy, np.zeros(len(image))], axis=1)
+
     def residuals(free: np.ndarray, image: np.ndarray, world: np.ndarray) -> np.ndarray:
         turned, moved = pose(free)
         local = world @ turned.T + moved
         ray = local[:, :2] / np.maximum(local[:, 2:], 1e-6 * depth)
         *matrix, distortion = intrinsics(free)
         ray *= 1 + distortion * (ray**2).sum(axis=1, keepdims=True)
-        return (ray * matrix[:2] + matrix[2:] - image).ravel()
+        return (ray * matrix[:2] + matrix[2:] - unskewed(free, image)).ravel()
 
     free, bounds = np.zeros(degrees_of_freedom), BOUNDS[:degrees_of_freedom]
     for _ in range(ROUNDS):
@@ -128,11 +151,12 @@ def resect(
             height=camera.height,
             params=[*intrinsics(free), 0, 0, 0],
         )
-        errors, _ = reprojection_errors(points2D, points3D, refined, lens)
-        if found is not None and (errors <= max_error).sum() <= found[2].sum():
+        image = unskewed(free, points2D)
+        errors, _ = reprojection_errors(image, points3D, refined, lens)
+        if found is not None and (errors <= max_error).sum() <= found.inliers.sum():
             break
         inliers = errors <= max_error
-        found = refined, lens, inliers
+        found = Resection(refined, lens, inliers, image)
     return found
 
 
@@ -142,7 +166,7 @@ def resect_anew(
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
     max_error: float,
-) -> tuple[pycolmap.Rigid3d, pycolmap.Camera, np.ndarray] | None:
+) -> Resection | None:
     """Find all intrinsics, and the pose, though those to begin with are far off.
 
     That many parameters have local optima. So the principal point is looked for in the middle and

@@ -1,5 +1,6 @@
 """Photos whose intrinsics are not what they seem: distorted, cropped, stretched, wrongly listed."""
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -8,9 +9,10 @@ from hloc_reduce import absolute_pose
 from hloc_reduce.absolute_pose import Pose
 from hloc_reduce.confidence import DEFAULT_GATE, reprojection_errors, uncertainty
 from hloc_reduce.intrinsics import REFINEMENTS
-from hloc_reduce.resection import ALL, RADIAL, resect, undistort
+from hloc_reduce.resection import ALL, RADIAL, SKEW, resect, undistort
 
-POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.05, 0.1, 0.02, 0.99])), [0.3, 0.1, 8.0])
+TURN = pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04]))  # axis and angle
+POSE = pycolmap.Rigid3d(TURN, [0.3, 0.1, 8.0])
 GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
 
 
@@ -35,11 +37,11 @@ PHOTOS = {
 
 
 def matches(
-    camera: pycolmap.Camera, number: int, deep: bool = True, noise: float = 1.0, wrong: int = 20
+    camera: pycolmap.Camera, number: int, depth: float = 3, noise: float = 1.0, wrong: int = 20
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return image points inside a photo and their world points, the last of them wrong."""
     generator = np.random.default_rng(0)
-    points = generator.uniform([-5, -4, -3], [5, 4, 3 if deep else -2.9], (20 * number, 3))
+    points = generator.uniform([-5, -4, -depth], [5, 4, depth], (20 * number, 3))
     _, projected = reprojection_errors(np.zeros((len(points), 2)), points, POSE, camera)
     inside = ((projected > 0) & (projected < [camera.width, camera.height])).all(axis=1)
     chosen = np.flatnonzero(inside)[: number + wrong]
@@ -88,7 +90,7 @@ def test_few_matches_of_a_cropped_photo_are_refused_or_right(photo, number):
 
 def test_the_principal_point_of_a_flat_scene_is_not_made_up():
     """A plane does not tell it, so it stays in the middle."""
-    found = solve(*matches(WHOLE, 300, deep=False), guessed(1600, 1200), "guess")
+    found = solve(*matches(WHOLE, 300, depth=0.05), guessed(1600, 1200), "guess")
     assert found.degrees_of_freedom < ALL
     assert found.camera.principal_point_x == 800 and found.camera.principal_point_y == 600
 
@@ -127,13 +129,43 @@ def test_a_pose_of_all_parameters_is_as_precise_as_measured():
         points2D, points3D = matches(camera, 200, noise=0, wrong=0)
         points2D += 2 * np.random.default_rng(seed).standard_normal(points2D.shape)
         # the right one first, so that all are of the same inliers
-        pose, lens, inliers = resect(points2D, points3D, POSE, camera, 12.0, ALL)
+        pose, lens, inliers, same = resect(points2D, points3D, POSE, camera, 12.0, ALL)
         centres.append(pose.inverse().translation)
-        assert inliers.all() and lens.width == start.width
+        assert inliers.all() and lens.width == start.width and same is points2D
     measured = np.sqrt(np.var(centres, axis=0).sum()) / 8
     expected, _ = uncertainty(points2D, points3D, pose, lens, ALL)
     assert 0.6 < expected / measured < 1.6
     assert resect(points2D[:9], points3D[:9], POSE, camera, 12.0, ALL) is None
+
+
+def homography(camera: pycolmap.Camera, amount: float) -> np.ndarray:
+    """Return what moves the corners of a photo unevenly, as when a print is photographed aslant."""
+    width, height = camera.width, camera.height
+    corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
+    moved = corners + amount * np.float32(
+        [[width, height / 2], [0, 0], [-width / 3, 0], [width / 5, -height]]
+    )
+    return cv2.getPerspectiveTransform(corners, moved.astype(np.float32))
+
+
+@pytest.mark.parametrize(("source", "amount"), [("guess", 0.06), ("list", 0.03), ("list", 0.06)])
+def test_photos_of_pictures_are_refused(source, amount):
+    """They were called localized, at 15 to 67 % of the distance from where they were taken."""
+    image, points3D = matches(WHOLE, 300, depth=0.5)
+    warped = cv2.perspectiveTransform(image[None], homography(WHOLE, amount))[0]
+    camera = guessed(1600, 1200) if source == "guess" else WHOLE
+    assert "photo of a picture" in solve(warped, points3D, camera, source).refusal
+    assert solve(image, points3D, camera, source).refusal is None
+
+
+def test_a_skew_is_undone():
+    image, points3D = matches(WHOLE, 300, noise=0)
+    sheared = image + 0.2 * np.stack([image[:, 1] - 600, np.zeros(len(image))], axis=1)
+    _, pinhole = undistort(image, WHOLE)
+    found = resect(sheared, points3D, POSE, pinhole, 12.0, SKEW, np.arange(320) < 300)
+    assert found.inliers[:300].all() and np.abs(found.points2D - image)[:300].max() < 0.5
+    position, rotation = error(Pose(found.cam_from_world, found.camera, found.inliers))
+    assert position < 1e-3 and rotation < 0.01
 
 
 def test_undistorted_points_are_those_of_a_pinhole():
