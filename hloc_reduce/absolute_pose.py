@@ -31,7 +31,9 @@ SAME_POSITION = 0.25  # of the inliers' median depth
 # confidence with other intrinsics, by that with the assumed ones: above these a distortion is
 # right, all others may be, and all others are
 DISTORTED, DOUBTFUL, RIGHT = 1.02, 1.05, 1.1
-STRICT = 0.5  # times the limits of uncertainty, where all intrinsics are estimated
+# times the limits of uncertainty: where all intrinsics are estimated, and by how much others than
+# given ones must move the pose to contradict them, as many lists give focal lengths of EXIF data
+STRICT, LENIENT = 0.5, 2.0
 
 
 @dataclass(frozen=True)
@@ -183,16 +185,17 @@ def _calibrate(
         return assumed, None
     if free and other.confidence > RIGHT * assumed.confidence:
         return other, None
-    if not differ(assumed, other, points3D, MAX_POSITION, MAX_ROTATION):
+    limit = 1 if free else LENIENT
+    if not differ(assumed, other, points3D, limit * MAX_POSITION, limit * MAX_ROTATION):
         return assumed, None
     if free:
         return assumed, (
             "it may be cropped or stretched: another principal point and aspect ratio fit about as "
             "well, and the pose differs"
         )
-    return assumed, (
-        "its intrinsics contradict the map: others fit better, with focal lengths of "
-        "{:.0f} and {:.0f} pixels, and the pose differs".format(*other.camera.params[:2])
+    return (
+        assumed,
+        "its intrinsics contradict the map: others fit much better, and the pose differs",
     )
 
 

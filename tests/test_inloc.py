@@ -202,9 +202,9 @@ def test_queries_of_the_benchmark(inloc_layout, tmp_path, monkeypatch):
     assert place.query_names() == [f"query/iphone7/{name}.JPG" for name in ("a", "b", "grey")]
     run(monkeypatch, "--dataset", inloc_layout, "--outputs", tmp_path / "o")
     _, rows = outcome(tmp_path / "o")
-    # its focal length is 373 pixels there, not 500: closer, but localized
-    assert rows["a.JPG"]["status"] == "localized"
+    # its focal length is 373 pixels there, not 500: the camera would be closer
     assert 0.05 < float(rows["a.JPG"]["position_error_m"]) < 1
+    assert rows["a.JPG"]["reason"].startswith("its intrinsics contradict the map")
 
 
 def test_queries_without_matches_do_not_stop_the_others(inloc_layout, tmp_path, monkeypatch):
@@ -219,6 +219,7 @@ def test_queries_without_matches_do_not_stop_the_others(inloc_layout, tmp_path, 
         tmp_path / "o/feats-dog-colmap_sift_sv64.h5",
         matches,
         tmp_path / "poses.txt",
+        queries=inloc_layout / "queries_with_intrinsics.txt",
     )
     assert not records["query/iphone7/a.JPG"]["localized"]
     assert records["query/iphone7/a.JPG"]["qvec"] is None
