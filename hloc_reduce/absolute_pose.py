@@ -157,7 +157,6 @@ def _calibrate(
         return pose, None
     threshold = _max_error(config)
     image, pinhole = resection.undistort(points2D, pose.camera)
-
     matches, start = (image, points3D), (pose.cam_from_world, pinhole, threshold)
 
     def judged(found: resection.Resection | None, freedom: int) -> Pose:
@@ -180,7 +179,8 @@ def _calibrate(
     if skewed.confidence > RIGHT * likelier.confidence and differ(
         skewed, likelier, points3D, MAX_POSITION, MAX_ROTATION
     ):
-        return likelier, "it was warped, or is a photo of a picture: a skew fits much better"
+        reason = "it was warped, or is a photo of a picture: a skew fits much better"
+        return likelier if free else assumed, reason
     if other.confidence <= (DOUBTFUL if free else RIGHT) * assumed.confidence:
         return assumed, None
     if free and other.confidence > RIGHT * assumed.confidence:
@@ -193,10 +193,8 @@ def _calibrate(
             "it may be cropped or stretched: another principal point and aspect ratio fit about as "
             "well, and the pose differs"
         )
-    return (
-        assumed,
-        "its intrinsics contradict the map: others fit much better, and the pose differs",
-    )
+    reason = "its intrinsics contradict the map: others fit much better, and the pose differs"
+    return assumed, reason
 
 
 def _max_error(config: dict) -> float:

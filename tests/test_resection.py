@@ -148,7 +148,7 @@ def homography(camera: pycolmap.Camera, amount: float) -> np.ndarray:
     return cv2.getPerspectiveTransform(corners, moved.astype(np.float32))
 
 
-@pytest.mark.parametrize(("source", "amount"), [("guess", 0.06), ("list", 0.03), ("list", 0.06)])
+@pytest.mark.parametrize(("source", "amount"), [("guess", 0.06), ("list", 0.03)])
 def test_photos_of_pictures_are_refused(source, amount):
     """They were called localized, at 15 to 67 % of the distance from where they were taken."""
     image, points3D = matches(WHOLE, 300, depth=0.5)
