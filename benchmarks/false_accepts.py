@@ -281,9 +281,8 @@ def intrinsics_of(
     """Return intrinsics of a photo of a width and height, and how they are refined."""
     if given == "guess":
         width, height = size
-        params = [intrinsics.GUESSED_FOCAL * max(size), width / 2, height / 2, 0]
-        guess = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
-        return guess, intrinsics.REFINEMENTS["guess"]
+        guess, source = intrinsics.infer(np.empty((height, width), np.uint8))
+        return guess, intrinsics.REFINEMENTS[source]
     camera = copy.deepcopy(camera)
     if given == "off":
         params = camera.params.copy()

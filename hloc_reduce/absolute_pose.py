@@ -30,7 +30,7 @@ SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the inliers' median depth
 # confidence with other intrinsics, by that with the assumed ones: above these a distortion is
 # right, all others may be, and all others are
-DISTORTED, DOUBTFUL, RIGHT = 1.02, 1.05, 1.1
+DISTORTED, UNCLEAR, RIGHT = 1.02, 1.05, 1.1
 # times the limits of uncertainty: where all intrinsics are estimated, and by how much others than
 # given ones must move the pose to contradict them, as many lists give focal lengths of EXIF data
 STRICT, LENIENT = 0.5, 2.0
@@ -47,7 +47,8 @@ class Pose:
         confidence: `confidence.confidence`.
         agreement: `confidence.agreement`.
         refusal: why it is not to be trusted, None if it is.
-        degrees_of_freedom: of what was estimated, as of `resection`.
+        degrees_of_freedom: 6 for the pose alone, 7 with the focal length, 8 with a distortion too,
+            11 with the aspect ratio and the principal point too.
     """
 
     cam_from_world: pycolmap.Rigid3d | None
@@ -181,7 +182,7 @@ def _calibrate(
     ):
         reason = "it was warped, or is a photo of a picture: a skew fits much better"
         return likelier if free else assumed, reason
-    if other.confidence <= (DOUBTFUL if free else RIGHT) * assumed.confidence:
+    if other.confidence <= (UNCLEAR if free else RIGHT) * assumed.confidence:
         return assumed, None
     if free and other.confidence > RIGHT * assumed.confidence:
         return other, None

@@ -57,7 +57,8 @@ def confidence(
         cam_from_world: the pose.
         camera: intrinsics.
         max_error: RANSAC's inlier threshold in pixels.
-        degrees_of_freedom: 6, or more where intrinsics were estimated, as of `resection`.
+        degrees_of_freedom: 6 for the pose alone, 7 with the focal length, 8 with a distortion too,
+            11 with the aspect ratio and the principal point too.
 
     Returns:
         Minus the decimal logarithm of the number of false alarms. Above 0 the pose is not expected
@@ -173,7 +174,8 @@ def uncertainty(
         points3D: (M, 3) their world points.
         cam_from_world: the pose.
         camera: intrinsics.
-        degrees_of_freedom: 6, or more where intrinsics were estimated, as of `resection`.
+        degrees_of_freedom: 6 for the pose alone, 7 with the focal length, 8 with a distortion too,
+            11 with the aspect ratio and the principal point too.
 
     Returns:
         The standard deviations of the position, in units of the inliers' median depth, and of the

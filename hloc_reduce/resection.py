@@ -94,7 +94,7 @@ def resect(
     """
     if chosen is None:
         chosen = reprojection_errors(points2D, points3D, cam_from_world, camera)[0] <= max_error
-    inliers, found = chosen, None
+    inliers, found = chosen, None  # those of each round, and what the last one found
     rotation, translation = cam_from_world.rotation.matrix(), cam_from_world.translation
     depth = np.median((points3D @ rotation.T + translation)[inliers, 2]) if inliers.any() else 1.0
     fx, fy, cx, cy, *coefficients = camera.params
