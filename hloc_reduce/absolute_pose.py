@@ -154,7 +154,7 @@ def _calibrate(
     Returns:
         The pose that is likelier, and a reason not to trust it, if any.
     """
-    if pose.num_inliers < resection.ALL:
+    if pose.num_inliers < resection.ALL or pose.camera.mean_focal_length() <= 0:
         return pose, None
     threshold = _max_error(config)
     image, pinhole = resection.undistort(points2D, pose.camera)

@@ -133,6 +133,33 @@ def reprojection_errors(
     return np.nan_to_num(errors, nan=np.inf, posinf=np.inf), projected
 
 
+def project(local: np.ndarray, distortion: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Project points with a focal length of 1 and a radial distortion.
+
+    Args:
+        local: (M, 3) points in front of the camera, in its frame.
+        distortion: coefficient of COLMAP's RADIAL.
+
+    Returns:
+        The image points (2, M), and their derivatives (2, 12, M) by a rotation about x, y, z, a
+        translation along them, and the intrinsics in the order of the degrees of freedom.
+    """
+    x, y, z = local.T
+    u, v, zero, one = x / z, y / z, np.zeros_like(z), np.ones_like(z)
+    r2 = u * u + v * v
+    scale, across = 1 + distortion * r2, 2 * distortion * u * v
+    du = np.array([-u * v, 1 + u * u, -v, 1 / z, zero, -u / z])
+    dv = np.array([-1 - v * v, u * v, u, zero, 1 / z, -v / z])
+    # focal length, distortion, aspect ratio, principal point, skew
+    along_x = [scale * u, u * r2, zero, one, zero, scale * v]
+    along_y = [scale * v, v * r2, scale * v, zero, one, zero]
+    derivatives = [
+        [*((scale + 2 * distortion * u * u) * du + across * dv), *along_x],
+        [*(across * du + (scale + 2 * distortion * v * v) * dv), *along_y],
+    ]
+    return scale * [u, v], np.array(derivatives)
+
+
 def _density(points2D: np.ndarray, projected: np.ndarray, camera: pycolmap.Camera) -> np.ndarray:
     """Return the probability (N,), by pixel, that a wrong match projects to image points (N, 2)."""
     uniform = 1 / (camera.width * camera.height)
@@ -182,16 +209,9 @@ def uncertainty(
         rotation in degrees; infinite where the inliers do not fix the pose.
     """
     local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
-    x, y, z = (local / np.median(local[:, 2])).T
-    u, v, zero, one = x / z, y / z, np.zeros_like(z), np.ones_like(z)
-    r2 = u * u + v * v
-    # derivatives by a rotation about x, y, z, a translation along them, the focal length, the
-    # distortion, the aspect ratio, and the principal point
-    rows = [
-        [-u * v, 1 + u * u, -v, 1 / z, zero, -u / z, u, u * r2, zero, one, zero],
-        [-1 - v * v, u * v, u, zero, 1 / z, -v / z, v, v * r2, v, zero, one],
-    ]
-    jacobian = camera.mean_focal_length() * np.concatenate(rows, axis=1)[:degrees_of_freedom].T
+    _, derivatives = project(local / np.median(local[:, 2]))
+    jacobian = camera.mean_focal_length() * np.concatenate(derivatives, axis=1)
+    jacobian = jacobian[:degrees_of_freedom].T
     equations, unknowns = jacobian.shape
     if equations <= unknowns:
         return np.inf, np.inf

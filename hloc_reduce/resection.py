@@ -10,19 +10,20 @@ from typing import NamedTuple
 
 import numpy as np
 import pycolmap
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from .colmap import cam_from_img
-from .confidence import photo_scale, reprojection_errors
+from .confidence import photo_scale, project, reprojection_errors
 
 RADIAL, ASPECT, ALL, SKEW = 8, 9, 11, 12  # degrees of freedom
 # of the logarithms of the changes of focal length and aspect ratio, the distortion, the shift of
 # the principal point in focal lengths, and the skew as a tangent
-BOUNDS = np.array([np.inf] * 6 + [2.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+BOUNDS = np.array([2.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 ROUNDS = 10  # of refinement, from the inliers of the one before
 NOISE = 2.0  # pixels, scale of the Cauchy loss
-EVALUATIONS = 30  # of the errors, a round
+EVALUATIONS = 30  # of the residuals, a round
+DAMPING, TINY = 1e-3, 1e-12  # of the first step; least damping, for a parameter without effect
+ENOUGH = 1e-6  # relative gain of the last step
 FAR = 1e6  # pixels
 # where all parameters are searched for: in a sample of the matches with errors of a few times the
 # threshold, with the principal point in the middle of the photo and near its corners
@@ -95,69 +96,121 @@ def resect(
     if chosen is None:
         chosen = reprojection_errors(points2D, points3D, cam_from_world, camera)[0] <= max_error
     inliers, found = chosen, None  # those of each round, and what the last one found
-    rotation, translation = cam_from_world.rotation.matrix(), cam_from_world.translation
-    depth = np.median((points3D @ rotation.T + translation)[inliers, 2]) if inliers.any() else 1.0
-    fx, fy, cx, cy, *coefficients = camera.params
-    before = coefficients[0] if coefficients else 0.0
-
-    def pose(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        turned = Rotation.from_rotvec(free[:3]).as_matrix() @ rotation
-        return turned, translation + depth * free[3:6]
-
-    def intrinsics(free: np.ndarray) -> list[float]:
-        """Return the parameters of an OPENCV camera with one coefficient of distortion."""
-        change, distortion, aspect, x, y, _ = np.pad(free[6:], (0, SKEW - len(free)))
-        change = np.exp(change)
-        return [
-            fx * change,
-            fy * change * np.exp(aspect),
-            cx + fx * x,
-            cy + fx * y,
-            before + distortion,
-        ]
-
-    def unskewed(free: np.ndarray, image: np.ndarray) -> np.ndarray:
-        if len(free) < SKEW:
-            return image
-        return image - free[-1] * np.stack([image[:, 1] - cy, np.zeros(len(image))], axis=1)
-
-    def residuals(free: np.ndarray, image: np.ndarray, world: np.ndarray) -> np.ndarray:
-        turned, moved = pose(free)
-        local = world @ turned.T + moved
-        ray = local[:, :2] / np.maximum(local[:, 2:], 1e-6 * depth)
-        *matrix, distortion = intrinsics(free)
-        ray *= 1 + distortion * (ray**2).sum(axis=1, keepdims=True)
-        return (ray * matrix[:2] + matrix[2:] - unskewed(free, image)).ravel()
-
-    free, bounds = np.zeros(degrees_of_freedom), BOUNDS[:degrees_of_freedom]
+    start = view = _View.of(cam_from_world, camera)
+    noise = NOISE * photo_scale(camera)
     for _ in range(ROUNDS):
         if inliers.sum() < degrees_of_freedom:
             break
-        free = least_squares(
-            residuals,
-            free,
-            bounds=(-bounds, bounds),
-            x_scale="jac",
-            loss="cauchy",
-            f_scale=NOISE * photo_scale(camera),
-            max_nfev=EVALUATIONS,
-            args=(points2D[inliers], points3D[inliers]),
-        ).x
-        turned, moved = pose(free)
-        refined = pycolmap.Rigid3d(pycolmap.Rotation3d(turned), moved)
-        lens = pycolmap.Camera(
-            model="OPENCV",
-            width=camera.width,
-            height=camera.height,
-            params=[*intrinsics(free), 0, 0, 0],
-        )
-        image = unskewed(free, points2D)
-        errors, _ = reprojection_errors(image, points3D, refined, lens)
+        chosen = points2D[inliers], points3D[inliers]
+        view = _fit(*chosen, view, start, degrees_of_freedom, noise)
+        pose, lens, image = view.pose, view.camera(camera), view.unskewed(points2D)
+        errors, _ = reprojection_errors(image, points3D, pose, lens)
         if found is not None and (errors <= max_error).sum() <= found.inliers.sum():
             break
         inliers = errors <= max_error
-        found = Resection(refined, lens, inliers, image)
+        found = Resection(pose, lens, inliers, image)
     return found
+
+
+class _View(NamedTuple):
+    """A pose and the intrinsics that are free, of shapes (3, 3), (3,) and (6,).
+
+    The intrinsics are the logarithm of the focal length, a radial distortion, the logarithm of the
+    aspect ratio, the principal point in pixels, and the skew as a tangent.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    intrinsics: np.ndarray
+
+    @classmethod
+    def of(cls, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> "_View":
+        fx, fy, cx, cy, distortion = [*camera.params, 0.0][:5]
+        intrinsics = np.array([np.log(fx), distortion, np.log(fy / fx), cx, cy, 0.0])
+        return cls(cam_from_world.rotation.matrix(), cam_from_world.translation, intrinsics)
+
+    @property
+    def pose(self) -> pycolmap.Rigid3d:
+        return pycolmap.Rigid3d(pycolmap.Rotation3d(self.rotation), self.translation)
+
+    @property
+    def focal_lengths(self) -> np.ndarray:
+        focal_length, _, aspect, *_ = self.intrinsics
+        return np.exp([focal_length, focal_length + aspect])
+
+    def camera(self, photo: pycolmap.Camera) -> pycolmap.Camera:
+        _, distortion, _, cx, cy, _ = self.intrinsics
+        return pycolmap.Camera(
+            model="OPENCV",
+            width=photo.width,
+            height=photo.height,
+            params=[*self.focal_lengths, cx, cy, distortion, 0, 0, 0],
+        )
+
+    def unskewed(self, points2D: np.ndarray) -> np.ndarray:
+        skew = self.intrinsics[5]
+        if not skew:
+            return points2D
+        fx, fy = self.focal_lengths
+        below = points2D[:, 1] - self.intrinsics[4]
+        return points2D - np.stack([skew * fx / fy * below, np.zeros(len(below))], axis=1)
+
+    def moved(self, step: np.ndarray, start: "_View") -> "_View":
+        """Return the view after a step, its intrinsics within BOUNDS of those at the start."""
+        unit = np.array([1, 1, 1, *start.focal_lengths, 1])
+        changed = self.intrinsics.copy()
+        changed[: len(step) - 6] += step[6:] * unit[: len(step) - 6]
+        reach = BOUNDS * unit
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        return _View(
+            turn @ self.rotation,
+            turn @ self.translation + step[3:6],
+            np.clip(changed, start.intrinsics - reach, start.intrinsics + reach),
+        )
+
+    def residuals(
+        self, points2D: np.ndarray, points3D: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return residuals (2, M), their derivatives (2, 12, M), and who is in front (M,)."""
+        local = points3D @ self.rotation.T + self.translation
+        front = local[:, 2] > 0
+        local[~front] = 0, 0, 1
+        _, distortion, _, *center, skew = self.intrinsics
+        ray, derivatives = project(local, distortion)
+        ray[0] += skew * ray[1]
+        derivatives[0, :RADIAL] += skew * derivatives[1, :RADIAL]
+        fx, fy = self.focal_lengths
+        scale = np.array([[fx], [fy]])
+        residuals = scale * ray + np.array(center)[:, None] - points2D.T
+        return residuals, scale[:, None] * derivatives, front
+
+
+def _fit(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    view: _View,
+    start: _View,
+    degrees_of_freedom: int,
+    noise: float,
+) -> _View:
+    """Minimize the Cauchy loss of the residuals by the method of Levenberg and Marquardt."""
+    least, damping, trial = np.inf, DAMPING, view
+    for _ in range(EVALUATIONS):
+        residuals, derivatives, front = trial.residuals(points2D, points3D)
+        squares = np.where(front, (residuals**2).sum(axis=0) / noise**2, FAR)
+        loss = np.log1p(squares).sum()
+        if loss < least:
+            gain, least, view, damping = least - loss, loss, trial, damping / 10
+            if gain < ENOUGH * loss:
+                break
+            jacobian = np.concatenate(derivatives[:, :degrees_of_freedom], axis=1)
+            weighted = jacobian * np.tile(front / (1 + squares), 2)
+            normal, gradient = weighted @ jacobian.T, weighted @ residuals.ravel()
+        else:
+            damping *= 10
+        damped = normal + np.diag(damping * np.diag(normal) + TINY)
+        trial = view.moved(-np.linalg.solve(damped, gradient), start)
+    return view
 
 
 def resect_anew(

@@ -7,7 +7,7 @@ import pytest
 
 from hloc_reduce import absolute_pose
 from hloc_reduce.absolute_pose import Pose
-from hloc_reduce.confidence import DEFAULT_GATE, reprojection_errors, uncertainty
+from hloc_reduce.confidence import DEFAULT_GATE, project, reprojection_errors, uncertainty
 from hloc_reduce.intrinsics import REFINEMENTS
 from hloc_reduce.resection import ALL, RADIAL, SKEW, resect, undistort
 
@@ -120,6 +120,29 @@ def test_given_intrinsics_stay_as_they_are():
         found = solve(*matches(camera, 300), listed, "list")
         assert found.refusal is None and found.degrees_of_freedom == 6
         assert found.camera.params.tolist() == listed.params.tolist()
+
+
+def test_a_negative_focal_length_is_not_refined():
+    """RANSAC may return one; the gate refuses it."""
+    camera = camera_of(1600, 1200, [-1400, 800, 600, 0], "SIMPLE_RADIAL")
+    pose = Pose(POSE, camera, np.ones(50, bool), confidence=50)
+    found, doubt = absolute_pose._calibrate(pose, *matches(WHOLE, 30), REFINEMENTS["guess"])
+    assert found is pose and doubt is None
+
+
+def test_derivatives_of_a_projection():
+    local = np.array([[0.3, -0.2, 1.5], [-1, 0.5, 2], [0, 0, 1]])
+
+    def projected(step: np.ndarray) -> np.ndarray:
+        turn = pycolmap.Rotation3d(step[:3]).matrix()
+        (u, v), _ = project(local @ turn.T + step[3:6], 0.2 + step[7])
+        fx, fy = np.exp(step[6]), np.exp(step[6] + step[8])
+        return np.array([fx * (u + step[11] * v) + step[9], fy * v + step[10]])
+
+    _, derivatives = project(local, 0.2)
+    steps = 1e-6 * np.eye(SKEW)
+    measured = [(projected(step) - projected(-step)) / 2e-6 for step in steps]
+    np.testing.assert_allclose(derivatives, np.stack(measured, axis=1), atol=1e-8)
 
 
 def test_a_pose_of_all_parameters_is_as_precise_as_measured():
