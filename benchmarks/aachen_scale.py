@@ -25,24 +25,21 @@ from pathlib import Path
 
 import numpy as np
 
-from hloc_reduce import cli, match_features, pairs_from_retrieval
-from hloc_reduce.cli import InputError
-from hloc_reduce.group_writer import GroupWriter
-from hloc_reduce.io import (
-    find_pair,
-    get_dataset,
-    get_matches,
-    open_h5,
-)
+from hloc_reduce import match_features, pairs_from_retrieval
 from hloc_reduce.pairs_from_covisibility import most_covisible
-from hloc_reduce.parsers import (
+from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import STORAGES, store
+from hloc_reduce.utils.h5 import get_dataset, open_h5
+from hloc_reduce.utils.match_files import find_pair, get_matches
+from hloc_reduce.utils.parsers import (
     image_names,
     parse_pairs,
     parse_query_list,
     parse_retrieval,
     write_pairs,
 )
-from hloc_reduce.storage import STORAGES, store
 
 NUM_COVIS, NUM_LOC = 40, 50
 SEEN = 0.15  # of the keypoints show landmarks

@@ -19,11 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hloc_reduce import cli, colmap
-from hloc_reduce.cli import InputError
-from hloc_reduce.datasets import Aachen, thresholds, true_poses
+from hloc_reduce.datasets import thresholds, true_poses
+from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import pose_error, recall
-from hloc_reduce.parsers import parse_poses, write_pairs
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.parsers import parse_poses, write_pairs
 
 STAGES = ("extraction", "matching", "triangulation", "localization")
 HLOC = "hloc"
@@ -36,8 +37,8 @@ def stages_of(name: str) -> dict[str, Callable]:
 
         conf = extract_features.confs["sift"]
     else:
-        from confs import features as features_confs
         from hloc_reduce import extract_features, localize_sfm, match_features, triangulation
+        from hloc_reduce.confs import features as features_confs
 
         _, conf = features_confs.get(name)
     return {

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hloc_reduce import cli
-from hloc_reduce.io import list_h5_names, open_h5
 from hloc_reduce.matchers.nearest_neighbor import mutual_nearest, nearest
-from hloc_reduce.storage import get_descriptors
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.feature_files import get_descriptors
+from hloc_reduce.utils.h5 import list_h5_names, open_h5
 
 RATIO = 0.8
 LOOSER = (0.85, 0.9, 0.95)

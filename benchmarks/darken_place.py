@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 import pycolmap
 
-from hloc_reduce import cli, colmap
-from hloc_reduce.cli import InputError
-from hloc_reduce.datasets import Aachen
-from hloc_reduce.io import read_image
+from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.images import read_image
 
 EVERY = 3
 GAIN = (0.06, 0.12)

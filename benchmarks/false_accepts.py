@@ -23,34 +23,32 @@ import numpy as np
 import pycolmap
 import torch
 
-from confs import features as features_confs
-from confs import matchers as matchers_confs
-from hloc_reduce import (
-    cli,
-    colmap,
-    extract_features,
-    intrinsics,
-    localization,
-    localize_inloc,
-    maps,
-    projections,
-    scans,
-)
-from hloc_reduce.confidence import DEFAULT_GATE, Gate
-from hloc_reduce.datasets import Aachen, InLoc, true_poses
+from hloc_reduce import extract_features, localize_inloc, maps, projections
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.datasets import scans, true_poses
+from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.io import (
-    get_colmap_keypoints,
-    get_image_size,
-    open_h5,
-    read_image,
-    replacing,
-    write_csv,
-)
-from hloc_reduce.localize_sfm import RANSAC_THRESH, SfmMap, merged
+from hloc_reduce.localization import query
+from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.localization.query import merged
+from hloc_reduce.localization.references import Reference, ScanMap, SfmMap
+from hloc_reduce.localize_sfm import RANSAC_THRESH
+from hloc_reduce.maps import intrinsics
 from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
-from hloc_reduce.storage import get_descriptors, restore, store
 from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.feature_files import (
+    get_colmap_keypoints,
+    get_descriptors,
+    get_image_size,
+    restore,
+    store,
+)
+from hloc_reduce.utils.files import replacing, write_csv
+from hloc_reduce.utils.h5 import open_h5
+from hloc_reduce.utils.images import read_image
 
 BASE, MAP_FEATURE = "colmap_sift", "colmap_sift_sv64"
 EVERY = 3
@@ -88,7 +86,7 @@ class Place:
     name: str
     images: Path
     queries: list[tuple[str, pycolmap.Camera, pycolmap.Rigid3d]]
-    reference: localization.Reference
+    reference: Reference
     names: list[str]
     features: Path
     metric: bool
@@ -142,7 +140,7 @@ def _of_scans(place: InLoc, output: Path) -> Place:
     queries = [(name, camera, truth[name]) for name, camera in place.queries(features)]
     points = localize_inloc.lift_keypoints(place.root, features, names, output / "points3D.h5")
     poses = {name: scans.read_pose(place.root, name) for name in names}
-    reference = localize_inloc.ScanMap(h5py.File(points), h5py.File(features), poses)
+    reference = ScanMap(h5py.File(points), h5py.File(features), poses)
     extent = float(np.linalg.norm(np.std([pose[:3, 3] for pose in poses.values()], axis=0)))
     return Place(place.root.name, place.root, queries, reference, names, features, True, extent)
 
@@ -301,9 +299,7 @@ def localize(
     """Localize a query with intrinsics that are refined in a way."""
     camera, refinement = camera
     config = merged({"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}, refinement)
-    cam_from_world, info = localization.localize(
-        place.reference, keypoints, camera, matches, config, gate
-    )
+    cam_from_world, info = query.localize(place.reference, keypoints, camera, matches, config, gate)
     depths = [np.nan]
     if cam_from_world is not None and info["inliers"].any():
         points = info["points3D"][info["inliers"]]

@@ -18,9 +18,9 @@ import cv2
 import darken_place
 import numpy as np
 
-from hloc_reduce import cli
-from hloc_reduce.io import read_image
 from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.images import read_image
 from pipelines.layouts import pipeline_of
 
 MEGAPIXELS = (0.3, 0.5, 1.0, 2.0, 12.0)

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hloc_reduce import Localizer, cli
-from hloc_reduce.extract_features import list_images
-from hloc_reduce.progress import progress
+from hloc_reduce import Localizer
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.images import list_images
+from hloc_reduce.utils.progress import progress
 
 STAGES = ("extraction", "retrieval", "matching", "pose")
 

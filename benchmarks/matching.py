@@ -16,9 +16,10 @@ from importlib.util import find_spec
 import numpy as np
 import torch
 
-from hloc_reduce import cli, parallel
-from hloc_reduce.cli import InputError
 from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
+from hloc_reduce.runtime import parallel
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
 
 RATIO = 0.8
 MATCHING = 0.1  # of the descriptors

@@ -21,13 +21,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hloc_reduce import cli, projections
-from hloc_reduce.cli import InputError
+from hloc_reduce import projections
 from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, DIM
 from hloc_reduce.evaluation.matching import average_precision
 from hloc_reduce.training import nested, tracks
 from hloc_reduce.training.__main__ import parse_maps
 from hloc_reduce.training.sampling import matchable
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
 
 KINDS = ("matched", "completed", "dark", "photo pairs")
 MIN_SHARED = 30  # points that a pair of photos must share

@@ -16,10 +16,12 @@ import pycolmap
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from confs import features as features_confs
-from hloc_reduce import cli, colmap, maps
-from hloc_reduce.cli import InputError
+from hloc_reduce import maps
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.maps import build
 from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.cli import InputError
 
 COLUMNS = ("registered", "points", "reprojection error", "positions", "rotations", "seconds")
 ROBUST = 10  # rounds of reweighting
@@ -183,11 +185,11 @@ def _main() -> None:
     parser.add_argument(
         "--max_exhaustive",
         type=int,
-        default=maps.MAX_EXHAUSTIVE,
+        default=build.MAX_EXHAUSTIVE,
         help="photos of which all pairs are matched",
     )
     args = parser.parse_args()
-    maps.MAX_EXHAUSTIVE = args.max_exhaustive
+    build.MAX_EXHAUSTIVE = args.max_exhaustive
     main(
         parse_maps(args.map),
         args.output,

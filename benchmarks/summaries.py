@@ -4,8 +4,8 @@ import argparse
 import json
 from pathlib import Path
 
-from hloc_reduce import cli
-from hloc_reduce.cli import InputError
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
 
 HEADER = (
     "| feature | bytes | list | localized | recall [%] | median error | mean inliers | points | s |"

@@ -1,12 +1,5 @@
-"""Matchers, by hloc's names."""
+"""Matchers by hloc's names."""
 
-confs = {
-    "NN-ratio": {
-        "output": "matches-NN-mutual-ratio.8",
-        "model": {"name": "nearest_neighbor", "ratio_threshold": 0.8},
-    },
-    "NN-mutual": {
-        "output": "matches-NN-mutual",
-        "model": {"name": "nearest_neighbor"},
-    },
-}
+from hloc_reduce.confs.matchers import confs
+
+__all__ = ["confs"]

@@ -1,8 +1,5 @@
 """Global descriptors made of local features."""
 
-confs = {
-    "vlad": {
-        "output": "global-feats-vlad",
-        "model": {"name": "vlad", "num_words": 64, "max_samples": 200_000},
-    },
-}
+from hloc_reduce.confs.retrieval import confs
+
+__all__ = ["confs"]

@@ -3,7 +3,7 @@
 import logging
 from typing import TYPE_CHECKING
 
-from . import interrupts
+from .utils import interrupts
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     import torch
 
-    from .localizer import Localizer
+    from .maps.localizer import Localizer
 
 __version__ = "0.1.0"
 
@@ -31,7 +31,7 @@ interrupts.while_importing()
 def __getattr__(name: str) -> "type[Localizer]":
     """Import `Localizer` when it is asked for: it takes seconds."""
     if name == "Localizer":
-        from .localizer import Localizer
+        from .maps.localizer import Localizer
 
         return Localizer
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -58,9 +58,8 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
     """
     import torch
 
-    from confs.features import of_patches
-
     from . import projections
+    from .confs.features import of_patches
     from .descriptors import Descriptor
 
     if not isinstance(patches, torch.Tensor):

@@ -8,17 +8,18 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
-from confs import retrieval as retrieval_confs
-
-from . import cli, colmap, extractors, io, logger, stamps
-from .base_model import dynamic_load
-from .cli import InputError
-from .extractors.vlad import read_vocabulary
-from .group_writer import GroupWriter, failures
-from .io import list_h5_names, open_h5, replacing
-from .paths import strings_as_paths
-from .progress import progress
-from .storage import get_descriptors
+from . import extractors, logger
+from .aggregators.vlad import read_vocabulary
+from .confs import retrieval as retrieval_confs
+from .runtime.group_writer import GroupWriter, failures
+from .utils import cli, colmap
+from .utils.base_model import dynamic_load
+from .utils.cli import InputError
+from .utils.feature_files import get_descriptors
+from .utils.files import file_sha256, replacing
+from .utils.h5 import file_provenance, list_h5_names, open_h5
+from .utils.paths import strings_as_paths
+from .utils.progress import progress
 
 confs = retrieval_confs.confs
 
@@ -52,12 +53,12 @@ def main(
     output = Path(export_dir or features.parent) / f"{conf['output']}_{features.stem}.h5"
     model = dynamic_load(extractors, conf["model"]["name"])(conf["model"]).eval()
     with open_h5(features) as file:
-        made_by = {"model": conf["model"], "features": io.provenance(file)}
+        made_by = {"model": conf["model"], "features": file_provenance(file)}
         learn = vocabulary is None
         if learn:
             vocabulary = vocabulary_of(output)
         else:
-            made_by["vocabulary"] = stamps.sha256(vocabulary)
+            made_by["vocabulary"] = file_sha256(vocabulary)
         with GroupWriter(output, made_by, overwrite) as writer:
             failed = failures(features)
             names = [name for name in list_h5_names(features) if name not in failed]

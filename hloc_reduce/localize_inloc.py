@@ -4,27 +4,32 @@ import argparse
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pycolmap
 
-from . import cli, localization, logger, scans, stamps
-from .cli import InputError
-from .confidence import DEFAULT_GATE, Gate, add_gate_options
-from .executors import SERIAL, Executor
-from .group_writer import Group, GroupWriter, failures, fill
-from .io import get_dataset, get_image_size, get_keypoints, open_h5, reading
-from .parsers import parse_query_lists, parse_retrieval
-from .paths import strings_as_paths
-from .progress import progress
+from . import logger
+from .datasets import scans
+from .datasets.inloc import RANSAC_SIZE, RANSAC_THRESH, by_iphone7
+from .localization import stage
+from .localization.confidence import DEFAULT_GATE, Gate, add_gate_options
+from .localization.records import to_stamp
+from .localization.references import ScanMap, point_group
+from .runtime import provenance
+from .runtime.executors import SERIAL, Executor
+from .runtime.group_writer import Group, GroupWriter, failures, fill
+from .utils import cli
+from .utils.cli import InputError
+from .utils.feature_files import get_image_size, get_keypoints
+from .utils.h5 import open_h5
+from .utils.parsers import parse_query_lists, parse_retrieval
+from .utils.paths import strings_as_paths
+from .utils.progress import progress
 
-RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
-RANSAC_SIZE = 4032  # the longer side of such a photo
 CHUNK = 4  # cutouts
-CACHED_IMAGES = 128  # points of so many cutouts stay in memory: 25 MB at 8,000 keypoints
 
 
 @strings_as_paths
@@ -86,10 +91,10 @@ def main(
     lift_keypoints(dataset_dir, features, cutouts, points, overwrite, executor)
 
     options = {"ransac_thresh": ransac_thresh, "skip_matches": skip_matches}
-    options["queries"] = localization.to_stamp(queries)
+    options["queries"] = to_stamp(queries)
     poses = {cutout: scans.read_pose(dataset_dir, cutout) for cutout in cutouts}
     options["scans"] = hashlib.sha256(np.array(list(poses.values())).tobytes()).hexdigest()
-    return localization.main(
+    return stage.main(
         partial(_load, points, features, poses),
         queries,
         retrieved,
@@ -97,7 +102,7 @@ def main(
         matches,
         results,
         partial(_config, ransac_thresh),
-        stamps.stamp(options, [p for p in (retrieval, features, matches) if p.exists()]),
+        provenance.stamp(options, [p for p in (retrieval, features, matches) if p.exists()]),
         overwrite,
         skip_matches=skip_matches,
         executor=executor,
@@ -117,30 +122,6 @@ def _config(ransac_thresh: float, _: str, camera: pycolmap.Camera) -> dict:
 def points_file(features: Path) -> Path:
     """Return the file of the points that the keypoints of a feature file show."""
     return features.with_name(f"{features.stem}-points3D.h5")
-
-
-def point_group(features: h5py.File, name: str) -> str:
-    """Return the group of the points of a cutout, which is named by its keypoints, too.
-
-    So features that have the same keypoints share their points, and others do not.
-    """
-    keypoints, _ = get_keypoints(features, name)
-    size = np.array(get_image_size(features, name))
-    return f"{name}/{hashlib.sha256(size.tobytes() + keypoints.tobytes()).hexdigest()[:16]}"
-
-
-def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap.Camera]]:
-    """Give queries of a feature file the intrinsics of the benchmark's: 28 mm on 35 mm film."""
-    queries = []
-    with open_h5(features) as file:
-        for name in names:
-            width, height = get_image_size(file, name)
-            params = [max(width, height) * 28 / 36, width / 2, height / 2]
-            camera = pycolmap.Camera(
-                model="SIMPLE_PINHOLE", width=width, height=height, params=params
-            )
-            queries.append((name, camera))
-    return queries
 
 
 @strings_as_paths
@@ -193,61 +174,6 @@ def _lift(
             if known < 0.5:
                 logger.warning("%.0f %% of the keypoints of %s have depth.", 100 * known, name)
             yield None, (point_group(file, name), {"points3D": points.astype(np.float32)}, {})
-
-
-class ScanMap:
-    """Keypoints of cutouts and the points that they show, as a `localization.Reference`.
-
-    Args:
-        file: open h5 file of `lift_keypoints`.
-        features: open feature file.
-        poses: from cutout to the pose of its scan, floor from scan (4, 4).
-    """
-
-    def __init__(self, file: h5py.File, features: h5py.File, poses: Mapping[str, np.ndarray]):
-        self.file, self.features, self.poses = file, features, poses
-        self.points = lru_cache(CACHED_IMAGES)(self._read)
-        # by name, so that no order of queries or cutouts changes anything
-        self.numbers = {name: number for number, name in enumerate(sorted(poses))}
-
-    def _read(self, name: str) -> np.ndarray:
-        group = point_group(self.features, name)
-        with reading(self.file.filename):
-            found = group in self.file
-        if not found:
-            raise InputError(
-                f"{self.file.filename} is not of the keypoints of {name} that are now in "
-                f"{self.features.filename}: localize anew."
-            )
-        points = get_dataset(self.file, group, "points3D")[()].astype(np.float64)
-        pose = self.poses[name]
-        return points @ pose[:3, :3].T + pose[:3, 3]
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.numbers
-
-    def num_keypoints(self, name: str) -> int:
-        """Return how many keypoints a cutout has."""
-        return get_dataset(self.features, name, "keypoints").shape[0]
-
-    def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ids and coordinates of the points that keypoints of a cutout show.
-
-        Every keypoint of every cutout has a point of its own.
-        """
-        points = self.points(name)[keypoints]
-        ids = (self.numbers[name] << 32) + keypoints
-        return np.where(np.isfinite(points[:, 0]), ids, -1), points
-
-    def clusters(self, names: list[str]) -> list[list[str]]:
-        """Split cutouts by floor, the floor of the first one first."""
-        floors: dict[str, list[str]] = {}
-        for name in names:
-            floors.setdefault(scans.floor_of(name), []).append(name)
-        return list(floors.values())
-
-    def fallback(self, names: list[str]) -> None:
-        """Return None: a cutout has no pose."""
 
 
 def _main() -> None:

@@ -5,17 +5,19 @@ from collections.abc import Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 
-import numpy as np
 import pycolmap
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from . import cli, colmap, localization, stamps
-from .cli import InputError
-from .confidence import DEFAULT_GATE, Gate, add_gate_options
-from .executors import SERIAL, Executor
-from .parsers import parse_query_lists, parse_retrieval
-from .paths import strings_as_paths
+from .localization import stage
+from .localization.confidence import DEFAULT_GATE, Gate, add_gate_options
+from .localization.query import merged
+from .localization.records import to_stamp
+from .localization.references import SfmMap
+from .runtime import provenance
+from .runtime.executors import SERIAL, Executor
+from .utils import cli, colmap
+from .utils.cli import InputError
+from .utils.parsers import parse_query_lists, parse_retrieval
+from .utils.paths import strings_as_paths
 
 RANSAC_THRESH = 12.0  # pixels, as in hloc
 
@@ -82,7 +84,7 @@ def main(
         inputs += sorted(queries.parent.glob(queries.name))
         queries = [query for part in parse_query_lists(queries).values() for query in part]
     else:
-        options["queries"] = localization.to_stamp(queries)
+        options["queries"] = to_stamp(queries)
     if in_memory:
         load = partial(SfmMap, reference_sfm, covisibility_clustering)
     else:
@@ -98,7 +100,7 @@ def main(
     if covisibility_clustering:
         options["covisibility_clustering"] = True
     try:
-        return localization.main(
+        return stage.main(
             load,
             queries,
             retrieved,
@@ -106,7 +108,7 @@ def main(
             matches,
             results,
             partial(_config, config, refinements),
-            stamps.stamp(options, [path for path in inputs if path.exists()]),
+            provenance.stamp(options, [path for path in inputs if path.exists()]),
             overwrite or in_memory,
             name_parts=None if full_names else 2 if prepend_camera_name else 1,
             executor=SERIAL if in_memory else executor,
@@ -124,76 +126,6 @@ def _load(path: Path, covisibility_clustering: bool, written: int) -> "SfmMap":
 
 def _config(config: dict, refinements: Mapping[str, dict], name: str, _: pycolmap.Camera) -> dict:
     return merged(config, refinements.get(name, {}))
-
-
-def merged(config: dict, refinement: dict) -> dict:
-    """Merge two dicts of options under "estimation" and "refinement"; the second one wins."""
-    keys = config.keys() | refinement.keys()
-    return {key: {**config.get(key, {}), **refinement.get(key, {})} for key in keys}
-
-
-class SfmMap:
-    """A COLMAP model to localize in, as a `localization.Reference`.
-
-    Args:
-        reconstruction: the model.
-        covisibility_clustering: match each cluster of images that see common points by itself.
-
-    Raises:
-        InputError: when it has no point.
-    """
-
-    def __init__(
-        self, reconstruction: pycolmap.Reconstruction, covisibility_clustering: bool = False
-    ):
-        if reconstruction.num_points3D() == 0:
-            raise InputError("The map is empty: no query can be localized in it.")
-        self.covisibility_clustering = covisibility_clustering
-        self.images = {image.name: image for image in reconstruction.images.values()}
-        ids = np.array(sorted(reconstruction.point3D_ids()), np.int64)
-        self.point_ids = ids
-        self.points = np.array([reconstruction.points3D[i].xyz for i in ids])
-        self._rows: dict[str, np.ndarray] = {}
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.images
-
-    def num_keypoints(self, name: str) -> int:
-        """Return how many keypoints an image has."""
-        return self.images[name].num_points2D()
-
-    def point_rows(self, name: str) -> np.ndarray:
-        """Return for each keypoint of an image the row of `points` (N,), -1 where none."""
-        if name not in self._rows:
-            ids = colmap.point3D_ids(self.images[name])
-            self._rows[name] = np.where(ids >= 0, np.searchsorted(self.point_ids, ids), -1)
-        return self._rows[name]
-
-    def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ids and coordinates of the points that keypoints of an image show."""
-        rows = self.point_rows(name)[keypoints]
-        return np.where(rows >= 0, self.point_ids[rows], -1), self.points[rows]
-
-    def clusters(self, names: list[str]) -> list[list[str]]:
-        """Split images into clusters that see no common point, the largest first."""
-        if not self.covisibility_clustering:
-            return [names]
-        rows = [self.point_rows(name) for name in names]
-        image = np.repeat(np.arange(len(rows)), [len(part) for part in rows])
-        point = np.concatenate(rows)
-        seen = coo_array(
-            (np.ones((point >= 0).sum()), (image[point >= 0], point[point >= 0])),
-            shape=(len(rows), len(self.points)),
-        ).tocsr()
-        number, label = connected_components(seen @ seen.T, directed=False)
-        clusters = [[] for _ in range(number)]
-        for name, cluster in zip(names, label, strict=True):
-            clusters[cluster].append(name)
-        return sorted(clusters, key=len, reverse=True)
-
-    def fallback(self, names: list[str]) -> pycolmap.Rigid3d:
-        """Return the pose of the first of some images, or of the first of all."""
-        return self.images[names[0] if names else min(self.images)].cam_from_world()
 
 
 def _main() -> None:

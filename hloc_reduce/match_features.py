@@ -12,20 +12,22 @@ import h5py
 import numpy as np
 import torch
 
-from confs import features as features_confs
-from confs import matchers as matchers_confs
-
-from . import cli, io, logger, matchers, parallel
-from .base_model import dynamic_load
-from .cli import InputError
-from .executors import SERIAL, Executor
-from .group_writer import Group, GroupWriter, fill
-from .io import names_to_pair, open_h5
+from . import logger, matchers
+from .confs import features as features_confs
+from .confs import matchers as matchers_confs
 from .matchers.nearest_neighbor import GPU_BYTES
-from .parsers import parse_pairs
-from .paths import strings_as_paths
-from .progress import progress
-from .storage import get_descriptors
+from .runtime import parallel
+from .runtime.executors import SERIAL, Executor
+from .runtime.group_writer import Group, GroupWriter, fill
+from .utils import cli
+from .utils.base_model import dynamic_load
+from .utils.cli import InputError
+from .utils.feature_files import get_descriptors
+from .utils.h5 import file_provenance, open_h5
+from .utils.match_files import names_to_pair
+from .utils.parsers import parse_pairs
+from .utils.paths import strings_as_paths
+from .utils.progress import progress
 
 confs = matchers_confs.confs
 CACHE_BYTES = 2**30  # descriptors that stay in memory: of 500 images at 8,000 x 64
@@ -103,7 +105,7 @@ def provenance(conf: dict, *feature_files: h5py.File) -> dict:
     """Return what determines the matches: the configurations of matcher and features."""
     made_by = {"model": conf["model"]}
     for i, file in enumerate(feature_files):
-        made_by[f"features{i}"] = io.provenance(file)
+        made_by[f"features{i}"] = file_provenance(file)
     return made_by
 
 

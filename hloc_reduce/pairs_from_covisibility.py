@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import coo_array
 
-from . import cli, colmap, logger
-from .parsers import write_pairs
-from .paths import strings_as_paths
+from . import logger
+from .utils import cli, colmap
+from .utils.parsers import write_pairs
+from .utils.paths import strings_as_paths
 
 BLOCK = 256  # images whose counts with all others are in memory at once
 

@@ -5,11 +5,12 @@ from collections.abc import Iterable
 from itertools import combinations, product
 from pathlib import Path
 
-from . import cli, logger
-from .cli import InputError
-from .io import list_h5_names
-from .parsers import check_names, image_names, write_pairs
-from .paths import strings_as_paths
+from . import logger
+from .utils import cli
+from .utils.cli import InputError
+from .utils.h5 import list_h5_names
+from .utils.parsers import check_names, image_names, write_pairs
+from .utils.paths import strings_as_paths
 
 
 @strings_as_paths

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from . import cli, colmap, logger
-from .cli import InputError
-from .io import get_array, list_h5_names, open_h5
-from .parsers import check_names, image_names, parse_retrieval, write_pairs
-from .paths import strings_as_paths
-from .progress import progress
+from . import logger
+from .utils import cli, colmap
+from .utils.cli import InputError
+from .utils.h5 import get_array, list_h5_names, open_h5
+from .utils.parsers import check_names, image_names, parse_retrieval, write_pairs
+from .utils.paths import strings_as_paths
+from .utils.progress import progress
 
 # queries, and images of the database, whose descriptors are in memory at once
 BLOCK, BLOCK_BYTES = 2**14, 2**28

@@ -12,14 +12,16 @@ import pycolmap
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from . import cli, colmap, io, logger, stamps
-from .cli import InputError
-from .extract_features import list_images
-from .io import list_h5_names, open_h5
+from . import logger
 from .pairs_from_retrieval import rank, read_global
-from .parsers import parse_pairs, write_pairs
-from .paths import strings_as_paths
+from .runtime import provenance
 from .triangulation import read_matches
+from .utils import cli, colmap
+from .utils.cli import InputError
+from .utils.h5 import file_provenance, list_h5_names, open_h5
+from .utils.images import list_images
+from .utils.parsers import parse_pairs, write_pairs
+from .utils.paths import strings_as_paths
 
 MIN_INLIERS = 15  # verified matches of a pair that connects its images, COLMAP's min_num_matches
 MIN_PAIRS = 3  # verified pairs of an image that is connected well
@@ -170,11 +172,11 @@ def _verify(
     path = matches.with_name(f"{matches.stem}_verified.json")
     with open_h5(features) as feature_file, open_h5(matches) as match_file:
         made_from = {
-            "features": io.provenance(feature_file),
-            "matches": io.provenance(match_file),
+            "features": file_provenance(feature_file),
+            "matches": file_provenance(match_file),
             "camera_mode": camera_mode.name,
         }
-    before = stamps.read(path)
+    before = provenance.read(path)
     known = before.get("pairs", {}) if before.get("made_from") == made_from else {}
     todo = [pair for pair in pairs if "\t".join(pair) not in known]
     if todo:
@@ -191,7 +193,7 @@ def _verify(
             counts = colmap.count_verified(database)
         counts = {tuple(sorted(pair)): number for pair, number in counts.items()}
         known = known | {"\t".join(pair): counts.get(pair, 0) for pair in todo}
-        stamps.write(path, {"made_from": made_from, "pairs": known})
+        provenance.write(path, {"made_from": made_from, "pairs": known})
     return {pair: known["\t".join(pair)] for pair in pairs}
 
 

@@ -11,13 +11,15 @@ import pycolmap
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from . import cli, colmap, logger, stamps
-from .cli import InputError
-from .confidence import focal_lengths
-from .extract_features import list_images
-from .io import list_h5_names
-from .paths import strings_as_paths
+from . import logger
+from .localization.confidence import focal_lengths
+from .runtime import provenance
 from .triangulation import STAMP, read_matches, replacing_map
+from .utils import cli, colmap
+from .utils.cli import InputError
+from .utils.h5 import list_h5_names
+from .utils.images import list_images
+from .utils.paths import strings_as_paths
 
 REGISTRATION = "registration.json"  # which images are in the model, and in other parts
 # shares of the images that are in the model, below which it is reported in detail, or refused
@@ -145,9 +147,9 @@ def reconstruct(
         "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
         "once": once,
     }
-    made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
-    is_whole = bool(stamps.read(sfm_dir / REGISTRATION))
-    if not overwrite and is_whole and stamps.is_current(sfm_dir / STAMP, made_from):
+    made_from = provenance.stamp({**options, **chosen}, [pairs, features, matches])
+    is_whole = bool(provenance.read(sfm_dir / REGISTRATION))
+    if not overwrite and is_whole and provenance.is_current(sfm_dir / STAMP, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
         return colmap.read_model(sfm_dir)
 
@@ -209,7 +211,7 @@ def reconstruct(
             "implausible": {name: lens for name, lens in dropped.items() if name in missing},
             "alike": alike,
         }
-        stamps.write(building / REGISTRATION, state)
+        provenance.write(building / REGISTRATION, state)
         database.rename(building / "database.db")
         for other in building.glob("database-*"):
             other.unlink()
@@ -344,7 +346,7 @@ def check(sfm_dir: Path, accept_partial: bool) -> None:
     Raises:
         InputError: if it has fewer than half of them, unless `accept_partial`.
     """
-    state = stamps.read(sfm_dir / REGISTRATION)
+    state = provenance.read(sfm_dir / REGISTRATION)
     missing, number = state["missing"], state["images"]
     registered = number - len(missing)
     if registered >= ENOUGH * number and len(state["parts"]) == 1:

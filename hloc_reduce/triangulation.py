@@ -9,12 +9,16 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from . import cli, colmap, logger, stamps
-from .cli import InputError
-from .io import get_colmap_keypoints, get_matches, open_h5
-from .parsers import parse_retrieval
-from .paths import strings_as_paths
-from .progress import progress
+from . import logger
+from .runtime import provenance
+from .utils import cli, colmap
+from .utils.cli import InputError
+from .utils.feature_files import get_colmap_keypoints
+from .utils.h5 import open_h5
+from .utils.match_files import get_matches
+from .utils.parsers import parse_retrieval
+from .utils.paths import strings_as_paths
+from .utils.progress import progress
 
 MAX_EPIPOLAR_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
 STAMP = "made_from.json"
@@ -75,8 +79,8 @@ def main(
         "min_match_score": min_match_score,
     }
     chosen = {key: value for key, value in verification.items() if value}
-    made_from = stamps.stamp({**options, **chosen}, [*model_files, pairs, features, matches])
-    if not overwrite and stamps.is_current(sfm_dir / STAMP, made_from):
+    made_from = provenance.stamp({**options, **chosen}, [*model_files, pairs, features, matches])
+    if not overwrite and provenance.is_current(sfm_dir / STAMP, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
         return colmap.read_model(sfm_dir)
 
@@ -132,7 +136,7 @@ def replacing_map(
     building.mkdir(parents=True)
     try:
         yield building
-        stamps.write(building / STAMP, made_from)
+        provenance.write(building / STAMP, made_from)
     except BaseException:
         shutil.rmtree(building, ignore_errors=True)
         raise

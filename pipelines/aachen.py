@@ -7,24 +7,18 @@ for each query and estimates its pose; a run that was stopped goes on where it w
 import argparse
 from pathlib import Path
 
-from confs import features as features_confs
-from confs import matchers as matchers_confs
-from hloc_reduce import (
-    cli,
-    colmap,
-    demo,
-    extract_features,
-    localize_sfm,
-    pairs_from_covisibility,
-    trace,
-    triangulation,
-)
-from hloc_reduce.confidence import DEFAULT_GATE, Gate
-from hloc_reduce.datasets import Aachen, thresholds, true_poses
-from hloc_reduce.detection import KEYPOINTS
-from hloc_reduce.executors import SERIAL, Executor
-from hloc_reduce.paths import strings_as_paths
-from hloc_reduce.storage import STORAGES
+from hloc_reduce import demo, extract_features, localize_sfm, pairs_from_covisibility, triangulation
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.datasets import thresholds, true_poses
+from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.detectors.dog import KEYPOINTS
+from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.runtime import trace
+from hloc_reduce.runtime.executors import SERIAL, Executor
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.paths import strings_as_paths
 
 from . import common
 

@@ -10,26 +10,35 @@ from pathlib import Path
 
 import pycolmap
 
-from confs import features as features_confs
-from confs import matchers as matchers_confs
 from hloc_reduce import (
     aggregate_features,
-    cli,
     extract_features,
     extractors,
-    io,
     logger,
     match_features,
     pairs_from_retrieval,
-    results,
-    stamps,
 )
-from hloc_reduce.cli import InputError
-from hloc_reduce.confidence import add_gate_options
-from hloc_reduce.executors import SERIAL, Executor
-from hloc_reduce.group_writer import failures
-from hloc_reduce.parsers import parse_pairs, parse_retrieval, write_pairs
-from hloc_reduce.versions import versions
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.evaluation.summaries import (
+    bytes_per_keypoint,
+    query_table,
+    recall_table,
+    summarize_list,
+    write_summary,
+)
+from hloc_reduce.localization.confidence import add_gate_options
+from hloc_reduce.runtime import provenance
+from hloc_reduce.runtime.executors import SERIAL, Executor
+from hloc_reduce.runtime.group_writer import failures
+from hloc_reduce.runtime.outputs import RunFolder
+from hloc_reduce.runtime.versions import versions
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.files import write_csv
+from hloc_reduce.utils.h5 import get_text, list_h5_names, open_h5
+from hloc_reduce.utils.images import list_images
+from hloc_reduce.utils.parsers import parse_pairs, parse_retrieval, write_pairs
 
 # suffix of a retrieval file -> what makes pairs of it; any other is a text file of pairs
 PAIRS_FROM = {".h5": pairs_from_retrieval.main, ".hdf5": pairs_from_retrieval.main}
@@ -144,7 +153,7 @@ def check_retrieval(
     if Path(retrieval).resolve() == output.resolve():
         raise InputError(f"--retrieval {retrieval} would be overwritten: move it elsewhere.")
     if Path(retrieval).suffix in PAIRS_FROM:
-        io.list_h5_names(Path(retrieval))
+        list_h5_names(Path(retrieval))
         return map_names
     pairs, names = parse_retrieval(Path(retrieval)), set(map_names)
     found = [[other for other in pairs.get(name, ()) if other in names] for name in query_names]
@@ -160,7 +169,7 @@ def check_queries(image_dir: Path, names: list[str], strict: bool) -> None:
         InputError: as said.
     """
     if strict or not any((image_dir / name).is_file() for name in names):
-        extract_features.list_images(image_dir, names)
+        list_images(image_dir, names)
 
 
 def readable(features: Path, names: list[str]) -> list[str]:
@@ -178,7 +187,7 @@ def run_folder(
     numbers: dict[str, int],
     overwrite: bool,
     features: Path | None = None,
-) -> results.RunFolder:
+) -> RunFolder:
     """Open the output folder of a data set's pipeline, or refuse it, before any work is done.
 
     It is begun anew if the given features were.
@@ -203,14 +212,14 @@ def run_folder(
     if retrieval != "vlad" and outputs.resolve().parent in Path(retrieval).resolve().parents:
         conf["retrieval"] = _placed(Path(retrieval), outputs)  # which may be moved with it
     if features is not None:
-        with io.open_h5(features) as file:
-            conf["features"] = io.get_text(file, "id", str(features))
-        before = stamps.read(outputs / "conf.json")
+        with open_h5(features) as file:
+            conf["features"] = get_text(file, "id", str(features))
+        before = provenance.read(outputs / "conf.json")
         made_anew = before.get("features") not in (None, conf["features"])
         overwrite |= made_anew and {**before, "features": conf["features"]} == conf
     elif overwrite or not (outputs / "conf.json").exists():
         extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
-    return results.RunFolder(
+    return RunFolder(
         outputs, conf, overwrite, inputs=[] if retrieval == "vlad" else [Path(retrieval)]
     )
 
@@ -248,15 +257,15 @@ def _aggregate(features: Path, map_names: list[str]) -> Path:
     name = f"{conf['output']}_{features.stem}"
     stamp = features.with_name(f"{name}.made_from.json")
     learned_from = {"images": hashlib.sha256("\n".join(map_names).encode()).hexdigest()}
-    if stamps.read(stamp) not in ({}, learned_from):
+    if provenance.read(stamp) not in ({}, learned_from):
         for made in features.parent.glob(f"{glob.escape(name)}*"):
             shutil.rmtree(made) if made.is_dir() else made.unlink()
-    stamps.write(stamp, learned_from)
+    provenance.write(stamp, learned_from)
     return aggregate_features.main(conf, features, map_names)
 
 
 def finish(
-    folder: results.RunFolder,
+    folder: RunFolder,
     summary: dict,
     lists: Mapping[str, Iterable[str]],
     records: Mapping[str, dict],
@@ -284,7 +293,7 @@ def finish(
     Returns:
         The summary.
     """
-    rows = results.query_table(lists, records, truth)
+    rows = query_table(lists, records, truth)
     failed = {name: reason for name, reason in failures(features).items() if name in records}
     if failed:
         logger.warning(
@@ -292,19 +301,17 @@ def finish(
             "them again.",
             *(len(failed), len(rows), extract_features.with_reasons(failed)),
         )
-    io.write_csv(rows, folder.path / "queries.csv")
+    write_csv(rows, folder.path / "queries.csv")
     summary = {
         **summary,
         "queries": len(rows),
         "queries_localized": sum(row["status"] == "localized" for row in rows),
         "queries_unreadable": len(failed),
         "lists": {
-            name: results.summarize_list(
-                [row for row in rows if row["list"] == name], thresholds[name]
-            )
+            name: summarize_list([row for row in rows if row["list"] == name], thresholds[name])
             for name in lists
         },
-        "bytes_per_keypoint": results.bytes_per_keypoint(features),
+        "bytes_per_keypoint": bytes_per_keypoint(features),
         "seconds": folder.seconds(),
         "bytes": folder.bytes(),
         "versions": versions(),
@@ -314,7 +321,7 @@ def finish(
             for key, path in {"features": features, **files}.items()
         },
     }
-    results.write_summary(summary, folder.path / "summary.json")
+    write_summary(summary, folder.path / "summary.json")
     return summary
 
 
@@ -335,6 +342,6 @@ def print_result(summary: dict, outputs: Path, unknown: str) -> None:
         outputs,
     )
     if any("recall_percent" in result for result in summary["lists"].values()):
-        print(results.recall_table(summary["feature"], summary["lists"]))
+        print(recall_table(summary["feature"], summary["lists"]))
     else:
         print(f"The true poses are not known here. {unknown.format(outputs / summary['poses'])}")

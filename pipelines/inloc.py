@@ -7,20 +7,18 @@ estimates the query's pose; a run that was stopped goes on where it was.
 import argparse
 from pathlib import Path
 
-from confs import features as features_confs
-from confs import matchers as matchers_confs
-from hloc_reduce import (
-    cli,
-    extract_features,
-    localize_inloc,
-    trace,
-)
-from hloc_reduce.confidence import DEFAULT_GATE, Gate
-from hloc_reduce.datasets import INLOC_THRESHOLDS, InLoc, true_poses
-from hloc_reduce.detection import KEYPOINTS
-from hloc_reduce.executors import SERIAL, Executor
-from hloc_reduce.paths import strings_as_paths
-from hloc_reduce.storage import STORAGES
+from hloc_reduce import extract_features, localize_inloc
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.datasets import INLOC_THRESHOLDS, true_poses
+from hloc_reduce.datasets.inloc import InLoc
+from hloc_reduce.detectors.dog import KEYPOINTS
+from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.runtime import trace
+from hloc_reduce.runtime.executors import SERIAL, Executor
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.paths import strings_as_paths
 
 from . import common
 

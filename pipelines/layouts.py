@@ -3,7 +3,7 @@
 from pathlib import Path
 from types import ModuleType
 
-from hloc_reduce.cli import InputError, no_folder
+from hloc_reduce.utils.cli import InputError, no_folder
 
 from . import aachen, inloc
 

@@ -14,33 +14,32 @@ from pathlib import Path
 
 import pycolmap
 
-from confs import features as features_confs
-from confs import matchers as matchers_confs
 from hloc_reduce import (
     aggregate_features,
-    cli,
-    colmap,
     extract_features,
-    intrinsics,
     localize_sfm,
     logger,
     maps,
     match_features,
     pairs_from_retrieval,
     reconstruction,
-    results,
-    stamps,
-    trace,
 )
-from hloc_reduce.cli import InputError
-from hloc_reduce.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
-from hloc_reduce.detection import KEYPOINTS
-from hloc_reduce.group_writer import failures
-from hloc_reduce.maps import Map
-from hloc_reduce.parsers import parse_query_lists, write_pairs
-from hloc_reduce.paths import strings_as_paths
-from hloc_reduce.storage import STORAGES
+from hloc_reduce.detectors.dog import KEYPOINTS
+from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.maps import intrinsics
+from hloc_reduce.maps.map import RETRIEVAL, Map
+from hloc_reduce.runtime import provenance, trace
+from hloc_reduce.runtime.group_writer import failures
+from hloc_reduce.runtime.outputs import RunFolder
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.images import list_images
+from hloc_reduce.utils.parsers import parse_query_lists, write_pairs
+from hloc_reduce.utils.paths import strings_as_paths
 
 from . import common
 
@@ -142,7 +141,7 @@ def main(
     matcher_conf = matchers_confs.confs[built.matcher]
     given, cameras = queries, {}
     if given is None:
-        names = extract_features.list_images(query_images)
+        names = list_images(query_images)
         lists = {query_images.resolve().name: names}
         cameras = _infer(query_images, names, strict)
         queries = outputs / LISTED
@@ -155,18 +154,18 @@ def main(
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
     made_from = outputs / MADE_FROM
-    before = stamps.read(made_from)
+    before = provenance.read(made_from)
     files = {name: query_images / name for name in names}
     files = {
         name: file for name, file in files.items() if file.is_file() and os.access(file, os.R_OK)
     }
-    now = {"map": built.id, "queries": stamps.fingerprints(files, before.get("queries", {}))}
-    changed = stamps.changed(before.get("queries", {}), now["queries"])
+    now = {"map": built.id, "queries": provenance.fingerprints(files, before.get("queries", {}))}
+    changed = provenance.changed(before.get("queries", {}), now["queries"])
     if before and before.get("map") != now["map"]:
         changed.append(f"the map {built.folder}")
     if changed:
         logger.info("Localizing anew, because of changes: %s.", ", ".join(changed))
-    with results.RunFolder(
+    with RunFolder(
         outputs,
         {
             "map": built.place,
@@ -180,7 +179,7 @@ def main(
     ) as folder:
         if not changed:  # photos that are not in this list may be in the next
             now["queries"] = {**before.get("queries", {}), **now["queries"]}
-        stamps.write(made_from, now)
+        provenance.write(made_from, now)
         sources = dict.fromkeys(names, "list") if given else {}
         sources |= {name: source for name, (_, source) in cameras.items()}
         if given is None:
@@ -202,11 +201,9 @@ def main(
         # when another one has been read, what is finished of these stays
         failed = failures(features)
         now["queries"] = {name: made for name, made in now["queries"].items() if name not in failed}
-        stamps.write(made_from, now)
+        provenance.write(made_from, now)
         with folder.stage("retrieval"):
-            descriptors = aggregate_features.main(
-                maps.RETRIEVAL, features, vocabulary=built.vocabulary
-            )
+            descriptors = aggregate_features.main(RETRIEVAL, features, vocabulary=built.vocabulary)
             if readable:
                 pairs_from_retrieval.main(
                     descriptors,
@@ -290,7 +287,7 @@ def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> P
     name = (queries or query_images.resolve()).stem
     name = re.sub(NOT_IN_NAMES, "_", name).strip("._-")
     folder = outputs / f"queries-{name or 'all'}"
-    before = stamps.read(folder / "conf.json")
+    before = provenance.read(folder / "conf.json")
     own = {"query_images": str(query_images.resolve())}
     own["queries"] = str((queries or folder / LISTED).resolve())
     if any(before.get(key, value) != value for key, value in own.items()):

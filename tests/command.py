@@ -9,7 +9,8 @@ from types import ModuleType
 import h5py
 import pytest
 
-from hloc_reduce import cli, io
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.h5 import iterate_h5_names
 
 
 def run(monkeypatch: pytest.MonkeyPatch, pipeline: ModuleType, *arguments) -> None:
@@ -46,7 +47,7 @@ def contents(path: Path) -> dict:
     with h5py.File(path) as file:
         # but the id, and what has ids of other files
         found = {"": {key: v for key, v in file.attrs.items() if key not in ("id", "conf")}}
-        for name in io.iterate_h5_names(file.id):
+        for name in iterate_h5_names(file.id):
             for key, dataset in file[name].items():
                 found[f"{name}/{key}"] = dataset[()].tobytes(), dict(dataset.attrs)
     return found

@@ -12,8 +12,8 @@ import pycolmap
 import pytest
 from scipy.io import savemat
 
-from hloc_reduce import colmap
 from hloc_reduce.descriptors import weights
+from hloc_reduce.utils import colmap
 
 SHARED = Path(__file__).parents[2] / "shared"
 

@@ -20,18 +20,15 @@ import loky
 import pytest
 from command import results
 
-from hloc_reduce import (
-    cli,
-    extract_features,
-    group_writer,
-    interrupts,
-    io,
-    localization,
-    localize_inloc,
-)
+from hloc_reduce import extract_features, localize_inloc
 from hloc_reduce import match_features as matching
-from hloc_reduce.executors import SERIAL, processes_of_this_machine
-from hloc_reduce.results import RunFolder
+from hloc_reduce.localization import stage as localization_stage
+from hloc_reduce.localization.records import Log
+from hloc_reduce.runtime import group_writer
+from hloc_reduce.runtime.executors import SERIAL, processes_of_this_machine
+from hloc_reduce.runtime.outputs import LOCK, RunFolder
+from hloc_reduce.utils import cli, interrupts
+from hloc_reduce.utils.h5 import iterate_h5_names
 from pipelines import aachen, inloc
 
 PIPELINES = {"aachen": aachen, "inloc": inloc}
@@ -140,7 +137,7 @@ def _run(
         os.dup2(said, number)
     loky.backend.context.set_start_method("fork")  # imports again
     _log_computed(log)
-    for module in (extract_features, matching, localize_inloc, localization):
+    for module in (extract_features, matching, localize_inloc, localization_stage):
         module.CHUNK = 2
     measured = RunFolder.stage
 
@@ -196,7 +193,7 @@ def _log_computed(log: Path) -> None:
         logged.logs = True
         return logged
 
-    pieces, records = group_writer.Pieces, localization._Log
+    pieces, records = group_writer.Pieces, Log
     if not hasattr(pieces.add, "logs"):
         pieces.add = logging(pieces.add, lambda self: self.folder.name.removesuffix(".pieces"))
         records.add = logging(records.add, lambda self: self.path.name)
@@ -223,7 +220,7 @@ def on_disk(outputs: Path) -> set[str]:
             continue
         file = path.name if path.parent == outputs else path.parent.name.removesuffix(".pieces")
         with h5py.File(path) as opened:
-            for name in io.iterate_h5_names(opened.id):
+            for name in iterate_h5_names(opened.id):
                 for dataset in opened[name].values():
                     dataset[()]
                 done.add(f"{file} {name}")
@@ -331,7 +328,7 @@ def end_at_random(
             assert code == 0 or lines[-1].endswith(interrupts.INTERRUPTED), lines
         assert results(outputs) == expected
         left = {path.name for path in outputs.iterdir() if path.name.startswith(".")}
-        assert left == {io.LOCK}
+        assert left == {LOCK}
         assert names(outputs) == whole
         assert not [name for name in os.listdir(outputs) if name.endswith(".pieces")]
     slowest = f"{max(seconds, default=0):.2f} s at most to end by {[*signals]}"

@@ -12,7 +12,8 @@ import pytest
 import torch
 from command import outcome
 
-from hloc_reduce import cli, projections
+from hloc_reduce import projections
+from hloc_reduce.utils import cli
 from pipelines import aachen
 
 

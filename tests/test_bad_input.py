@@ -19,34 +19,34 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load, save_file
 
-from confs import features as features_confs
 from hloc_reduce import (
     aggregate_features,
-    colmap,
     extract_features,
-    group_writer,
-    intrinsics,
-    io,
-    localization,
     localize_sfm,
     match_features,
     pairs_from_retrieval,
-    parsers,
-    phototour,
     projections,
     report,
-    scans,
     storage,
     triangulation,
 )
-from hloc_reduce.cli import InputError
+from hloc_reduce.aggregators.vlad import read_vocabulary
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.datasets import phototour, scans
 from hloc_reduce.evaluation.hpatches import lists
 from hloc_reduce.evaluation.hpatches.data import test_sequences as sequences
 from hloc_reduce.evaluation.poses import pose_error, read_estimates
-from hloc_reduce.extract_features import list_images, provenance
-from hloc_reduce.extractors.vlad import read_vocabulary
-from hloc_reduce.group_writer import GroupWriter
-from hloc_reduce.io import names_to_pair
+from hloc_reduce.extract_features import provenance
+from hloc_reduce.localization.records import RECORDS
+from hloc_reduce.maps import intrinsics
+from hloc_reduce.runtime import group_writer
+from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.utils import colmap, parsers
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import get_descriptors, get_image_size, get_keypoints, store
+from hloc_reduce.utils.h5 import file_provenance, list_h5_names, open_h5
+from hloc_reduce.utils.images import list_images
+from hloc_reduce.utils.match_files import get_matches, names_to_pair
 
 fuzzed = settings(
     max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -105,7 +105,7 @@ TEXTS = {
     "records": (
         "r_logs.jsonl",
         [
-            json.dumps({"records": localization.RECORDS}),
+            json.dumps({"records": RECORDS}),
             json.dumps(["a.jpg", RECORD]),
             '["b.jpg", {"localized": false, "qvec": null}]',
         ],
@@ -472,8 +472,8 @@ def test_damaged_data_are_named(scene):
         for chunk in offsets:
             file.seek(chunk.byte_offset)
             file.write(bytes(chunk.size))
-    with io.open_h5(scene.features) as file:
-        for read in (io.get_keypoints, storage.get_descriptors):
+    with open_h5(scene.features) as file:
+        for read in (get_keypoints, get_descriptors):
             with pytest.raises(InputError, match="features.h5: .*db/0.jpg cannot be read"):
                 read(file, "db/0.jpg")
 
@@ -488,7 +488,7 @@ def write_features(path):
                 "descriptors": generator.standard_normal((8, 20)).astype(np.float32),
                 "image_size": np.array([100, 100]),
             }
-            arrays, attrs = storage.store(features, kind)
+            arrays, attrs = store(features, kind)
             attrs["keypoints"] = {"uncertainty": 1.0}
             failed = {"": {group_writer.FAILURE: "no image"}} if kind == "float32" else {}
             writer.add(name, arrays, attrs | failed)
@@ -496,12 +496,12 @@ def write_features(path):
 
 def read_features(path):
     group_writer.failures(path)
-    with io.open_h5(path) as file:
-        io.provenance(file)
-        for name in io.list_h5_names(path):
-            io.get_keypoints(file, name)
-            io.get_image_size(file, name)
-            storage.get_descriptors(file, name)
+    with open_h5(path) as file:
+        file_provenance(file)
+        for name in list_h5_names(path):
+            get_keypoints(file, name)
+            get_image_size(file, name)
+            get_descriptors(file, name)
 
 
 def write_matches(path):
@@ -517,9 +517,9 @@ def write_matches(path):
 
 def read_matches(path):
     GroupWriter(path, {})
-    with io.open_h5(path) as file:
+    with open_h5(path) as file:
         for name in ("db/0.jpg", "db/1.jpg"):
-            io.get_matches(file, "q.jpg", name, (20, 20))
+            get_matches(file, "q.jpg", name, (20, 20))
 
 
 @pytest.mark.parametrize("old_format", [False, True])  # h5py's default, which hloc's files have
@@ -553,9 +553,9 @@ def test_damaged_h5_files_are_read_or_refused(write, read, old_format, tmp_path)
 
 
 def test_a_damaged_h5_file_is_not_blamed_for_a_bug(scene):
-    with pytest.raises(KeyError, match="no_such"), io.open_h5(scene.features) as file:
+    with pytest.raises(KeyError, match="no_such"), open_h5(scene.features) as file:
         file["no_such"]
-    with pytest.raises(ZeroDivisionError), io.open_h5(scene.features):
+    with pytest.raises(ZeroDivisionError), open_h5(scene.features):
         1 / 0  # noqa: B018
 
 
@@ -651,7 +651,7 @@ def test_names_of_any_kind_of_letters_and_dots_are_localized(plane):
     assert parsers.parse_query_list(queries)[0][0] == query
     conf = features_confs.confs["colmap_sift"]
     features = extract_features.main(conf, plane / "images", plane)
-    assert sorted(io.list_h5_names(features)) == sorted([*renamed, query])
+    assert sorted(list_h5_names(features)) == sorted([*renamed, query])
     found = aggregate_features.main(aggregate_features.confs["vlad"], features, renamed)
     retrieved = pairs_from_retrieval.main(found, plane / "retrieved.txt", 4, query_list=[query])
     assert set(parsers.parse_retrieval(retrieved)[query]) == set(renamed)

@@ -16,15 +16,19 @@ from pathlib import Path
 import command
 import pytest
 
-from hloc_reduce import aggregate_features, cli, detection, extract_features, jobs, scans
-from hloc_reduce.cli import InputError
-from hloc_reduce.confidence import Gate
+from hloc_reduce import aggregate_features, extract_features
+from hloc_reduce.datasets import scans
 from hloc_reduce.descriptors import Descriptor
+from hloc_reduce.detectors import dog
 from hloc_reduce.evaluation import published
-from hloc_reduce.jobs import Job
+from hloc_reduce.localization.confidence import Gate
 from hloc_reduce.report import __main__ as report
-from pipelines import aachen, batch, inloc, tables
-from pipelines.shared import Shared
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
+from pipelines import aachen, batch, inloc
+from pipelines.batch import jobs, tables
+from pipelines.batch.jobs import Job
+from pipelines.batch.shared import Shared
 
 
 def write(path, text):
@@ -150,7 +154,7 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
         monkeypatch.setattr(module, name, counted)
 
     monkeypatch.setattr(extract_features.parallel, "cores", lambda: 1)  # no process detects
-    count(detection, "detect")
+    count(dog, "detect")
     count(Descriptor, "forward")
     count(extract_features, "read_image")
     count(aggregate_features, "main")

@@ -6,9 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from hloc_reduce import absolute_pose
-from hloc_reduce.cli import InputError
-from hloc_reduce.confidence import (
+from hloc_reduce.localization import absolute_pose
+from hloc_reduce.localization.confidence import (
     DEFAULT_GATE,
     Gate,
     _log10_tail,
@@ -17,6 +16,7 @@ from hloc_reduce.confidence import (
     reprojection_errors,
     uncertainty,
 )
+from hloc_reduce.utils.cli import InputError
 
 CAMERA = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1600, height=1200, params=[1400, 800, 600])
 GUESS = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1600, height=1200, params=[1920, 800, 600])

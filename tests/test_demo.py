@@ -8,19 +8,12 @@ import pycolmap
 import pytest
 
 from hloc_reduce import demo
-from hloc_reduce.cli import InputError
 from hloc_reduce.demo import cameras, town
 from hloc_reduce.demo.cameras import MAP, look
 from hloc_reduce.demo.photo import take
-from hloc_reduce.demo.render import (
-    SUPERSAMPLING,
-    Light,
-    Scene,
-    downsample,
-    rasterize,
-    render,
-)
+from hloc_reduce.demo.render import SUPERSAMPLING, Light, Scene, downsample, rasterize, render
 from hloc_reduce.demo.surface import Surface, Texture, View
+from hloc_reduce.utils.cli import InputError
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=256, height=192, params=[212, 214, 125.3, 98.1])
 # Obliquely from the left and from below, rolled, as the surfaces stand in the plane y = 0.

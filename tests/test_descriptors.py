@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from confs import features
-from hloc_reduce import descriptors, downloads, extract_features, extractors
-from hloc_reduce.cli import InputError
+from hloc_reduce import descriptors, extract_features, extractors
+from hloc_reduce.confs import features
 from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, Descriptor
 from hloc_reduce.extract_features import provenance
 from hloc_reduce.training import __main__ as training
 from hloc_reduce.training import tracks
+from hloc_reduce.utils import downloads
+from hloc_reduce.utils.cli import InputError
 
 
 @pytest.mark.parametrize("name", DESCRIPTORS)

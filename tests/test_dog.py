@@ -9,12 +9,15 @@ import torch
 from kornia.feature.laf import extract_patches_from_pyramid, laf_from_center_scale_ori
 from scipy.spatial import cKDTree
 
-from confs import features as features_confs
-from hloc_reduce import colmap, detection, extract_features, parallel
-from hloc_reduce.cli import InputError
+from hloc_reduce import extract_features
+from hloc_reduce.confs import features as features_confs
 from hloc_reduce.descriptors import Descriptor
+from hloc_reduce.detectors import dog
 from hloc_reduce.extractors.dog import DoG, extract_patches
-from hloc_reduce.group_writer import GroupWriter
+from hloc_reduce.runtime import parallel
+from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.utils import colmap
+from hloc_reduce.utils.cli import InputError
 
 
 def detect(image, **conf):
@@ -219,24 +222,24 @@ def test_a_killed_detector_is_said(tmp_path, textured, monkeypatch):
 def test_settings_follow_the_photo(textured):
     """A photo with enough keypoints keeps hloc's; a dark and a small one get more."""
     photo = np.tile(textured, (3, 4)).astype(np.float32) / 255
-    assert max(photo.shape) > detection.SMALL
-    keypoints, descriptors = detection.detect(photo, detection.HLOC, adaptive=True)
-    expected = colmap.detect_dog(photo, detection.HLOC)
-    assert len(keypoints) >= detection.ENOUGH
+    assert max(photo.shape) > dog.SMALL
+    keypoints, descriptors = dog.detect(photo, dog.HLOC, adaptive=True)
+    expected = colmap.detect_dog(photo, dog.HLOC)
+    assert len(keypoints) >= dog.ENOUGH
     np.testing.assert_array_equal(keypoints, expected[0])
     np.testing.assert_array_equal(descriptors, expected[1])
 
     dark = np.round(photo * 0.06 * 255) / 255
-    assert len(colmap.detect_dog(dark, detection.HLOC)[0]) < 10
-    found, _ = detection.detect(dark, detection.HLOC, adaptive=True)
+    assert len(colmap.detect_dog(dark, dog.HLOC)[0]) < 10
+    found, _ = dog.detect(dark, dog.HLOC, adaptive=True)
     distance, _ = cKDTree(expected[0][:, :2]).query(found[:, :2])
-    assert len(found) >= detection.ENOUGH and (distance < 2).sum() > 0.5 * len(expected[0])
+    assert len(found) >= dog.ENOUGH and (distance < 2).sum() > 0.5 * len(expected[0])
 
     small = cv2.resize(0.15 * photo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    few = colmap.detect_dog(small, detection.HLOC)[0]
-    assert len(few) < small.size / detection.PIXELS
-    assert len(detection.detect(small, detection.HLOC, adaptive=True)[0]) > 2 * len(few)
-    assert len(detection.detect(small, detection.HLOC)[0]) == len(few)
+    few = colmap.detect_dog(small, dog.HLOC)[0]
+    assert len(few) < small.size / dog.PIXELS
+    assert len(dog.detect(small, dog.HLOC, adaptive=True)[0]) > 2 * len(few)
+    assert len(dog.detect(small, dog.HLOC)[0]) == len(few)
 
 
 @pytest.mark.parametrize("noise", [0, 0.003, 0.02, 0.1])
@@ -245,16 +248,16 @@ def test_noise_does_not_become_keypoints(noise, size):
     """A covered lens gives no more keypoints than with hloc's settings."""
     view = 0.05 + noise * np.random.default_rng(0).standard_normal(size)
     view = (np.round(view.clip(0, 1) * 255) / 255).astype(np.float32)
-    assert detection.is_noise(view)
-    found = detection.detect(view, detection.HLOC, adaptive=True)
-    assert len(found[0]) == len(colmap.detect_dog(view, detection.HLOC)[0])
+    assert dog.is_noise(view)
+    found = dog.detect(view, dog.HLOC, adaptive=True)
+    assert len(found[0]) == len(colmap.detect_dog(view, dog.HLOC)[0])
 
 
 def test_a_very_dark_photo_is_not_noise(textured):
     generator = np.random.default_rng(0)
     view = np.tile(textured, (3, 4)) / 255 * 0.06
     view = view + 0.01 * generator.standard_normal(view.shape)
-    assert not detection.is_noise((np.round(view.clip(0, 1) * 255) / 255).astype(np.float32))
+    assert not dog.is_noise((np.round(view.clip(0, 1) * 255) / 255).astype(np.float32))
 
 
 def test_options_of_ones_own_are_used_as_they_are(textured):
@@ -264,12 +267,10 @@ def test_options_of_ones_own_are_used_as_they_are(textured):
     expected, _ = colmap.detect_dog(image[0, 0].numpy(), options)
     np.testing.assert_array_equal(found, expected[:, :2])
     hloc = DoG({"keypoints": "hloc"})({"image": image})["keypoints"][0].numpy()
-    np.testing.assert_array_equal(
-        hloc, colmap.detect_dog(image[0, 0].numpy(), detection.HLOC)[0][:, :2]
-    )
+    np.testing.assert_array_equal(hloc, colmap.detect_dog(image[0, 0].numpy(), dog.HLOC)[0][:, :2])
     colmaps = DoG({"keypoints": "colmap"})({"image": image})["keypoints"][0].numpy()
     np.testing.assert_array_equal(
-        colmaps, colmap.detect_dog(image[0, 0].numpy(), detection.COLMAP)[0][:, :2]
+        colmaps, colmap.detect_dog(image[0, 0].numpy(), dog.COLMAP)[0][:, :2]
     )
     with pytest.raises(
         InputError, match="Unknown keypoints 'many'. There are: colmap, adaptive, hloc"

@@ -13,14 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pycolmap import Rigid3d, Rotation3d
 
-from hloc_reduce import cli
 from hloc_reduce.evaluation import __main__ as evaluation
 from hloc_reduce.evaluation import hpatches, poses, published
 from hloc_reduce.evaluation.hpatches import data, lists, tasks
 from hloc_reduce.evaluation.ranking import average_precision, roc_area
-from hloc_reduce.group_writer import GroupWriter
-from hloc_reduce.localization import RECORDS
-from hloc_reduce.parsers import parse_query_lists, write_poses
+from hloc_reduce.localization.records import RECORDS
+from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.parsers import parse_query_lists, write_poses
 from pipelines import aachen
 
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from command import contents, results
 
-from hloc_reduce import executors, extract_features, localize_inloc, match_features
-from hloc_reduce.cli import InputError
-from hloc_reduce.executors import SERIAL, Pool, processes_of_this_machine
-from hloc_reduce.group_writer import GroupWriter, fill
+from hloc_reduce import extract_features, localize_inloc, match_features
+from hloc_reduce.runtime import executors
+from hloc_reduce.runtime.executors import SERIAL, Pool, processes_of_this_machine
+from hloc_reduce.runtime.group_writer import GroupWriter, fill
+from hloc_reduce.utils.cli import InputError
 from pipelines import aachen, inloc
 
 

@@ -6,8 +6,8 @@ import pytest
 from command import refused, run
 
 from hloc_reduce import pairs_from_exhaustive
-from hloc_reduce.cli import InputError
-from hloc_reduce.parsers import parse_pairs
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.parsers import parse_pairs
 
 NAMES = ["db/b.jpg", "db/a.jpg", "db/c.jpg"]
 QUERIES = ["query/2.jpg", "query/1.jpg"]

@@ -18,23 +18,16 @@ from scipy.io import savemat
 from test_projections import trained
 
 import hloc_reduce
-from confs import features
-from confs.matchers import confs as matchers
-from hloc_reduce import (
-    cli,
-    extractors,
-    localize_sfm,
-    match_features,
-    parsers,
-    projections,
-    triangulation,
-)
+from hloc_reduce import extractors, localize_sfm, match_features, projections, triangulation
 from hloc_reduce import hloc as plugin
-from hloc_reduce.cli import InputError
+from hloc_reduce.confs import features
+from hloc_reduce.confs.matchers import confs as matchers
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.hloc import __main__ as command
 from hloc_reduce.training import __main__ as training
 from hloc_reduce.training import tracks
+from hloc_reduce.utils import cli, parsers
+from hloc_reduce.utils.cli import InputError
 
 # --- a test double: what the plugin needs of hloc, and no more
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from confs import features as features_confs
 from hloc_reduce import extract_features
-from hloc_reduce.cli import InputError
-from hloc_reduce.io import UnreadableImage, read_image
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.images import UnreadableImage, read_image
 
 
 @pytest.fixture

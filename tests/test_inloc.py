@@ -11,9 +11,11 @@ import pytest
 from conftest import SHARED, scan_frame
 from scipy.io import savemat
 
-from hloc_reduce import cli, localize_inloc, scans
-from hloc_reduce.cli import InputError
-from hloc_reduce.datasets import InLoc
+from hloc_reduce import localize_inloc
+from hloc_reduce.datasets import scans
+from hloc_reduce.datasets.inloc import InLoc, by_iphone7
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
 from pipelines import inloc
 
 
@@ -89,7 +91,7 @@ def test_intrinsics_of_the_benchmark(tmp_path):
     with h5py.File(tmp_path / "f.h5", "w") as file:
         file["a/image_size"] = np.array([4032, 3024])
         file["b/image_size"] = np.array([3024, 4032])
-    (_, wide), (_, high) = localize_inloc.by_iphone7(tmp_path / "f.h5", ["a", "b"])
+    (_, wide), (_, high) = by_iphone7(tmp_path / "f.h5", ["a", "b"])
     assert wide.params.tolist() == [3136, 2016, 1512]
     assert high.params.tolist() == [3136, 1512, 2016] and (high.width, high.height) == (3024, 4032)
 

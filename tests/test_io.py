@@ -4,14 +4,18 @@ import h5py
 import numpy as np
 import pytest
 
-from hloc_reduce import group_writer, io
-from hloc_reduce.cli import InputError
-from hloc_reduce.group_writer import GroupWriter
+from hloc_reduce.runtime import group_writer
+from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.files import replacing
+from hloc_reduce.utils.h5 import list_h5_names, open_h5
+from hloc_reduce.utils.images import read_image
+from hloc_reduce.utils.match_files import get_matches
 
 
 def read(path):
     with h5py.File(path) as file:
-        return {name: file[name]["a"][()].tolist() for name in io.list_h5_names(path)}
+        return {name: file[name]["a"][()].tolist() for name in list_h5_names(path)}
 
 
 def test_writer_extends_and_keeps_attributes(tmp_path):
@@ -78,7 +82,7 @@ def test_broken_h5_is_refused_and_kept(tmp_path):
     with pytest.raises(InputError, match="not a whole h5 file"):
         GroupWriter(path, {})
     assert path.exists()
-    with pytest.raises(InputError, match="not there"), io.open_h5(tmp_path / "absent.h5"):
+    with pytest.raises(InputError, match="not there"), open_h5(tmp_path / "absent.h5"):
         pass
 
 
@@ -92,18 +96,18 @@ def test_only_groups_of_the_file_itself_are_listed(tmp_path):
         file.create_group("empty")
         file["elsewhere"] = h5py.ExternalLink("other.h5", "x")
         file["nowhere"] = h5py.SoftLink("/absent")
-    assert io.list_h5_names(path) == ["db/10.jpg", "db/2.jpg", "db/sub/3.jpg", "q/1"]
+    assert list_h5_names(path) == ["db/10.jpg", "db/2.jpg", "db/sub/3.jpg", "q/1"]
     with h5py.File(path, "a") as file:
         file["db/sub/itself"] = file["db"]
     with pytest.raises(InputError, match="has another name"):
-        io.list_h5_names(path)
+        list_h5_names(path)
 
 
 def test_replacing_keeps_the_old_file_on_failure(tmp_path):
     path = tmp_path / "sub" / "a.txt"
-    with io.replacing(path) as temporary:
+    with replacing(path) as temporary:
         temporary.write_text("old")
-    with pytest.raises(RuntimeError), io.replacing(path) as temporary:
+    with pytest.raises(RuntimeError), replacing(path) as temporary:
         temporary.write_text("new")
         raise RuntimeError
     assert path.read_text() == "old"
@@ -113,7 +117,7 @@ def test_replacing_keeps_the_old_file_on_failure(tmp_path):
 def test_replacing_by_the_same_keeps_the_time(tmp_path):
     path = tmp_path / "a.txt"
     for text, kept in (("old", False), ("old", True), ("new", False), ("new", True)):
-        with io.replacing(path) as temporary:
+        with replacing(path) as temporary:
             temporary.write_text(text)
         assert path.read_text() == text and (path.stat().st_mtime_ns == 10**9) is kept
         os.utime(path, ns=(10**9, 10**9))
@@ -132,20 +136,20 @@ def test_matches_are_found_in_any_order_and_format(tmp_path, group, reverse):
     with h5py.File(tmp_path / "m.h5", "w") as file:
         file[f"{group}/matches0"] = np.array([-1, 5, -1, 0], np.int16)
         file[f"{group}/matching_scores0"] = np.array([0, 0.5, 0, 1], np.float16)
-        matches, scores = io.get_matches(file, "db/1.jpg", "query/2.jpg")
+        matches, scores = get_matches(file, "db/1.jpg", "query/2.jpg")
         expected = [[5, 1], [0, 3]] if reverse else [[1, 5], [3, 0]]
         assert matches.tolist() == expected and scores.tolist() == [0.5, 1]
         with pytest.raises(InputError, match="not in the match file"):
-            io.get_matches(file, "db/1.jpg", "query/3.jpg")
+            get_matches(file, "db/1.jpg", "query/3.jpg")
 
 
 def test_unreadable_images_are_named(tmp_path):
     for content in (b"", b"no image"):
         (tmp_path / "a.jpg").write_bytes(content)
         with pytest.raises(InputError, match="a.jpg"):
-            io.read_image(tmp_path / "a.jpg")
+            read_image(tmp_path / "a.jpg")
     with pytest.raises(InputError, match="b.jpg"):
-        io.read_image(tmp_path / "b.jpg")
+        read_image(tmp_path / "b.jpg")
 
 
 def test_two_writers_of_a_file_lose_nothing(tmp_path, monkeypatch):
@@ -157,7 +161,7 @@ def test_two_writers_of_a_file_lose_nothing(tmp_path, monkeypatch):
         pass
     with first:
         pass
-    assert io.list_h5_names(tmp_path / "f.h5") == ["a", "b", "c"]
+    assert list_h5_names(tmp_path / "f.h5") == ["a", "b", "c"]
 
 
 def test_a_full_temporary_folder_is_said(tmp_path):
@@ -180,4 +184,4 @@ def test_a_gap_in_the_pieces_loses_none(tmp_path, monkeypatch):
         assert [name in writer for name in "abc"] == [False, True, True]
         for name in "de":
             writer.add(name, {"a": np.arange(3)})
-    assert io.list_h5_names(path) == ["b", "c", "d", "e"]
+    assert list_h5_names(path) == ["b", "c", "d", "e"]

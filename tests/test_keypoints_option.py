@@ -2,8 +2,8 @@
 
 import json
 
-from confs import features as features_confs
 from hloc_reduce import extract_features
+from hloc_reduce.confs import features as features_confs
 
 
 def test_a_yaml_file_says_its_settings(tmp_path):

@@ -13,25 +13,23 @@ import pycolmap
 import pytest
 from command import outcome
 
-from confs import features as features_confs
 from hloc_reduce import (
     Localizer,
-    cli,
-    colmap,
-    intrinsics,
-    io,
-    localization,
     maps,
     match_features,
     pairs_from_verification,
-    parsers,
     projections,
     reconstruction,
 )
-from hloc_reduce.cli import InputError
+from hloc_reduce.confs import features as features_confs
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.localization.records import pose_of
+from hloc_reduce.maps import intrinsics
+from hloc_reduce.runtime.outputs import LOCK
 from hloc_reduce.training import tracks
 from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.utils import cli, colmap, parsers
+from hloc_reduce.utils.cli import InputError
 from pipelines import aachen, localize
 
 LISTS = "*_time_queries_with_intrinsics.txt"
@@ -51,7 +49,7 @@ def propagated(monkeypatch):
 
 
 def state(folder):
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != io.LOCK)
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
     return {path: path.stat().st_mtime_ns for path in files}
 
 
@@ -924,4 +922,4 @@ def test_names_with_spaces(by_model, plane, tmp_path, monkeypatch):
 
 
 def test_records_of_failed_queries_have_no_pose():
-    assert localization.pose({"qvec": None, "tvec": None}) is None
+    assert pose_of({"qvec": None, "tvec": None}) is None

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hloc_reduce import pairs_from_verification
-from hloc_reduce.cli import InputError
+from hloc_reduce.utils.cli import InputError
 
 
 def test_a_pair_of_an_image_that_is_not_listed_is_refused(tmp_path):

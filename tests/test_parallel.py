@@ -10,7 +10,7 @@ from concurrent.futures import BrokenExecutor
 import pytest
 import torch
 
-from hloc_reduce import parallel, processes, trace
+from hloc_reduce.runtime import parallel, processes, trace
 
 
 def test_in_order_whoever_is_faster():

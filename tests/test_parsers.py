@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hloc_reduce import parsers
-from hloc_reduce.cli import InputError
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.utils import parsers
+from hloc_reduce.utils.cli import InputError
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ import pytest
 from hloc_reduce import (
     Localizer,
     aggregate_features,
-    compare,
     extract_features,
     localize_inloc,
     localize_sfm,
@@ -24,11 +23,11 @@ from hloc_reduce import (
     storage,
     triangulation,
 )
-from hloc_reduce.cli import InputError
-from hloc_reduce.paths import strings_as_paths
 from hloc_reduce.training import __main__ as training
-from hloc_reduce.training import phototour, tracks
-from pipelines import aachen, batch, inloc, localize
+from hloc_reduce.training import patch_tracks, tracks
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.paths import strings_as_paths
+from pipelines import aachen, batch, compare, inloc, localize
 
 FEATURE = "colmap_sift_sv16"
 CONF = extract_features.confs[FEATURE]
@@ -222,6 +221,6 @@ def test_training(plane, tmp_path):
     (path,) = training.main({"plane": place}, [], "sift", "pca", [16], *out)
     assert path == tmp_path / "weights/sift_pca16.safetensors" and path.is_file()
     with pytest.raises(InputError, match="not a PhotoTour sequence"):
-        phototour.main(str(tmp_path), str(tmp_path / "cache"))
+        patch_tracks.main(str(tmp_path), str(tmp_path / "cache"))
     with pytest.raises(InputError, match="not a PhotoTour sequence"):
         training.main({}, [str(tmp_path)], "sift", "pca", [16], *out)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from hloc_reduce import cli, match_features, progress
-from hloc_reduce.parsers import write_pairs
+from hloc_reduce import match_features
+from hloc_reduce.utils import cli, progress
+from hloc_reduce.utils.parsers import write_pairs
 
 ROOT = Path(__file__).parents[1]
 
@@ -102,4 +103,4 @@ def test_every_loop_goes_through_one_place():
                     continue
                 if any(name.split(".")[0] == "tqdm" for name in names):
                     importing.add(path.relative_to(ROOT).as_posix())
-    assert importing == {"hloc_reduce/progress.py"}
+    assert importing == {"hloc_reduce/utils/progress.py"}

@@ -13,12 +13,13 @@ from safetensors.torch import save_file
 from torch import nn
 
 import hloc_reduce
-from confs import features
-from confs.features import confs
-from hloc_reduce import downloads, extractors, projections
-from hloc_reduce.cli import InputError
+from hloc_reduce import extractors, projections
+from hloc_reduce.confs import features
+from hloc_reduce.confs.features import confs
 from hloc_reduce.extractors.reduced import Reduced
 from hloc_reduce.projections import MLP, Projection, released
+from hloc_reduce.utils import downloads
+from hloc_reduce.utils.cli import InputError
 
 
 def trained(sizes):

@@ -14,9 +14,10 @@ import pytest
 import survival
 from command import contents, results
 
-from hloc_reduce import demo, extract_features, interrupts, match_features
-from hloc_reduce.cli import InputError
-from hloc_reduce.executors import SERIAL, processes_of_this_machine, ray_cluster
+from hloc_reduce import demo, extract_features, match_features
+from hloc_reduce.runtime.executors import SERIAL, processes_of_this_machine, ray_cluster
+from hloc_reduce.utils import interrupts
+from hloc_reduce.utils.cli import InputError
 from pipelines import aachen, batch
 
 ray = pytest.importorskip("ray")

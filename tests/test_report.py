@@ -9,11 +9,13 @@ import command
 import h5py
 import pytest
 
-from hloc_reduce import cli, compare, io
 from hloc_reduce.evaluation import published
 from hloc_reduce.report import __main__ as report
 from hloc_reduce.report import runs
-from pipelines import aachen, inloc, localize
+from hloc_reduce.runtime.outputs import LOCK
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.h5 import iterate_h5_names
+from pipelines import aachen, compare, inloc, localize
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
@@ -152,7 +154,7 @@ def test_runs_of_scans_and_of_a_map_of_ones_own(
     (tmp_path / "i/away").rename(points)
     features = next((tmp_path / "i").glob("feats-*_sv32.h5"))
     with h5py.File(shutil.copy(features, tmp_path / "other.h5"), "r+") as file:
-        for name in io.iterate_h5_names(file["database"].id, "database/"):
+        for name in iterate_h5_names(file["database"].id, "database/"):
             file[name]["keypoints"][0] += 1
     (tmp_path / "other.h5").replace(features)
     command.run(monkeypatch, report, folders[0], "-o", output)
@@ -291,7 +293,7 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog, inloc_lay
     page = tmp_path / "p.html"
     command.run(monkeypatch, compare, *given, "sift_sv16", "-o", page)
     assert page.exists() and len(times) > 10
-    files = [path for path in times if path.is_file() and path.name != io.LOCK]
+    files = [path for path in times if path.is_file() and path.name != LOCK]
     assert {path.name: path.stat().st_mtime_ns for path in files} == {
         path.name: times[path] for path in files
     }

@@ -5,11 +5,16 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hloc_reduce import absolute_pose
-from hloc_reduce.absolute_pose import Pose
-from hloc_reduce.confidence import DEFAULT_GATE, project, reprojection_errors, uncertainty
-from hloc_reduce.intrinsics import REFINEMENTS
-from hloc_reduce.resection import ALL, RADIAL, SKEW, resect, undistort
+from hloc_reduce.localization import absolute_pose
+from hloc_reduce.localization.absolute_pose import Pose
+from hloc_reduce.localization.confidence import (
+    DEFAULT_GATE,
+    project,
+    reprojection_errors,
+    uncertainty,
+)
+from hloc_reduce.localization.resection import ALL, RADIAL, SKEW, resect, undistort
+from hloc_reduce.maps.intrinsics import REFINEMENTS
 
 TURN = pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04]))  # axis and angle
 POSE = pycolmap.Rigid3d(TURN, [0.3, 0.1, 8.0])

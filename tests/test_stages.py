@@ -11,23 +11,25 @@ import torch
 from command import refused
 
 from hloc_reduce import (
-    cli,
-    colmap,
-    localization,
     localize_sfm,
     match_features,
     pairs_from_covisibility,
     pairs_from_retrieval,
-    stamps,
-    storage,
     triangulation,
 )
-from hloc_reduce.cli import InputError
-from hloc_reduce.confidence import AGREEMENT, AGREEMENT_RATIO
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.group_writer import GroupWriter
-from hloc_reduce.io import get_matches, list_h5_names
-from hloc_reduce.parsers import parse_pairs, parse_poses, parse_retrieval, write_pairs
+from hloc_reduce.localization import query
+from hloc_reduce.localization.confidence import AGREEMENT, AGREEMENT_RATIO
+from hloc_reduce.localization.records import log_file, pose_of, read_records
+from hloc_reduce.localization.references import SfmMap
+from hloc_reduce.runtime import provenance
+from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import dimension
+from hloc_reduce.utils.h5 import list_h5_names
+from hloc_reduce.utils.match_files import get_matches
+from hloc_reduce.utils.parsers import parse_pairs, parse_poses, parse_retrieval, write_pairs
 
 MATCHER = match_features.confs["NN-ratio"]
 
@@ -221,7 +223,7 @@ def test_queries_are_localized_exactly(built):
     for name, record in records.items():
         assert record["localized"] and record["num_inliers"] == 300
         assert record["num_matches"] == 6 * 300 and record["db"] == "db/0.jpg"
-        metres, degrees = pose_error(localization.pose(record), built.poses[name])
+        metres, degrees = pose_error(pose_of(record), built.poses[name])
         assert metres < 1e-4 and degrees < 1e-2
     lines = (built.root / "poses.txt").read_text().splitlines()
     assert [line.split()[0] for line in lines] == ["6.jpg", "7.jpg"]
@@ -280,8 +282,8 @@ def test_clusters_of_covisible_images_are_solved_by_themselves(built):
                 built.map.delete_observation(image.image_id, index)
     names = [f"db/{i}.jpg" for i in (5, 1, 3, 0, 2)]
     clusters = [["db/1.jpg", "db/0.jpg", "db/2.jpg"], names[0:3:2]]
-    assert localize_sfm.SfmMap(built.map, True).clusters(names) == clusters
-    assert localize_sfm.SfmMap(built.map).clusters(names) == [names]
+    assert SfmMap(built.map, True).clusters(names) == clusters
+    assert SfmMap(built.map).clusters(names) == [names]
     whole = built.localize(reference_sfm=built.map)["query/6.jpg"]
     part = built.localize(reference_sfm=built.map, covisibility_clustering=True)["query/6.jpg"]
     assert (whole["num_inliers"], part["num_inliers"]) == (300, 180)
@@ -318,7 +320,7 @@ def test_hopeless_queries_fall_back_and_say_so(built):
         record = records[f"query/{i}.jpg"]
         assert not record["localized"] and record["db"] == db, record
         pose = built.poses[db or "db/0.jpg"]
-        assert max(pose_error(localization.pose(record), pose)) < 1e-6
+        assert max(pose_error(pose_of(record), pose)) < 1e-6
     assert records["query/8.jpg"]["num_inliers"] == 0
     assert records["query/10.jpg"]["num_matches"] == 40
     assert len((built.root / "poses.txt").read_text().splitlines()) == 5
@@ -499,13 +501,13 @@ def test_retrieval_ranks_by_similarity(tmp_path, monkeypatch, block):
 def test_stamps_notice_changes(tmp_path):
     source, file = tmp_path / "source", tmp_path / "stamp.json"
     source.write_text("a")
-    made_from = stamps.stamp({"x": (1, 2)}, [source])
-    assert not stamps.is_current(file, made_from)
-    stamps.write(file, made_from)
-    assert stamps.is_current(file, made_from)
-    assert not stamps.is_current(file, stamps.stamp({"x": (1, 3)}, [source]))
+    made_from = provenance.stamp({"x": (1, 2)}, [source])
+    assert not provenance.is_current(file, made_from)
+    provenance.write(file, made_from)
+    assert provenance.is_current(file, made_from)
+    assert not provenance.is_current(file, provenance.stamp({"x": (1, 3)}, [source]))
     source.write_text("ab")
-    assert not stamps.is_current(file, stamps.stamp({"x": (1, 2)}, [source]))
+    assert not provenance.is_current(file, provenance.stamp({"x": (1, 2)}, [source]))
 
 
 def test_a_query_that_cannot_be_localized_says_why(built):
@@ -545,7 +547,7 @@ def test_the_command_line_of_localization(built, monkeypatch):
     words = [word for key, value in options.items() for word in (f"--{key}", str(value))]
     monkeypatch.setattr(sys, "argv", ["localize_sfm", *words])
     cli.run(localize_sfm._main)
-    records = localization.read_records(localization.log_file(options["results"]))
+    records = read_records(log_file(options["results"]))
     assert {record["reason"] for record in records.values()} == {
         "too few inliers: 300, at least 301 are needed"
     }
@@ -565,8 +567,8 @@ def test_the_gate_knows_the_matcher_by_its_file(built, conf, agreement, monkeypa
         match_features.main(
             conf, built.loc_pairs, built.features, matches=built.loc_matches, overwrite=True
         )
-    gates, localize = [], localization.localize
-    monkeypatch.setattr(localization, "localize", lambda *a: gates.append(a[-1]) or localize(*a))
+    gates, localize = [], query.localize
+    monkeypatch.setattr(query, "localize", lambda *a: gates.append(a[-1]) or localize(*a))
     assert built.localize()["query/6.jpg"]["localized"]
     assert {gate.min_agreement for gate in gates} == {agreement}
 
@@ -576,9 +578,9 @@ def test_the_gate_skips_images_without_descriptors(built, monkeypatch):
     with h5py.File(built.features, "r+") as file:
         del file["db/0.jpg/descriptors"]
         file["db/1.jpg"].attrs["failure"] = "Cannot read it."
-    assert storage.dimension(built.features) == 64
+    assert dimension(built.features) == 64
     assert built.localize()["query/6.jpg"]["localized"]
     with h5py.File(built.features, "r+") as file:
         for name in list_h5_names(built.features):
             file[name].pop("descriptors", None)
-    assert storage.dimension(built.features) == 0
+    assert dimension(built.features) == 0

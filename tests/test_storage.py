@@ -6,8 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hloc_reduce import extract_features, match_features, storage
-from hloc_reduce.cli import InputError
-from hloc_reduce.group_writer import GroupWriter
+from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import (
+    QUANTIZED,
+    get_descriptors,
+    quantize,
+    restore,
+    store,
+    stored_descriptors,
+)
 
 
 def unit(number, dim, seed):
@@ -23,7 +31,7 @@ def write(path, kind, *names):
                 "scores": np.ones(50, np.float32),
                 "descriptors": unit(50, 16, seed).T,
             }
-            arrays, attrs = storage.store(features, kind)
+            arrays, attrs = store(features, kind)
             writer.add(name, arrays, attrs | {"keypoints": {"uncertainty": 2.0}})
     return path
 
@@ -34,7 +42,7 @@ def write(path, kind, *names):
 @settings(max_examples=50, deadline=None)
 def test_quantized_within_half_a_step(number, dim, offset, width, seed):
     descriptors = offset + width * np.random.default_rng(seed).random((dim, number), np.float32)
-    levels, scale, offset = storage.quantize(descriptors)
+    levels, scale, offset = quantize(descriptors)
     assert levels.dtype == np.uint8 and levels.shape == descriptors.shape
     if number:
         assert np.abs(offset + scale * levels - descriptors).max() <= 0.51 * scale + 1e-5
@@ -47,17 +55,17 @@ def test_quantized_within_half_a_step(number, dim, offset, width, seed):
 def test_stored_and_read(tmp_path, kind, bytes_each, error):
     path = write(tmp_path / "feats.h5", kind, "db/a.jpg")
     with h5py.File(path) as file:
-        assert storage.stored_descriptors(file, "db/a.jpg").dtype.itemsize == bytes_each
+        assert stored_descriptors(file, "db/a.jpg").dtype.itemsize == bytes_each
         assert ("descriptors" in file["db/a.jpg"]) == (kind != "uint8")  # what hloc looks for
-        descriptors = storage.get_descriptors(file, "db/a.jpg")
+        descriptors = get_descriptors(file, "db/a.jpg")
     assert descriptors.dtype == np.float32 and descriptors.flags.c_contiguous
     np.testing.assert_allclose(descriptors, unit(50, 16, 0), atol=error)
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=2e-3)
 
 
 def test_no_keypoints():
-    arrays, attrs = storage.store({"descriptors": np.zeros((16, 0), np.float32)}, "uint8")
-    assert storage.restore(arrays, attrs).shape == (0, 16)
+    arrays, attrs = store({"descriptors": np.zeros((16, 0), np.float32)}, "uint8")
+    assert restore(arrays, attrs).shape == (0, 16)
 
 
 def test_command_converts_to_hlocs_format(tmp_path, monkeypatch):
@@ -71,19 +79,19 @@ def test_command_converts_to_hlocs_format(tmp_path, monkeypatch):
             assert after[name]["keypoints"].attrs["uncertainty"] == 2
             np.testing.assert_array_equal(after[name]["keypoints"], before[name]["keypoints"])
             np.testing.assert_allclose(
-                storage.get_descriptors(after, name),
-                storage.get_descriptors(before, name),
+                get_descriptors(after, name),
+                get_descriptors(before, name),
                 atol=1e-3,
             )
     run(monkeypatch, storage, "--features", quantized, "--output", output)  # all is there
     same = storage.main(quantized, tmp_path / "same.h5", "uint8")
     with h5py.File(quantized) as before, h5py.File(same) as after:
-        levels = [file["b.jpg"][storage.QUANTIZED] for file in (before, after)]
+        levels = [file["b.jpg"][QUANTIZED] for file in (before, after)]
         assert (levels[0][()] == levels[1][()]).all()
         assert dict(levels[0].attrs) == dict(levels[1].attrs)
     back = storage.main(output, tmp_path / "back.h5", "uint8")
     with h5py.File(quantized) as before, h5py.File(back) as after:
-        levels = [file["b.jpg"][storage.QUANTIZED][()].astype(int) for file in (before, after)]
+        levels = [file["b.jpg"][QUANTIZED][()].astype(int) for file in (before, after)]
     assert np.abs(levels[0] - levels[1]).max() <= 1
 
 
@@ -93,7 +101,7 @@ def test_conversion_copies_other_data_sets_as_they_are(tmp_path):
         writer.add("a.jpg", {"descriptors": unit(3, 16, 0).T, "scores": scores})
     storage.main(tmp_path / "a.h5", tmp_path / "b.h5", "uint8")
     with h5py.File(tmp_path / "b.h5") as file:
-        assert sorted(file["a.jpg"]) == [storage.QUANTIZED, "scores"]
+        assert sorted(file["a.jpg"]) == [QUANTIZED, "scores"]
         np.testing.assert_array_equal(file["a.jpg/scores"], scores)
 
 
@@ -108,7 +116,7 @@ def test_quantized_match_like_floats(tmp_path):
         second /= np.linalg.norm(second, axis=1, keepdims=True)
         with GroupWriter(path, {}) as writer:
             for name, descriptors in (("a.jpg", first), ("b.jpg", second)):
-                writer.add(name, *storage.store({"descriptors": descriptors.T}, kind))
+                writer.add(name, *store({"descriptors": descriptors.T}, kind))
         conf = match_features.confs["NN-ratio"]
         match_features.main(conf, pairs, path, matches=tmp_path / f"m{kind}.h5")
         with h5py.File(tmp_path / f"m{kind}.h5") as file:
@@ -125,7 +133,7 @@ def test_wrong_input(tmp_path, monkeypatch, caplog):
     with pytest.raises(InputError, match="Unknown storage 'uint4'"):
         extract_features.main(conf, tmp_path, tmp_path)
     with h5py.File(path, "a") as file:
-        del file["a.jpg"][storage.QUANTIZED].attrs["scale"]
+        del file["a.jpg"][QUANTIZED].attrs["scale"]
     with pytest.raises(InputError, match="no scale and offset"):
         storage.main(path, tmp_path / "new.h5")
     command = ["--features", path, "--output", tmp_path / "c.h5", "--storage", "uint4"]

@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 import survival
 
-from hloc_reduce import cli, interrupts, io
-from hloc_reduce.cli import InputError
-from hloc_reduce.group_writer import GroupWriter
+from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.runtime.outputs import LOCK, Lock
+from hloc_reduce.utils import cli, interrupts
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.h5 import write_h5
 from pipelines import aachen
 
 SEED = 0
@@ -42,7 +44,7 @@ lock = Lock(Path({str(outputs)!r})); print('held', flush=True); time.sleep(60)"
         given = ("--dataset", aachen_layout, "--outputs", outputs, "--feature", "sift_sv16")
         message = command.refused(monkeypatch, caplog, aachen, *given)
         assert f"Another run is at work in {outputs} (process {other.pid} on " in message
-        assert {path.name for path in outputs.iterdir()} == {io.LOCK}
+        assert {path.name for path in outputs.iterdir()} == {LOCK}
     finally:
         other.kill()
         other.wait()
@@ -70,17 +72,17 @@ def test_outputs_of_another_configuration_are_refused(aachen_layout, tmp_path, m
 
 
 def test_a_lock_ends_with_its_block(tmp_path):
-    lock = io.Lock(tmp_path)
+    lock = Lock(tmp_path)
     with pytest.raises(InputError, match=f"process {os.getpid()}"):
-        io.Lock(tmp_path)
+        Lock(tmp_path)
     lock.release()
-    io.Lock(tmp_path).release()
+    Lock(tmp_path).release()
 
 
 @pytest.mark.skipif(os.getuid() == 0, reason="root may write to any folder")
 def test_a_folder_that_cannot_be_written_needs_no_lock(tmp_path):
     tmp_path.chmod(0o500)
-    io.Lock(tmp_path).release()
+    Lock(tmp_path).release()
     tmp_path.chmod(0o700)
 
 
@@ -167,7 +169,7 @@ def test_a_run_that_is_ended_at_any_moment_goes_on(
 
 
 def test_an_h5_file_is_whole_when_an_interrupt_is_heard(tmp_path):
-    with pytest.raises(KeyboardInterrupt), io.write_h5(tmp_path / "a.h5") as file:
+    with pytest.raises(KeyboardInterrupt), write_h5(tmp_path / "a.h5") as file:
         for i in range(100):
             file[str(i)] = np.arange(1000)
             if i == 50:
@@ -178,11 +180,11 @@ def test_an_h5_file_is_whole_when_an_interrupt_is_heard(tmp_path):
 
 def test_what_a_full_disk_does_not_hold_is_one_error(disk):
     folder, set_free = disk
-    with io.write_h5(folder / "a.h5") as file:
+    with write_h5(folder / "a.h5") as file:
         file["whole"] = np.arange(1000)
     set_free(100_000)
     shutil.copy(folder / "a.h5", folder / "b.h5")
-    with pytest.raises(OSError, match="No space left"), io.write_h5(folder / "b.h5") as file:
+    with pytest.raises(OSError, match="No space left"), write_h5(folder / "b.h5") as file:
         for i in range(100):
             file[str(i)] = np.random.rand(1000)
             assert np.isfinite(file[str(i)][()]).all()

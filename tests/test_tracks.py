@@ -10,11 +10,11 @@ import pycolmap
 import pytest
 import torch
 
-from confs import features
-from hloc_reduce.cli import InputError
-from hloc_reduce.colmap import detect_dog, point3D_ids
+from hloc_reduce.confs import features
 from hloc_reduce.training import tracks
 from hloc_reduce.training.completion import Completion
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.colmap import detect_dog, point3D_ids
 
 
 def test_tracks_of_a_plane(plane):

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from hloc_reduce import projections
-from hloc_reduce.cli import InputError
 from hloc_reduce.evaluation.matching import average_precision
 from hloc_reduce.training import __main__ as training
 from hloc_reduce.training import loop, nested, pca, ss, sv, tracks, us
 from hloc_reduce.training.losses import distance_loss, triplet_loss
 from hloc_reduce.training.sampling import DescriptorSampler, PairSampler
 from hloc_reduce.training.tracks import Tracks
+from hloc_reduce.utils.cli import InputError
 
 SMALL = {"hidden": [64], "distance_weight": 0.0, "steps": 300, "batch_size": 100, "lr": 3e-3}
 RECIPE = {**sv.RECIPES["best"], **SMALL}

@@ -9,13 +9,13 @@ import pytest
 import torch
 from command import refused
 
-from hloc_reduce import phototour as layout
 from hloc_reduce import projections
-from hloc_reduce.cli import InputError
+from hloc_reduce.datasets import phototour as layout
 from hloc_reduce.descriptors import DESCRIPTORS, Base, Descriptor
-from hloc_reduce.evaluation.phototour import fpr95
+from hloc_reduce.evaluation.patch_verification import fpr95
 from hloc_reduce.training import __main__ as training
-from hloc_reduce.training import phototour, tracks
+from hloc_reduce.training import patch_tracks, tracks
+from hloc_reduce.utils.cli import InputError
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_patches_are_read_row_by_row(sequence):
 
 def test_patches_of_a_point_are_a_track(sequence, tmp_path):
     folder, patches, points = sequence
-    data = tracks.load(phototour.main(folder, tmp_path / "cache"))
+    data = tracks.load(patch_tracks.main(folder, tmp_path / "cache"))
     assert data.num_tracks == 100 and len(data.track) == 300
     assert (points[data.image] == data.track).all()  # an image of its own each, by its number
     first = torch.from_numpy(layout.read_sheet(folder / "patches0000.bmp")[:1, None])
@@ -65,8 +65,8 @@ def test_patches_of_a_point_are_a_track(sequence, tmp_path):
 def test_description_goes_on_after_an_interruption(sequence, tmp_path, monkeypatch):
     folder, _, _ = sequence
     shutil.copy(folder / "patches0001.bmp", folder / "patches0002.bmp")  # of no listed patch
-    expected = phototour.main(folder, tmp_path / "whole").read_bytes()
-    sheets, read = [], phototour.read_sheet
+    expected = patch_tracks.main(folder, tmp_path / "whole").read_bytes()
+    sheets, read = [], patch_tracks.read_sheet
 
     def interrupted(path):
         sheets.append(path.stem)
@@ -74,10 +74,10 @@ def test_description_goes_on_after_an_interruption(sequence, tmp_path, monkeypat
             raise KeyboardInterrupt
         return read(path)
 
-    monkeypatch.setattr(phototour, "read_sheet", interrupted)
+    monkeypatch.setattr(patch_tracks, "read_sheet", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        phototour.main(folder, tmp_path / "cache")
-    path = phototour.main(folder, tmp_path / "cache")
+        patch_tracks.main(folder, tmp_path / "cache")
+    path = patch_tracks.main(folder, tmp_path / "cache")
     assert sheets == ["patches0000", "patches0001", "patches0001"]
     assert path.read_bytes() == expected
     assert {p.name for p in path.parent.iterdir()} == {path.name, f"{path.stem}.json"}
@@ -129,13 +129,13 @@ def test_descriptors_of_photos_are_refused(sequence, monkeypatch, caplog):
 def test_broken_sequences_are_refused(sequence, tmp_path):
     folder, _, _ = sequence
     with pytest.raises(InputError, match="not a PhotoTour sequence"):
-        phototour.main(tmp_path, tmp_path / "cache")
+        patch_tracks.main(tmp_path, tmp_path / "cache")
     (folder / "patches0001.bmp").unlink()
     with pytest.raises(InputError, match="300 patches, 1 sheets miss"):
-        phototour.main(folder, tmp_path / "cache")
+        patch_tracks.main(folder, tmp_path / "cache")
     (folder / "info.txt").write_text("1 0\nx 0\n")
     with pytest.raises(InputError, match="info.txt, line 2"):
-        phototour.main(folder, tmp_path / "cache")
+        patch_tracks.main(folder, tmp_path / "cache")
     (folder / layout.PAIRS).write_text("1 2 3\n")
     with pytest.raises(InputError, match="line 1: not a pair"):
         layout.read_pairs(folder)
@@ -145,10 +145,10 @@ def test_broken_sequences_are_refused(sequence, tmp_path):
     cv2.imwrite(str(folder / "patches0000.bmp"), np.zeros((64, 64), np.uint8))
     (folder / "info.txt").write_text("1 0\n2 0\n")
     with pytest.raises(InputError, match="no two patches"):
-        phototour.main(folder, tmp_path / "cache")
+        patch_tracks.main(folder, tmp_path / "cache")
     (folder / "info.txt").write_text("1 0\n1 0\n")
     with pytest.raises(InputError, match="not a sheet"):
-        phototour.main(folder, tmp_path / "cache")
+        patch_tracks.main(folder, tmp_path / "cache")
 
 
 def test_fpr95_by_hand():

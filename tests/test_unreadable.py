@@ -7,7 +7,9 @@ import command
 import pytest
 from command import outcome
 
-from hloc_reduce import cli, colmap, localization, maps, parsers
+from hloc_reduce import maps
+from hloc_reduce.localization.records import log_file, read_records
+from hloc_reduce.utils import cli, colmap, parsers
 from pipelines import aachen, inloc, localize
 
 PIPELINES = {"aachen": aachen, "inloc": inloc, "localize": localize}
@@ -77,8 +79,8 @@ def test_a_query_that_cannot_be_read_does_not_stop_the_others(
     )
     assert row["reason"] == f"Cannot read image {photo}: {why}."
     assert rows == {other: row for other, row in expected.items() if other != name}
-    logs = localization.log_file(outputs / summary["poses"])
-    assert localization.read_records(logs)[name]["reason"] == row["reason"]
+    logs = log_file(outputs / summary["poses"])
+    assert read_records(logs)[name]["reason"] == row["reason"]
     line = f"1 of {len(expected)} queries could not be read and are not localized: {name} ({why})."
     assert any(line in record.getMessage() for record in caplog.records)
     # nothing is done anew but that it is read again
@@ -147,8 +149,8 @@ def test_queries_without_a_list(aachen_layout, tmp_path, monkeypatch, caplog):
     assert [row["status"] for row in rows.values()] == ["localized", "fallback", "fallback"]
     assert rows["new.png"]["reason"] == f"Cannot read image {broken}: it is empty."
     assert summary["intrinsics"] == {"guess": 2}
-    logs = localization.log_file(outputs / "queries-day" / summary["poses"])
-    assert localization.read_records(logs)["new.png"]["camera"] is None
+    logs = log_file(outputs / "queries-day" / summary["poses"])
+    assert read_records(logs)["new.png"]["camera"] is None
     shutil.copy(images / "query/day/a.png", broken)
     command.run(monkeypatch, localize, *arguments)
     summary, rows = outcome(outputs / "queries-day")

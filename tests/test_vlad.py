@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from hloc_reduce import aggregate_features
-from hloc_reduce.cli import InputError
-from hloc_reduce.extractors.vlad import VLAD
+from hloc_reduce.aggregators.vlad import VLAD
+from hloc_reduce.utils.cli import InputError
 
 CONF = {"output": "vlad", "model": {"name": "vlad", "num_words": 4, "max_samples": 1000}}
 

@@ -31,6 +31,6 @@ def test_wheel_is_complete(tmp_path):
         f"hloc_reduce/projections/weights/{name}.safetensors" for name in projections.names()
     }
     assert weights and weights <= names
-    assert "hloc_reduce/extractors/vlad_sift_sv64.safetensors" in names
+    assert "hloc_reduce/aggregators/vlad_sift_sv64.safetensors" in names
     assert {f"hloc_reduce/report/page.{kind}" for kind in ("html", "css", "js")} <= names
     assert "hloc_reduce/evaluation/published/localization_recall.csv" in names

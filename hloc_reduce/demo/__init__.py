@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 
 from .. import logger
-from ..cli import InputError
-from ..progress import progress
+from ..utils.cli import InputError
+from ..utils.progress import progress
 from .cameras import DAY, MAP, NIGHT, Photo, list_photos
 from .model import write_model
 from .photo import take

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from .. import colmap
+from ..utils import colmap
 from .cameras import Photo
 from .render import Scene
 from .surface import View

@@ -6,17 +6,7 @@ import cv2
 import numpy as np
 
 from .fittings import sign
-from .textures import (
-    DENSITY,
-    MATERIALS,
-    Opening,
-    finish,
-    fractal,
-    noise,
-    soft_step,
-    spot,
-    tinted,
-)
+from .textures import DENSITY, MATERIALS, Opening, finish, fractal, noise, soft_step, spot, tinted
 
 
 def paint_wall(

@@ -8,8 +8,8 @@ import torch
 from kornia import feature
 from torch import nn
 
-from .. import downloads
-from ..cli import choose
+from ..utils import downloads
+from ..utils.cli import choose
 from .sift import SIFT
 
 PATCH_SIZE = 32

@@ -5,14 +5,15 @@ from pathlib import Path
 
 import torch
 
-from confs import features as features_confs
-
-from .. import cli, logger, plots, projections, results
-from ..cli import InputError
+from .. import logger, projections
+from ..confs import features as features_confs
 from ..datasets import INLOC_THRESHOLDS, thresholds
-from ..io import write_csv
-from . import hpatches, phototour, poses
+from ..utils import cli
+from ..utils.cli import InputError
+from ..utils.files import write_csv
+from . import hpatches, patch_verification, plots, poses
 from .hpatches import data
+from .summaries import recall_table
 
 PAPER = ("aachen", "inloc")
 SHOWN = 20  # failures of each kind that are named
@@ -62,7 +63,7 @@ def evaluate_poses(args: argparse.Namespace) -> None:
         plots.save(
             plots.figure(list(plots.error_curves(by_list).values()), 2), outputs / "curves.svg"
         )
-    print(f"{label}:\n{results.recall_table('', summaries)}")
+    print(f"{label}:\n{recall_table('', summaries)}")
     for group, summary in summaries.items():
         medians = [summary[f"median_{key}"] for key in ("position_error_m", "rotation_error_deg")]
         known = None not in medians
@@ -170,7 +171,9 @@ def evaluate_phototour(args: argparse.Namespace) -> None:
         by_base.setdefault(base, {})[features_confs.get(feature)[0]] = project
     found = {}
     for base, projects in by_base.items():
-        found |= phototour.main(args.root / args.name, args.outputs / args.name, base, projects)
+        found |= patch_verification.main(
+            args.root / args.name, args.outputs / args.name, base, projects
+        )
     write_csv(
         [{"feature": name, "fpr95_percent": 100 * value} for name, value in found.items()],
         args.outputs / f"{args.name}.csv",

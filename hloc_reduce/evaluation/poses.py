@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from .. import localization
-from ..cli import InputError
-from ..parsers import parse_poses
+from ..localization.records import pose_of, read_records
+from ..utils.cli import InputError
+from ..utils.parsers import parse_poses
 
 FAILED = (float("inf"), float("inf"))
 
@@ -140,8 +140,8 @@ def read_estimates(path: Path) -> tuple[dict[str, pycolmap.Rigid3d], set[str]]:
     """
     if path.suffix != ".jsonl":
         return parse_poses(path), set()
-    records = localization.read_records(path)
-    poses = {name: localization.pose(record) for name, record in records.items()}
+    records = read_records(path)
+    poses = {name: pose_of(record) for name, record in records.items()}
     known = {name: pose for name, pose in poses.items() if pose is not None}
     return known, {name for name in known if not records[name]["localized"]}
 

@@ -5,8 +5,8 @@ import sys
 
 from torch import nn
 
-from ..base_model import dynamic_load
-from ..cli import InputError
+from ..utils.base_model import dynamic_load
+from ..utils.cli import InputError
 
 
 def load(conf: dict) -> nn.Module:
@@ -21,10 +21,10 @@ def load(conf: dict) -> nn.Module:
     name = str(conf.get("name"))
     ours = [module.name for module in pkgutil.iter_modules(__path__)]
     if name not in ours:
-        from ..hloc import is_installed
+        from ..utils.hloc import is_installed
 
         if is_installed() or name.startswith("hloc."):
-            from ..hloc.extractor import HlocExtractor
+            from .hloc import HlocExtractor
 
             return HlocExtractor({"conf": conf})
     return dynamic_load(sys.modules[__name__], name)(conf)

@@ -5,10 +5,11 @@ import numpy as np
 import torch
 from torch.nn.functional import grid_sample
 
-from .. import colmap, detection
-from ..base_model import BaseModel
-from ..cli import InputError, choose
 from ..descriptors import BASES, COLMAP, PATCH_SIZE, Descriptor
+from ..detectors import dog
+from ..utils import colmap
+from ..utils.base_model import BaseModel
+from ..utils.cli import InputError, choose
 
 
 def extract_patches(
@@ -83,7 +84,7 @@ class DoG(BaseModel):
     """
 
     default_conf = {
-        "options": detection.HLOC,
+        "options": dog.HLOC,
         "keypoints": "adaptive",
         "descriptor": "sift",
         "max_keypoints": -1,
@@ -93,12 +94,12 @@ class DoG(BaseModel):
     detection_noise = 1.0
 
     def _init(self, conf: dict) -> None:
-        name = choose("keypoints", conf["keypoints"], detection.KEYPOINTS)
+        name = choose("keypoints", conf["keypoints"], dog.KEYPOINTS)
         descriptor = choose("descriptor", conf["descriptor"], BASES)
         self.describe = None if descriptor == COLMAP else Descriptor(descriptor)
         colmap.check_dog_options(conf["options"])
-        own = conf["options"] != detection.HLOC
-        self.settings = (conf["options"], False) if own else detection.SETTINGS[name]
+        own = conf["options"] != dog.HLOC
+        self.settings = (conf["options"], False) if own else dog.SETTINGS[name]
 
     @property
     def descriptor(self) -> str:
@@ -107,7 +108,7 @@ class DoG(BaseModel):
 
     def detect(self, image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
         """Detect keypoints in an image (1, 1, H, W), as `colmap.detect_dog` returns them."""
-        return detection.detect(image[0, 0].cpu().numpy(), *self.settings)
+        return dog.detect(image[0, 0].cpu().numpy(), *self.settings)
 
     def _forward(self, data: dict) -> dict:
         """Extract from an image (1, 1, H, W), or describe what was `detected` in it.

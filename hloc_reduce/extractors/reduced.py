@@ -1,8 +1,8 @@
 """Any extractor followed by a frozen projection of its descriptors."""
 
 from .. import projections
-from ..base_model import BaseModel
-from ..cli import InputError
+from ..utils.base_model import BaseModel
+from ..utils.cli import InputError
 from . import load_local
 
 

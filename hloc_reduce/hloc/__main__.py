@@ -8,9 +8,10 @@ import ast
 import sys
 from pathlib import Path
 
-from .. import cli
-from ..cli import InputError
-from . import import_module, register
+from ..utils import cli
+from ..utils.cli import InputError
+from ..utils.hloc import import_module
+from . import register
 
 
 def main(name: str, args: list[str]) -> None:

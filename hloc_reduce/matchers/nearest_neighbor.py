@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import torch
 from torch.nn.utils.rnn import pad_sequence
 
-from ..base_model import BaseModel
+from ..utils.base_model import BaseModel
 
 PART_BYTES = 2**19  # of descriptors1 at once, which stay in the cache of a core
 TILE = 2**20  # similarities at once

@@ -10,10 +10,9 @@ from safetensors import safe_open
 from safetensors.torch import save as serialize
 from torch import nn
 
-from .. import stamps
-from ..cli import InputError
 from ..descriptors import DESCRIPTORS
-from ..io import replacing
+from ..utils.cli import InputError
+from ..utils.files import file_sha256, replacing
 from . import released
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -142,7 +141,7 @@ def split_prefix(projection: str | Path) -> tuple[str, str]:
 
 def checksum(projection: str | Path) -> str:
     """Return the sha256 of a projection's file, to tell which one made a feature file."""
-    return stamps.sha256(find(projection))
+    return file_sha256(find(projection))
 
 
 def save(mlp: MLP, metadata: dict, path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from .. import downloads
+from ..utils import downloads
 
 SOURCE = "https://github.com/PRBonn/descriptor-dr"
 URL = f"{SOURCE}/raw/main/models"

@@ -6,11 +6,13 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
-from .. import __version__, cli, logger, plots
-from ..cli import InputError
-from ..io import replacing
-from ..paths import strings_as_paths
-from ..progress import progress
+from .. import __version__, logger
+from ..evaluation import plots
+from ..utils import cli
+from ..utils.cli import InputError
+from ..utils.files import replacing
+from ..utils.paths import strings_as_paths
+from ..utils.progress import progress
 from . import pictures, runs, scene
 from .runs import ERRORS, Run
 

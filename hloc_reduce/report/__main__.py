@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from .. import cli
+from ..utils import cli
 from . import NUM_QUERIES, main
 
 

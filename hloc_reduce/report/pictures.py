@@ -3,8 +3,11 @@
 import cv2
 import numpy as np
 
-from .. import localization
-from ..io import get_keypoints, get_matches, open_h5, read_image
+from ..localization.records import camera_of, pose_of
+from ..utils.feature_files import get_keypoints
+from ..utils.h5 import open_h5
+from ..utils.images import read_image
+from ..utils.match_files import get_matches
 from .runs import Run
 
 HEIGHT = 320  # pixels of both images
@@ -57,11 +60,11 @@ def _inliers(
     """Tell which points that keypoints (M,) of a map image show reproject to those (M, 2)."""
     inliers = np.zeros(len(keypoints), bool)
     if record["localized"]:
-        pose = localization.pose(record)
+        pose = pose_of(record)
         ids, points = run.reference.lift(name, keypoints)
         known = np.flatnonzero(ids >= 0)
         in_camera = points[known] @ pose.rotation.matrix().T + pose.translation
-        projected = localization.camera(record).img_from_cam(in_camera)
+        projected = camera_of(record).img_from_cam(in_camera)
         apart = np.linalg.norm(projected - (matched_to[known] + 0.5), axis=1)
         inliers[known] = (apart <= record["max_error"]) & (in_camera[:, 2] > 0)
     return inliers

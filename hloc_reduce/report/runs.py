@@ -12,15 +12,18 @@ import h5py
 import numpy as np
 import pycolmap
 
-from .. import cli, colmap, localization, localize_inloc, logger, scans
-from ..cli import InputError, no_folder
+from .. import logger
+from ..datasets import scans
 from ..evaluation import published
 from ..evaluation.poses import FAILED
-from ..io import open_h5
-from ..jobs import SHARED
-from ..localize_sfm import SfmMap
-from ..maps import is_map
-from ..parsers import parse_poses, parse_retrieval
+from ..localization.records import log_file, read_records
+from ..localization.references import Reference, ScanMap, SfmMap
+from ..maps.map import is_map
+from ..runtime.outputs import SHARED
+from ..utils import cli, colmap
+from ..utils.cli import InputError, no_folder
+from ..utils.h5 import open_h5
+from ..utils.parsers import parse_poses, parse_retrieval
 
 NUMBERS = ("num_matches", "num_correspondences", "num_inliers")
 ERRORS = ("position_error_m", "rotation_error_deg")
@@ -108,7 +111,7 @@ class Run:
         ]
 
     def _read_records(self) -> dict[str, dict]:
-        records = localization.read_records(localization.log_file(self.poses))
+        records = read_records(log_file(self.poses))
         if records.keys() != self.rows.keys():
             raise InputError(f"{self.folder} is of a run that did not finish: run it again.")
         return records
@@ -119,7 +122,7 @@ class Run:
         return colmap.read_model(self.files["map"]) if self.files["map"].is_dir() else None
 
     @cached_property
-    def reference(self) -> localization.Reference:
+    def reference(self) -> Reference:
         """The map, which knows what point each keypoint of its images shows."""
         if self.reconstruction is not None:
             return SfmMap(self.reconstruction)
@@ -128,7 +131,7 @@ class Run:
             files = h5py.File(points), h5py.File(features)
         names = sorted({name for names in self.retrieved.values() for name in names})
         poses = {name: scans.read_pose(self.files["map_images"], name) for name in names}
-        return localize_inloc.ScanMap(*files, poses)
+        return ScanMap(*files, poses)
 
     @cached_property
     def retrieved(self) -> dict[str, list[str]]:

@@ -5,9 +5,12 @@ import base64
 import numpy as np
 import pycolmap
 
-from .. import localization, scans
-from ..cli import InputError
-from ..io import get_keypoints, open_h5, read_image
+from ..datasets import scans
+from ..localization.records import pose_of
+from ..utils.cli import InputError
+from ..utils.feature_files import get_keypoints
+from ..utils.h5 import open_h5
+from ..utils.images import read_image
 from .runs import Run
 
 POINTS = 6000  # shown, at most
@@ -50,7 +53,7 @@ def _scene(run: Run, cameras: dict[str, list[float]], records: dict[str, dict]) 
     points, colours = _points(run, sorted(cameras))
     queries = []
     for name, record in records.items():
-        pose = localization.pose(record)
+        pose = pose_of(record)
         queries.append(
             {
                 "name": name,

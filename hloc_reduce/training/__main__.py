@@ -10,17 +10,18 @@ from pathlib import Path
 
 import torch
 
-from confs import features as features_confs
-
-from .. import cli, extractors, logger, projections, stamps
-from .. import phototour as layout
-from ..cli import InputError
+from .. import extractors, logger, projections
+from ..confs import features as features_confs
+from ..datasets import phototour as layout
 from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM, check_weights
-from ..evaluation import phototour as verification
-from ..maps import Map, is_map
-from ..paths import strings_as_paths
-from ..versions import versions
-from . import nested, pca, phototour, ss, sv, tracks, us
+from ..evaluation import patch_verification as verification
+from ..maps.map import Map, is_map
+from ..runtime.versions import versions
+from ..utils import cli
+from ..utils.cli import InputError
+from ..utils.files import file_sha256
+from ..utils.paths import strings_as_paths
+from . import nested, patch_tracks, pca, ss, sv, tracks, us
 
 SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
 RECIPE_NAMES = ("best", "paper", "tune")
@@ -77,7 +78,7 @@ def main(
         for path in paths.values()
     }
     files = {
-        folder.resolve().name: phototour.main(
+        folder.resolve().name: patch_tracks.main(
             folder, cache / folder.resolve().name, descriptor, seed
         )
         for folder in sequences
@@ -85,7 +86,7 @@ def main(
         name: tracks.main(images, model, cache / name, descriptor, seed, conf)
         for name, (images, model) in maps.items()
     }
-    checksums = {name: stamps.sha256(file) for name, file in files.items()}
+    checksums = {name: file_sha256(file) for name, file in files.items()}
     data = [tracks.load(file) for file in files.values()]
     size = data[0].descriptors.shape[-1]
     if max(paths) > size:

@@ -8,8 +8,8 @@ import torch
 from torch import nn
 
 from .. import logger
-from ..io import replacing
-from ..progress import progress
+from ..utils.files import replacing
+from ..utils.progress import progress
 
 CHECKPOINT_STEPS, CHECKPOINT_SECONDS = 500, 30.0  # whichever comes first
 

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from sklearn.decomposition import PCA
 
-from ..cli import InputError
 from ..projections import MLP
+from ..utils.cli import InputError
 from .tracks import Tracks
 
 

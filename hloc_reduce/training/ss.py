@@ -9,10 +9,10 @@ import torch
 from torch import nn
 
 from .. import logger
-from ..cli import InputError
-from ..group_writer import resume_or_replace
-from ..io import get_dataset, open_h5
 from ..projections import MLP
+from ..runtime.group_writer import resume_or_replace
+from ..utils.cli import InputError
+from ..utils.h5 import get_dataset, open_h5
 from . import sv
 from .loop import device, fit
 from .sampling import DescriptorSampler

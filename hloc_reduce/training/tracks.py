@@ -11,28 +11,29 @@ import torch
 from safetensors.numpy import load_file, save_file
 from scipy.spatial import cKDTree
 
-from confs import features as features_confs
-
 from .. import (
-    colmap,
     extract_features,
     extractors,
     logger,
     match_features,
     pairs_from_covisibility,
-    stamps,
     triangulation,
 )
-from ..cli import InputError, choose
-from ..colmap import point3D_ids
+from ..confs import features as features_confs
 from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM, Descriptor
 from ..extractors.dog import extract_patches
-from ..group_writer import resume_or_replace
-from ..io import get_colmap_keypoints, get_dataset, open_h5, replacing
-from ..maps import Map, is_map
-from ..paths import strings_as_paths
-from ..progress import progress
-from ..storage import get_descriptors
+from ..maps.map import Map, is_map
+from ..runtime import provenance
+from ..runtime.group_writer import resume_or_replace
+from ..utils import colmap
+from ..utils.cli import InputError, choose
+from ..utils.colmap import point3D_ids
+from ..utils.feature_files import get_colmap_keypoints, get_descriptors
+from ..utils.files import replacing
+from ..utils.h5 import get_dataset, open_h5
+from ..utils.images import load_image
+from ..utils.paths import strings_as_paths
+from ..utils.progress import progress
 from .completion import Completion
 from .loop import device
 
@@ -105,9 +106,11 @@ def main(
     source = {"images": str(images.resolve()), "model": str(model.resolve())}
     if is_map(model.parent):  # which may have been built anew, of other photos
         source["map"] = Map(model.parent).id
-    if (output / "source.json").exists() and not stamps.is_current(output / "source.json", source):
+    if (output / "source.json").exists() and not provenance.is_current(
+        output / "source.json", source
+    ):
         raise InputError(f"{output} holds the tracks of another map. Choose another folder.")
-    stamps.write(output / "source.json", source)
+    provenance.write(output / "source.json", source)
     if conf is None and descriptor not in DESCRIPTORS:
         conf = features_confs.get(descriptor, keypoints=KEYPOINTS)[1]
     found_by, patches = (descriptor, False) if conf else (MATCHED, True)
@@ -125,7 +128,7 @@ def main(
 
     tracks = output / f"tracks_{descriptor}.safetensors"
     made_from = stamp(descriptor, seed, [sfm / "points3D.bin", features])
-    if tracks.exists() and stamps.is_current(tracks.with_suffix(".json"), made_from):
+    if tracks.exists() and provenance.is_current(tracks.with_suffix(".json"), made_from):
         return tracks
     complete, matched, keypoints = _observations(reconstruction, features, names)
     describe = PatchDescriber(descriptor) if patches else FeatureDescriber(conf["model"])
@@ -139,7 +142,7 @@ def main(
             if not len(kept):
                 continue
             generator = np.random.default_rng([seed, number])
-            image, size = extract_features.load_image(images / name, conf["preprocessing"])
+            image, size = load_image(images / name, conf["preprocessing"])
             ratio = np.array(image.shape[:1:-1]) / size
             scaled = keypoints[name][kept]  # in pixels of the resized image
             scaled[:, :2] = (scaled[:, :2] + 0.5) * ratio - 0.5
@@ -190,7 +193,7 @@ def _observations(
 def stamp(descriptor: str, seed: int, inputs: list[Path]) -> dict:
     """Describe what a file of `load` is made from."""
     options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "format": 2}
-    return stamps.stamp(options, inputs)
+    return provenance.stamp(options, inputs)
 
 
 def save(
@@ -221,7 +224,7 @@ def save(
     tracks = Tracks(descriptors, track, image, xy, matched).only(order)
     with replacing(path) as temporary:
         save_file(vars(tracks), temporary)
-    stamps.write(path.with_suffix(".json"), made_from)
+    provenance.write(path.with_suffix(".json"), made_from)
     logger.info("%d observations of %d points: %s", len(track), tracks.num_tracks, path)
     return path
 

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from confs import features as features_confs
-
-from ... import cli, io, projections, stamps
+from ... import projections
+from ...confs import features as features_confs
 from ...descriptors import check_weights
-from ...io import open_h5
-from ...paths import strings_as_paths
+from ...runtime import provenance
+from ...utils import cli
+from ...utils.files import write_csv
+from ...utils.h5 import file_provenance, open_h5
+from ...utils.paths import strings_as_paths
 from .. import published
 from . import data, lists, tasks
 from .data import NOISE, Descriptors
@@ -71,10 +73,10 @@ def main(
         data.describe(root, sequences, base, file)
         with open_h5(file) as described:
             made_from = {
-                "descriptors": io.provenance(described),
+                "descriptors": file_provenance(described),
                 "projection": checksum,
                 "sequences": sequences,
-                "lists": stamps.stamp({}, sorted(task_lists.glob(f"*_split-{split}.csv"))),
+                "lists": provenance.stamp({}, sorted(task_lists.glob(f"*_split-{split}.csv"))),
             }
         scores[name] = _score(
             outputs / split / f"{name}.json",
@@ -86,8 +88,8 @@ def main(
     rows = [
         {"feature": name, **_means(found, paper.get(name, {}))} for name, found in scores.items()
     ]
-    io.write_csv(_score_rows(scores), outputs / f"{split}_scores.csv")
-    io.write_csv(rows, outputs / f"{split}.csv")
+    write_csv(_score_rows(scores), outputs / f"{split}_scores.csv")
+    write_csv(rows, outputs / f"{split}.csv")
     return rows
 
 
@@ -130,13 +132,13 @@ def _score(
     evaluate: Callable[[str], Iterator[tuple[str, str, float]]],
 ) -> dict[str, list]:
     """Return the scores of a feature in each task, those that a file has and those computed now."""
-    before = stamps.read(path)
+    before = provenance.read(path)
     current = before.get("made_from") == json.loads(json.dumps(made_from))
     scores = before["scores"] if current else {}
     for task in chosen:
         if task not in scores:
             scores[task] = list(evaluate(task))
-            stamps.write(path, {"made_from": made_from, "scores": scores})
+            provenance.write(path, {"made_from": made_from, "scores": scores})
     return {task: scores[task] for task in chosen}
 
 

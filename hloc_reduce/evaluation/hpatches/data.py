@@ -7,12 +7,14 @@ import cv2
 import numpy as np
 import torch
 
-from ... import cli, io, parallel
-from ...cli import InputError
 from ...descriptors import PATCH_SIZE, Descriptor
-from ...group_writer import GroupWriter
-from ...io import get_dataset, open_h5
-from ...progress import progress
+from ...runtime import parallel
+from ...runtime.group_writer import GroupWriter
+from ...utils import cli
+from ...utils.cli import InputError
+from ...utils.h5 import get_dataset, open_h5
+from ...utils.images import read_image
+from ...utils.progress import progress
 
 SIDE = 65
 NOISE = {"e": "easy", "h": "hard", "t": "tough"}
@@ -65,7 +67,7 @@ def read_patches(path: Path) -> np.ndarray:
     Raises:
         InputError: when it is none.
     """
-    image = io.read_image(path, grayscale=True)
+    image = read_image(path, grayscale=True)
     if image.shape[1] != SIDE or len(image) % SIDE:
         raise InputError(f"{path} is not a column of patches of {SIDE} x {SIDE} pixels.")
     return image.reshape(-1, SIDE, SIDE)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...cli import InputError
-from ...io import replacing
-from ...progress import progress
+from ...utils.cli import InputError
+from ...utils.files import replacing
+from ...utils.progress import progress
 from .data import IMAGES
 
 SEED = 42

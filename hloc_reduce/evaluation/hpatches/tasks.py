@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from ... import parallel
-from ...progress import progress
+from ...runtime import parallel
+from ...utils.progress import progress
 from ..ranking import average_precision, roc_area
 from .data import IMAGES, NOISE, TYPES, Descriptors
 

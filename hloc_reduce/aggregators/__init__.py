@@ -1,0 +1,1 @@
+"""Aggregators: local features to a global descriptor."""

@@ -1,0 +1,1 @@
+"""Named configurations, dicts of hloc's shape; the package `confs` shows them."""

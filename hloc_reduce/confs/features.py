@@ -1,0 +1,173 @@
+"""Local features: base descriptors, 128-D, their projections, and those of a user's own file.
+
+`<descriptor>_<scheme><dim>` are the paper's; `<descriptor>_nested` is 64-D, and
+`<descriptor>_nested@<dim>` its first numbers. `colmap_sift` is COLMAP's own SIFT.
+"""
+
+from argparse import ArgumentParser
+from pathlib import Path
+
+from .. import projections
+from ..descriptors import COLMAP, DESCRIPTORS
+from ..detectors.dog import HLOC, KEYPOINTS
+from ..utils.cli import InputError, choose
+from ..utils.feature_files import STORAGES
+from ..utils.parsers import read_yaml
+
+RECOMMENDED = "colmap_sift_sv64"  # the fastest, and the best measured (docs/performance.md)
+DIMS = (64, 32, 24, 16)
+SCHEMES = dict.fromkeys(DESCRIPTORS, ("pca", "us", "ss", "sv")) | {COLMAP: ("pca", "sv")}
+
+PREPROCESSING = {"grayscale": True, "resize_max": 1600}
+
+
+def base(descriptor: str) -> dict:
+    """Return the model configuration of a base descriptor at DoG keypoints."""
+    return {"name": "dog", "descriptor": descriptor, "keypoints": KEYPOINTS[0]}
+
+
+def feature(name: str, model: dict) -> dict:
+    """Return the configuration of a feature."""
+    return {"output": f"feats-dog-{name}", "model": model, "preprocessing": PREPROCESSING}
+
+
+def names(descriptor: str) -> list[str]:
+    """List the projections of a base descriptor."""
+    reduced = [f"{descriptor}_{scheme}{dim}" for scheme in SCHEMES[descriptor] for dim in DIMS]
+    if descriptor == COLMAP:
+        return reduced
+    nested = f"{descriptor}_nested"
+    return [*reduced, nested, *(f"{nested}@{dim}" for dim in DIMS[1:])]
+
+
+confs = {name: feature(name, base(name)) for name in SCHEMES} | {
+    name: feature(name, {"name": "reduced", "base": base(descriptor), "projection": name})
+    for descriptor in SCHEMES
+    for name in names(descriptor)
+}
+
+
+def get(
+    name: str,
+    projection: Path | None = None,
+    storage: str = STORAGES[0],
+    keypoints: str = KEYPOINTS[0],
+) -> tuple[str, dict]:
+    """Return the name and the configuration of a feature.
+
+    Args:
+        name: a key of `confs`, or the path of a YAML file with a `model` and perhaps
+            `preprocessing`; that feature is called as the file.
+        projection: file of another projection of the same base; the feature is called after it.
+        storage: how descriptors are kept, one of `storage.STORAGES`.
+        keypoints: settings of DoG, one of `detection.KEYPOINTS`; "adaptive" leaves those of a YAML
+            file as they are.
+
+    Raises:
+        InputError: for an unknown name or a file that is none.
+    """
+    choose("storage", storage, STORAGES)
+    choose("keypoints", keypoints, KEYPOINTS)
+    if Path(name).suffix in (".yaml", ".yml"):
+        name, conf = Path(name).stem, read(Path(name))
+    else:
+        conf = confs[choose("feature", name, confs)]
+    if storage != STORAGES[0]:
+        conf = {**conf, "storage": storage}
+    if keypoints != KEYPOINTS[0]:
+        conf = {**conf, "model": with_keypoints(conf["model"], keypoints)}
+    if projection is None:
+        return name, conf
+    model = {
+        "name": "reduced",
+        "base": conf["model"].get("base", conf["model"]),
+        "projection": str(projection),
+    }
+    file, prefix = projections.split_prefix(projection)
+    name = Path(file).stem + (prefix and f"@{prefix}")
+    return name, {**conf, "output": feature(name, model)["output"], "model": model}
+
+
+def with_keypoints(model: dict, keypoints: str) -> dict:
+    """Return the configuration of a model with other settings of DoG, if it has that detector."""
+    if "base" in model:
+        return {**model, "base": with_keypoints(model["base"], keypoints)}
+    return {**model, "keypoints": keypoints} if model["name"] == "dog" else model
+
+
+def keypoints_of(model: dict) -> str | None:
+    """Return the name of the settings of DoG of a model, None if it has options of its own."""
+    base = model.get("base", model)
+    return base.get("keypoints") if base.get("options", HLOC) == HLOC else None
+
+
+def of_patches(name: str) -> tuple[str, str | None]:
+    """Return the base descriptor and the projection, if any, of a feature that describes patches.
+
+    Args:
+        name: as of `get`.
+
+    Raises:
+        InputError: for an unknown one, or one that describes photos only.
+    """
+    name, conf = get(name)
+    model = conf["model"]
+    base = model.get("base", model)
+    descriptor = base.get("descriptor", "sift")
+    if base["name"] != "dog" or descriptor == COLMAP:
+        raise InputError(f"{name} describes photos, not patches.")
+    return choose("descriptor", descriptor, DESCRIPTORS), model.get("projection")
+
+
+def add_storage_option(parser: ArgumentParser) -> None:
+    """Add --storage."""
+    parser.add_argument(
+        "--storage",
+        default=STORAGES[0],
+        help=f"how descriptors are kept, one of {', '.join(STORAGES)}; hloc reads no uint8",
+    )
+
+
+def add_keypoints_option(parser: ArgumentParser) -> None:
+    """Add --keypoints."""
+    parser.add_argument(
+        "--keypoints",
+        default=KEYPOINTS[0],
+        help=f"settings of the DoG detector, one of {', '.join(KEYPOINTS)}: adaptive finds more "
+        "keypoints in small, dark and hazy photos; colmap finds several times as many in every "
+        "photo; hloc uses hloc's settings for every photo",
+    )
+
+
+def read(path: Path) -> dict:
+    """Read the configuration of a feature from a YAML file.
+
+    Raises:
+        InputError: when it is none.
+    """
+    content = read_yaml(path)
+    model = content.get("model") if isinstance(content, dict) else None
+    for part in (model, model.get("base", model) if isinstance(model, dict) else None):
+        if not isinstance(part, dict) or "name" not in part:
+            raise InputError(f"{path} has no model with a name, such as: model: {{name: dog}}.")
+    projection = model.get("projection", "" if model["name"] == "reduced" else None)
+    if projection is not None and not (isinstance(projection, str) and projection):
+        raise InputError(f"{path}: the {model['name']} model names no projection.")
+    base = model.get("base", model)
+    if base["name"] == "dog" and "keypoints" not in base:
+        model = with_keypoints(model, KEYPOINTS[0])
+    if projection and Path(projections.split_prefix(projection)[0]).suffix:
+        model = {**model, "projection": str(Path(projection).absolute())}  # other machines read it
+    given = content.get("preprocessing") or {}
+    if not isinstance(given, dict):
+        raise InputError(f"{path}: preprocessing cannot be {given!r}.")
+    # what the confs of hloc have besides, `output`, is not needed
+    unknown = content.keys() - {"model", "preprocessing", "output"}
+    unknown |= given.keys() - {*PREPROCESSING, "resize_force"}
+    if unknown:
+        raise InputError(f"{path}: unknown keys {', '.join(map(str, sorted(unknown, key=str)))}.")
+    preprocessing = {**PREPROCESSING, **given}
+    resize_max = preprocessing["resize_max"]
+    if resize_max is not None and not (isinstance(resize_max, int) and resize_max > 0):
+        raise InputError(f"{path}: resize_max is a number of pixels or null, not {resize_max!r}.")
+    return {"output": f"feats-{path.stem}", "model": model, "preprocessing": preprocessing}

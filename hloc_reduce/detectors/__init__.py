@@ -1,0 +1,1 @@
+"""Detectors: image to keypoints."""

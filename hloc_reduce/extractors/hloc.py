@@ -1,0 +1,69 @@
+"""An extractor of hloc's as one of this project's."""
+
+import pkgutil
+
+import torch
+from torch.nn.functional import normalize
+
+from ..utils.base_model import BaseModel
+from ..utils.cli import InputError, choose
+from ..utils.hloc import extractors_package
+
+# keys of hloc's configurations that say which descriptors there will be
+DETERMINING = ("descriptor", "model_name", "weights")
+
+
+def _reason(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error) else ''}"
+
+
+class HlocExtractor(BaseModel):
+    """The features of an extractor of an installed hloc, as this project's extractors give them.
+
+    `conf` is hloc's configuration: `name` and what that extractor takes.
+    """
+
+    default_conf = {"conf": {}}
+    required_inputs = ("image",)
+
+    def _init(self, conf: dict) -> None:
+        package, load = extractors_package()
+        conf = dict(conf["conf"])
+        name = conf["name"] = str(conf["name"]).removeprefix("hloc.")
+        self.name = choose(
+            "extractor", name, [module.name for module in pkgutil.iter_modules(package.__path__)]
+        )
+        try:
+            self.model = load(package, name)(conf)
+        except Exception as error:  # whatever hloc and its third parties raise
+            raise InputError(
+                f"hloc's extractor {name} cannot be made ({_reason(error)})."
+            ) from None
+        self.detection_noise = getattr(self.model, "detection_noise", 1.0)
+
+    @property
+    def descriptor(self) -> str:
+        """The name that a projection of these descriptors is kept under: hloc.disk.depth."""
+        chosen = [str(self.model.conf[key]) for key in DETERMINING if self.model.conf.get(key)]
+        return ".".join(["hloc", self.name, *chosen])
+
+    @torch.no_grad()
+    def _forward(self, data: dict) -> dict:
+        """Extract keypoints (1, N, 2), descriptors (1, D, N) of unit norm and whatever else."""
+        try:
+            features = {key: value[0] for key, value in self.model(data).items()}
+        except (torch.cuda.OutOfMemoryError, MemoryError):
+            raise
+        except Exception as error:
+            raise InputError(
+                f"hloc's extractor {self.name} fails ({_reason(error)}). "
+                "Is preprocessing as it needs it, grayscale above all?"
+            ) from error
+        if "descriptors" not in features:
+            raise InputError(f"hloc's extractor {self.name} gives no local descriptors.")
+        # some describe on the CPU, wherever they are
+        descriptors = features["descriptors"].to(data["image"].device).float()
+        features["descriptors"] = normalize(descriptors, dim=0)
+        if "keypoint_scores" in features:
+            features["scores"] = features.pop("keypoint_scores")
+        return {key: value[None] for key, value in features.items()}

@@ -1,0 +1,115 @@
+"""Localize one query: 2D-3D matches through retrieved images, PnP + RANSAC."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pycolmap
+
+from . import absolute_pose
+from .confidence import DEFAULT_GATE, RIVAL, Gate
+from .references import Reference
+
+
+def localize(
+    reference: Reference,
+    keypoints: np.ndarray,
+    camera: pycolmap.Camera,
+    matches: Mapping[str, np.ndarray],
+    config: dict,
+    gate: Gate = DEFAULT_GATE,
+) -> tuple[pycolmap.Rigid3d | None, dict]:
+    """Localize a query.
+
+    Args:
+        reference: the map.
+        keypoints: (N, 2) of the query, COLMAP's pixels.
+        camera: intrinsics.
+        matches: from map images, best first, to (M, 2) indices of the keypoints of the query and
+            of the image.
+        config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
+        gate: what a pose must have to be trusted.
+
+    Returns:
+        The pose (camera from world) or None, and info: `reason`, why the pose is not to be trusted,
+        None if it is; `confidence`, as of `confidence.confidence` and at least 0; `agreement`, as
+        of `confidence.agreement`; `num_inliers`; `num_matches`, with a 3D point, of
+        `num_correspondences` different ones (M); `num_without_point`, the other matches; `camera`,
+        the intrinsics, refined where `config` says so; `db`, the image retrieved first, of the
+        cluster that was localized in; and of that cluster `keypoints` (M,), indices of the query's,
+        `point3D_ids` (M,), `points3D` (M, 3) and `inliers` (M,) bool.
+    """
+    solved = []
+    for names in reference.clusters(list(matches)) if matches else [[]]:
+        info, images = _correspondences(reference, names, matches)
+        points = keypoints[info["keypoints"]], info["points3D"]
+        found = absolute_pose.estimate(*points, images, camera, config, gate)
+        info |= {
+            "reason": _reason(len(keypoints), names, info) or found.refusal,
+            "confidence": round(max(0.0, found.confidence), 2),
+            "agreement": round(found.agreement, 3),
+            "camera": found.camera,
+            "num_inliers": found.num_inliers,
+            "inliers": found.inliers,
+            "db": names[0] if names else None,
+        }
+        solved.append((found, info))
+    best, info = max(solved, key=lambda both: _quality(both[1]))
+    for other, its_info in solved:
+        if info["reason"] is None is its_info["reason"] and other is not best:
+            rivals = other.num_inliers >= RIVAL * best.num_inliers
+            if rivals and absolute_pose.differ(best, other, info["points3D"]):
+                info["reason"] = (
+                    f"ambiguous: a pose by other images has {other.num_inliers} inliers, this one "
+                    f"{best.num_inliers}"
+                )
+    return best.cam_from_world, info
+
+
+def _quality(info: dict) -> tuple[bool, float, int]:
+    return info["reason"] is None, info["confidence"], info["num_inliers"]
+
+
+def _reason(num_keypoints: int, names: list[str], info: dict) -> str | None:
+    """Say why a query has no matches to localize it by, if it has none."""
+    if not num_keypoints:
+        return "no keypoints"
+    if not names:
+        return "no map image was retrieved"
+    return None if info["num_matches"] else "no match with a 3D point"
+
+
+def _correspondences(
+    reference: Reference, names: list[str], matches: Mapping[str, np.ndarray]
+) -> tuple[dict, list[np.ndarray]]:
+    """Collect the different 2D-3D matches through some images, sorted.
+
+    Returns:
+        Parts of `info` of `localize`, and of each image the indices of its matches.
+    """
+    keypoints, ids, points = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 3))]
+    for name in names:
+        shown, xyz = reference.lift(name, matches[name][:, 1])
+        keypoints.append(matches[name][:, 0])
+        ids.append(shown)
+        points.append(xyz)
+    pairs = np.stack([np.concatenate(keypoints), np.concatenate(ids)], 1)
+    known = np.flatnonzero(pairs[:, 1] >= 0)
+    different, first, which = np.unique(
+        pairs[known], axis=0, return_index=True, return_inverse=True
+    )
+    image = np.repeat(np.arange(len(names)), [len(matches[name]) for name in names])[known]
+    images = [np.unique(which.reshape(-1)[image == i]) for i in range(len(names))]
+    return {
+        "num_matches": len(known),
+        "num_without_point": len(pairs) - len(known),
+        "num_correspondences": len(different),
+        "keypoints": different[:, 0],
+        "point3D_ids": different[:, 1],
+        "points3D": np.concatenate(points)[known[first]],
+    }, images
+
+
+def merged(config: dict, refinement: dict) -> dict:
+    """Merge two dicts of options under "estimation" and "refinement"; the second one wins."""
+    keys = config.keys() | refinement.keys()
+    return {key: {**config.get(key, {}), **refinement.get(key, {})} for key in keys}

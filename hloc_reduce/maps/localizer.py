@@ -1,0 +1,153 @@
+"""Localize one photo at a time in a map that is held in memory."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import torch
+
+from .. import extract_features, extractors
+from ..aggregators.vlad import read_vocabulary
+from ..confs import matchers as matchers_confs
+from ..localization import query
+from ..localization.confidence import DEFAULT_GATE, Gate
+from ..localization.query import merged
+from ..localization.references import SfmMap
+from ..localize_sfm import RANSAC_THRESH
+from ..matchers.nearest_neighbor import mutual_nearest
+from ..pairs_from_retrieval import rank, read_global
+from ..runtime import parallel
+from ..utils import colmap
+from ..utils.base_model import dynamic_load
+from ..utils.cli import InputError
+from ..utils.feature_files import dimension, get_descriptors, restore, store, to_colmap
+from ..utils.h5 import open_h5
+from . import intrinsics
+from .map import RETRIEVAL, Map
+
+
+class Localizer:
+    """Localizes photos in a map.
+
+    The poses are those of `pipelines.localize`. Of a map image only the keypoints that show a
+    point are matched: the others cannot help.
+
+    Args:
+        map_dir: the folder of a map, as `maps.main` or `pipelines.localize` makes it.
+        num_loc: how many of the most similar map images a photo is matched with.
+        ransac_thresh: RANSAC's inlier threshold in pixels.
+        gate: what a pose must have to be trusted.
+
+    Raises:
+        InputError: when the folder is not a map.
+
+    Example:
+        >>> localizer = Localizer("outputs/map")  # doctest: +SKIP
+        >>> cam_from_world, info = localizer.localize("photo.jpg")  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        map_dir: Path | str,
+        num_loc: int = 50,
+        ransac_thresh: float = RANSAC_THRESH,
+        gate: Gate = DEFAULT_GATE,
+    ):
+        built = Map(map_dir)
+        self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
+        self.preprocessing = built.conf["preprocessing"]
+        self.storage = built.storage
+        matcher = matchers_confs.confs[built.matcher]["model"]
+        self.ratio_threshold = matcher.get("ratio_threshold")
+        self.gate = gate.of_matches(matcher, dimension(built.features))
+        self.device = "cuda" if torch.cuda.is_available() else "cpu"
+        self.extractor = extractors.load(built.conf["model"]).eval().to(self.device)
+        self.vlad = dynamic_load(extractors, RETRIEVAL["model"]["name"])(RETRIEVAL["model"]).eval()
+        self.vlad.vocabulary = read_vocabulary(built.vocabulary)
+        self.reference = SfmMap(colmap.read_model(built.sfm))
+        self.names = sorted(self.reference.images)
+        self.global_descriptors = read_global(built.descriptors, self.names)
+        self.descriptors, self.shown = {}, {}
+        with open_h5(built.features) as file:
+            for name in self.names:
+                descriptors = torch.from_numpy(get_descriptors(file, name))
+                self.descriptors[name] = descriptors.to(self.device)
+                shown = np.flatnonzero(self.reference.point_rows(name) >= 0)
+                self.shown[name] = torch.from_numpy(shown).to(self.device)
+
+    def localize(
+        self, image: Path | str | np.ndarray, camera: pycolmap.Camera | None = None
+    ) -> tuple[pycolmap.Rigid3d | None, dict]:
+        """Localize a photo.
+
+        Args:
+            image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
+            camera: its intrinsics; default: from the EXIF data of the file, or guessed, and
+                estimated with the pose.
+
+        Returns:
+            The pose, camera from world, in the units of the map, or None if the photo cannot be
+            localized, for the `reason` in info; and info, as of `localization.localize`, with
+            `points2D` (M, 2) in COLMAP's pixels, `retrieved`, names of map images, best first,
+            `intrinsics` ("given", "EXIF" or "guess"), and `seconds` by stage.
+
+        Raises:
+            InputError: when the image cannot be read, or the camera is of another size.
+        """
+        image = image if isinstance(image, np.ndarray) else Path(image)
+        seconds, start = {}, time.perf_counter()
+
+        def lap(stage: str) -> None:
+            seconds[stage] = time.perf_counter() - start - sum(seconds.values())
+
+        source, refinement = "given", {}
+        if camera is None:
+            camera, source = intrinsics.infer(image)
+            refinement = intrinsics.REFINEMENTS[source]
+        features = extract_features.extract(self.extractor, image, self.preprocessing, self.device)
+        width, height = map(int, features["image_size"])
+        if (camera.width, camera.height) != (width, height):
+            raise InputError(
+                f"The camera is of {camera.width}x{camera.height} pixels, the photo has "
+                f"{width}x{height}."
+            )
+        # as they are in the map
+        descriptors = torch.from_numpy(restore(*store(features, self.storage)))
+        lap("extraction")
+        retrieved = self._retrieve(descriptors)
+        lap("retrieval")
+        matches = self._match(descriptors.to(self.device), retrieved)
+        lap("matching")
+        config = {"estimation": {"ransac": {"max_error": self.ransac_thresh}}}
+        keypoints = to_colmap(features["keypoints"])
+        cam_from_world, info = query.localize(
+            self.reference, keypoints, camera, matches, merged(config, refinement), self.gate
+        )
+        lap("pose")
+        info |= {
+            "points2D": keypoints[info["keypoints"]],
+            "retrieved": retrieved,
+            "intrinsics": source,
+            "seconds": seconds,
+        }
+        return cam_from_world if info["reason"] is None else None, info
+
+    def _retrieve(self, descriptors: torch.Tensor) -> list[str]:
+        """Return the names of the map images most similar to local descriptors (N, D)."""
+        query = self.vlad({"descriptors": descriptors.T[None]})["global_descriptor"]
+        query = query.half().float().numpy()  # as they are in the map
+        return [self.names[j] for j in rank(query, self.global_descriptors, self.num_loc)[0]]
+
+    def _match(self, descriptors: torch.Tensor, names: list[str]) -> dict[str, np.ndarray]:
+        """Match descriptors (N, D) with those of map images that show a point."""
+
+        def match(name: str) -> np.ndarray:
+            shown = self.shown[name]
+            found, _ = mutual_nearest(
+                self.descriptors[name], descriptors, self.ratio_threshold, shown
+            )
+            matched = found >= 0
+            return torch.stack([found[matched], shown[matched]], dim=1).cpu().numpy()
+
+        return dict(zip(names, parallel.ordered("match", match, names), strict=True))

@@ -1,0 +1,197 @@
+"""Maps to localize in: the points, features and global descriptors of photos, kept in a folder."""
+
+import glob
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from .. import (
+    aggregate_features,
+    extract_features,
+    projections,
+)
+from ..aggregators.vlad import read_vocabulary
+from ..confs import features as features_confs
+from ..confs import matchers as matchers_confs
+from ..detectors.dog import KEYPOINTS
+from ..utils import colmap
+from ..utils.cli import InputError, choose, no_folder
+from ..utils.feature_files import STORAGES
+from ..utils.h5 import file_provenance, open_h5
+from ..utils.paths import strings_as_paths
+
+FINISHED = "map.json"  # is written when all else is there
+FINGERPRINTS = "fingerprints.json"
+SFM = "sfm"  # the folder of the COLMAP model
+# what is added to the names of what later attempts make: with more keypoints, or without these
+MORE, FURTHER = "-keypoints_colmap", "-further"
+PLACE = "place.txt"  # stays when the map is built anew
+RETRIEVAL = aggregate_features.confs["vlad"]
+
+
+class Map:
+    """A map that `main` made; what it needs is in its folder, which may be moved.
+
+    Args:
+        folder: of the map.
+
+    Raises:
+        InputError: when the folder is not there, is no map or not a finished one.
+    """
+
+    @strings_as_paths
+    def __init__(self, folder: Path):
+        self.folder = folder
+        try:
+            self.place = (folder / PLACE).read_text()
+            content = json.loads((folder / FINISHED).read_text())
+            self.id = str(content["id"])
+            self.feature = _file_name(content["feature"])
+            self.matcher = choose("matcher", content["matcher"], matchers_confs.confs)
+            self.images = Path(content["image_dir"])
+            self.num_images = int(content["images_with_pose"])
+            self.num_points3D = int(content["points3D"])
+            self.camera_mode = content.get("camera_mode")  # None for the cameras of a model
+            conf = content["conf"]
+            self._conf = {
+                "output": _file_name(conf["output"]),
+                "model": dict(conf["model"]),
+                "preprocessing": dict(conf["preprocessing"]),
+            }
+            base = conf["model"].get("base", conf["model"])
+            if base["name"] == "dog" and "keypoints" not in base:  # made before these could adapt
+                self._conf["model"] = features_confs.with_keypoints(conf["model"], "hloc")
+            model = self._conf["model"]
+            found = model.get("base", model).get("keypoints", KEYPOINTS[0])
+            self._keypoints = choose("keypoints", content.get("keypoints", found), KEYPOINTS)
+            self._sfm = _file_name(content.get("sfm", SFM))
+            if "storage" in conf:
+                self._conf["storage"] = choose("storage", conf["storage"], STORAGES)
+            with_projection(self._conf, _file_name)
+        except (OSError, ValueError, KeyError, TypeError):
+            if not folder.is_dir():
+                raise no_folder(folder) from None
+            raise InputError(
+                f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}."
+            ) from None
+        self._check()
+
+    def _check(self) -> None:
+        """Refuse a map that lacks a file, or has a broken one, before any work is done in it."""
+        projection = self.conf["model"].get("projection")
+        needed = [self.features, self.descriptors, self.vocabulary]
+        needed += [Path(projections.split_prefix(projection)[0])] if projection else []
+        missing = [path for path in needed if not path.is_file()]
+        for part in ("cameras", "images", "points3D"):
+            if not any((self.sfm / f"{part}{suffix}").is_file() for suffix in (".bin", ".txt")):
+                missing.append(self.sfm / f"{part}.bin")
+        try:
+            if missing:
+                named = ", ".join(str(path.relative_to(self.folder)) for path in missing)
+                raise InputError(f"it has no {named}")
+            for path in (self.features, self.descriptors):
+                with open_h5(path) as file:
+                    file_provenance(file)
+            read_vocabulary(self.vocabulary)
+            if projection:
+                projections.load(projection)
+        except InputError as error:
+            raise InputError(
+                f"The map {self.folder} is broken: {str(error).rstrip('.')}. Copy it again, or "
+                "build it anew with --overwrite."
+            ) from None
+
+    @property
+    def conf(self) -> dict:
+        """The configuration of the map's features, for more images."""
+        return with_projection(self._conf, lambda name: str(self.folder / name))
+
+    def check_feature(self, feature: str, projection: Path | None = None) -> None:
+        """Refuse a feature that is not the map's.
+
+        Args:
+            feature: as in `confs.features.get`.
+            projection: likewise.
+
+        Raises:
+            InputError: if it is another, or has the same name but another projection.
+        """
+        name, conf = features_confs.get(feature, projection, self.storage, self.keypoints)
+        made_by = extract_features.provenance(conf)
+        if json.loads((self.folder / "conf.json").read_text())["feature"] != made_by:
+            other = "" if name != self.feature else f", but not of the {name} that it is now"
+            raise InputError(
+                f"The map {self.folder} is of --feature {self.feature}{other}. "
+                "Leave it out to localize in this map."
+            )
+
+    @property
+    def storage(self) -> str:
+        """How descriptors are kept, as in `confs.features.get`."""
+        return self._conf.get("storage", STORAGES[0])
+
+    @property
+    def keypoints(self) -> str:
+        """The settings of the DoG detector that were asked for, as in `confs.features.get`.
+
+        `conf` may have others, which found more keypoints.
+        """
+        return self._keypoints
+
+    @property
+    def sfm(self) -> Path:
+        """The folder of the COLMAP model."""
+        return self.folder / self._sfm
+
+    def drop_others(self) -> None:
+        """Delete what other attempts to build the map left."""
+        kept = self._conf["output"]
+        plain = kept.removesuffix(MORE)
+        for name in {plain, f"{plain}{MORE}"} - {kept}:
+            escaped = glob.escape(name)
+            others = [f"{escaped}.h5*", f"{escaped}_matches*"]
+            others.append(f"{RETRIEVAL['output']}_{escaped}.*")
+            for path in [path for pattern in others for path in self.folder.glob(pattern)]:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for name in {SFM, f"{SFM}{MORE}", f"{SFM}{FURTHER}"} - {self._sfm}:
+            shutil.rmtree(self.folder / name, ignore_errors=True)
+
+    @property
+    def features(self) -> Path:
+        """The feature file of the map images."""
+        return self.folder / f"{self._conf['output']}.h5"
+
+    @property
+    def descriptors(self) -> Path:
+        """The h5 file of the global descriptors of the map images."""
+        return self.folder / f"{RETRIEVAL['output']}_{self.features.stem}.h5"
+
+    @property
+    def vocabulary(self) -> Path:
+        """The file of the vocabulary of the global descriptors."""
+        return aggregate_features.vocabulary_of(self.descriptors)
+
+    def names(self) -> list[str]:
+        """List the images that have a pose."""
+        return sorted(image.name for image in colmap.read_model(self.sfm).images.values())
+
+
+def _file_name(name: str) -> str:
+    """Return a name that leads out of no folder, or raise a ValueError."""
+    if Path(name).name != name:
+        raise ValueError(f"{name!r} is not the name of a file")
+    return name
+
+
+def with_projection(conf: dict, change: Callable[[str], str]) -> dict:
+    """Return the configuration of a feature with another path of its projection, if it has one."""
+    model = dict(conf["model"])
+    if model.get("projection") is not None:
+        model["projection"] = change(model["projection"])
+    return {**conf, "model": model}
+
+
+def is_map(folder: Path) -> bool:
+    """Return whether a folder is a map of `main`'s, finished or not, rather than a COLMAP model."""
+    return any((folder / name).exists() for name in (FINISHED, FINGERPRINTS))

@@ -1,0 +1,1 @@
+"""How work is done and survives: outputs folders, files, processes, machines."""

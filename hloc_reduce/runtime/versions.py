@@ -1,0 +1,38 @@
+"""The versions of what determines the numbers."""
+
+import platform
+from importlib import metadata
+
+import cv2
+import kornia
+import numpy as np
+import pycolmap
+import safetensors
+import torch
+
+from .. import __version__
+
+MODULES = {
+    "kornia": kornia,
+    "numpy": np,
+    "opencv": cv2,
+    "pycolmap": pycolmap,
+    "safetensors": safetensors,
+    "torch": torch,
+}
+# that not every command needs, and the optional one
+DISTRIBUTIONS = {"faiss": "faiss-cpu", "scikit-learn": "scikit-learn"}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this project, Python and the libraries, by name."""
+    return {
+        "hloc_reduce": __version__,
+        "python": platform.python_version(),
+        **{name: str(module.__version__) for name, module in MODULES.items()},
+        **{name: metadata.version(key) for name, key in DISTRIBUTIONS.items() if _installed(key)},
+    }
+
+
+def _installed(distribution: str) -> bool:
+    return any(metadata.distributions(name=distribution))

@@ -1,0 +1,1 @@
+"""What knows nothing of localization: files, images, command lines, COLMAP, hloc."""

@@ -1,0 +1,96 @@
+"""What all command lines share: how a user's mistake ends a program."""
+
+import argparse
+import difflib
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from .. import logger
+from . import interrupts
+
+NEAREST = 8  # names shown in place of an unknown one
+
+
+class InputError(ValueError):
+    """Something the user gave is wrong; the message says what and how to mend it."""
+
+
+def run(main: Callable[[], None]) -> None:
+    """Run a command line: an error that a user can mend is one logged line and exit code 2.
+
+    Ctrl-C, and a SIGTERM as of Slurm, end it as an error would, so that what is done is written.
+    """
+    try:
+        interrupts.hear()
+        # argparse would call a module by its file
+        if spec := sys.modules["__main__"].__spec__:
+            sys.argv[0] = f"python -m {spec.name.removesuffix('.__main__')}"
+        main()
+        if spec and spec.name.startswith(interrupts.COMMANDS):
+            interrupts.ignore()
+    except (InputError, OSError) as error:
+        logger.error(error)
+        sys.exit(2)
+    except KeyboardInterrupt as interrupt:
+        interrupts.end(interrupt)
+
+
+def choose(kind: str, name: str, names: Iterable[str]) -> str:
+    """Return `name` if it is one of `names`, else raise an InputError with the nearest names."""
+    names = list(names)
+    if name not in names:
+        by_lower = {known.lower(): known for known in names}
+        near = difflib.get_close_matches(str(name).lower(), by_lower, n=NEAREST, cutoff=0)
+        shown = ", ".join(by_lower[lower] for lower in near) or "none"
+        there_are = "There are" if len(names) <= NEAREST else f"The nearest of {len(names)}"
+        raise InputError(f"Unknown {kind} '{name}'. {there_are}: {shown}.")
+    return name
+
+
+def check_positive(args: argparse.Namespace, *names: str) -> None:
+    """Raise an InputError if an option is not above 0."""
+    for name in names:
+        if not getattr(args, name) > 0:
+            raise InputError(f"--{name} {getattr(args, name)}: at least 1.")
+
+
+def no_folder(path: Path) -> InputError:
+    """Return the error that a folder is not there."""
+    return InputError(
+        f"{path} is a file, not a folder." if path.exists() else f"There is no folder {path}."
+    )
+
+
+def check_folder(path: Path) -> None:
+    """Raise an InputError if a folder for results cannot be made, as a file has its name."""
+    for part in (path, *path.parents):
+        if part.exists() and not part.is_dir():
+            raise InputError(f"{part} is a file: choose a folder for the results.")
+
+
+def check_file(path: Path, what: str) -> None:
+    """Raise an InputError if a file cannot be written, as a folder has its name."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder: name {what} in it.")
+    check_folder(path.parent)
+
+
+def some(names: Iterable[str], number: int = 5) -> str:
+    """Name the first few of many."""
+    names = list(names)
+    return ", ".join(names[:number]) + (", ..." if len(names) > number else "")
+
+
+class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows defaults, except of options that have none, and keeps an example on its line."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if text.startswith("example: "):
+            return text
+        return super()._fill_text(text, width, indent)
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        if action.default is None or action.default is False or action.default == []:
+            return action.help
+        return super()._get_help_string(action)

@@ -1,0 +1,58 @@
+"""Files that are downloaded once, checked by their sha256."""
+
+import hashlib
+from collections.abc import Iterable
+from http.client import HTTPException
+from pathlib import Path
+from urllib.request import urlopen
+
+import torch
+
+from .cli import InputError
+from .files import file_sha256, replacing
+
+TIMEOUT = 5  # seconds to wait for a server
+
+
+def cache() -> Path:
+    """Return torch's folder of downloaded files."""
+    return Path(torch.hub.get_dir()) / "checkpoints"
+
+
+def fetch(path: Path, urls: Iterable[str], sha256: str, what: str, otherwise: str) -> Path:
+    """Return a file, downloaded if it is not there.
+
+    Args:
+        path: of the file.
+        urls: tried one after the other.
+        sha256: of the file, which is checked in any case.
+        what: the file is, for a message, as in "The weights of tfeat".
+        otherwise: what else the user can do, likewise.
+
+    Raises:
+        InputError: when it cannot be downloaded, or is another one.
+    """
+    if path.is_file():
+        if file_sha256(path) != sha256:
+            raise InputError(
+                f"{what}, {path}, are broken: their sha256 is not {sha256}. Delete it."
+            )
+        return path
+    reasons = {}
+    for url in urls:
+        try:
+            with urlopen(url, timeout=TIMEOUT) as response:
+                content = response.read()
+        except (OSError, HTTPException) as error:
+            reasons[url] = getattr(error, "reason", error)
+            continue
+        if hashlib.sha256(content).hexdigest() == sha256:
+            with replacing(path) as temporary:
+                temporary.write_bytes(content)
+            return path
+        reasons[url] = f"what it sends has not the sha256 {sha256}"
+    tried = "; ".join(f"{url}: {reason}" for url, reason in reasons.items())
+    raise InputError(
+        f"{what} are not there, and cannot be downloaded ({tried}): put them to {path}, "
+        f"{otherwise}."
+    )

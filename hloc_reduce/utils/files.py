@@ -1,0 +1,59 @@
+"""Files: written whole or not at all, and their checksums."""
+
+import csv
+import filecmp
+import hashlib
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path` and move it into place when the block succeeds.
+
+    A file that is replaced by an equal one keeps its time, so that nothing is made anew of it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with naming(path):
+            yield temporary
+        filecmp.clear_cache()  # which goes by sizes and times
+        if path.exists() and filecmp.cmp(temporary, path, shallow=False):
+            shutil.copystat(path, temporary)
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())  # else a power cut may leave an empty file
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Have an error of the system that names no file, as that of a full disk, name this one."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+def write_csv(rows: list[dict], path: Path, columns: Iterable[str] = ()) -> None:
+    """Write rows that have the same keys, the columns; None is empty.
+
+    Where there may be no row, `columns` names them.
+    """
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(columns) or list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def file_sha256(path: Path) -> str:
+    """Return the sha256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

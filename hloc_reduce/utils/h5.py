@@ -1,0 +1,240 @@
+"""h5 files, of which a broken one is an error of its user's."""
+
+import io
+import os
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from .cli import InputError
+from .interrupts import uninterrupted
+
+MOST_COMPRESSED = 2000  # times what an h5 file holds is more than gzip can pack into it
+
+
+@contextmanager
+def open_h5(path: Path) -> Iterator[h5py.File]:
+    """Open an h5 file for reading; one that is absent or broken raises an InputError."""
+    try:
+        file = h5py.File(path, "r", libver="latest")
+    except Exception as error:
+        if not _is_of_h5py(error):
+            raise
+        reason = "it is not there" if not path.exists() else "not a whole h5 file"
+        raise InputError(f"Cannot open {path}: {reason}.") from error
+    with file, reading(path):
+        yield file
+
+
+@contextmanager
+def reading(path: Path | str) -> Iterator[None]:
+    """Have an error of h5py, which may be of any kind if the file is damaged, name the file.
+
+    Raises:
+        InputError: in its place.
+    """
+    try:
+        yield
+    except Exception as error:
+        if not _is_of_h5py(error):
+            raise
+        raise InputError(f"Cannot read {path}: it is corrupted ({_first_line(error)}).") from error
+
+
+def _is_of_h5py(error: Exception) -> bool:
+    """Tell whether h5py raised an error, but for a name that is not in a file."""
+    if isinstance(error, KeyError) and "doesn't exist" in str(error):
+        return False
+    *_, last = traceback.walk_tb(error.__traceback__)
+    return "h5py" in Path(last[0].f_code.co_filename).parts
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip("'\"").splitlines()), type(error).__name__)
+
+
+@contextmanager
+def write_h5(path: Path) -> Iterator[h5py.File]:
+    """Open an h5 file, or a new one, to add to it; Ctrl-C waits until the block ends.
+
+    Raises:
+        OSError: after the block, when the disk is full; HDF5 itself would crash.
+    """
+    modes = ("r+b", "r+") if path.exists() else ("w+b", "w")
+    with uninterrupted(), path.open(modes[0], buffering=0) as file:
+        disk = _Disk(file)
+        with h5py.File(disk, modes[1], libver="latest") as h5_file:
+            yield h5_file
+        if disk.error is not None:
+            raise disk.error
+
+
+class _Disk:
+    """A file for HDF5, which must not see an error: what cannot be written is kept in memory."""
+
+    def __init__(self, file: io.FileIO):
+        self.file, self.place = file, 0
+        self.error: OSError | None = None
+        self.unwritten: list[tuple[int, bytes]] = []  # where, and what
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self.place = offset if whence == os.SEEK_SET else self.file.seek(offset, whence)
+        return self.place
+
+    def tell(self) -> int:
+        return self.place
+
+    def read(self, size: int) -> bytes:
+        data = bytearray(size)
+        self.readinto(data)
+        return bytes(data)
+
+    def readinto(self, buffer: memoryview) -> int:
+        buffer = memoryview(buffer).cast("B")
+        self.file.seek(self.place)
+        number = self.file.readinto(buffer)
+        buffer[number:] = bytes(len(buffer) - number)
+        for start, kept in self.unwritten:
+            begin = max(start, self.place)
+            end = min(start + len(kept), self.place + len(buffer))
+            if begin < end:
+                buffer[begin - self.place : end - self.place] = kept[begin - start : end - start]
+        self.place += len(buffer)
+        return len(buffer)
+
+    def write(self, data: memoryview) -> int:
+        data, written = memoryview(data).cast("B"), 0
+        try:
+            self.file.seek(self.place)
+            while self.error is None and written < len(data):
+                written += self.file.write(data[written:])
+        except OSError as error:
+            self.error = error
+        if written < len(data):
+            self.unwritten.append((self.place + written, bytes(data[written:])))
+        self.place += len(data)
+        return len(data)
+
+    def truncate(self, size: int) -> None:
+        try:
+            if self.error is None:
+                self.file.truncate(size)
+        except OSError as error:
+            self.error = error
+
+    def flush(self) -> None:
+        pass
+
+
+def list_h5_names(path: Path) -> list[str]:
+    """List the groups of an h5 file that hold data sets, in the order of their names."""
+    with open_h5(path) as file:
+        return list(iterate_h5_names(file.id))
+
+
+def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]:
+    """Yield the groups below a group that hold data sets, in the order of their names.
+
+    Reads one group at a time: HDF5's own visit of all groups keeps all in memory. Only what the
+    file itself holds counts, not links to elsewhere.
+
+    Raises:
+        InputError: when a group has several names, and so could be in itself.
+    """
+    names = []
+
+    def gather(name: bytes, link: h5py.h5l.LinkInfo) -> None:
+        if link.type == h5py.h5l.TYPE_HARD:
+            names.append(name)
+
+    group.links.iterate(gather, info=True)
+    holds_data = False
+    for name in names:
+        child = h5py.h5o.get_info(group, name)
+        if child.type == h5py.h5o.TYPE_GROUP:
+            path = f"{prefix}{name.decode()}"
+            if child.rc > 1:
+                file = h5py.h5f.get_name(group).decode()
+                raise InputError(f"{file}: the group {path} has another name, too; copy the file.")
+            yield from iterate_h5_names(h5py.h5g.open(group, name), f"{path}/")
+        elif prefix and not holds_data:
+            holds_data = True
+            yield prefix[:-1]
+
+
+def get_dataset(file: h5py.File, name: str, key: str) -> h5py.Dataset:
+    """Return a data set of an image or a pair in an open h5 file, or raise an InputError."""
+    with reading(file.filename):
+        group = file.get(name)
+        dataset = group.get(key) if isinstance(group, h5py.Group) else None
+    if group is None:
+        raise InputError(f"{name} is not in the file {file.filename}.")
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError(f"{file.filename} is not a file of {key}: {name} has none.")
+    return dataset
+
+
+def get_array(file: h5py.File, name: str, key: str, least: tuple[int, ...]) -> np.ndarray:
+    """Read a data set of finite numbers of an image or a pair in an open h5 file.
+
+    Args:
+        file: the h5 file.
+        name: of the image or pair.
+        key: of the data set.
+        least: the least size of each of its dimensions.
+
+    Raises:
+        InputError: when it is not there or is none of such.
+    """
+    dataset = get_dataset(file, name, key)
+    said = f"{file.filename}: the {key} of {name}"
+    with reading(file.filename):
+        shape, dtype = dataset.shape or (), dataset.dtype
+        claimed = dataset.size * dtype.itemsize if dataset.size else 0
+    if claimed > MOST_COMPRESSED * Path(file.filename).stat().st_size:
+        raise InputError(f"{said} cannot be read (they claim to be {claimed:,} bytes).")
+    if len(shape) != len(least) or any(n < m for n, m in zip(shape, least, strict=True)):
+        raise InputError(f"{said} are of the wrong shape {shape}.")
+    if dtype.kind not in "iuf":
+        raise InputError(f"{said} are no numbers, but {dtype}.")
+    try:
+        array = dataset[()]
+    except Exception as error:
+        if not _is_of_h5py(error):
+            raise
+        raise InputError(f"{said} cannot be read ({_first_line(error)}).") from error
+    if array.dtype.kind == "f" and not np.isfinite(array.astype(np.float32)).all():
+        raise InputError(f"{said} have numbers that are not finite.")
+    return array
+
+
+def set_text(item: h5py.Group | h5py.Dataset, key: str, text: str) -> None:
+    """Set a text attribute of an open h5 file.
+
+    It has a fixed length: HDF5 keeps others in a heap without checksums, and may hang if that is
+    damaged.
+    """
+    item.attrs[key] = np.bytes_(text.encode()) if text else h5py.Empty("S1")
+
+
+def get_text(item: h5py.Group | h5py.Dataset, key: str, default: str | None = None) -> str | None:
+    """Return a text attribute of an open h5 file, or the default where it has none.
+
+    Raises:
+        InputError: when the file is damaged.
+    """
+    with reading(item.file.filename):
+        value = item.attrs.get(key, default)
+    if isinstance(value, h5py.Empty):
+        return ""
+    return value.decode(errors="replace") if isinstance(value, bytes) else value
+
+
+def file_provenance(file: h5py.File) -> str:
+    """Return what tells an open h5 file from others: what made it and when, or its name."""
+    conf = get_text(file, "conf", Path(file.filename).name)
+    return f"{conf} {get_text(file, 'id', '')}".strip()

@@ -1,0 +1,119 @@
+"""Images: their names, their pixels, and what models get of them."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from .cli import InputError, no_folder
+from .parsers import check_names, image_names
+
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
+
+
+def list_images(
+    image_dir: Path, image_list: Path | str | Iterable[str] | None = None, folder: str = ""
+) -> list[str]:
+    """Return the names of the images of a folder, or of a list, checked to be there.
+
+    Args:
+        image_dir: the folder that names are relative to.
+        image_list: names, or a text file of them; default: every image of `folder`.
+        folder: a folder in `image_dir`.
+
+    Raises:
+        InputError: when there is none, or one of the list is not there.
+    """
+    within = Path(image_dir, folder)
+    if not within.is_dir():
+        raise no_folder(within)
+    if image_list is None:
+        names = sorted(
+            path.relative_to(image_dir).as_posix()
+            for path in within.rglob("*")
+            if path.suffix.lower() in IMAGE_SUFFIXES
+        )
+        if not names:
+            raise InputError(f"There is no image in {within}.")
+        return check_names(names, within)
+    names = image_names(image_list)
+    missing = [name for name in names if not (image_dir / name).is_file()]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(names)} images are not in {image_dir}: "
+            f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+        )
+    return names
+
+
+def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:
+    """Read an image and resize it to at most `resize_max` pixels on its longer side.
+
+    With `resize_force` smaller ones get so many, too.
+
+    Args:
+        image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
+        preprocessing: `grayscale`, `resize_max`, `resize_force` of a feature's configuration.
+
+    Returns:
+        The image (1, C, H, W) float32 in [0, 1], and its original (width, height).
+
+    Raises:
+        InputError: when it cannot be read.
+    """
+    grayscale = preprocessing.get("grayscale", False)
+    image = (
+        convert(image, grayscale) if isinstance(image, np.ndarray) else read_image(image, grayscale)
+    )
+    image = image.astype(np.float32)
+    size = np.array(image.shape[1::-1])
+    resize_max = preprocessing.get("resize_max")
+    if resize_max and (size.max() > resize_max or preprocessing.get("resize_force")):
+        # one pixel at least: a panorama may be a thousand times wider than high
+        new_size = np.maximum(1, np.round(size * (resize_max / size.max())).astype(int))
+        smaller = (new_size <= size).all()
+        interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR  # as hloc
+        image = cv2.resize(image, new_size.tolist(), interpolation=interpolation)
+    image = np.atleast_3d(image).transpose(2, 0, 1) / 255
+    return torch.from_numpy(np.ascontiguousarray(image))[None], size
+
+
+def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
+    """Return pixels (H, W) or (H, W, 3) RGB, uint8, as (H, W) if `grayscale` or else (H, W, 3).
+
+    Raises:
+        InputError: for other arrays.
+    """
+    if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.size == 0:
+        raise InputError(
+            f"An image is uint8 (H, W) or (H, W, 3) RGB, not {image.dtype} {image.shape}."
+        )
+    if image.ndim == 3 and grayscale:
+        return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 and not grayscale else image
+
+
+class UnreadableImage(InputError):
+    """A file that is not there, or no image that can be read."""
+
+
+def read_image(path: Path, grayscale: bool = False) -> np.ndarray:
+    """Read an image as uint8, (H, W) or (H, W, 3) RGB, without applying EXIF's rotation.
+
+    Raises:
+        UnreadableImage: when the file is no image that OpenCV can read.
+    """
+    mode = cv2.IMREAD_GRAYSCALE if grayscale else cv2.IMREAD_COLOR
+    try:
+        data = np.fromfile(path, np.uint8)
+        image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+        reason = "it is not an image, or it is truncated" if data.size else "it is empty"
+    except OSError as error:
+        image, reason = None, error.strerror
+    except cv2.error as error:
+        image, reason = None, f"OpenCV says that not {error.err}"
+    if image is None:
+        raise UnreadableImage(f"Cannot read image {path}: {reason}.")
+    return image if grayscale else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

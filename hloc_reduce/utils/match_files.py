@@ -1,0 +1,87 @@
+"""Match files in hloc's format."""
+
+import json
+
+import h5py
+import numpy as np
+
+from .cli import InputError
+from .h5 import get_array, get_text, reading
+
+
+def get_matcher(match_file: h5py.File) -> dict:
+    """Return the configuration of the matcher's model of a match file, {} if it does not say."""
+    try:
+        model = json.loads(get_text(match_file, "conf", "{}"))["model"]
+    except (ValueError, TypeError, KeyError):
+        return {}
+    return model if isinstance(model, dict) else {}
+
+
+def names_to_pair(name0: str, name1: str, separator: str = "/") -> str:
+    """Return the name of a pair's group in a match file."""
+    return separator.join((name0.replace("/", "-"), name1.replace("/", "-")))
+
+
+def find_pair(file: h5py.File, name0: str, name1: str) -> tuple[str | None, bool]:
+    """Return the group of a pair in an open match file (None if absent) and if it is reversed."""
+    for separator in "/_":  # the second is hloc's old format
+        for reverse in (False, True):
+            names = (name1, name0) if reverse else (name0, name1)
+            pair = names_to_pair(*names, separator)
+            with reading(file.filename):
+                found = pair in file
+            if found:
+                return pair, reverse
+    return None, False
+
+
+def get_matches(
+    file: h5py.File, name0: str, name1: str, sizes: tuple[int, int] | None = None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read the matches of a pair, stored in either order.
+
+    Args:
+        file: the match file.
+        name0: an image.
+        name1: another.
+        sizes: how many keypoints both have, if that is to be checked.
+
+    Returns:
+        matches (M, 2) int64, indices of the keypoints of name0 and name1, and scores (M,), None
+        where the file has none.
+
+    Raises:
+        InputError: when the pair was not matched, or its matches are of other keypoints.
+    """
+    pair, reverse = find_pair(file, name0, name1)
+    if pair is None:
+        raise InputError(f"The pair {name0}, {name1} is not in the match file {file.filename}.")
+    matches0 = get_array(file, pair, "matches0", (0,))
+    matched = np.flatnonzero(matches0 != -1)
+    matches = np.stack([matched, matches0[matched].astype(np.int64)], -1)
+    matches = matches[:, ::-1] if reverse else matches
+    if sizes is not None:
+        _check_matches(file, matches, (name0, name1), sizes)
+    with reading(file.filename):
+        scored = "matching_scores0" in file[pair]
+    if not scored:
+        return matches, None
+    return matches, get_array(file, pair, "matching_scores0", matches0.shape)[matched]
+
+
+def _check_matches(
+    file: h5py.File, matches: np.ndarray, names: tuple[str, str], sizes: tuple[int, int]
+) -> None:
+    """Raise an InputError if matches (M, 2) refer to keypoints that images do not have."""
+    said = f"{file.filename}: the matches of {names[0]}, {names[1]}"
+    if len(matches) and matches.min() < 0:
+        raise InputError(
+            f"{said} are negative, as hloc's are that have more than 32,767 keypoints: match these "
+            "anew."
+        )
+    for column, (name, size) in enumerate(zip(names, sizes, strict=True)):
+        if len(matches) and matches[:, column].max() >= size:
+            raise InputError(
+                f"{said} were made of other features: {name} has {size} keypoints only."
+            )

@@ -1,0 +1,259 @@
+"""Text files: those of hloc, image lists, query lists with intrinsics, pairs, poses; and YAML.
+
+The words of a line are separated by spaces, as in hloc. A line of a name that has spaces itself,
+which no list of hloc's can hold, has tabs after its names instead.
+"""
+
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import yaml
+from scipy.spatial.transform import Rotation
+
+from .cli import InputError, choose, some
+from .files import replacing
+
+CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+_ENDS = r"\t\n\v\f\r\x1c-\x1f\x85\u2028\u2029"  # of lines, and of names in them
+_LETTER = rf"[^{_ENDS}/\0\ud800-\udfff]"
+_PART = rf"(?!\.\.?(?:/|$))(?!\s){_LETTER}+(?<!\s)"  # neither . nor .., and what h5 and lists hold
+_NUMBER = re.compile(r"[-+]?\d+\.\d+(e[-+]?\d+)?")
+_NAME = re.compile(rf"(?!#){_PART}(?:/{_PART})*")
+
+
+def check_names(names: list[str], place: Path | str) -> list[str]:
+    """Return names of images, the paths of their files in a folder, if they are sound.
+
+    Args:
+        names: from a list, a model, a folder or an h5 file.
+        place: the one that they are from, for the message.
+
+    Raises:
+        InputError: for a name that is absolute, or begins with a space, or the like.
+    """
+    wrong = [name for name in names if not _NAME.fullmatch(name)]
+    if wrong:
+        raise InputError(
+            f"{place}: {some(map(repr, wrong), 3)} cannot be names of images: these are relative "
+            "to a folder, without a # or spaces at the beginning, spaces at the end, tabs, or . or "
+            ".. as a part. Rename them."
+        )
+    return names
+
+
+def _lines(path: Path, names: int = 1) -> Iterator[tuple[str, list[str]]]:
+    """Yield ("file:number", words) of every line that is neither empty nor a comment.
+
+    The first words, so many, are names of images.
+    """
+    try:
+        with path.open(encoding="utf-8-sig") as file:  # which Windows likes to mark as such
+            for number, line in enumerate(file, 1):
+                words = _words(line, names)
+                if words and not words[0].startswith("#"):
+                    place = f"{path}:{number}"
+                    check_names(words[:names], place)
+                    yield place, words
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"Cannot read {path}: {error}.") from None
+
+
+def _words(line: str, names: int) -> list[str]:
+    """Split a line that begins with a number of image names."""
+    # lists of other programs may mix spaces and tabs
+    after = line.partition("\t")[0].split()[1:]
+    if "\t" not in line or any(map(_is_value, after)):
+        return line.split()
+    *first, rest = line.strip().split("\t", names)
+    if len(first) < names:
+        return [word.strip() for word in (*first, rest)]
+    return [word.strip() for word in first] + rest.split()
+
+
+def _is_value(word: str) -> bool:
+    """Tell whether a word is none of a name: a camera model, or a number of a pose."""
+    return word in CAMERA_MODELS or _NUMBER.fullmatch(word) is not None
+
+
+def to_line(*words: object, names: int = 1) -> str:
+    """Join words to a line of a list.
+
+    Args:
+        words: the words.
+        names: how many of them, the first ones, are names of images.
+    """
+    named, rest = list(map(str, words[:names])), list(map(str, words[names:]))
+    if any(name.split() != [name] for name in named):
+        return "\t".join([*named, *[" ".join(rest)] * bool(rest)]) + "\n"
+    return " ".join([*named, *rest]) + "\n"
+
+
+def read_yaml(path: Path) -> object:
+    """Read a YAML file of plain values.
+
+    Raises:
+        InputError: when it is none.
+    """
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except Exception as error:  # yaml raises whatever a broken value leads it to
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise InputError(f"{path} cannot be read ({reason}).") from None
+
+
+def parse_image_list(path: Path) -> list[str]:
+    """Read image names, the first word of every line."""
+    return [words[0] for _, words in _lines(path)]
+
+
+def image_names(images: Path | str | Iterable[str]) -> list[str]:
+    """Return the names of a list file, given by its path, or of any other iterable.
+
+    Raises:
+        InputError: when there is none.
+    """
+    if isinstance(images, (Path, str)):
+        names = parse_image_list(Path(images))
+    else:
+        names = check_names(list(images), "The list of images")
+    if not names:
+        raise InputError(f"There is no image in the list {images}.")
+    return names
+
+
+def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
+    """Read queries with intrinsics, one `name MODEL width height params...` a line.
+
+    Raises:
+        InputError: for a broken line, with file and line number, a name that is listed twice, or
+            an empty list.
+    """
+    queries: dict[str, pycolmap.Camera] = {}
+    for place, words in _lines(path):
+        try:
+            name, model, width, height, *params = words
+            choose("camera model", model, CAMERA_MODELS)
+            camera = pycolmap.Camera(
+                model=model,
+                width=int(width),
+                height=int(height),
+                params=np.array(params, float),
+            )
+            if not camera.verify_params():
+                raise ValueError(f"wrong number of parameters for {model}")
+            # of a panorama, which has none, COLMAP crashes when asked for the first
+            focal_lengths = camera.params[camera.focal_length_idxs()]
+            sizes = camera.width, camera.height, *focal_lengths
+            if not (np.isfinite(camera.params).all() and min(sizes) > 0):
+                raise ValueError("sizes and focal lengths are positive and finite")
+        except (ValueError, TypeError, AttributeError, RuntimeError) as error:
+            reason = str(error).strip().splitlines()[0]
+            raise InputError(
+                f"{place}: not a query `name MODEL width height params...` ({reason}); put a tab "
+                "after a name that has spaces."
+            ) from None
+        if name in queries:
+            raise InputError(f"{place}: query {name} is listed twice.")
+        queries[name] = camera
+    if not queries:
+        raise InputError(f"{path} lists no query.")
+    return list(queries.items())
+
+
+def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]]]:
+    """Read all query lists that match a glob, for example `queries/*_with_intrinsics.txt`.
+
+    Returns:
+        From the stem of each list to its queries, in the order of the file names.
+
+    Raises:
+        InputError: when no file matches or a name is listed twice.
+    """
+    files = sorted(paths.parent.glob(paths.name))
+    if not files:
+        raise InputError(f"There is no query list {paths}.")
+    lists = {path.stem: parse_query_list(path) for path in files}
+    of_list: dict[str, str] = {}
+    for path in files:
+        for name, _ in lists[path.stem]:
+            if name in of_list:
+                raise InputError(f"{path}: query {name} is in {of_list[name]} too.")
+            of_list[name] = path.name
+    return lists
+
+
+def parse_pairs(path: Path) -> Iterator[tuple[str, str]]:
+    """Read pairs, one `name0 name1` a line, as they are drawn: a list may be of any length."""
+    for place, words in _lines(path, names=2):
+        if len(words) != 2:
+            raise InputError(
+                f"{place}: not a pair `name0 name1`; put a tab between names that have spaces."
+            )
+        yield words[0], words[1]
+
+
+def parse_retrieval(path: Path) -> dict[str, list[str]]:
+    """Read pairs, one `name0 name1` a line, as name0 -> [name1, ...] in the order of the file."""
+    retrieval: dict[str, list[str]] = {}
+    for name0, name1 in parse_pairs(path):
+        retrieval.setdefault(name0, []).append(sys.intern(name1))
+    return retrieval
+
+
+def write_pairs(pairs: Iterable[tuple[str, str]], path: Path) -> int:
+    """Write pairs, one `name0 name1` a line, as they are drawn, and return how many they are."""
+    number = 0
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        for name0, name1 in pairs:
+            file.write(to_line(name0, name1, names=2))
+            number += 1
+    return number
+
+
+def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
+    """Read poses, one `name qw qx qy qz tx ty tz` (camera from world, metres) a line.
+
+    Raises:
+        InputError: for a broken line, or a name that is listed twice.
+    """
+    poses = {}
+    for place, (name, *values) in _lines(path):
+        if name in poses:
+            raise InputError(
+                f"{place}: {name} is listed twice: whole names are needed, which the "
+                "*_logs.jsonl of a pipeline has."
+            )
+        try:
+            qw, qx, qy, qz, *translation = map(float, values)
+            if not (
+                np.isfinite(translation).all() and 1e-9 < np.hypot.reduce([qw, qx, qy, qz]) < 1e9
+            ):
+                raise ValueError
+            rotation = pycolmap.Rotation3d(Rotation.from_quat([qx, qy, qz, qw]).as_matrix())
+            poses[name] = pycolmap.Rigid3d(rotation, np.array(translation).reshape(3))
+        except ValueError:
+            raise InputError(f"{place}: not a pose `name qw qx qy qz tx ty tz`.") from None
+    return poses
+
+
+def write_poses(
+    poses: Mapping[str, pycolmap.Rigid3d], path: Path, name_parts: int | None = 1
+) -> None:
+    """Write poses (camera from world) in the submission format of visuallocalization.net.
+
+    Args:
+        poses: from image name to pose.
+        path: the text file, one `name qw qx qy qz tx ty tz` a line.
+        name_parts: how much of names is written: 1 for `basename`, 2 for `folder/basename`
+            (RobotCar's format), None for all.
+    """
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        for name, pose in poses.items():
+            written = name if name_parts is None else "/".join(name.split("/")[-name_parts:])
+            x, y, z, w = pose.rotation.quat
+            numbers = (repr(float(value)) for value in (w, x, y, z, *pose.translation))
+            file.write(to_line(written, *numbers))

@@ -1,0 +1,94 @@
+"""How far a loop is: a bar on a terminal, and elsewhere, as in a log file, a line a minute."""
+
+import sys
+import time
+from collections.abc import Iterable, Iterator
+
+from tqdm import tqdm
+
+from .. import logger
+
+INTERVAL = 60.0  # seconds between two lines
+PLURALS = {"query": "queries"}  # of units; the others only add an s
+
+
+def progress(
+    items: Iterable | None = None,
+    desc: str = "",
+    unit: str = "item",
+    total: int | None = None,
+    initial: int = 0,
+) -> "tqdm | Lines":
+    """Show how far a loop is.
+
+    Args:
+        items: what the loop goes through; None to call `update` of what is returned.
+        desc: what is done.
+        unit: what one of the items is.
+        total: how many there are, with those of `initial`; default: the length of `items`.
+        initial: how many were done before.
+
+    Returns:
+        A context manager to iterate over, with tqdm's `update` and `set_postfix`.
+    """
+    if not sys.stderr.isatty():
+        return Lines(items, desc, unit, total, initial)
+    # results of batches come at once, so that the rate is averaged over many
+    return tqdm(items, desc, total, unit=unit, initial=initial, smoothing=0.1)
+
+
+class Lines:
+    """Logs at most one line every `INTERVAL` seconds, none for short work. Arguments as above."""
+
+    def __init__(
+        self,
+        items: Iterable | None = None,
+        desc: str = "",
+        unit: str = "item",
+        total: int | None = None,
+        initial: int = 0,
+    ):
+        self.items, self.desc, self.unit, self.initial = items, desc, unit, initial
+        self.total = len(items) if total is None and hasattr(items, "__len__") else total
+        self.number, self.postfix = initial, ""
+        self.begun = self.said = time.monotonic()
+
+    def __iter__(self) -> Iterator:
+        for item in self.items:
+            yield item
+            self.update()
+
+    def __enter__(self) -> "Lines":
+        return self
+
+    def __exit__(self, *_) -> None:
+        pass
+
+    def update(self, number: int = 1) -> None:
+        """Advance by a number of items."""
+        self.number += number
+        if time.monotonic() - self.said >= INTERVAL:
+            self.said = time.monotonic()
+            logger.info(self.line(self.said - self.begun))
+
+    def set_postfix(self, refresh: bool = True, **values: object) -> None:
+        """Add values to the lines."""
+        self.postfix = "".join(f", {key} {value}" for key, value in values.items())
+
+    def line(self, elapsed: float) -> str:
+        """Report the progress after a number of seconds."""
+        units = PLURALS.get(self.unit, f"{self.unit}s")
+        if not self.total:
+            return f"{self.desc}: {self.number:,} {units}{self.postfix}"
+        left = (self.total - self.number) * elapsed / max(self.number - self.initial, 1)
+        return (
+            f"{self.desc}: {self.number:,} of {self.total:,} {units} "
+            f"({100 * self.number // self.total} %), {duration(left)} left{self.postfix}"
+        )
+
+
+def duration(seconds: float) -> str:
+    """Format a duration in the unit that suits it."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,172 @@
+"""Run the jobs of a file: data sets, features, matchers and options of the pipelines, in grids.
+
+What the jobs of a data set have in common is done once: keypoints are detected once, each base
+descriptor is computed once for all its projections, and retrieval is done once. A job that fails
+does not stop the others; a batch that was stopped goes on where it was.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from hloc_reduce import logger
+from hloc_reduce.runtime.executors import SERIAL, Executor
+from hloc_reduce.runtime.outputs import SHARED, Lock
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.h5 import list_h5_names
+from hloc_reduce.utils.paths import strings_as_paths
+from hloc_reduce.utils.tables import aligned
+
+from . import jobs, tables
+from .jobs import Job
+from .shared import Shared
+
+# what --dry_run takes for granted, of keypoints as DoG finds them at 1600 pixels
+KEYPOINTS = 5000  # of an image
+FEATURE_BYTES, MATCH_BYTES, MAP_BYTES = 14, 0.75, 67  # of a keypoint but for its descriptor, ...
+
+
+@strings_as_paths
+def main(
+    job_file: Path,
+    outputs: Path | None = None,
+    overwrite: bool = False,
+    strict: bool = False,
+    executor: Executor = SERIAL,
+) -> list[dict]:
+    """Run jobs, and print and write their tables.
+
+    Args:
+        job_file: as of `jobs.read`.
+        outputs: the folder for the results: jobs.csv, jobs.txt, failures.csv, and for each data
+            set a folder with one for each job; default: that of the file.
+        overwrite: begin anew.
+        strict: stop the jobs of a data set at an image that cannot be read. Else it is left out
+            of the map, or as a query not localized; it is listed in failures.csv, and read again
+            by a later run.
+        executor: does the work.
+
+    Returns:
+        The rows of jobs.csv, of `tables.COLUMNS`: for each job one for each list and threshold of
+        recall, or one with the `error`.
+
+    Raises:
+        InputError: when the file is none of jobs, or another run is at work in `outputs`.
+    """
+    named, all_jobs = jobs.read(job_file)
+    outputs = (outputs or named).resolve()
+    cli.check_folder(outputs)
+    lock = Lock(outputs)
+    try:
+        done: list[tuple[Shared, dict[Job, dict]]] = []
+        for shared in list(plan(all_jobs, outputs)):
+            summaries: dict[Job, dict] = {}
+            done.append((shared, summaries))
+            shared.main(executor, strict, overwrite)
+            for job in shared.running():
+                logger.info("%s, %s:", shared.dataset.name, job.name)
+                with shared.failing([job]):
+                    summaries[job] = shared.pipeline.main(
+                        shared.dataset,
+                        folder_of(shared, job),
+                        job.feature,
+                        job.matcher,
+                        shared.retrieval(job),
+                        ground_truth=job.ground_truth,
+                        overwrite=overwrite,
+                        storage=job.storage,
+                        keypoints=job.keypoints,
+                        executor=executor,
+                        features=shared.features[job],
+                        strict=strict,
+                        accept_partial=not strict,
+                        gate=job.gate,
+                        **job.numbers,
+                    )
+                tables.write(done, outputs)
+        rows, text = tables.write(done, outputs)
+    finally:
+        lock.release()
+    print(text)
+    logger.info("The tables are %s and jobs.txt.", outputs / "jobs.csv")
+    return rows
+
+
+def plan(all_jobs: list[Job], outputs: Path) -> Iterator[Shared]:
+    """Yield the jobs of each data set, checked."""
+    for dataset, of_dataset in jobs.by_dataset(all_jobs).items():
+        yield Shared(dataset, of_dataset, outputs / dataset.name / SHARED)
+
+
+def folder_of(shared: Shared, job: Job) -> Path:
+    """Return the outputs folder of a job."""
+    return shared.folder.with_name(job.name)
+
+
+@strings_as_paths
+def dry_run(job_file: Path, outputs: Path | None = None, overwrite: bool = False) -> list[str]:
+    """Print what `main` would do: the steps, with about how many bytes they write.
+
+    Args:
+        job_file: as of `jobs.read`.
+        outputs: as of `main`.
+        overwrite: as of `main`.
+
+    Returns:
+        The jobs that cannot be run.
+    """
+    named, all_jobs = jobs.read(job_file)
+    outputs = (outputs or named).resolve()
+    cli.check_folder(outputs)
+    lines, total, failed = [["data set", "step", "of", "items", "", "MB"]], 0.0, []
+    for shared in plan(all_jobs, outputs):
+        failed += [f"{shared.dataset.name}/{job.name}" for job in shared.failed]
+        for step, of, number, items, size in steps(shared, overwrite):
+            if number:
+                size /= 1e6
+                lines.append([shared.dataset.name, step, of, f"{number:,}", items, f"{size:,.1f}"])
+                total += size
+    if len(lines) > 1:
+        print(aligned(lines, left=3))
+    print(
+        f"About {total / 1e3:,.2f} GB in {outputs}, for {KEYPOINTS:,} keypoints an image. Numbers "
+        "of pairs are upper limits. What is done is left out."
+    )
+    return failed
+
+
+def steps(shared: Shared, overwrite: bool) -> Iterator[tuple[str, str, int, str, float]]:
+    """Yield the steps of the jobs of a data set: name, of what, how many of what items, bytes."""
+    running = shared.running()
+    if not running:
+        return
+    map_images, queries = len(shared.map_names), len(shared.query_names)
+    for group in shared.groups():
+        todo, size = set(), 0.0
+        for path in group:
+            done = path.exists() and not overwrite
+            missing = set(shared.images()) - set(list_h5_names(path) if done else ())
+            number_bytes = np.dtype(shared.confs[path].get("storage", STORAGES[0])).itemsize
+            each = FEATURE_BYTES + shared.dims[path] * number_bytes
+            size += len(missing) * KEYPOINTS * each
+            todo |= missing
+        names = ", ".join(path.stem.removeprefix("feats-dog-") for path in group)
+        yield "extract_features", names, len(todo), "images", size
+    by_vlad = [Path(shared.retrieval(job)) for job in running if job.retrieval == "vlad"]
+    for path in dict.fromkeys(by_vlad):
+        if overwrite or not path.exists():
+            yield "retrieval", path.stem.removeprefix("pairs-query-"), queries, "queries", 0
+    for job in running:
+        if (folder_of(shared, job) / "summary.json").exists() and not overwrite:
+            continue
+        numbers = shared.numbers(job)
+        if "num_covis" in numbers:
+            pairs = map_images * min(numbers["num_covis"], map_images - 1)
+            yield "match_map", job.name, pairs, "pairs", pairs * KEYPOINTS * MATCH_BYTES
+            size = map_images * KEYPOINTS * MAP_BYTES
+            yield "triangulation", job.name, map_images, "images", size
+        pairs = queries * min(numbers["num_loc"], map_images)
+        yield "match_queries", job.name, pairs, "pairs", pairs * KEYPOINTS * MATCH_BYTES
+        yield "localization", job.name, queries, "queries", 0

@@ -1,0 +1,235 @@
+"""Job files: grids of runs of the pipelines of data sets, in YAML.
+
+    outputs: outputs/example           # default: outputs/<name of the file>
+    jobs:                              # grids: each option a value, or a list of values
+      - dataset: [datasets/aachen_v1.1, datasets/demo_town]
+        feature: [sift, {descriptor: [sift, mkd], scheme: sv, dim: [64, 16]}]
+        matcher: NN-ratio
+    exclude:                           # jobs that agree with all that is named, * is anything
+      - {dataset: "*demo_town", feature: "*16"}
+
+Options are those of `pipelines.aachen` and `pipelines.inloc`.
+"""
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+from fnmatch import fnmatchcase
+from itertools import product
+from pathlib import Path
+
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.detectors.dog import KEYPOINTS
+from hloc_reduce.localization.confidence import Gate
+from hloc_reduce.runtime.outputs import SHARED
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.parsers import read_yaml
+
+SHIPPED = Path(__file__).parents[2] / "confs/jobs"
+# from options that are numbers to their types, and what a message calls these
+NUMBERS = {
+    "num_covis": (int, "an integer"),
+    "num_loc": (int, "an integer"),
+    "min_confidence": ((int, float), "a number"),
+    "min_inliers": (int, "an integer"),
+}
+NAME_PARTS = ("descriptor", "scheme", "dim")  # of the name of a feature
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run of a pipeline.
+
+    Args:
+        dataset: the folder of a data set.
+        feature: name of a feature or YAML file, as of `confs.features.get`.
+        matcher: name of a matcher.
+        storage: how descriptors are kept.
+        keypoints: settings of the DoG detector.
+        retrieval: vlad, of the first feature of the data set, or a file.
+        ground_truth: true poses of the queries; default: those of the data set.
+        num_covis: pairs of each map image; default: that of the pipeline.
+        num_loc: map images of each query; default: that of the pipeline.
+        min_confidence, min_inliers: what makes a query localized; default: those of the gate.
+    """
+
+    dataset: Path
+    feature: str = features_confs.RECOMMENDED
+    matcher: str = "NN-ratio"
+    storage: str = STORAGES[0]
+    keypoints: str = KEYPOINTS[0]
+    retrieval: str = "vlad"
+    ground_truth: Path | None = None
+    num_covis: int | None = None
+    num_loc: int | None = None
+    min_confidence: float | None = None
+    min_inliers: int | None = None
+
+    @property
+    def name(self) -> str:
+        """What its folder is called: the feature, and whatever is not by default."""
+        parts = [Path(self.feature).stem]
+        for field in fields(self)[2:]:
+            value = getattr(self, field.name)
+            if value != field.default and field.name != "ground_truth":
+                named = field.name in NUMBERS or field.name == "keypoints"
+                prefix = field.name if named else ""
+                text = f"{value:g}" if field.name in NUMBERS else Path(value).stem
+                parts.append(prefix + text.removeprefix("pairs-query-"))
+        return "+".join(parts)
+
+    @property
+    def numbers(self) -> dict[str, int]:
+        """The numbers that are given."""
+        given = {"num_covis": self.num_covis, "num_loc": self.num_loc}
+        return {name: number for name, number in given.items() if number is not None}
+
+    @property
+    def gate(self) -> Gate:
+        """What a pose must have for a query to be called localized."""
+        given = {"min_confidence": self.min_confidence, "min_inliers": self.min_inliers}
+        return Gate(**{name: least for name, least in given.items() if least is not None})
+
+
+OPTIONS = tuple(field.name for field in fields(Job))
+
+
+def read(path: Path) -> tuple[Path, list[Job]]:
+    """Read a job file, or one that ships and is called as `path`.
+
+    Returns:
+        The folder for the results, and the jobs in the order of the file, each once.
+
+    Raises:
+        InputError: when it is none.
+    """
+    shipped = SHIPPED / path.name
+    if not path.exists() and shipped.exists() and path.parent in (Path(), Path("confs/jobs")):
+        path = shipped
+    content = read_yaml(path)
+    try:
+        content = _mapping("a job file", content, ("outputs", "jobs", "exclude"))
+        found = [job for grid in _list(content.get("jobs")) for job in _expand(grid)]
+        excluded = [
+            _mapping("what is excluded", item, OPTIONS) for item in _list(content.get("exclude"))
+        ]
+        outputs = content.get("outputs", f"outputs/{path.stem}")
+        if not isinstance(outputs, str):
+            raise InputError(f"outputs is a folder, not {outputs!r}.")
+        for item in excluded:
+            if not any(_agrees(job, item) for job in found):
+                raise InputError(f"no job is excluded by {item}.")
+        jobs = [job for job in dict.fromkeys(found) if not any(_agrees(job, e) for e in excluded)]
+        if found and not jobs:
+            raise InputError(f"all {len(found)} jobs are excluded.")
+        _check(jobs)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return Path(outputs), jobs
+
+
+def by_dataset(jobs: Iterable[Job]) -> dict[Path, list[Job]]:
+    """Group jobs by data set."""
+    groups: dict[Path, list[Job]] = {}
+    for job in jobs:
+        # links keep their names
+        groups.setdefault(Path(os.path.abspath(job.dataset)), []).append(job)
+    return groups
+
+
+def _expand(grid: object) -> Iterator[Job]:
+    """Yield the jobs of a grid."""
+    grid = _mapping("a grid of jobs", grid, OPTIONS)
+    if "dataset" not in grid:
+        raise InputError("a grid of jobs names no dataset.")
+    axes = {name: _list(value) for name, value in grid.items()}
+    if "feature" in axes:
+        axes["feature"] = [name for item in axes["feature"] for name in _features(item)]
+    if empty := [name for name, values in axes.items() if not values]:
+        raise InputError(f"{empty[0]} of a grid of jobs has no value.")
+    for values in product(*axes.values()):
+        yield _job(dict(zip(axes, values, strict=True)))
+
+
+def _features(item: object) -> list[str]:
+    """Return the names of a feature, or of a grid of descriptors, schemes and dimensions."""
+    if not isinstance(item, dict):
+        return [item]
+    item = _mapping("a grid of features", item, NAME_PARTS)
+    if absent := [part for part in NAME_PARTS if part not in item]:
+        raise InputError(f"a grid of features has no {absent[0]}.")
+    parts = product(*(_list(item[part]) for part in NAME_PARTS))
+    return [f"{descriptor}_{scheme}{dim}" for descriptor, scheme, dim in parts]
+
+
+def _job(options: dict) -> Job:
+    """Make a job of options of the right types."""
+    for name, value in options.items():
+        kind, called = NUMBERS.get(name, (str, "a name"))
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise InputError(f"{name} is {value!r}: {called} is needed.")
+        if name.startswith("num_") and value < 1:
+            raise InputError(f"{name} is {value}: at least 1.")
+    paths = {
+        name: Path(os.path.normpath(options[name]))
+        for name in ("dataset", "ground_truth")
+        if name in options
+    }
+    job = Job(**options | paths)
+    _ = job.gate  # raises for bad values
+    features_confs.get(job.feature, storage=job.storage, keypoints=job.keypoints)
+    cli.choose("matcher", job.matcher, matchers_confs.confs)
+    return job
+
+
+def _agrees(job: Job, excluded: dict) -> bool:
+    """Return whether a job has one of the named values of each named option."""
+    return all(
+        any(fnmatchcase(_text(getattr(job, name)), _text(value)) for value in _list(values))
+        for name, values in excluded.items()
+    )
+
+
+def _text(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _check(jobs: list[Job]) -> None:
+    """Refuse that there is no job, or that two would have the same folder."""
+    if not jobs:
+        raise InputError("there is no job.")
+    datasets: dict[str, Path] = {}
+    folders: dict[tuple[str, str], Job] = {}
+    for job in jobs:
+        path = Path(os.path.abspath(job.dataset))
+        if datasets.setdefault(path.name, path) != path:
+            raise InputError(
+                f"{path} and {datasets[path.name]} would have the same folder: rename one, or use "
+                "two job files."
+            )
+        if job.name == SHARED:
+            raise InputError(f"a feature cannot be called {SHARED}: rename {job.feature}.")
+        other = folders.setdefault((path.name, job.name), job)
+        if other != job:
+            differ = [name for name in OPTIONS if getattr(other, name) != getattr(job, name)]
+            raise InputError(
+                f"two jobs are called {job.name} of {job.dataset.name}, but differ in "
+                f"{' and '.join(differ)}: rename a file or a folder, or use two job files."
+            )
+
+
+def _mapping(what: str, value: object, keys: Iterable[str]) -> dict:
+    if not isinstance(value, dict):
+        raise InputError(f"{what} is a mapping of {', '.join(keys)}, not {value!r}.")
+    for key in value:
+        cli.choose(f"key of {what}", key, keys)
+    return value
+
+
+def _list(value: object) -> list:
+    if value is None:
+        return []
+    return value if isinstance(value, list) else [value]

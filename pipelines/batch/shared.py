@@ -1,0 +1,202 @@
+"""What the jobs of a batch have in common on a data set: features, and retrieval."""
+
+import errno
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from hloc_reduce import aggregate_features, extract_features, extractors, logger
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.datasets import true_poses
+from hloc_reduce.descriptors import DIM
+from hloc_reduce.detectors.dog import KEYPOINTS
+from hloc_reduce.runtime import provenance
+from hloc_reduce.runtime.executors import Executor
+from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.runtime.outputs import STAGES, RunFolder
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.h5 import get_text, open_h5
+
+from .. import common
+from ..layouts import pipeline_of
+from .jobs import Job
+
+RECORD = "shared.json"  # the ids of feature files, and the feature by which VLAD is
+
+
+class Shared:
+    """The jobs of a data set, checked as far as can be before any work is done.
+
+    Args:
+        dataset: the folder of the data set.
+        jobs: its jobs.
+        folder: for what they have in common.
+
+    Attributes:
+        failed: from each job that cannot be run to the reason.
+        features: from each other job to its feature file.
+        confs: from each feature file to the configuration.
+        dims: from each feature file to the number of dimensions.
+        pipeline: the module of the pipeline.
+    """
+
+    def __init__(self, dataset: Path, jobs: list[Job], folder: Path):
+        self.dataset, self.jobs, self.folder = dataset, jobs, folder
+        self.failed: dict[Job, Exception] = {}
+        self.features: dict[Job, Path] = {}
+        self.confs: dict[Path, dict] = {}
+        self.dims: dict[Path, int] = {}
+        self._used: set[str] = set()  # map images
+        self._truths: set[Path | None] = set()  # of which options ground_truth is checked
+        self._record = provenance.read(folder / RECORD)
+        with self.failing(jobs):
+            self.pipeline = pipeline_of(dataset)
+            self._place = self.pipeline.Place(dataset)
+            self.map_names = self._place.map_names()
+            self.query_names = self._place.query_names()
+            for job in jobs:
+                with self.failing([job]):
+                    self._check(job)
+
+    def _check(self, job: Job) -> None:
+        """Refuse a job that cannot be run, or note what it needs."""
+        for name in job.numbers:
+            cli.choose(f"option for {self.dataset.name}", name, self.pipeline.NUMBERS)
+        if job.retrieval != "vlad" and not Path(job.retrieval).is_file():
+            raise InputError(f"retrieval {job.retrieval}: neither vlad nor a file that is there.")
+        num_loc, names = self.numbers(job)["num_loc"], (self.query_names, self.map_names)
+        used = common.check_retrieval(job.retrieval, self.folder, num_loc, *names)
+        self._place.check(used)
+        if job.ground_truth not in self._truths:
+            truth = job.ground_truth or self._place.ground_truth
+            true_poses(self.query_names, truth, job.ground_truth is not None)
+            self._truths.add(job.ground_truth)
+        _, conf = features_confs.get(job.feature, None, job.storage, job.keypoints)
+        extract_features.provenance(conf)
+        project = getattr(extractors.load(conf["model"]), "project", None)
+        stored = "" if job.storage == STORAGES[0] else f"-{job.storage}"
+        found = "" if job.keypoints == KEYPOINTS[0] else f"-keypoints_{job.keypoints}"
+        path = self.folder / f"{conf['output']}{stored}{found}.h5"
+        if self.confs.setdefault(path, conf) != conf:
+            raise InputError(f"{path.name} is that of another feature, too: rename its YAML file.")
+        self.features[job] = path
+        self.dims[path] = project.dim if project else DIM
+        self._used |= set(self.map_names if self._place.whole_map else used)
+
+    @contextmanager
+    def failing(self, jobs: list[Job]) -> Iterator[None]:
+        """Have an error of a block be that of jobs, and go no further."""
+        try:
+            yield
+        except Exception as error:
+            if getattr(error, "errno", None) == errno.ENOSPC:  # which is no job's own
+                raise
+            logger.error(
+                "%s, %s: %s",
+                self.dataset.name,
+                cli.some(job.name for job in jobs),
+                error,
+                exc_info=not isinstance(error, (InputError, OSError)),
+            )
+            self.failed = dict.fromkeys(jobs, error) | self.failed
+
+    def running(self) -> list[Job]:
+        """Return the jobs that did not fail so far."""
+        return [job for job in self.jobs if job not in self.failed]
+
+    def numbers(self, job: Job) -> dict[str, int]:
+        """Return the numbers of a job, those of its pipeline where it does not say."""
+        return {**self.pipeline.NUMBERS, **job.numbers}
+
+    def images(self) -> list[str]:
+        """Return the images whose features are needed."""
+        return [*sorted(self._used), *self.query_names]
+
+    def groups(self) -> list[list[Path]]:
+        """Return the feature files that are extracted together."""
+        groups: dict[str, list[Path]] = {}
+        for path in dict.fromkeys(self.features[job] for job in self.running()):
+            groups.setdefault(extract_features.shared_key(self.confs[path]), []).append(path)
+        return list(groups.values())
+
+    def retrieval(self, job: Job) -> str:
+        """Return the retrieval file of a job, its own or by VLAD."""
+        if job.retrieval != "vlad":
+            return str(Path(job.retrieval).resolve())
+        name = f"pairs-query-vlad{self.numbers(job)['num_loc']}.txt"
+        return str(self.folder / f"vlad_{self._vlad_features().stem}" / name)
+
+    def _vlad_features(self) -> Path:
+        """Return the feature file of which VLAD is made: the first one, or that of before."""
+        before = self.folder / self._record.get("vlad", "")
+        return before if before in self.confs else self.features[next(iter(self.features))]
+
+    def seconds(self) -> dict[str, float]:
+        """Return how long each stage of `main` took, all runs together."""
+        kept = provenance.read(self.folder / STAGES)
+        return {name: stage["seconds"] for name, stage in kept.items()}
+
+    def main(self, executor: Executor, strict: bool, overwrite: bool) -> None:
+        """Extract the features and retrieve.
+
+        Args:
+            executor: does the work.
+            strict: as of `extract_features.extract_several`.
+            overwrite: begin anew.
+        """
+        if not self.running():
+            return
+        conf = {"dataset": str(self.dataset)}
+        with (
+            self.failing(self.running()),
+            RunFolder(self.folder, conf, overwrite) as folder,
+        ):
+            with folder.stage("extract_features"):
+                for group in self.groups():
+                    with self.failing([j for j in self.running() if self.features[j] in group]):
+                        self._extract(group, executor, strict)
+            self._drop_stale()
+            by_vlad = [job for job in self.running() if job.retrieval == "vlad"]
+            with folder.stage("retrieval"), self.failing(by_vlad):
+                self._retrieve(by_vlad, not strict)
+
+    def _retrieve(self, jobs: list[Job], accept_partial: bool) -> None:
+        """Retrieve by VLAD for jobs."""
+        if not jobs:
+            return
+        features = self._vlad_features()
+        if features not in {self.features[job] for job in self.running()}:
+            raise InputError(f"Retrieval is by VLAD of {features.stem}, which failed.")
+        names = (
+            common.readable(features, self.query_names),
+            extract_features.keep_readable(features, self.map_names, accept_partial),
+        )
+        for pairs, num_loc in {(self.retrieval(j), self.numbers(j)["num_loc"]) for j in jobs}:
+            common.retrieve("vlad", features, Path(pairs), num_loc, *names)
+
+    def _extract(self, paths: list[Path], executor: Executor, strict: bool) -> None:
+        """Extract features whose keypoints are the same."""
+        with ExitStack() as stack:
+            features = {}
+            for path in paths:
+                made_by = extract_features.provenance(self.confs[path])
+                writer = stack.enter_context(GroupWriter(path, made_by))
+                features[path] = {"storage": STORAGES[0], **self.confs[path]}, writer
+            extract_features.extract_several(
+                features, self._place.images, self.images(), executor, strict
+            )
+
+    def _drop_stale(self) -> None:
+        """Delete what was made of features that were begun anew."""
+        ids = {}
+        for path in {self.features[job] for job in self.running()}:
+            with open_h5(path) as file:
+                ids[path.name] = get_text(file, "id")
+        before = self._record.get("ids", {})
+        if any(before.get(name, made) != made for name, made in ids.items()):
+            for derived in self.folder.glob(f"{aggregate_features.confs['vlad']['output']}*"):
+                derived.unlink()
+        self._record = {"vlad": self._vlad_features().name, "ids": before | ids}
+        provenance.write(self.folder / RECORD, self._record)

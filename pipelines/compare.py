@@ -1,0 +1,178 @@
+"""Compare features on a data set: run what is missing, print a table of recall, and report.
+
+A data set is in the layout of Aachen Day-Night or of InLoc. On Aachen Day-Night v1.1 and InLoc
+themselves the paper's recall is shown below that of each feature. Each feature has its own outputs
+folder, like those of pipelines.aachen and pipelines.inloc, where an interrupted run resumes.
+"""
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+
+from hloc_reduce import logger, report
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate, add_gate_options
+from hloc_reduce.report import runs
+from hloc_reduce.runtime import provenance
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.files import write_csv
+from hloc_reduce.utils.paths import strings_as_paths
+from hloc_reduce.utils.tables import aligned, joined
+
+from .layouts import pipeline_of
+
+
+@strings_as_paths
+def main(
+    dataset: Path,
+    features: Iterable[str],
+    outputs: Path,
+    page: Path | None = None,
+    retrieval: str = "vlad",
+    ground_truth: Path | None = None,
+    gate: Gate = DEFAULT_GATE,
+) -> dict[str, str]:
+    """Localize the queries of a data set with several features, print their table and report.
+
+    Args:
+        dataset: its folder.
+        features: names, or YAML files, as of the pipelines.
+        outputs: folder of the outputs folders, and of compare.csv.
+        page: the report; default: `<outputs>/report.html`.
+        retrieval: as of the pipelines.
+        ground_truth: as of the pipelines; default: what a folder was made with, or theirs.
+        gate: what a pose must have for a query to be called localized.
+
+    Returns:
+        From each feature that failed to what was wrong.
+
+    Raises:
+        InputError: for another layout, an unknown feature, or when all failed.
+    """
+    pipeline = pipeline_of(dataset).main
+    report.check()
+    page = page or outputs / "report.html"
+    cli.check_folder(outputs)
+    cli.check_file(page, "the HTML file")
+    given = {features_confs.get(feature)[0]: feature for feature in features}
+    finished, failed = [], {}
+    for name, feature in given.items():
+        logger.info("%s:", name)
+        folder = outputs / name
+        before = provenance.read(folder / "summary.json").get("files", {}).get("ground_truth")
+        truth = ground_truth or (before and folder / before)
+        try:
+            pipeline(dataset, folder, feature, retrieval=retrieval, ground_truth=truth, gate=gate)
+        except (InputError, OSError) as error:
+            logger.error("%s failed: %s", name, error)
+            failed[name] = str(error)
+        else:
+            finished.append(folder)
+    if not finished:
+        raise InputError(f"None of {len(failed)} features could be run.")
+    tables = runs.recall_tables(runs.load(finished))
+    write_csv(rows(tables), outputs / "compare.csv")
+    print(table(tables))
+    report.main(finished, page)
+    return failed
+
+
+def rows(tables: list[dict]) -> list[dict]:
+    """Return a row for each run, list and threshold: recall, and the paper's if it has any.
+
+    Args:
+        tables: as of `runs.recall_tables`.
+    """
+    return [
+        {
+            "feature": row["run"].label,
+            "bytes": row["run"].bytes,
+            "seconds": round(row["run"].seconds, 1),
+            "list": found["list"],
+            "threshold_m": metres,
+            "threshold_deg": degrees,
+            "recall_percent": recall,
+            "paper_percent": paper,
+            "mean_inliers": row["summary"]["mean_inliers"],
+        }
+        for found in tables
+        for row in found["rows"]
+        for (metres, degrees), recall, paper in zip(
+            found["thresholds"] or [(None, None)],
+            row["recall"] or [None],
+            row["paper"] or [None] * max(1, len(found["thresholds"])),
+            strict=True,
+        )
+    ]
+
+
+def table(tables: list[dict]) -> str:
+    """Format recall, a row for each feature, and below it the paper's if it has any."""
+    lines = [["", "bytes", *(found["list"] for found in tables)]]
+    for unit, place in (("distance [m]", 0), ("orient. [deg]", 1)):
+        limits = [[limit[place] for limit in found["thresholds"]] for found in tables]
+        lines.append([unit, "", *(joined(values, "g") for values in limits)])
+    compared = dict.fromkeys(row["run"].label for found in tables for row in found["rows"])
+    for label in compared:
+        of_lists = [
+            next((row for row in found["rows"] if row["run"].label == label), None)
+            for found in tables
+        ]
+        (size,) = {row["run"].bytes for row in of_lists if row}
+        recall = (joined(row and row["recall"], ".1f") for row in of_lists)
+        lines.append([label, str(size), *recall])
+        paper = [joined(row and row["paper"], ".1f") for row in of_lists]
+        if set(paper) != {"-"}:
+            lines.append(["  in the paper", "", *paper])
+    return aligned(lines)
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.compare --dataset datasets/demo_town "
+        "--features sift sift_sv64 sift_sv16",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument("--dataset", type=Path, required=True, help="folder of the data set")
+    parser.add_argument(
+        "--features",
+        nargs="+",
+        required=True,
+        help="see pipelines.aachen --list_features, or YAML files",
+    )
+    parser.add_argument(
+        "--outputs",
+        type=Path,
+        help="folder with a folder for each feature (default: outputs/<dataset>)",
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, help="the report (default: <outputs>/report.html)"
+    )
+    parser.add_argument(
+        "--retrieval", default="vlad", metavar="vlad|FILE", help="as of the pipelines"
+    )
+    parser.add_argument(
+        "--ground_truth",
+        type=Path,
+        help="true poses of the queries (default: what was given before, or that of the data set)",
+    )
+    add_gate_options(parser)
+    args = parser.parse_args()
+    outputs = args.outputs or Path("outputs") / args.dataset.resolve().name
+    failed = main(
+        args.dataset,
+        args.features,
+        outputs,
+        args.output,
+        args.retrieval,
+        args.ground_truth,
+        Gate(args.min_confidence, args.min_inliers),
+    )
+    if failed:
+        raise InputError(f"These failed, see above: {', '.join(failed)}. The others are reported.")
+
+
+if __name__ == "__main__":
+    cli.run(_main)
