@@ -166,6 +166,24 @@ def test_a_pose_of_all_parameters_is_as_precise_as_measured():
     assert resect(points2D[:9], points3D[:9], POSE, camera, 12.0, ALL) is None
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("points", ["equal", "behind", "on a line", "far off"])
+def test_points_that_fix_nothing_are_survived(points):
+    points2D, points3D = matches(WHOLE, 40, wrong=0)
+    centre = POSE.inverse().translation
+    if points == "far off":
+        points2D = 1e5 * points2D
+    else:
+        share = np.linspace(0, 1, 40)[:, None]
+        towards = {"equal": 0 * share, "on a line": share, "behind": -2 + 0 * share}[points]
+        points3D = points3D[0] + towards * (points3D[0] - centre)
+    pinhole = guessed(1600, 1200)
+    pinhole = camera_of(1600, 1200, [*pinhole.params[[0, 0, 1, 2]]], "PINHOLE")
+    for freedom in (RADIAL, ALL, SKEW):
+        found = resect(points2D, points3D, POSE, pinhole, 12.0, freedom, np.ones(40, bool))
+        assert found is None or np.isfinite(found.camera.params).all()
+
+
 def homography(camera: pycolmap.Camera, amount: float) -> np.ndarray:
     """Return what moves the corners of a photo unevenly, as when a print is photographed aslant."""
     width, height = camera.width, camera.height

@@ -15,14 +15,15 @@ from scipy.spatial.transform import Rotation
 from ..utils.colmap import cam_from_img
 from .confidence import photo_scale, project, reprojection_errors
 
-RADIAL, ASPECT, ALL, SKEW = 8, 9, 11, 12  # degrees of freedom
-# of the logarithms of the changes of focal length and aspect ratio, the distortion, the shift of
-# the principal point in focal lengths, and the skew as a tangent
-BOUNDS = np.array([2.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+POSE, RADIAL, ASPECT, ALL, SKEW = 6, 8, 9, 11, 12  # degrees of freedom
+# standard deviations of the logarithm of the focal length, the distortion, the logarithm of the
+# aspect ratio, the principal point in focal lengths, and the skew as a tangent: all others are
+# possible, but what few matches do not tell is not made up
+PRIOR = np.array([0.5, 0.25, 0.25, 0.25, 0.25, 0.25])
 ROUNDS = 10  # of refinement, from the inliers of the one before
 NOISE = 2.0  # pixels, scale of the Cauchy loss
-EVALUATIONS = 30  # of the residuals, a round
-DAMPING, TINY = 1e-3, 1e-12  # of the first step; least damping, for a parameter without effect
+EVALUATIONS = 100  # of the residuals, a round
+DAMPING, TINY = 1e-3, 1e-9  # of the first step; what is damped at least
 ENOUGH = 1e-6  # relative gain of the last step
 FAR = 1e6  # pixels
 # where all parameters are searched for: in a sample of the matches with errors of a few times the
@@ -138,6 +139,15 @@ class _View(NamedTuple):
         focal_length, _, aspect, *_ = self.intrinsics
         return np.exp([focal_length, focal_length + aspect])
 
+    @property
+    def _units(self) -> np.ndarray:
+        """The units of changes of the intrinsics: focal lengths for the principal point."""
+        return np.array([1, 1, 1, *self.focal_lengths, 1])
+
+    def change(self, start: "_View") -> np.ndarray:
+        """Return how much the intrinsics (6,) differ from others, in units of PRIOR."""
+        return (self.intrinsics - start.intrinsics) / (PRIOR * start._units)
+
     def camera(self, photo: pycolmap.Camera) -> pycolmap.Camera:
         _, distortion, _, cx, cy, _ = self.intrinsics
         return pycolmap.Camera(
@@ -155,17 +165,14 @@ class _View(NamedTuple):
         below = points2D[:, 1] - self.intrinsics[4]
         return points2D - np.stack([skew * fx / fy * below, np.zeros(len(below))], axis=1)
 
-    def moved(self, step: np.ndarray, start: "_View") -> "_View":
-        """Return the view after a step, its intrinsics within BOUNDS of those at the start."""
-        unit = np.array([1, 1, 1, *start.focal_lengths, 1])
-        changed = self.intrinsics.copy()
-        changed[: len(step) - 6] += step[6:] * unit[: len(step) - 6]
-        reach = BOUNDS * unit
+    def moved(self, step: np.ndarray) -> "_View":
+        """Return the view after a step (7 to 12,), in the order of the degrees of freedom."""
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        step = np.pad(step, (0, SKEW - len(step)))
         return _View(
             turn @ self.rotation,
-            turn @ self.translation + step[3:6],
-            np.clip(changed, start.intrinsics - reach, start.intrinsics + reach),
+            turn @ self.translation + step[3:POSE],
+            self.intrinsics + self._units * step[POSE:],
         )
 
     def residuals(
@@ -185,6 +192,7 @@ class _View(NamedTuple):
         return residuals, scale[:, None] * derivatives, front
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a step that is too long, and refused
 def _fit(
     points2D: np.ndarray,
     points3D: np.ndarray,
@@ -193,23 +201,30 @@ def _fit(
     degrees_of_freedom: int,
     noise: float,
 ) -> _View:
-    """Minimize the Cauchy loss of the residuals by the method of Levenberg and Marquardt."""
+    """Minimize the Cauchy loss of the residuals by the method of Levenberg and Marquardt.
+
+    What the residuals do not fix stays as it is at the start.
+    """
     least, damping, trial = np.inf, DAMPING, view
+    free = slice(degrees_of_freedom - POSE)
     for _ in range(EVALUATIONS):
         residuals, derivatives, front = trial.residuals(points2D, points3D)
-        squares = np.where(front, (residuals**2).sum(axis=0) / noise**2, FAR)
-        loss = np.log1p(squares).sum()
+        squares = np.where(front, (residuals / noise) ** 2, FAR).ravel()
+        change = trial.change(start)
+        loss = np.log1p(squares).sum() + (change**2).sum()
         if loss < least:
             gain, least, view, damping = least - loss, loss, trial, damping / 10
             if gain < ENOUGH * loss:
                 break
             jacobian = np.concatenate(derivatives[:, :degrees_of_freedom], axis=1)
-            weighted = jacobian * np.tile(front / (1 + squares), 2)
+            weighted = jacobian * np.tile(front, 2) / (1 + squares) / noise**2
             normal, gradient = weighted @ jacobian.T, weighted @ residuals.ravel()
+            normal[POSE:, POSE:] += np.diag(1 / PRIOR[free] ** 2)
+            gradient[POSE:] += (change / PRIOR)[free]
         else:
             damping *= 10
-        damped = normal + np.diag(damping * np.diag(normal) + TINY)
-        trial = view.moved(-np.linalg.solve(damped, gradient), start)
+        damped = normal + damping * np.diag(np.maximum(np.diag(normal), TINY))
+        trial = view.moved(-np.linalg.solve(damped, gradient))
     return view
 
 
