@@ -60,7 +60,7 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
 
     from . import projections
     from .confs.features import of_patches
-    from .descriptors import Descriptor
+    from .descriptors.model import Descriptor
 
     if not isinstance(patches, torch.Tensor):
         raise ValueError(f"Patches are a torch.Tensor, not {type(patches).__name__}.")

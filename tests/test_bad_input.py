@@ -39,6 +39,7 @@ from hloc_reduce.evaluation.poses import pose_error, read_estimates
 from hloc_reduce.extract_features import provenance
 from hloc_reduce.localization.records import RECORDS
 from hloc_reduce.maps import intrinsics
+from hloc_reduce.projections import network
 from hloc_reduce.runtime import group_writer
 from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.utils import colmap, parsers
@@ -795,8 +796,8 @@ def weights(tmp_path_factory):
     """Files of weights, one of each kind, and what reads them."""
     folder = tmp_path_factory.mktemp("weights")
     torch.manual_seed(0)
-    mlp = projections.MLP((8, 6, 4))
-    projections.save(mlp, {"descriptor": "sift", "scheme": "sv"}, folder / "p.safetensors")
+    mlp = network.MLP((8, 6, 4))
+    network.save(mlp, {"descriptor": "sift", "scheme": "sv"}, folder / "p.safetensors")
     torch.save(
         {f"module.{key}": value for key, value in mlp.state_dict().items()}, folder / "p.pth"
     )

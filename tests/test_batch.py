@@ -18,7 +18,7 @@ import pytest
 
 from hloc_reduce import aggregate_features, extract_features
 from hloc_reduce.datasets import scans
-from hloc_reduce.descriptors import Descriptor
+from hloc_reduce.descriptors.model import Descriptor
 from hloc_reduce.detectors import dog
 from hloc_reduce.evaluation import published
 from hloc_reduce.localization.confidence import Gate

@@ -13,7 +13,8 @@ import torch
 
 from hloc_reduce import descriptors, extract_features, extractors
 from hloc_reduce.confs import features
-from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, Descriptor
+from hloc_reduce.descriptors import COLMAP, DESCRIPTORS
+from hloc_reduce.descriptors.model import Descriptor
 from hloc_reduce.extract_features import provenance
 from hloc_reduce.training import __main__ as training
 from hloc_reduce.training import tracks

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from hloc_reduce import extract_features
 from hloc_reduce.confs import features as features_confs
-from hloc_reduce.descriptors import Descriptor
+from hloc_reduce.descriptors.model import Descriptor
 from hloc_reduce.detectors import dog
 from hloc_reduce.extractors.dog import DoG, extract_patches
 from hloc_reduce.runtime import parallel

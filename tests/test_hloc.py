@@ -24,6 +24,7 @@ from hloc_reduce.confs import features
 from hloc_reduce.confs.matchers import confs as matchers
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.hloc import __main__ as command
+from hloc_reduce.projections import network
 from hloc_reduce.training import __main__ as training
 from hloc_reduce.training import tracks
 from hloc_reduce.utils import cli, parsers
@@ -286,7 +287,7 @@ def test_what_determines_descriptors_is_in_their_name(double):
 
 def test_projections_of_other_dimensions_are_refused_with_both(double, tmp_path):
     file = tmp_path / "p.safetensors"
-    projections.save(trained((128, 16)), {}, file)
+    network.save(trained((128, 16)), {}, file)
     conf = {"name": "reduced", "base": {"name": "dots"}, "projection": str(file)}
     with pytest.raises(InputError, match="for 128-D .* have 256"):
         extractors.load(conf)({"image": torch.rand(1, 3, 40, 40)})

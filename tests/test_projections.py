@@ -17,7 +17,8 @@ from hloc_reduce import extractors, projections
 from hloc_reduce.confs import features
 from hloc_reduce.confs.features import confs
 from hloc_reduce.extractors.reduced import Reduced
-from hloc_reduce.projections import MLP, Projection, released
+from hloc_reduce.projections import network, released
+from hloc_reduce.projections.network import MLP, Projection
 from hloc_reduce.utils import downloads
 from hloc_reduce.utils.cli import InputError
 
@@ -45,7 +46,7 @@ def test_folding_changes_nothing(sizes):
 def test_saved_and_loaded(tmp_path):
     mlp, descriptors = trained((128, 32, 32, 16)), torch.randn(50, 128)
     path = tmp_path / "p.safetensors"
-    projections.save(mlp, {"descriptor": "sift", "dim": 16, "seed": 0}, path)
+    network.save(mlp, {"descriptor": "sift", "dim": 16, "seed": 0}, path)
     loaded = projections.load(path)
     assert loaded.metadata == {
         "descriptor": "sift",
@@ -154,7 +155,7 @@ def test_what_does_not_ship_says_how_to_train_it():
 
 def test_the_first_numbers_of_a_nested_projection(tmp_path):
     mlp = trained((128, 32, 24))
-    projections.save(mlp, {"scheme": "nested"}, tmp_path / "p.safetensors")
+    network.save(mlp, {"scheme": "nested"}, tmp_path / "p.safetensors")
     whole = projections.load(tmp_path / "p.safetensors")
     first = projections.load(f"{tmp_path / 'p.safetensors'}@8")
     descriptors = torch.rand(10, 128)
@@ -164,7 +165,7 @@ def test_the_first_numbers_of_a_nested_projection(tmp_path):
     for prefix in ("25", "0", "x"):
         with pytest.raises(InputError, match="first"):
             projections.load(f"{tmp_path / 'p.safetensors'}@{prefix}")
-    projections.save(mlp, {"scheme": "sv"}, tmp_path / "p.safetensors")
+    network.save(mlp, {"scheme": "sv"}, tmp_path / "p.safetensors")
     with pytest.raises(InputError, match="not nested"):
         projections.load(f"{tmp_path / 'p.safetensors'}@8")
 
@@ -172,7 +173,7 @@ def test_the_first_numbers_of_a_nested_projection(tmp_path):
 def test_a_path_may_have_an_at_sign(tmp_path):
     path = tmp_path / "me@home" / "a@b.safetensors"
     path.parent.mkdir()
-    projections.save(trained((128, 16)), {"scheme": "nested"}, path)
+    network.save(trained((128, 16)), {"scheme": "nested"}, path)
     assert projections.load(path).dim == 16 and projections.load(f"{path}@8").dim == 8
     assert projections.checksum(path) == projections.checksum(f"{path}@8")
 
@@ -341,7 +342,7 @@ def test_no_patches_and_unknown_features():
 
 
 def test_projection_of_other_descriptors_is_refused(tmp_path, textured):
-    projections.save(trained((256, 16)), {}, tmp_path / "p.safetensors")
+    network.save(trained((256, 16)), {}, tmp_path / "p.safetensors")
     conf = {"name": "reduced", "projection": str(tmp_path / "p.safetensors")}
     image = torch.from_numpy(textured / np.float32(255))[None, None]
     with pytest.raises(InputError, match="for 256-D .* have 128"):

@@ -8,6 +8,7 @@ import torch
 
 from hloc_reduce import projections
 from hloc_reduce.evaluation.matching import average_precision
+from hloc_reduce.projections import network
 from hloc_reduce.training import __main__ as training
 from hloc_reduce.training import loop, nested, pca, ss, sv, tracks, us
 from hloc_reduce.training.losses import distance_loss, triplet_loss
@@ -438,7 +439,7 @@ def test_tuning_begins_with_what_ships(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(tracks, "main", lambda *_: tmp_path / "tracks.safetensors")
     monkeypatch.setattr(tracks, "load", lambda _: noisy_tracks())
     (tmp_path / "tracks.safetensors").touch()
-    shipped, _ = projections.read("sift_sv16")
+    shipped, _ = network.read("sift_sv16")
     others = [], "sift", "sv", [16]
     for scheme, steps, lr in ((sv, 1, 0.0), (sv, 60, 1e-3)):
         recipe = {**scheme.RECIPES["tune"], "steps": steps, "lr": lr, "batch_size": 100}
@@ -446,7 +447,7 @@ def test_tuning_begins_with_what_ships(scene, tmp_path, monkeypatch):
         output = tmp_path / str(steps)
         place = {"a": (scene.images, scene.model)}
         (path,) = training.main(place, *others, output, tmp_path, "tune")
-        tuned, metadata = projections.read(path)
+        tuned, metadata = network.read(path)
         assert metadata["recipe"]["begin_with"] == "sift_sv16" and metadata["recipe"]["lr"] == lr
         same = torch.equal(tuned.linears[0].weight, shipped.linears[0].weight)
         assert same == (steps == 1)

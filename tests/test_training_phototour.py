@@ -11,7 +11,8 @@ from command import refused
 
 from hloc_reduce import projections
 from hloc_reduce.datasets import phototour as layout
-from hloc_reduce.descriptors import DESCRIPTORS, Base, Descriptor
+from hloc_reduce.descriptors import DESCRIPTORS, Base
+from hloc_reduce.descriptors.model import Descriptor
 from hloc_reduce.evaluation.patch_verification import fpr95
 from hloc_reduce.training import __main__ as training
 from hloc_reduce.training import patch_tracks, tracks

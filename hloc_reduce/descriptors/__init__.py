@@ -3,14 +3,12 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-
-import torch
-from kornia import feature
-from torch import nn
+from typing import TYPE_CHECKING
 
 from ..utils import downloads
-from ..utils.cli import choose
-from .sift import SIFT
+
+if TYPE_CHECKING:
+    from torch import nn
 
 PATCH_SIZE = 32
 DIM = 128
@@ -30,21 +28,33 @@ class Base:
             one for learned ones (Sec. III-D).
     """
 
-    make: Callable[[], nn.Module]
+    make: "Callable[[], nn.Module]"
     urls: tuple[str, ...] = ()
     sha256: str = ""
     hidden: tuple[int, ...] = (512, 512)
 
 
+def _sift() -> "nn.Module":
+    from .sift import SIFT
+
+    return SIFT(PATCH_SIZE)
+
+
+def _kornia(name: str, **options: object) -> "nn.Module":
+    from kornia import feature
+
+    return getattr(feature, name)(**options)
+
+
 DESCRIPTORS = {
-    "sift": Base(lambda: SIFT(PATCH_SIZE)),
+    "sift": Base(_sift),
     "mkd": Base(
-        feature.MKDDescriptor,
+        lambda: _kornia("MKDDescriptor"),
         ("https://github.com/manyids2/mkd_pytorch/raw/master/mkd_pytorch/mkd-concat-64.pth",),
         "e31112000009e0d6e159dd7726aeea9f6a7d746cfe7d59b59bfb86c570667641",
     ),
     "tfeat": Base(
-        lambda: feature.TFeat(pretrained=True),
+        lambda: _kornia("TFeat", pretrained=True),
         (
             "https://huggingface.co/kornia/tfeat/resolve/main/tfeat-liberty.params",
             "https://github.com/vbalnt/tfeat/raw/master/pretrained-models/tfeat-liberty.params",
@@ -53,7 +63,7 @@ DESCRIPTORS = {
         hidden=(512,),
     ),
     "hardnet": Base(
-        lambda: feature.HardNet(pretrained=True),
+        lambda: _kornia("HardNet", pretrained=True),
         (
             "https://huggingface.co/kornia/hardnet/resolve/main/checkpoint_liberty_with_aug.pth",
             "https://github.com/DagnyT/hardnet/raw/master/pretrained/train_liberty_with_aug/"
@@ -64,33 +74,6 @@ DESCRIPTORS = {
     ),
 }
 BASES = (*DESCRIPTORS, COLMAP)  # of features of photos
-
-
-class Descriptor(nn.Module):
-    """A base descriptor by name; computes in small batches, which stay in the cache.
-
-    Args:
-        name: a key of `DESCRIPTORS`.
-
-    Raises:
-        InputError: for an unknown name, or when its weights are broken or not to be had.
-    """
-
-    batch_size = 128  # whose intermediate results stay in the cache of a CPU
-
-    def __init__(self, name: str):
-        super().__init__()
-        base = DESCRIPTORS[choose("descriptor", name, DESCRIPTORS)]
-        check_weights(name)  # before kornia unpickles them
-        self.describe = base.make().eval()
-
-    @torch.no_grad()
-    def forward(self, patches: torch.Tensor) -> torch.Tensor:
-        """Map patches (N, 1, 32, 32) in [0, 1] to descriptors (N, 128) float32 of unit norm."""
-        if len(patches) == 0:
-            return patches.new_zeros((0, DIM))
-        batches = [self.describe(batch) for batch in patches.split(self.batch_size)]
-        return nn.functional.normalize(torch.cat(batches), dim=1)
 
 
 def check_weights(name: str) -> None:

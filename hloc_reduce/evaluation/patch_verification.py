@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from ..datasets.phototour import SHEET, read_pairs, read_points, read_sheet, sheets
-from ..descriptors import Descriptor
+from ..descriptors.model import Descriptor
 from ..runtime import parallel
 from ..runtime.group_writer import GroupWriter
 from ..utils.cli import InputError

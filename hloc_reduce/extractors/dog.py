@@ -5,7 +5,8 @@ import numpy as np
 import torch
 from torch.nn.functional import grid_sample
 
-from ..descriptors import BASES, COLMAP, PATCH_SIZE, Descriptor
+from ..descriptors import BASES, COLMAP, PATCH_SIZE
+from ..descriptors.model import Descriptor
 from ..detectors import dog
 from ..utils import colmap
 from ..utils.base_model import BaseModel

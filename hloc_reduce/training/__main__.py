@@ -16,6 +16,7 @@ from ..datasets import phototour as layout
 from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM, check_weights
 from ..evaluation import patch_verification as verification
 from ..maps.map import Map, is_map
+from ..projections import network
 from ..runtime.versions import versions
 from ..utils import cli
 from ..utils.cli import InputError
@@ -128,7 +129,7 @@ def main(
             checkpoint=checkpoint,
             made_from=json.dumps(metadata, sort_keys=True),
         )
-        projections.save(mlp, metadata, path)
+        network.save(mlp, metadata, path)
         for file in (checkpoint, ss.clusters_of(checkpoint)):
             file.unlink(missing_ok=True)
         logger.info("Saved %s.", path)

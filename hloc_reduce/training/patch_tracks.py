@@ -6,7 +6,8 @@ import numpy as np
 import torch
 
 from ..datasets.phototour import SHEET, read_points, read_sheet, sheets
-from ..descriptors import DIM, Descriptor
+from ..descriptors import DIM
+from ..descriptors.model import Descriptor
 from ..runtime import provenance
 from ..runtime.group_writer import resume_or_replace
 from ..utils.paths import strings_as_paths

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from sklearn.decomposition import PCA
 
-from ..projections import MLP
+from ..projections.network import MLP
 from ..utils.cli import InputError
 from .tracks import Tracks
 

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from .. import logger
-from ..projections import MLP
+from ..projections.network import MLP
 from ..runtime.group_writer import resume_or_replace
 from ..utils.cli import InputError
 from ..utils.h5 import get_dataset, open_h5

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from ..projections import MLP, read
+from ..projections.network import MLP, read
 from .loop import device, fit
 from .losses import distance_loss, triplet_loss
 from .sampling import PairSampler

@@ -20,7 +20,8 @@ from .. import (
     triangulation,
 )
 from ..confs import features as features_confs
-from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM, Descriptor
+from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM
+from ..descriptors.model import Descriptor
 from ..extractors.dog import extract_patches
 from ..maps.map import Map, is_map
 from ..runtime import provenance

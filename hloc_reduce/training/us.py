@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from ..projections import MLP
+from ..projections.network import MLP
 from .loop import device, fit
 from .losses import distance_loss
 from .sampling import DescriptorSampler

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import torch
 
-from ...descriptors import PATCH_SIZE, Descriptor
+from ...descriptors import PATCH_SIZE
+from ...descriptors.model import Descriptor
 from ...runtime import parallel
 from ...runtime.group_writer import GroupWriter
 from ...utils import cli

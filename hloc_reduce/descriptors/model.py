@@ -1,0 +1,34 @@
+"""Base descriptors as torch modules."""
+
+import torch
+from torch import nn
+
+from ..utils.cli import choose
+from . import DESCRIPTORS, DIM, check_weights
+
+
+class Descriptor(nn.Module):
+    """A base descriptor by name; computes in small batches, which stay in the cache.
+
+    Args:
+        name: a key of `DESCRIPTORS`.
+
+    Raises:
+        InputError: for an unknown name, or when its weights are broken or not to be had.
+    """
+
+    batch_size = 128  # whose intermediate results stay in the cache of a CPU
+
+    def __init__(self, name: str):
+        super().__init__()
+        base = DESCRIPTORS[choose("descriptor", name, DESCRIPTORS)]
+        check_weights(name)  # before kornia unpickles them
+        self.describe = base.make().eval()
+
+    @torch.no_grad()
+    def forward(self, patches: torch.Tensor) -> torch.Tensor:
+        """Map patches (N, 1, 32, 32) in [0, 1] to descriptors (N, 128) float32 of unit norm."""
+        if len(patches) == 0:
+            return patches.new_zeros((0, DIM))
+        batches = [self.describe(batch) for batch in patches.split(self.batch_size)]
+        return nn.functional.normalize(torch.cat(batches), dim=1)
