@@ -5,15 +5,11 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import torch
-from safetensors.torch import save
 
-from . import extractors, logger
-from .aggregators.vlad import read_vocabulary
+from . import logger
 from .confs import retrieval as retrieval_confs
 from .runtime.group_writer import GroupWriter, failures
 from .utils import cli, colmap
-from .utils.base_model import dynamic_load
 from .utils.cli import InputError
 from .utils.feature_files import get_descriptors
 from .utils.files import file_sha256, replacing
@@ -50,8 +46,14 @@ def main(
     Raises:
         InputError: when the images have no features to learn a vocabulary from.
     """
+    import torch
+    from safetensors.torch import save
+
+    from . import aggregators
+    from .aggregators.vlad import read_vocabulary
+
     output = Path(export_dir or features.parent) / f"{conf['output']}_{features.stem}.h5"
-    model = dynamic_load(extractors, conf["model"]["name"])(conf["model"]).eval()
+    model = aggregators.load(conf["model"]).eval()
     with open_h5(features) as file:
         made_by = {"model": conf["model"], "features": file_provenance(file)}
         learn = vocabulary is None

@@ -1,29 +1,25 @@
 """Extract local features from images into an h5 file."""
 
 import argparse
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from . import extractors, logger, projections
+from . import logger, projections
 from .confs import features as features_confs
 from .descriptors import DESCRIPTORS, check_weights
-from .detectors import dog
-from .extractors.dog import DoG
 from .runtime import parallel, processes
 from .runtime.executors import SERIAL, Executor
-from .runtime.group_writer import FAILURE, Group, GroupWriter, Key, failures, fill
+from .runtime.group_writer import FAILURE, Group, GroupWriter, failures, fill
 from .runtime.trace import span
 from .utils import cli
 from .utils.cli import InputError
 from .utils.feature_files import STORAGES, store
-from .utils.images import UnreadableImage, list_images, load_image
+from .utils.images import UnreadableImage, list_images
 from .utils.parsers import image_names
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
@@ -31,7 +27,6 @@ from .utils.progress import progress
 confs = features_confs.confs
 CHUNK = 8  # images
 BLACK = 32  # pixels, the sides of what stands for an image that cannot be read
-Detect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # as colmap.detect_dog
 
 
 @strings_as_paths
@@ -75,7 +70,7 @@ def main(
     else:
         names = image_names(image_list)
     if overwrite:
-        extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
+        check_model(conf)
     with GroupWriter(feature_path, provenance(conf, as_half), overwrite) as writer:
         extract_several({feature_path: (stored, writer)}, image_dir, names, executor, strict)
     return feature_path
@@ -93,8 +88,8 @@ def extract_several(
     Keypoints are detected once, and each base descriptor is computed once for all its projections.
 
     Args:
-        features: from feature file to the configuration, with `storage`, and the writer; all of
-            one `shared_key`.
+        features: from feature file to the configuration, with `storage`, and the writer; all with
+            the same keypoints (`extractors.Extractor.detection`) and preprocessing.
         image_dir: the folder that names are relative to.
         names: the images; a file's own are skipped.
         executor: does the work.
@@ -111,7 +106,7 @@ def extract_several(
     )
     todo = [(name, paths) for name, paths in wanted if paths]
     if todo:
-        work = partial(_extract_groups, confs, image_dir, strict)
+        work = partial(_extract, confs, image_dir, strict)
         # counts files: an image is as many as are wanted of it
         number = sum(len(paths) for _, paths in todo)
         with closing(fill(writers, work, todo, executor, CHUNK, gpu=True)) as done:
@@ -121,95 +116,87 @@ def extract_several(
         logger.info("Features of %d images are in %s.", len(names), path)
 
 
-def shared_key(conf: dict) -> str:
-    """Return what features have in common whose keypoints are the same."""
-    base = conf["model"].get("base", conf["model"])
-    if base["name"] == "dog":
-        base = {key: value for key, value in base.items() if key != "descriptor"}
-    return json.dumps([base, conf["preprocessing"]], sort_keys=True)
-
-
-def _extract_groups(
+def _extract(
     confs: Mapping[Path, dict],
     image_dir: Path,
     strict: bool,
     items: Iterable[tuple[str, list[Path]]],
 ) -> Iterator[tuple[Path, Group]]:
-    """Yield the features of images, for each the wanted ones, as files keep them."""
-    items = list(items)
-    images = [(image_dir / name, paths) for name, paths in items]
-    # closed at once if writing fails: it has processes
-    with closing(extract_all(confs, images, strict)) as extracted:
-        for (name, _), several in zip(items, extracted, strict=True):
-            for path, features in several.items():
-                uncertainty, failure = features.pop("uncertainty"), features.pop(FAILURE, None)
-                if failure:
-                    logger.warning(failure)
-                elif len(features["keypoints"]) == 0:
-                    logger.warning("Image %s has no keypoints.", name)
-                arrays, attrs = store(features, confs[path]["storage"])
-                attrs |= {"keypoints": {"uncertainty": uncertainty}}
-                yield path, (name, arrays, attrs | ({"": {FAILURE: failure}} if failure else {}))
+    """Yield the features of images, for each the wanted ones, as files keep them.
 
-
-def extract_all(
-    confs: Mapping[Key, dict], images: list[tuple[Path, list[Key]]], strict: bool = True
-) -> Iterator[dict[Key, dict[str, np.ndarray]]]:
-    """Extract features of images on all cores, and yield them in order.
-
-    COLMAP's detector, which lets no other thread of its process run, gets processes. An extractor
-    of another kind takes one image after the other, on all cores or a GPU.
-
-    Args:
-        confs: configurations, all of one `shared_key`.
-        images: files, each with the keys of what is wanted of it.
-        strict: raise an UnreadableImage. Else the features are those of a black image, and
-            `FAILURE` says why.
-
-    Yields:
-        For each image the features, as of `extract`, by key.
+    COLMAP's detector lets no other thread of its process run, so what an extractor detects apart
+    is detected in processes.
     """
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    models = {key: extractors.load(conf["model"]).eval().to(device) for key, conf in confs.items()}
-    model, conf = next(iter(models.values())), next(iter(confs.values()))
-    base = getattr(model, "base", model)
-    workers = min(parallel.cores(), len(images))
+    import torch
 
-    def work(item: tuple[Path, list[Key]], detect: Detect | None = None) -> dict:
-        image, keys = item
-        extract = partial(extract_each, [models[key] for key in keys], device=device, detect=detect)
+    from . import extractors
+
+    items, preprocessing = list(items), next(iter(confs.values()))["preprocessing"]
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    models = {path: extractors.load(conf["model"]).eval() for path, conf in confs.items()}
+    models = {path: model.to(device) for path, model in models.items()}
+
+    def work(item: tuple[str, list[Path]], detect: Callable | None = None) -> list:
+        name, paths = item
+        wanted = [models[path] for path in paths]
+        extract = partial(extractors.extract_several, wanted, device=device, detect=detect)
+        failure = None
         try:
-            found = extract(image, conf["preprocessing"])
+            found = extract(image_dir / name, preprocessing)
         except UnreadableImage as error:
             if strict:
                 raise
-            black = np.zeros((BLACK, BLACK), np.uint8)
-            found = [
-                {**features, FAILURE: str(error)}
-                for features in extract(black, conf["preprocessing"])
-            ]
-        return dict(zip(keys, found, strict=True))
+            failure = str(error)
+            found = extract(np.zeros((BLACK, BLACK), np.uint8), preprocessing)
+        groups = [
+            _to_group(name, features, confs[path]["storage"], failure)
+            for path, features in zip(paths, found, strict=True)
+        ]
+        return list(zip(paths, groups, strict=True))
 
-    if workers == 1 or not isinstance(base, DoG):
-        for item in images:
+    workers, detect = min(parallel.cores(), len(items)), next(iter(models.values())).detect
+    if workers == 1 or detect is None:
+        for item in items:
             with span("extract"):
-                features = work(item)
-            yield features
+                groups = work(item)
+            yield from groups
         return
+    with _in_processes(detect, workers) as detect:
+        results = parallel.ordered("extract", partial(work, detect=detect), items, workers)
+        with closing(results):  # at once if writing fails: it has processes
+            for groups in results:
+                yield from groups
+
+
+@contextmanager
+def _in_processes(detect: Callable, workers: int) -> Iterator[Callable]:
+    """Give a function that does in processes what another does here."""
     with processes.pool(workers) as pool:
 
-        def detect(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def detect_there(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             try:
                 with span("detect"):
-                    arguments = image, *base.settings
-                    return pool.submit(dog.detect, *arguments).result()
+                    return pool.submit(detect, image).result()
             except BrokenExecutor:
                 raise InputError(
                     "A process that detects keypoints was killed, perhaps for want of memory: "
                     "try fewer cores, for example OMP_NUM_THREADS=1. What is written is kept."
                 ) from None
 
-        yield from parallel.ordered("extract", partial(work, detect=detect), images, workers)
+        yield detect_there
+
+
+def _to_group(
+    name: str, features: dict[str, np.ndarray], storage: str, failure: str | None
+) -> Group:
+    """Return the features of an image as a file keeps them."""
+    if failure:
+        logger.warning(failure)
+    elif len(features["keypoints"]) == 0:
+        logger.warning("Image %s has no keypoints.", name)
+    arrays, attrs = store({k: v for k, v in features.items() if k != "uncertainty"}, storage)
+    attrs["keypoints"] = {"uncertainty": features["uncertainty"]}
+    return name, arrays, attrs | ({"": {FAILURE: failure}} if failure else {})
 
 
 def provenance(conf: dict, as_half: bool = True) -> dict:
@@ -225,10 +212,21 @@ def provenance(conf: dict, as_half: bool = True) -> dict:
         # a file may be moved
         made_by["model"] = {**conf["model"], "projection": Path(projection).name}
         made_by["projection_sha256"] = projections.checksum(projection)
-    base = conf["model"].get("base", conf["model"])
-    if base["name"] == "dog" and base.get("descriptor") in list(DESCRIPTORS):
-        check_weights(base["descriptor"])
+    descriptor = features_confs.descriptor_of(conf["model"])
+    if descriptor in list(DESCRIPTORS):  # a wrong one may be of any kind
+        check_weights(descriptor)
     return made_by
+
+
+def check_model(conf: dict) -> None:
+    """Fail for a bad configuration of a feature before anything is deleted.
+
+    Raises:
+        InputError: when its extractor cannot be made.
+    """
+    from . import extractors
+
+    extractors.load(conf["model"])
 
 
 def keep_present(image_dir: Path, names: list[str], accept_partial: bool) -> list[str]:
@@ -286,72 +284,6 @@ def with_reasons(failed: Mapping[str, str]) -> str:
     return cli.some(
         f"{name} ({reason.rpartition(': ')[2].rstrip('.')})" for name, reason in failed.items()
     )
-
-
-def extract(
-    model: torch.nn.Module,
-    image: Path | np.ndarray,
-    preprocessing: dict,
-    device: str = "cpu",
-) -> dict[str, np.ndarray]:
-    """Extract the features of one image.
-
-    Args:
-        model: an extractor.
-        image: as of `load_image`.
-        preprocessing: as of `load_image`.
-        device: of the model.
-
-    Returns:
-        keypoints (N, 2) float32 (x, y) in pixels of the original image, centres at integers;
-        descriptors (D, N); scores, scales (pixels), oris (degrees) (N,), as far as the model has
-        them; image_size (2,) width, height; and the uncertainty of the keypoints in pixels.
-    """
-    return extract_each([model], image, preprocessing, device)[0]
-
-
-@torch.no_grad()
-def extract_each(
-    models: list[torch.nn.Module],
-    image: Path | np.ndarray,
-    preprocessing: dict,
-    device: str = "cpu",
-    detect: Detect | None = None,
-) -> list[dict[str, np.ndarray]]:
-    """Extract several features of one image, what they have in common once.
-
-    Args:
-        models: extractors, all of one `shared_key`.
-        image: as of `load_image`.
-        preprocessing: as of `load_image`.
-        device: of the models.
-        detect: finds DoG keypoints in place of the models, as `colmap.detect_dog`.
-
-    Returns:
-        Of each model what `extract` returns.
-    """
-    image, size = load_image(image, preprocessing)
-    data = {"image": image.to(device)}
-    bases = [getattr(model, "base", model) for model in models]
-    if detect is not None:
-        data["detected"] = detect(image[0, 0].numpy())
-    elif len(models) > 1 and isinstance(bases[0], DoG):
-        data["detected"] = bases[0].detect(data["image"])
-    ratio = (size / np.array(image.shape[:1:-1])).astype(np.float32)
-    described, extracted = {}, []
-    for model, base in zip(models, bases, strict=True):
-        key = json.dumps(base.conf, sort_keys=True, default=str)
-        if key not in described:
-            described[key] = base(data)
-        found = described[key] if model is base else model.reduce(described[key])
-        features = {key: value[0].cpu().numpy() for key, value in found.items()}
-        features["keypoints"] = (features["keypoints"] + 0.5) * ratio - 0.5
-        if "scales" in features:
-            features["scales"] = features["scales"] * ratio.mean()
-        features["image_size"] = size
-        features["uncertainty"] = model.detection_noise * ratio.mean()
-        extracted.append(features)
-    return extracted
 
 
 def _main() -> None:

@@ -10,17 +10,14 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import torch
 
-from . import logger, matchers
+from . import logger
 from .confs import features as features_confs
 from .confs import matchers as matchers_confs
-from .matchers.nearest_neighbor import GPU_BYTES
 from .runtime import parallel
 from .runtime.executors import SERIAL, Executor
 from .runtime.group_writer import Group, GroupWriter, fill
 from .utils import cli
-from .utils.base_model import dynamic_load
 from .utils.cli import InputError
 from .utils.feature_files import get_descriptors
 from .utils.h5 import file_provenance, open_h5
@@ -44,7 +41,7 @@ def main(
     matches: Path | None = None,
     features_ref: Path | None = None,
     overwrite: bool = False,
-    gpu_bytes: int = GPU_BYTES,
+    gpu_bytes: int | None = None,
     executor: Executor = SERIAL,
 ) -> Path:
     """Match all pairs of a list, each unordered pair once.
@@ -59,7 +56,7 @@ def main(
         matches: the match file itself; needed where `features` is a path.
         features_ref: feature file of the second images; default: `features`.
         overwrite: match anew what is there.
-        gpu_bytes: what similarities of descriptors may take of the memory of a GPU at once.
+        gpu_bytes: what a matcher may take of the memory of a GPU at once; default: 1 GiB.
         executor: does the work.
 
     Returns:
@@ -68,7 +65,7 @@ def main(
     Raises:
         InputError: for an image without features, or no path for the matches.
     """
-    if gpu_bytes < 1:
+    if gpu_bytes is not None and gpu_bytes < 1:
         raise InputError(f"--gpu_bytes {gpu_bytes}: at least 1.")
     number = sum(1 for _ in parse_pairs(pairs))
     if not number:
@@ -128,34 +125,40 @@ def unmatched_pairs(
 def _match(
     conf: dict,
     feature_paths: tuple[Path, Path],
-    gpu_bytes: int,
+    gpu_bytes: int | None,
     pairs: Iterable[tuple[str, str]],
 ) -> Iterator[tuple[None, Group]]:
     """Match pairs while others are read and written, which this thread does."""
+    import torch
+
+    from . import matchers
+
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    matcher = dynamic_load(matchers, conf["model"]["name"])(conf["model"]).eval()
+    matcher = matchers.load(conf["model"]).eval().to(device)
     read = DescriptorCache(CACHE_BYTES)
     drawn = iter(pairs)
     size, workers = (1, parallel.cores()) if device == "cpu" else (PAIRS_ON_GPU, 1)
 
     def match(
-        batch: tuple[list[str], list[tuple[torch.Tensor, torch.Tensor]]],
+        batch: tuple[list[str], list[tuple[np.ndarray, np.ndarray]]],
     ) -> list[tuple[str, dict[str, np.ndarray]]]:
         groups, descriptors = batch
-        moved = {id(part): part.to(device) for pair in descriptors for part in pair}
+        moved = {
+            id(part): torch.from_numpy(part).to(device) for pair in descriptors for part in pair
+        }
         on_device = [(moved[id(part0)], moved[id(part1)]) for part0, part1 in descriptors]
         matched = [
             {
                 "matches0": matches.cpu().numpy().astype(np.int32),
                 "matching_scores0": scores.cpu().numpy().astype(np.float16),
             }
-            for matches, scores in matcher.match(on_device, gpu_bytes)
+            for matches, scores in matcher.match(on_device, gpu_bytes or matchers.GPU_BYTES)
         ]
         return list(zip(groups, matched, strict=True))
 
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
 
-        def read_pair(name0: str, name1: str) -> tuple[torch.Tensor, torch.Tensor]:
+        def read_pair(name0: str, name1: str) -> tuple[np.ndarray, np.ndarray]:
             pair = read(file0, name0), read(file1, name1)
             if pair[0].shape[1] != pair[1].shape[1]:
                 raise InputError(
@@ -164,7 +167,7 @@ def _match(
                 )
             return pair
 
-        def draw() -> Iterator[tuple[list[str], list[tuple[torch.Tensor, torch.Tensor]]]]:
+        def draw() -> Iterator[tuple[list[str], list[tuple[np.ndarray, np.ndarray]]]]:
             while batch := list(islice(drawn, size)):
                 groups = [names_to_pair(*names) for names in batch]
                 yield groups, [read_pair(*names) for names in batch]
@@ -184,15 +187,15 @@ class DescriptorCache:
 
     def __init__(self, max_bytes: int):
         self.max_bytes, self.bytes = max_bytes, 0
-        self.kept: OrderedDict[tuple[str, str], torch.Tensor] = OrderedDict()
+        self.kept: OrderedDict[tuple[str, str], np.ndarray] = OrderedDict()
 
-    def __call__(self, file: h5py.File, name: str) -> torch.Tensor:
+    def __call__(self, file: h5py.File, name: str) -> np.ndarray:
         """Return the descriptors (N, D) float32 of an image in an open feature file."""
         key = file.filename, name
         if key in self.kept:
             self.kept.move_to_end(key)
             return self.kept[key]
-        descriptors = torch.from_numpy(get_descriptors(file, name))
+        descriptors = get_descriptors(file, name)
         self.kept[key] = descriptors
         self.bytes += descriptors.nbytes
         while self.bytes > self.max_bytes and len(self.kept) > 1:
@@ -220,8 +223,7 @@ def _main() -> None:
     parser.add_argument(
         "--gpu_bytes",
         type=int,
-        default=GPU_BYTES,
-        help="bytes of a GPU's memory that similarities of descriptors may take at once; without a "
+        help="bytes of a GPU's memory that a matcher may take at once (default: 1 GiB); without a "
         "GPU it means nothing",
     )
     args = parser.parse_args()

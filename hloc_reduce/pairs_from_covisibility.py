@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
 
 from . import logger
 from .utils import cli, colmap
@@ -63,6 +62,8 @@ def most_covisible(point3D_ids: Iterable[np.ndarray], number: int) -> Iterator[n
         point3D_ids: for each image the point of each keypoint, -1 where it has none.
         number: how many to find.
     """
+    from scipy.sparse import coo_array
+
     points = [ids[ids >= 0] for ids in point3D_ids]
     rows = np.repeat(np.arange(len(points)), [len(ids) for ids in points])
     _, columns = np.unique(np.concatenate(points), return_inverse=True)

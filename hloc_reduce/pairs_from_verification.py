@@ -9,8 +9,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from . import logger
 from .pairs_from_retrieval import rank, read_global
@@ -111,6 +109,9 @@ def more_pairs(
     Returns:
         New pairs, each sorted.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     index = {name: i for i, name in enumerate(names)}
     rows, columns = np.array([(index[a], index[b]) for a, b in connected]).reshape(-1, 2).T
     graph = coo_array((np.ones(len(rows)), (rows, columns)), (len(names),) * 2)

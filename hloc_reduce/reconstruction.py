@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from . import logger
 from .localization.confidence import focal_lengths
@@ -282,6 +280,9 @@ def _plausible(
 
 def _keep_connected(model: pycolmap.Reconstruction) -> None:
     """Drop all images but those of the largest part that is connected by common points."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     ids = sorted(model.reg_image_ids())
     row = {image_id: number for number, image_id in enumerate(ids)}
     seen = [

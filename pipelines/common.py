@@ -13,7 +13,6 @@ import pycolmap
 from hloc_reduce import (
     aggregate_features,
     extract_features,
-    extractors,
     logger,
     match_features,
     pairs_from_retrieval,
@@ -218,7 +217,7 @@ def run_folder(
         made_anew = before.get("features") not in (None, conf["features"])
         overwrite |= made_anew and {**before, "features": conf["features"]} == conf
     elif overwrite or not (outputs / "conf.json").exists():
-        extractors.load(feature_conf["model"])  # is wrong before anything is deleted, if it is
+        extract_features.check_model(feature_conf)
     return RunFolder(
         outputs, conf, overwrite, inputs=[] if retrieval == "vlad" else [Path(retrieval)]
     )

@@ -80,7 +80,7 @@ def get(
         return name, conf
     model = {
         "name": "reduced",
-        "base": conf["model"].get("base", conf["model"]),
+        "base": base_of(conf["model"]),
         "projection": str(projection),
     }
     file, prefix = projections.split_prefix(projection)
@@ -95,10 +95,21 @@ def with_keypoints(model: dict, keypoints: str) -> dict:
     return {**model, "keypoints": keypoints} if model["name"] == "dog" else model
 
 
+def base_of(model: dict) -> dict:
+    """Return the configuration of the extractor below a projection, or of the model itself."""
+    return model.get("base", model)
+
+
+def descriptor_of(model: dict) -> str | None:
+    """Return the base descriptor of a model at DoG keypoints; None for another extractor."""
+    found = base_of(model)
+    return found.get("descriptor", "sift") if found["name"] == "dog" else None
+
+
 def keypoints_of(model: dict) -> str | None:
     """Return the name of the settings of DoG of a model, None if it has options of its own."""
-    base = model.get("base", model)
-    return base.get("keypoints") if base.get("options", HLOC) == HLOC else None
+    found = base_of(model)
+    return found.get("keypoints") if found.get("options", HLOC) == HLOC else None
 
 
 def of_patches(name: str) -> tuple[str, str | None]:
@@ -111,12 +122,10 @@ def of_patches(name: str) -> tuple[str, str | None]:
         InputError: for an unknown one, or one that describes photos only.
     """
     name, conf = get(name)
-    model = conf["model"]
-    base = model.get("base", model)
-    descriptor = base.get("descriptor", "sift")
-    if base["name"] != "dog" or descriptor == COLMAP:
+    descriptor = descriptor_of(conf["model"])
+    if descriptor in (None, COLMAP):
         raise InputError(f"{name} describes photos, not patches.")
-    return choose("descriptor", descriptor, DESCRIPTORS), model.get("projection")
+    return choose("descriptor", descriptor, DESCRIPTORS), conf["model"].get("projection")
 
 
 def add_storage_option(parser: ArgumentParser) -> None:

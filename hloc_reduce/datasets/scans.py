@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from scipy.io import loadmat
 
 from ..utils.cli import InputError
 
@@ -71,6 +70,8 @@ def read_scan(path: Path) -> np.ndarray:
     Raises:
         InputError: when the file is not there or holds no such array.
     """
+    from scipy.io import loadmat
+
     try:
         scan = loadmat(path, variable_names=["XYZcut"])["XYZcut"]
     except KeyError:

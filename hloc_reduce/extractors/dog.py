@@ -1,5 +1,7 @@
 """DoG keypoints by COLMAP's SIFT and a base descriptor of the patches around them."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 import torch
@@ -9,8 +11,8 @@ from ..descriptors import BASES, COLMAP, PATCH_SIZE
 from ..descriptors.model import Descriptor
 from ..detectors import dog
 from ..utils import colmap
-from ..utils.base_model import BaseModel
 from ..utils.cli import InputError, choose
+from . import Extractor
 
 
 def extract_patches(
@@ -71,7 +73,7 @@ def pyramid(image: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-class DoG(BaseModel):
+class DoG(Extractor):
     """hloc's `dog`: DoG keypoints of COLMAP and descriptors of 32x32 patches.
 
     With the descriptor `colmap_sift` these are COLMAP's own, which need no patches. Unlike hloc's
@@ -91,8 +93,6 @@ class DoG(BaseModel):
         "max_keypoints": -1,
         "mr_size": 12,
     }
-    required_inputs = ("image",)
-    detection_noise = 1.0
 
     def _init(self, conf: dict) -> None:
         name = choose("keypoints", conf["keypoints"], dog.KEYPOINTS)
@@ -100,16 +100,18 @@ class DoG(BaseModel):
         self.describe = None if descriptor == COLMAP else Descriptor(descriptor)
         colmap.check_dog_options(conf["options"])
         own = conf["options"] != dog.HLOC
-        self.settings = (conf["options"], False) if own else dog.SETTINGS[name]
+        options, adaptive = (conf["options"], False) if own else dog.SETTINGS[name]
+        self.detect = partial(dog.detect, options=options, adaptive=adaptive)
 
     @property
     def descriptor(self) -> str:
-        """The name that a projection of these descriptors is kept under."""
+        """The name that projections of these descriptors are kept under."""
         return self.conf["descriptor"]
 
-    def detect(self, image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Detect keypoints in an image (1, 1, H, W), as `colmap.detect_dog` returns them."""
-        return dog.detect(image[0, 0].cpu().numpy(), *self.settings)
+    @property
+    def detection(self) -> dict:
+        """What determines the keypoints."""
+        return {key: value for key, value in super().detection.items() if key != "descriptor"}
 
     def _forward(self, data: dict) -> dict:
         """Extract from an image (1, 1, H, W), or describe what was `detected` in it.
@@ -119,7 +121,7 @@ class DoG(BaseModel):
         image = data["image"]
         if image.shape[1] != 1:
             raise InputError("DoG needs grey images: preprocessing: {grayscale: true}.")
-        keypoints, descriptors = data.get("detected") or self.detect(image)
+        keypoints, descriptors = data.get("detected") or self.detect(image[0, 0].cpu().numpy())
         if self.conf["max_keypoints"] >= 0:
             order = np.argsort(-keypoints[:, 2], kind="stable")[: self.conf["max_keypoints"]]
             keypoints, descriptors = keypoints[order], descriptors[order]

@@ -5,9 +5,9 @@ import pkgutil
 import torch
 from torch.nn.functional import normalize
 
-from ..utils.base_model import BaseModel
 from ..utils.cli import InputError, choose
 from ..utils.hloc import extractors_package
+from . import Extractor
 
 # keys of hloc's configurations that say which descriptors there will be
 DETERMINING = ("descriptor", "model_name", "weights")
@@ -17,18 +17,19 @@ def _reason(error: Exception) -> str:
     return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error) else ''}"
 
 
-class HlocExtractor(BaseModel):
+class HlocExtractor(Extractor):
     """The features of an extractor of an installed hloc, as this project's extractors give them.
 
     `conf` is hloc's configuration: `name` and what that extractor takes.
     """
 
     default_conf = {"conf": {}}
-    required_inputs = ("image",)
 
     def _init(self, conf: dict) -> None:
         package, load = extractors_package()
         conf = dict(conf["conf"])
+        if "name" not in conf:
+            raise InputError("The extractor hloc names none of hloc's: conf: {name: ...}.")
         name = conf["name"] = str(conf["name"]).removeprefix("hloc.")
         self.name = choose(
             "extractor", name, [module.name for module in pkgutil.iter_modules(package.__path__)]

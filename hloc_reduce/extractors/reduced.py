@@ -1,12 +1,11 @@
 """Any extractor followed by a frozen projection of its descriptors."""
 
 from .. import projections
-from ..utils.base_model import BaseModel
 from ..utils.cli import InputError
-from . import load_local
+from . import Extractor, load
 
 
-class Reduced(BaseModel):
+class Reduced(Extractor):
     """The features of `base` with descriptors projected to fewer dimensions.
 
     `base` is the configuration of an extractor, of this project or of an installed hloc;
@@ -14,10 +13,10 @@ class Reduced(BaseModel):
     """
 
     default_conf = {"base": {"name": "dog"}, "projection": None}
-    required_inputs = ("image",)
 
     def _init(self, conf: dict) -> None:
-        self.base = load_local(conf["base"])
+        self.extractor = load(conf["base"])
+        self.detect, self.dim = self.base.detect, self.base.dim
         self.project = None
         if conf["projection"] is None:
             return
@@ -28,11 +27,22 @@ class Reduced(BaseModel):
                 f"The projection {conf['projection']} is for {trained_on}, not for "
                 f"{self.base.descriptor}."
             )
+        self.dim = self.project.dim
+
+    @property
+    def base(self) -> Extractor:
+        """The extractor whose descriptors are projected."""
+        return self.extractor
 
     @property
     def detection_noise(self) -> float:
         """The standard deviation of the keypoints in pixels, as the base extractor has it."""
         return self.base.detection_noise
+
+    @property
+    def detection(self) -> dict:
+        """What determines the keypoints."""
+        return self.base.detection
 
     def _forward(self, data: dict) -> dict:
         return self.reduce(self.base(data))

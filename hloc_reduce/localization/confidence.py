@@ -2,11 +2,10 @@
 
 from argparse import ArgumentParser
 from dataclasses import dataclass, replace
+from math import lgamma
 
 import numpy as np
 import pycolmap
-from scipy.spatial import cKDTree
-from scipy.special import gammaln
 
 from ..utils.cli import InputError
 
@@ -166,6 +165,8 @@ def _density(points2D: np.ndarray, projected: np.ndarray, camera: pycolmap.Camer
     visible = np.unique(projected[np.isfinite(projected).all(axis=1)].round(), axis=0)
     if len(visible) <= NEIGHBORS:
         return np.full(len(points2D), uniform)
+    from scipy.spatial import cKDTree
+
     # the nearest may be the keypoint's own
     distance = cKDTree(visible).query(points2D, k=[NEIGHBORS + 1])[0][:, 0]
     share = NEIGHBORS / len(projected)
@@ -173,7 +174,7 @@ def _density(points2D: np.ndarray, projected: np.ndarray, camera: pycolmap.Camer
 
 
 def _log10_choose(n: int, k: int) -> float:
-    return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)) / np.log(10)
+    return (lgamma(n + 1) - lgamma(k + 1) - lgamma(n - k + 1)) / np.log(10)
 
 
 def _log10_tail(successes: int, trials: int, probability: float) -> float:

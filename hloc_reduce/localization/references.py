@@ -8,8 +8,6 @@ from typing import Protocol
 import h5py
 import numpy as np
 import pycolmap
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ..datasets import scans
 from ..utils import colmap
@@ -155,6 +153,9 @@ class SfmMap:
         """Split images into clusters that see no common point, the largest first."""
         if not self.covisibility_clustering:
             return [names]
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
         rows = [self.point_rows(name) for name in names]
         image = np.repeat(np.arange(len(rows)), [len(part) for part in rows])
         point = np.concatenate(rows)

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pycolmap
-from scipy.spatial.transform import Rotation
 
 from ..utils.colmap import cam_from_img
 from .confidence import photo_scale, project, reprojection_errors
@@ -167,7 +166,7 @@ class _View(NamedTuple):
 
     def moved(self, step: np.ndarray) -> "_View":
         """Return the view after a step (7 to 12,), in the order of the degrees of freedom."""
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        turn = pycolmap.Rotation3d(step[:3]).matrix()
         step = np.pad(step, (0, SKEW - len(step)))
         return _View(
             turn @ self.rotation,
@@ -274,8 +273,10 @@ def _turned(
     """Move the principal point by shares of width and height, and turn the camera there."""
     fx, fy, cx, cy = camera.params
     x, y = x * camera.width, y * camera.height
-    turn, _ = Rotation.align_vectors([[0, 0, 1]], [[x / fx, y / fy, 1]])
-    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(turn.as_matrix()), np.zeros(3))
+    ray = np.array([x / fx, y / fy, 1])
+    axis = np.cross(ray, [0, 0, 1]) / np.hypot(*ray[:2])
+    turn = pycolmap.Rotation3d(np.arctan(np.hypot(*ray[:2])) * axis)
+    turn = pycolmap.Rigid3d(turn, np.zeros(3))
     moved = pycolmap.Camera(
         model="PINHOLE",
         width=camera.width,

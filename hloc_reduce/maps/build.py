@@ -11,7 +11,6 @@ import pycolmap
 from .. import (
     aggregate_features,
     extract_features,
-    extractors,
     logger,
     match_features,
     pairs_from_covisibility,
@@ -106,7 +105,7 @@ def main(
         raise InputError(f"A map of photos alone needs two or more: {image_dir} has one.")
     made_by = extract_features.provenance(conf)
     if overwrite or not (map_dir / "conf.json").exists():
-        extractors.load(conf["model"])  # is wrong before anything is deleted, if it is
+        extract_features.check_model(conf)
     files = {f"images/{name}": image_dir / name for name in names}
     files |= {f"model/{name}": path for name, path in model_files.items()}
     fingerprints = provenance.fingerprints(files, provenance.read(map_dir / FINGERPRINTS))

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import torch
 
-from .. import extract_features, extractors
+from .. import aggregators, extractors
 from ..aggregators.vlad import read_vocabulary
 from ..confs import matchers as matchers_confs
 from ..localization import query
@@ -19,7 +19,6 @@ from ..matchers.nearest_neighbor import mutual_nearest
 from ..pairs_from_retrieval import rank, read_global
 from ..runtime import parallel
 from ..utils import colmap
-from ..utils.base_model import dynamic_load
 from ..utils.cli import InputError
 from ..utils.feature_files import dimension, get_descriptors, restore, store, to_colmap
 from ..utils.h5 import open_h5
@@ -63,7 +62,7 @@ class Localizer:
         self.gate = gate.of_matches(matcher, dimension(built.features))
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
         self.extractor = extractors.load(built.conf["model"]).eval().to(self.device)
-        self.vlad = dynamic_load(extractors, RETRIEVAL["model"]["name"])(RETRIEVAL["model"]).eval()
+        self.vlad = aggregators.load(RETRIEVAL["model"]).eval()
         self.vlad.vocabulary = read_vocabulary(built.vocabulary)
         self.reference = SfmMap(colmap.read_model(built.sfm))
         self.names = sorted(self.reference.images)
@@ -105,7 +104,7 @@ class Localizer:
         if camera is None:
             camera, source = intrinsics.infer(image)
             refinement = intrinsics.REFINEMENTS[source]
-        features = extract_features.extract(self.extractor, image, self.preprocessing, self.device)
+        features = extractors.extract(self.extractor, image, self.preprocessing, self.device)
         width, height = map(int, features["image_size"])
         if (camera.width, camera.height) != (width, height):
             raise InputError(

@@ -11,7 +11,6 @@ from .. import (
     extract_features,
     projections,
 )
-from ..aggregators.vlad import read_vocabulary
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
@@ -59,11 +58,11 @@ class Map:
                 "model": dict(conf["model"]),
                 "preprocessing": dict(conf["preprocessing"]),
             }
-            base = conf["model"].get("base", conf["model"])
+            base = features_confs.base_of(conf["model"])
             if base["name"] == "dog" and "keypoints" not in base:  # made before these could adapt
                 self._conf["model"] = features_confs.with_keypoints(conf["model"], "hloc")
             model = self._conf["model"]
-            found = model.get("base", model).get("keypoints", KEYPOINTS[0])
+            found = features_confs.base_of(model).get("keypoints", KEYPOINTS[0])
             self._keypoints = choose("keypoints", content.get("keypoints", found), KEYPOINTS)
             self._sfm = _file_name(content.get("sfm", SFM))
             if "storage" in conf:
@@ -79,6 +78,8 @@ class Map:
 
     def _check(self) -> None:
         """Refuse a map that lacks a file, or has a broken one, before any work is done in it."""
+        from ..aggregators.vlad import read_vocabulary
+
         projection = self.conf["model"].get("projection")
         needed = [self.features, self.descriptors, self.vocabulary]
         needed += [Path(projections.split_prefix(projection)[0])] if projection else []

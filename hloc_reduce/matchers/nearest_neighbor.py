@@ -5,11 +5,10 @@ from collections.abc import Iterator
 import torch
 from torch.nn.utils.rnn import pad_sequence
 
-from ..utils.base_model import BaseModel
+from . import GPU_BYTES, Matcher
 
 PART_BYTES = 2**19  # of descriptors1 at once, which stay in the cache of a core
 TILE = 2**20  # similarities at once
-GPU_BYTES = 2**30  # of the memory of a GPU for similarities
 
 
 def nearest(
@@ -162,11 +161,10 @@ def _nearest_padded(
     return torch.where(accepted, index, -1), best
 
 
-class NearestNeighbor(BaseModel):
+class NearestNeighbor(Matcher):
     """The matches of hloc's `nearest_neighbor`: mutual, and both ways through the ratio test."""
 
     default_conf = {"ratio_threshold": None}
-    required_inputs = ("descriptors0", "descriptors1")
 
     @torch.no_grad()
     def match(

@@ -17,8 +17,6 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-import torch
-
 from ..utils.cli import InputError
 from ..utils.interrupts import interruptible, uninterrupted
 from . import parallel, processes
@@ -140,6 +138,8 @@ def processes_of_this_machine(workers: int | None = None) -> Iterator[Pool]:
     Args:
         workers: how many; default: one for each core.
     """
+    import torch
+
     workers = workers or parallel.cores()
     with processes.pool(workers) as pool:
         yield Pool(pool.submit, lambda: workers, SERIAL if torch.cuda.is_available() else None)

@@ -6,8 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from threading import Lock
 
-import torch
-
 from .trace import span
 
 BACKLOG = 4  # results for each worker that may wait to be taken
@@ -20,6 +18,8 @@ _threads = 1  # of torch before the first of them
 
 def cores() -> int:
     """Return how many cores to use: OMP_NUM_THREADS if it is set, else all."""
+    import torch
+
     with _lock:
         return _threads if _running else torch.get_num_threads()
 
@@ -28,6 +28,8 @@ def cores() -> int:
 def _one_thread_each() -> Iterator[None]:
     """Have torch compute in the thread that asks it to; several such blocks may overlap."""
     global _running, _threads
+    import torch
+
     with _lock:
         if not _running:
             _threads = torch.get_num_threads()

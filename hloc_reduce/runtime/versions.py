@@ -4,24 +4,20 @@ import platform
 from importlib import metadata
 
 import cv2
-import kornia
 import numpy as np
 import pycolmap
-import safetensors
-import torch
 
 from .. import __version__
 
-MODULES = {
-    "kornia": kornia,
-    "numpy": np,
-    "opencv": cv2,
-    "pycolmap": pycolmap,
-    "safetensors": safetensors,
-    "torch": torch,
+MODULES = {"numpy": np, "opencv": cv2, "pycolmap": pycolmap}
+# these take long to import, or may be missing
+DISTRIBUTIONS = {
+    "faiss": "faiss-cpu",
+    "kornia": "kornia",
+    "safetensors": "safetensors",
+    "scikit-learn": "scikit-learn",
+    "torch": "torch",
 }
-# that not every command needs, and the optional one
-DISTRIBUTIONS = {"faiss": "faiss-cpu", "scikit-learn": "scikit-learn"}
 
 
 def versions() -> dict[str, str]:

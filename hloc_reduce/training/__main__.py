@@ -73,7 +73,7 @@ def main(
         paths = {dim: output / f"{descriptor}_{scheme}{dim}.safetensors" for dim in dims}
     base = {"descriptor": descriptor}
     if conf:
-        base = {"descriptor": extractors.load_local(conf["model"]).descriptor, "base": conf}
+        base = {"descriptor": extractors.load(conf["model"]).descriptor, "base": conf}
     settings = {
         path: complete_recipe(scheme, recipe, base["descriptor"], path.stem)
         for path in paths.values()
@@ -167,7 +167,7 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
 
 def base_of(conf: dict) -> dict:
     """Return the configuration of the feature that a reduced one is made from."""
-    return {**conf, "model": conf["model"].get("base", conf["model"])}
+    return {**conf, "model": features_confs.base_of(conf["model"])}
 
 
 def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
@@ -273,7 +273,7 @@ def _main() -> None:
         if args.phototour or args.validate:
             raise InputError("--base describes photos, not the patches of PhotoTour.")
         args.descriptor, conf = [args.base.stem], base_of(features_confs.read(args.base))
-        extractors.load_local(conf["model"])  # is wrong before any work is done, if it is
+        extractors.load(conf["model"])  # is wrong before any work is done, if it is
     of_patches = args.phototour or args.validate
     for descriptor in [] if conf else args.descriptor:
         if of_patches and descriptor == COLMAP:

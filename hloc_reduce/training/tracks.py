@@ -32,7 +32,6 @@ from ..utils.colmap import point3D_ids
 from ..utils.feature_files import get_colmap_keypoints, get_descriptors
 from ..utils.files import replacing
 from ..utils.h5 import get_dataset, open_h5
-from ..utils.images import load_image
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
 from .completion import Completion
@@ -143,7 +142,7 @@ def main(
             if not len(kept):
                 continue
             generator = np.random.default_rng([seed, number])
-            image, size = load_image(images / name, conf["preprocessing"])
+            image, size = extractors.load_image(images / name, conf["preprocessing"])
             ratio = np.array(image.shape[:1:-1]) / size
             scaled = keypoints[name][kept]  # in pixels of the resized image
             scaled[:, :2] = (scaled[:, :2] + 0.5) * ratio - 0.5
@@ -300,7 +299,7 @@ class FeatureDescriber:
     """Describes keypoints by an extractor, which finds them anew in each variant of a photo."""
 
     def __init__(self, model: dict):
-        self.extract = extractors.load_local(model).eval().to(device())
+        self.extract = extractors.load(model).eval().to(device())
         self.mirror = MIRRORS.get(self.extract.descriptor, np.copy)
 
     @torch.no_grad()

@@ -6,8 +6,6 @@ from http.client import HTTPException
 from pathlib import Path
 from urllib.request import urlopen
 
-import torch
-
 from .cli import InputError
 from .files import file_sha256, replacing
 
@@ -16,6 +14,8 @@ TIMEOUT = 5  # seconds to wait for a server
 
 def cache() -> Path:
     """Return torch's folder of downloaded files."""
+    import torch
+
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 

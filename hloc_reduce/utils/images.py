@@ -5,7 +5,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from .cli import InputError, no_folder
 from .parsers import check_names, image_names
@@ -46,38 +45,6 @@ def list_images(
             f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
         )
     return names
-
-
-def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:
-    """Read an image and resize it to at most `resize_max` pixels on its longer side.
-
-    With `resize_force` smaller ones get so many, too.
-
-    Args:
-        image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-        preprocessing: `grayscale`, `resize_max`, `resize_force` of a feature's configuration.
-
-    Returns:
-        The image (1, C, H, W) float32 in [0, 1], and its original (width, height).
-
-    Raises:
-        InputError: when it cannot be read.
-    """
-    grayscale = preprocessing.get("grayscale", False)
-    image = (
-        convert(image, grayscale) if isinstance(image, np.ndarray) else read_image(image, grayscale)
-    )
-    image = image.astype(np.float32)
-    size = np.array(image.shape[1::-1])
-    resize_max = preprocessing.get("resize_max")
-    if resize_max and (size.max() > resize_max or preprocessing.get("resize_force")):
-        # one pixel at least: a panorama may be a thousand times wider than high
-        new_size = np.maximum(1, np.round(size * (resize_max / size.max())).astype(int))
-        smaller = (new_size <= size).all()
-        interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR  # as hloc
-        image = cv2.resize(image, new_size.tolist(), interpolation=interpolation)
-    image = np.atleast_3d(image).transpose(2, 0, 1) / 255
-    return torch.from_numpy(np.ascontiguousarray(image))[None], size
 
 
 def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import yaml
-from scipy.spatial.transform import Rotation
 
 from .cli import InputError, choose, some
 from .files import replacing
@@ -229,11 +228,11 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
             )
         try:
             qw, qx, qy, qz, *translation = map(float, values)
-            if not (
-                np.isfinite(translation).all() and 1e-9 < np.hypot.reduce([qw, qx, qy, qz]) < 1e9
-            ):
+            quaternion = np.array([qx, qy, qz, qw])
+            norm = np.linalg.norm(quaternion)
+            if not (np.isfinite(translation).all() and 1e-9 < norm < 1e9):
                 raise ValueError
-            rotation = pycolmap.Rotation3d(Rotation.from_quat([qx, qy, qz, qw]).as_matrix())
+            rotation = pycolmap.Rotation3d(quaternion / norm)
             poses[name] = pycolmap.Rigid3d(rotation, np.array(translation).reshape(3))
         except ValueError:
             raise InputError(f"{place}: not a pose `name qw qx qy qz tx ty tz`.") from None

@@ -1,14 +1,14 @@
 """What the jobs of a batch have in common on a data set: features, and retrieval."""
 
 import errno
+import json
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from hloc_reduce import aggregate_features, extract_features, extractors, logger
+from hloc_reduce import aggregate_features, extract_features, logger
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import true_poses
-from hloc_reduce.descriptors import DIM
 from hloc_reduce.detectors.dog import KEYPOINTS
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.executors import Executor
@@ -48,6 +48,7 @@ class Shared:
         self.features: dict[Job, Path] = {}
         self.confs: dict[Path, dict] = {}
         self.dims: dict[Path, int] = {}
+        self._detections: dict[Path, str] = {}  # what determines the keypoints of feature files
         self._used: set[str] = set()  # map images
         self._truths: set[Path | None] = set()  # of which options ground_truth is checked
         self._record = provenance.read(folder / RECORD)
@@ -62,6 +63,8 @@ class Shared:
 
     def _check(self, job: Job) -> None:
         """Refuse a job that cannot be run, or note what it needs."""
+        from hloc_reduce import extractors
+
         for name in job.numbers:
             cli.choose(f"option for {self.dataset.name}", name, self.pipeline.NUMBERS)
         if job.retrieval != "vlad" and not Path(job.retrieval).is_file():
@@ -75,14 +78,15 @@ class Shared:
             self._truths.add(job.ground_truth)
         _, conf = features_confs.get(job.feature, None, job.storage, job.keypoints)
         extract_features.provenance(conf)
-        project = getattr(extractors.load(conf["model"]), "project", None)
+        model = extractors.load(conf["model"])
         stored = "" if job.storage == STORAGES[0] else f"-{job.storage}"
         found = "" if job.keypoints == KEYPOINTS[0] else f"-keypoints_{job.keypoints}"
         path = self.folder / f"{conf['output']}{stored}{found}.h5"
         if self.confs.setdefault(path, conf) != conf:
             raise InputError(f"{path.name} is that of another feature, too: rename its YAML file.")
         self.features[job] = path
-        self.dims[path] = project.dim if project else DIM
+        self.dims[path] = model.dim
+        self._detections[path] = json.dumps([model.detection, conf["preprocessing"]], default=str)
         self._used |= set(self.map_names if self._place.whole_map else used)
 
     @contextmanager
@@ -118,7 +122,7 @@ class Shared:
         """Return the feature files that are extracted together."""
         groups: dict[str, list[Path]] = {}
         for path in dict.fromkeys(self.features[job] for job in self.running()):
-            groups.setdefault(extract_features.shared_key(self.confs[path]), []).append(path)
+            groups.setdefault(self._detections[path], []).append(path)
         return list(groups.values())
 
     def retrieval(self, job: Job) -> str:
