@@ -16,7 +16,7 @@ from pathlib import Path
 import command
 import pytest
 
-from hloc_reduce import aggregate_features, extract_features
+from hloc_reduce import aggregate_features, extract_features, extractors
 from hloc_reduce.datasets import scans
 from hloc_reduce.descriptors.model import Descriptor
 from hloc_reduce.detectors import dog
@@ -156,7 +156,7 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
     monkeypatch.setattr(extract_features.parallel, "cores", lambda: 1)  # no process detects
     count(dog, "detect")
     count(Descriptor, "forward")
-    count(extract_features, "read_image")
+    count(extractors, "read_image")
     count(aggregate_features, "main")
     features = ["sift_sv64", "sift", "sift_sv16", "colmap_sift"]
     grid = {"dataset": str(aachen_layout), "feature": features, "matcher": "NN-ratio"}

@@ -9,7 +9,7 @@ import torch
 from kornia.feature.laf import extract_patches_from_pyramid, laf_from_center_scale_ori
 from scipy.spatial import cKDTree
 
-from hloc_reduce import extract_features
+from hloc_reduce import extract_features, extractors
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.descriptors.model import Descriptor
 from hloc_reduce.detectors import dog
@@ -119,19 +119,18 @@ def test_all_cores_extract_the_same(tmp_path, textured):
         extracted = []
         for number in (1, 3):
             torch.set_num_threads(number)
-            conf = {name: features_confs.confs[name]}
-            found = extract_features.extract_all(conf, [(image, [name]) for image in images])
-            extracted.append([features[name] for features in found])
+            conf = features_confs.confs[name]
+            extracted.append(extract_features.main(conf, tmp_path, tmp_path / str(number)))
         torch.set_num_threads(threads)
-        for alone, together in zip(*extracted, strict=True):
-            for key in alone:
-                np.testing.assert_array_equal(alone[key], together[key])
+        with h5py.File(extracted[0]) as alone, h5py.File(extracted[1]) as together:
+            assert len(alone) == len(together) == len(images)
+            for image in images:
+                for key, array in alone[image.name].items():
+                    np.testing.assert_array_equal(array[()], together[image.name][key][()])
     images[3].write_bytes(b"no image")
     torch.set_num_threads(2)
-    conf = {"sift": features_confs.confs["sift"]}
-    results = extract_features.extract_all(conf, [(image, ["sift"]) for image in images])
     with pytest.raises(InputError, match="Cannot read image .*3.png"):
-        list(results)
+        extract_features.main(features_confs.confs["sift"], tmp_path, tmp_path / "broken")
     torch.set_num_threads(threads)
 
 
@@ -156,7 +155,8 @@ def test_several_features_at_once_are_those_of_each(tmp_path, textured, monkeypa
             path = tmp_path / "together" / f"{conf['output']}.h5"
             writer = stack.enter_context(GroupWriter(path, {}))
             features[path] = conf, writer
-        assert len({extract_features.shared_key(conf) for conf, _ in features.values()}) == 1
+        models = [extractors.load(conf["model"]) for conf, _ in features.values()]
+        assert all(model.detection == models[0].detection for model in models)
         files = [f"{i}.png" for i in range(3)]
         extract_features.extract_several(features, tmp_path, files)
     assert len(detected) == len(described) == 3
@@ -197,8 +197,8 @@ def test_extraction_in_original_pixels(tmp_path, textured):
     cv2.imwrite(str(tmp_path / "large.png"), large)
     model = DoG({})
     preprocessing = {"grayscale": True, "resize_max": 320}
-    small = extract_features.extract(model, tmp_path / "small.png", preprocessing)
-    large = extract_features.extract(model, tmp_path / "large.png", preprocessing)
+    small = extractors.extract(model, tmp_path / "small.png", preprocessing)
+    large = extractors.extract(model, tmp_path / "large.png", preprocessing)
     assert large["image_size"].tolist() == [640, 480] and large["uncertainty"] == 2
     np.testing.assert_allclose(large["keypoints"], small["keypoints"] * 2 + 0.5, atol=1e-3)
     np.testing.assert_allclose(large["scales"], small["scales"] * 2, rtol=1e-5)

@@ -16,6 +16,7 @@ import torch
 from packaging.version import Version
 from scipy.io import savemat
 from test_projections import trained
+from torch.nn.functional import normalize
 
 import hloc_reduce
 from hloc_reduce import extractors, localize_sfm, match_features, projections, triangulation
@@ -24,6 +25,7 @@ from hloc_reduce.confs import features
 from hloc_reduce.confs.matchers import confs as matchers
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.hloc import __main__ as command
+from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
 from hloc_reduce.projections import network
 from hloc_reduce.training import __main__ as training
 from hloc_reduce.training import tracks
@@ -405,6 +407,28 @@ CHAINS = {
     "hloc's localization": ["pairs_from_retrieval", "localize_sfm"],
     "hloc's features and matches": ["extract_features", "match_features"],
 }
+
+
+@pytest.mark.hloc
+@pytest.mark.parametrize("ratio_threshold", [None, 0.9])
+@pytest.mark.parametrize("distance_threshold", [None, 1.1])
+@pytest.mark.parametrize("do_mutual_check", [True, False])
+def test_matches_are_hlocs(registered, ratio_threshold, distance_threshold, do_mutual_check):
+    conf = {
+        "name": "nearest_neighbor",
+        "ratio_threshold": ratio_threshold,
+        "distance_threshold": distance_threshold,
+        "do_mutual_check": do_mutual_check,
+    }
+    theirs = importlib.import_module("hloc.matchers.nearest_neighbor").NearestNeighbor(conf)
+    ours = NearestNeighbor(conf)
+    generator = torch.Generator().manual_seed(0)
+    for n, m in ((300, 200), (200, 1), (1, 7)):
+        first, second = (torch.randn(1, 8, k, generator=generator) for k in (n, m))
+        data = {"descriptors0": normalize(first, dim=1), "descriptors1": normalize(second, dim=1)}
+        expected = theirs(data)["matches0"]
+        assert torch.equal(ours(data)["matches0"], expected)
+        assert (expected >= 0).any()
 
 
 @pytest.mark.hloc

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hloc_reduce import extract_features
+from hloc_reduce import extract_features, extractors
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.images import UnreadableImage, read_image
@@ -122,8 +122,8 @@ def test_sizes(size, feature, tmp_path):
     image = cv2.resize(np.random.default_rng(0).integers(0, 256, (60, 80), np.uint8), size[::-1])
     cv2.imwrite(str(tmp_path / "a.jpg"), image)
     conf = features_confs.confs[feature]
-    (found,) = extract_features.extract_all({"": conf}, [(tmp_path / "a.jpg", [""])])
-    features = found[""]
+    model = extractors.load(conf["model"])
+    features = extractors.extract(model, tmp_path / "a.jpg", conf["preprocessing"])
     assert features["image_size"].tolist() == [size[1], size[0]]
     number = len(features["keypoints"])
     assert number == features["descriptors"].shape[1] == len(features["scales"])
@@ -138,4 +138,4 @@ def test_other_failures_are_not_those_of_an_image(picture, tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), picture)
     conf = {**features_confs.confs["sift"], "preprocessing": {"resize_max": 1600}}  # in colour
     with pytest.raises(InputError, match="DoG needs grey images"):
-        list(extract_features.extract_all({"": conf}, [(tmp_path / "a.png", [""])], strict=False))
+        extract_features.main(conf, tmp_path, tmp_path / "o", strict=False)

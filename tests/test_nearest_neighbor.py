@@ -15,36 +15,53 @@ def unit(number, dim, seed):
     return torch.nn.functional.normalize(descriptors, dim=1)
 
 
-def match(descriptors0, descriptors1, ratio_threshold=None):
-    matcher = NearestNeighbor({"ratio_threshold": ratio_threshold})
+def match(descriptors0, descriptors1, ratio_threshold=None, **options):
+    matcher = NearestNeighbor({"ratio_threshold": ratio_threshold, **options})
     result = matcher({"descriptors0": descriptors0.T[None], "descriptors1": descriptors1.T[None]})
     return result["matches0"][0], result["matching_scores0"][0]
 
 
-def by_definition(descriptors0, descriptors1, ratio_threshold):
-    """Mutual nearest neighbours, both through the ratio test, from sorted distances."""
+def by_definition(
+    descriptors0, descriptors1, ratio_threshold, distance_threshold=None, do_mutual_check=True
+):
+    """Nearest neighbours both ways through the tests, from sorted distances."""
     distances = (2 - 2 * descriptors0 @ descriptors1.T).clamp(min=0).sqrt()
 
     def nearest(distances):
         values, indices = distances.sort(dim=1)
         passed = torch.ones(len(values), dtype=torch.bool)
         if ratio_threshold:
-            passed = values[:, 0] <= ratio_threshold * values[:, 1]
+            passed &= values[:, 0] <= ratio_threshold * values[:, 1]
+        if distance_threshold:
+            passed &= values[:, 0] <= distance_threshold
         return [int(i) if ok else -1 for i, ok in zip(indices[:, 0], passed, strict=True)]
 
     forward, backward = nearest(distances), nearest(distances.T)
+    if not do_mutual_check:
+        return forward
     return [j if j >= 0 and backward[j] == i else -1 for i, j in enumerate(forward)]
 
 
+# as hloc's configurations have them
+OPTIONS = {
+    "plain": {},
+    "distance": {"distance_threshold": 0.7},
+    "one way": {"do_mutual_check": False},
+    "distance, one way": {"distance_threshold": 0.7, "do_mutual_check": False},
+}
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
 @pytest.mark.parametrize("ratio_threshold", [None, 0.8, 0.95])
 @pytest.mark.parametrize("sizes", [(200, 300), (300, 2), (2, 2)])
-def test_matches_by_definition(sizes, ratio_threshold):
+def test_matches_by_definition(sizes, ratio_threshold, options):
     base = unit(max(sizes), 16, 0)
     descriptors0 = base[: sizes[0]]
     descriptors1 = torch.nn.functional.normalize(base + 0.5 * unit(len(base), 16, 1), dim=1)
     descriptors1 = descriptors1.flip(0)[: sizes[1]]
-    matches, scores = match(descriptors0, descriptors1, ratio_threshold)
-    assert matches.tolist() == by_definition(descriptors0, descriptors1, ratio_threshold)
+    matches, scores = match(descriptors0, descriptors1, ratio_threshold, **options)
+    expected = by_definition(descriptors0, descriptors1, ratio_threshold, **options)
+    assert matches.tolist() == expected
     assert (scores[matches < 0] == 0).all()
     cosines = (descriptors0[matches >= 0] * descriptors1[matches[matches >= 0]]).sum(1)
     torch.testing.assert_close(scores[matches >= 0], (cosines + 1) / 2)
@@ -73,15 +90,18 @@ def test_a_lone_descriptor_skips_the_ratio_test():
     assert (matches >= 0).sum() == 1
 
 
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
 @pytest.mark.parametrize("ratio_threshold", [None, 0.8, 0.95])
-def test_padded_pairs_match_as_single_ones(ratio_threshold):
+def test_padded_pairs_match_as_single_ones(ratio_threshold, options):
+    distance_threshold = options.get("distance_threshold")
+    limits = {"distance_threshold": distance_threshold, "mutual": "do_mutual_check" not in options}
     sizes = [(200, 300), (300, 2), (2, 150), (5, 1), (1, 5), (1, 1), (300, 300)]
     base = unit(300, 16, 0)
     other = torch.nn.functional.normalize(base + 0.5 * unit(300, 16, 1), dim=1).flip(0)
     pairs = [(base[:n], other[:m]) for n, m in sizes]
-    padded = mutual_nearest_padded(*zip(*pairs, strict=True), ratio_threshold)
+    padded = mutual_nearest_padded(*zip(*pairs, strict=True), ratio_threshold, **limits)
     for pair, (matches, cosines) in zip(pairs, padded, strict=True):
-        expected, expected_cosines = mutual_nearest(*pair, ratio_threshold)
+        expected, expected_cosines = mutual_nearest(*pair, ratio_threshold, **limits)
         assert matches.tolist() == expected.tolist()
         torch.testing.assert_close(cosines, expected_cosines)
 

@@ -294,7 +294,8 @@ def test_features_of_a_file(tmp_path):
         ({"name": "dog", "descriptor": "sfit"}, "Unknown descriptor 'sfit'"),
         ({"name": "dog", "options": {"threshold": 1}}, "The DoG options"),
         ({"name": "dog", "options": {"peak_threshold": "low"}}, "The DoG options"),
-        ({"name": "vlad"}, "VLAD needs|Vlad needs"),
+        ({"name": "vlad"}, "Unknown extractor 'vlad'"),
+        ({"name": "hloc"}, "names none of hloc's|hloc is not installed"),
     ],
 )
 def test_a_wrong_model_is_one_clear_error(model, message):

@@ -1,4 +1,4 @@
-"""Mutual nearest neighbours with a ratio test."""
+"""Nearest neighbours: mutual, with a ratio test and a distance threshold, as in hloc."""
 
 from collections.abc import Iterator
 
@@ -16,8 +16,9 @@ def nearest(
     descriptors1: torch.Tensor,
     ratio_threshold: float | None,
     gpu_bytes: int = GPU_BYTES,
+    distance_threshold: float | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Find the nearest descriptor1 of every descriptor0 that passes the ratio test.
+    """Find the nearest descriptor1 of every descriptor0 that passes the tests.
 
     Args:
         descriptors0: (N, D) of unit norm.
@@ -25,6 +26,7 @@ def nearest(
         ratio_threshold: accept if the distance to the nearest is at most this times the distance
             to the second nearest; None accepts all.
         gpu_bytes: what similarities may take of the memory of a GPU at once.
+        distance_threshold: accept if the distance to the nearest is at most this.
 
     Returns:
         Its index (N,) int64, -1 where it does not pass, and its cosine (N,).
@@ -53,14 +55,29 @@ def nearest(
         index[i] += i * len(parts[0])
     cosine, winner = best.max(dim=0, keepdim=True)
     found = index.gather(0, winner)[0]
-    if ratio_threshold is None:
-        return found, cosine[0]
-    runner_up = torch.maximum(
-        second.gather(0, winner), best.scatter(0, winner, -torch.inf).amax(0, keepdim=True)
-    )
+    runner_up = None
+    if ratio_threshold is not None:
+        runner_up = torch.maximum(
+            second.gather(0, winner), best.scatter(0, winner, -torch.inf).amax(0, keepdim=True)
+        )[0]
+    accepted = _accepted(cosine[0], runner_up, ratio_threshold, distance_threshold)
+    return torch.where(accepted, found, -1), cosine[0]
+
+
+def _accepted(
+    cosine: torch.Tensor,
+    runner_up: torch.Tensor | None,
+    ratio_threshold: float | None,
+    distance_threshold: float | None,
+) -> torch.Tensor:
+    """Tell which nearest neighbours pass the tests, by their cosines and those of the second."""
     # squared distances of unit vectors are 2 - 2 * cosine
-    accepted = 1 - cosine <= ratio_threshold**2 * (1 - runner_up)
-    return torch.where(accepted[0], found, -1), cosine[0]
+    accepted = torch.ones_like(cosine, dtype=torch.bool)
+    if ratio_threshold is not None:
+        accepted &= 1 - cosine <= ratio_threshold**2 * (1 - runner_up)
+    if distance_threshold is not None:
+        accepted &= 2 * (1 - cosine) <= distance_threshold**2
+    return accepted
 
 
 def _argmax(similarity: torch.Tensor) -> torch.Tensor:
@@ -76,8 +93,10 @@ def mutual_nearest(
     ratio_threshold: float | None,
     rows: torch.Tensor | None = None,
     gpu_bytes: int = GPU_BYTES,
+    distance_threshold: float | None = None,
+    mutual: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Match descriptors that are each other's nearest, both ways through the ratio test.
+    """Match descriptors that are each other's nearest, both ways through the tests.
 
     Args:
         descriptors0: (N, D) of unit norm.
@@ -85,6 +104,8 @@ def mutual_nearest(
         ratio_threshold: as of `nearest`.
         rows: (K,) of descriptors0, to find the matches of these only; default: all.
         gpu_bytes: as of `nearest`.
+        distance_threshold: as of `nearest`.
+        mutual: if not, match each row with its nearest, whatever that one's nearest is.
 
     Returns:
         For each of the rows the index of its match (K,) int64, or -1, and its cosine (K,).
@@ -96,12 +117,15 @@ def mutual_nearest(
     # as in hloc, a lone descriptor on either side, which has no second best, skips the test
     if min(len(descriptors0), len(descriptors1)) == 1:
         ratio_threshold = None
-    forward, cosine = nearest(chosen, descriptors1, ratio_threshold, gpu_bytes)
+    limits = ratio_threshold, gpu_bytes, distance_threshold
+    forward, cosine = nearest(chosen, descriptors1, *limits)
+    if not mutual:
+        return forward, cosine
     # the way back only for those that somebody wants
     wanted = forward[forward >= 0].unique()
     backward = torch.full((len(descriptors1),), -1, device=forward.device)
     if len(wanted):
-        returned, _ = nearest(descriptors1[wanted], descriptors0, ratio_threshold, gpu_bytes)
+        returned, _ = nearest(descriptors1[wanted], descriptors0, *limits)
         backward[wanted] = returned
     own = torch.arange(len(descriptors0), device=forward.device) if rows is None else rows
     matched = (backward[forward] == own) & (forward >= 0)
@@ -112,6 +136,8 @@ def mutual_nearest_padded(
     descriptors0: list[torch.Tensor],
     descriptors1: list[torch.Tensor],
     ratio_threshold: float | None,
+    distance_threshold: float | None = None,
+    mutual: bool = True,
 ) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Match several pairs as `mutual_nearest` does, at once, as suits a GPU.
 
@@ -119,6 +145,8 @@ def mutual_nearest_padded(
         descriptors0: of P pairs (N, D), N > 0, of unit norm.
         descriptors1: of these (M, D), M > 0, of unit norm.
         ratio_threshold: as of `nearest`.
+        distance_threshold: as of `nearest`.
+        mutual: as of `mutual_nearest`.
 
     Returns:
         Of each pair the index of the match of each descriptor0 (N,) int64, or -1, and its cosine
@@ -133,11 +161,13 @@ def mutual_nearest_padded(
         padding = torch.arange(similarity.shape[dim], device=sizes.device) >= sizes[:, None]
         similarity.masked_fill_(padding.unsqueeze(3 - dim), -torch.inf)
     lone = torch.minimum(sizes0, sizes1) == 1
-    forward, cosine = _nearest_padded(similarity, 2, ratio_threshold, lone)
-    backward, _ = _nearest_padded(similarity, 1, ratio_threshold, lone)
-    own = torch.arange(similarity.shape[1], device=forward.device)
-    matched = (forward >= 0) & (backward.gather(1, forward.clamp(min=0)) == own)
-    matches = torch.where(matched, forward, -1)
+    limits = ratio_threshold, lone, distance_threshold
+    matches, cosine = _nearest_padded(similarity, 2, *limits)
+    if mutual:
+        backward, _ = _nearest_padded(similarity, 1, *limits)
+        own = torch.arange(similarity.shape[1], device=matches.device)
+        returned = backward.gather(1, matches.clamp(min=0)) == own
+        matches = torch.where(returned, matches, -1)
     return [(matches[i, :n], cosine[i, :n]) for i, n in enumerate(sizes0.tolist())]
 
 
@@ -146,25 +176,34 @@ def _pad(descriptors: list[torch.Tensor]) -> torch.Tensor:
 
 
 def _nearest_padded(
-    similarity: torch.Tensor, dim: int, ratio_threshold: float | None, lone: torch.Tensor
+    similarity: torch.Tensor,
+    dim: int,
+    ratio_threshold: float | None,
+    lone: torch.Tensor,
+    distance_threshold: float | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Do what `nearest` does along a dimension of cosines (P, N, M); `lone` (P,) skip the test."""
     best, index = similarity.max(dim)
-    accepted = best > -torch.inf  # nothing is the nearest of padding
+    # nothing is the nearest of padding
+    accepted = (best > -torch.inf) & _accepted(best, None, None, distance_threshold)
     if ratio_threshold is None:
         return torch.where(accepted, index, -1), best
     hidden = index.unsqueeze(dim)
     similarity.scatter_(dim, hidden, -torch.inf)
     second = similarity.amax(dim)
     similarity.scatter_(dim, hidden, best.unsqueeze(dim))
-    accepted &= (1 - best <= ratio_threshold**2 * (1 - second)) | lone[:, None]
+    accepted &= _accepted(best, second, ratio_threshold, None) | lone[:, None]
     return torch.where(accepted, index, -1), best
 
 
 class NearestNeighbor(Matcher):
-    """The matches of hloc's `nearest_neighbor`: mutual, and both ways through the ratio test."""
+    """The matches of hloc's `nearest_neighbor`, with its options."""
 
-    default_conf = {"ratio_threshold": None}
+    default_conf = {
+        "ratio_threshold": None,
+        "distance_threshold": None,
+        "do_mutual_check": True,
+    }
 
     @torch.no_grad()
     def match(
@@ -182,6 +221,10 @@ class NearestNeighbor(Matcher):
             [0, 1].
         """
         ratio_threshold = self.conf["ratio_threshold"]
+        options = {
+            "distance_threshold": self.conf["distance_threshold"],
+            "mutual": self.conf["do_mutual_check"],
+        }
         found = {}
         if all(descriptors.is_cpu for pair in pairs for descriptors in pair):
             batches = [[i] for i in range(len(pairs))]
@@ -190,9 +233,11 @@ class NearestNeighbor(Matcher):
         for batch in batches:
             parts = [pairs[i] for i in batch]
             if len(batch) == 1:
-                matched = [mutual_nearest(*parts[0], ratio_threshold, gpu_bytes=gpu_bytes)]
+                matched = [mutual_nearest(*parts[0], ratio_threshold, None, gpu_bytes, **options)]
             else:
-                matched = mutual_nearest_padded(*zip(*parts, strict=True), ratio_threshold)
+                matched = mutual_nearest_padded(
+                    *zip(*parts, strict=True), ratio_threshold, **options
+                )
             found.update(zip(batch, matched, strict=True))
         results = [found[i] for i in range(len(pairs))]
         return [(m, torch.where(m >= 0, (cosine + 1) / 2, 0)) for m, cosine in results]
