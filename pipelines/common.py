@@ -123,7 +123,7 @@ def check_options(args: argparse.Namespace) -> None:
         SystemExit: after the features are listed.
     """
     if args.list_features:
-        print("\n".join(features_confs.confs))
+        print(features_confs.table())
         raise SystemExit(0)
     if args.matcher is not None:
         cli.choose("matcher", args.matcher, matchers_confs.confs)

@@ -18,6 +18,7 @@ from hloc_reduce.confs import features
 from hloc_reduce.confs.features import confs
 from hloc_reduce.extractors.reduced import Reduced
 from hloc_reduce.projections import network, released
+from hloc_reduce.projections.files import WEIGHTS
 from hloc_reduce.projections.network import MLP, Projection
 from hloc_reduce.utils import downloads
 from hloc_reduce.utils.cli import InputError
@@ -116,7 +117,7 @@ def test_everything_ships_in_25_megabytes():
         if "@" not in name
     }
     assert set(projections.names()) == expected and len(expected) == 59
-    assert sum(path.stat().st_size for path in projections.WEIGHTS.iterdir()) < 25e6
+    assert sum(path.stat().st_size for path in WEIGHTS.iterdir()) < 25e6
 
 
 @pytest.mark.parametrize("name", projections.names())

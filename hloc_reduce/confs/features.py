@@ -4,15 +4,18 @@
 `<descriptor>_nested@<dim>` its first numbers. `colmap_sift` is COLMAP's own SIFT.
 """
 
+import re
 from argparse import ArgumentParser
 from pathlib import Path
 
 from .. import projections
-from ..descriptors import COLMAP, DESCRIPTORS
+from ..descriptors import COLMAP, DESCRIPTORS, DIM
 from ..detectors.dog import HLOC, KEYPOINTS
+from ..projections.released import FILES as RELEASED
 from ..utils.cli import InputError, choose
 from ..utils.feature_files import STORAGES
 from ..utils.parsers import read_yaml
+from ..utils.tables import aligned
 
 RECOMMENDED = "colmap_sift_sv64"  # the fastest, and the best measured (docs/performance.md)
 DIMS = (64, 32, 24, 16)
@@ -45,6 +48,36 @@ confs = {name: feature(name, base(name)) for name in SCHEMES} | {
     for descriptor in SCHEMES
     for name in names(descriptor)
 }
+
+
+def dimension(name: str) -> int:
+    """Return how many numbers the descriptors of a key of `confs` have."""
+    digits = re.search(r"\d+$", name)
+    if digits:
+        return int(digits[0])
+    return DIMS[0] if name.endswith("_nested") else DIM
+
+
+def table() -> str:
+    """Format the features with the size of their descriptors, as float16, and their weights."""
+    lines = [("feature", "numbers", "bytes", "weights")]
+    for name, conf in confs.items():
+        dim = dimension(name)
+        lines.append((name, str(dim), str(2 * dim), _weights(conf["model"])))
+    return aligned(lines, left=4)
+
+
+def _weights(model: dict) -> str:
+    """Say where the weights of a model come from."""
+    projection = model.get("projection")
+    if projection is None:
+        descriptor = DESCRIPTORS.get(model["descriptor"])
+        return "downloaded on first use" if descriptor and descriptor.urls else "none needed"
+    if projections.split_prefix(projection)[0] in projections.names():
+        return "shipped"
+    if projection in RELEASED:
+        return "downloaded on first use, released by the paper's authors"
+    return "to be trained: docs/training.md"
 
 
 def get(

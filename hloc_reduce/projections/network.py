@@ -12,7 +12,8 @@ from torch import nn
 from ..descriptors import DESCRIPTORS
 from ..utils.cli import InputError
 from ..utils.files import replacing
-from . import find, released, split_prefix
+from . import released
+from .files import find, split_prefix
 
 
 class MLP(nn.Module):

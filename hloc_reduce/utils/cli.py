@@ -29,6 +29,9 @@ def run(main: Callable[[], None]) -> None:
         main()
         if spec and spec.name.startswith(interrupts.COMMANDS):
             interrupts.ignore()
+    except BrokenPipeError:  # of a pager or head that has read enough
+        sys.stdout = None
+        sys.exit(1)
     except (InputError, OSError) as error:
         logger.error(error)
         sys.exit(2)
