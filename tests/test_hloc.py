@@ -180,7 +180,7 @@ def test_a_broken_hloc_and_a_folder_of_its_name(double, monkeypatch):
     with pytest.raises(InputError, match="hloc cannot be imported .*not_there"):
         hloc_reduce.register()
     # what Python finds where a folder has the name but is no package
-    monkeypatch.setattr(plugin, "find_spec", lambda name: ModuleSpec(name, None))
+    monkeypatch.setattr("hloc_reduce.utils.hloc.find_spec", lambda name: ModuleSpec(name, None))
     with pytest.raises(InputError, match="hloc is not installed"):
         hloc_reduce.register()
 
@@ -198,7 +198,8 @@ def test_features_of_files_are_registered_by_their_names(double, tmp_path):
 
 
 def test_a_missing_hloc_is_named(monkeypatch, forgotten):
-    monkeypatch.setattr(plugin, "is_installed", lambda: False)
+    for module in ("utils.hloc", "extractors"):
+        monkeypatch.setattr(f"hloc_reduce.{module}.is_installed", lambda: False)
     with pytest.raises(InputError, match="hloc is not installed: pip install"):
         hloc_reduce.register()
     with pytest.raises(InputError, match="Unknown extractor 'disk'"):

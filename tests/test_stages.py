@@ -18,7 +18,7 @@ from hloc_reduce import (
     triangulation,
 )
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.localization import query
+from hloc_reduce.localization import query, stage
 from hloc_reduce.localization.confidence import AGREEMENT, AGREEMENT_RATIO
 from hloc_reduce.localization.records import log_file, pose_of, read_records
 from hloc_reduce.localization.references import SfmMap
@@ -261,7 +261,7 @@ def test_descriptors_in_memory_are_bounded(tmp_path):
     with h5py.File(path) as file:
         read = match_features.DescriptorCache(max_bytes=2 * 4 * 10 * 4)
         first = read(file, "a")
-        assert first.shape == (10, 4) and first.is_contiguous()
+        assert first.shape == (10, 4) and first.flags["C_CONTIGUOUS"]
         read(file, "b")
         assert read(file, "a") is first  # and is the last one used now
         read(file, "c")
@@ -568,7 +568,7 @@ def test_the_gate_knows_the_matcher_by_its_file(built, conf, agreement, monkeypa
             conf, built.loc_pairs, built.features, matches=built.loc_matches, overwrite=True
         )
     gates, localize = [], query.localize
-    monkeypatch.setattr(query, "localize", lambda *a: gates.append(a[-1]) or localize(*a))
+    monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[-1]) or localize(*a))
     assert built.localize()["query/6.jpg"]["localized"]
     assert {gate.min_agreement for gate in gates} == {agreement}
 
