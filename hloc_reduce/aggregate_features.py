@@ -85,6 +85,13 @@ def main(
     return output
 
 
+def files_of(features: Path) -> list[Path]:
+    """Return the files and folders that `main` may write beside a feature file."""
+    descriptors = features.with_name(f"{confs['vlad']['output']}_{features.stem}.h5")
+    pieces = descriptors.with_name(f"{descriptors.name}.pieces")
+    return [descriptors, pieces, vocabulary_of(descriptors)]
+
+
 def vocabulary_of(descriptors: Path) -> Path:
     """Return the file of the vocabulary that was learned for a file of global descriptors."""
     return descriptors.with_suffix(".vocabulary.safetensors")

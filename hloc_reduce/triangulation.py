@@ -14,6 +14,7 @@ from .runtime import provenance
 from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.feature_files import get_colmap_keypoints
+from .utils.files import announce
 from .utils.h5 import open_h5
 from .utils.match_files import get_matches
 from .utils.parsers import parse_retrieval
@@ -131,6 +132,7 @@ def replacing_map(
             f"{sfm_dir} is not a map that this program or hloc triangulated, so it is not "
             "replaced. Choose another folder."
         )
+    announce(sfm_dir)
     building = sfm_dir.with_name(f".{sfm_dir.name}.tmp")
     shutil.rmtree(building, ignore_errors=True)
     building.mkdir(parents=True)

@@ -1,10 +1,8 @@
 """What the pipelines share: options, retrieval, and what a run leaves behind."""
 
 import argparse
-import glob
 import hashlib
 import os
-import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -34,7 +32,7 @@ from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.runtime.versions import versions
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.files import write_csv
+from hloc_reduce.utils.files import delete, write_csv
 from hloc_reduce.utils.h5 import get_text, list_h5_names, open_h5
 from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.parsers import parse_pairs, parse_retrieval, write_pairs
@@ -257,8 +255,8 @@ def _aggregate(features: Path, map_names: list[str]) -> Path:
     stamp = features.with_name(f"{name}.made_from.json")
     learned_from = {"images": hashlib.sha256("\n".join(map_names).encode()).hexdigest()}
     if provenance.read(stamp) not in ({}, learned_from):
-        for made in features.parent.glob(f"{glob.escape(name)}*"):
-            shutil.rmtree(made) if made.is_dir() else made.unlink()
+        for made in aggregate_features.files_of(features):
+            delete(made)
     provenance.write(stamp, learned_from)
     return aggregate_features.main(conf, features, map_names)
 

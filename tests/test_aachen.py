@@ -221,8 +221,16 @@ def test_outputs_of_another_configuration_are_refused(aachen_layout, tmp_path, m
     message = refused(monkeypatch, caplog, *arguments, "--matcher", "NN-mutual")
     assert "matcher" in message and "--overwrite" in message
     assert (outputs / "summary.json").read_bytes() == before
+    foreign = ("settings.json", "sfm_notes.txt", "my-feats-1.h5", ".mine.tmp", "sfm_old/a.bin")
+    for name in foreign:
+        (outputs / name).parent.mkdir(exist_ok=True)
+        (outputs / name).write_text("mine")
+    left = outputs / ".summary.json.123.tmp"  # of a killed run
+    left.write_text("{")
     run(monkeypatch, *arguments, "--matcher", "NN-mutual", "--overwrite")
-    assert outcome(outputs)[0]["matcher"] == "NN-mutual"
+    assert outcome(outputs)[0]["matcher"] == "NN-mutual" and not left.exists()
+    assert all((outputs / name).read_text() == "mine" for name in foreign)
+    assert not list(outputs.glob("*_NN-mutual-ratio.8_*")) and not list(outputs.glob("sfm_*ratio"))
 
 
 def test_grey_photos_only_give_an_empty_map(aachen_layout, tmp_path, monkeypatch, caplog):

@@ -764,12 +764,12 @@ def test_lists_of_hpatches_round_trip(tmp_path, rows):
 def test_lists_are_utf8_whatever_the_locale(tmp_path):
     code = (
         "import sys; from pathlib import Path; from pycolmap import Camera, Rigid3d; "
-        "from hloc_reduce import intrinsics, io, parsers; name = '\\xe9\\u6771.jpg'; "
+        "from hloc_reduce.maps import intrinsics; from hloc_reduce.utils import files, parsers; name = '\\xe9\\u6771.jpg'; "
         "folder = Path(sys.argv[1]); "
         "camera = Camera(model='SIMPLE_PINHOLE', width=9, height=9, params=[9, 4, 4]); "
         "parsers.write_poses({name: Rigid3d()}, folder / 'poses.txt'); "
         "intrinsics.write_queries({name: (camera, 'list')}, folder / 'queries.txt'); "
-        "io.write_csv([{'query': name}], folder / 'queries.csv')"
+        "files.write_csv([{'query': name}], folder / 'queries.csv')"
     )
     environment = {**os.environ, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], env=environment, check=True)

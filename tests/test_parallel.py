@@ -114,7 +114,7 @@ def test_processes_work_and_end_with_a_script(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import os, time\n"
-        "from hloc_reduce import processes\n"
+        "from hloc_reduce.runtime import processes\n"
         "with processes.pool(2) as pool:\n"
         "    print(pool.submit(os.getpid).result(), flush=True)\n"
         "    pool.submit(time.sleep, 100).result()\n"

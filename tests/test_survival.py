@@ -36,8 +36,10 @@ def test_a_second_run_is_refused_and_a_dead_one_is_not_in_the_way(
     aachen_layout, tmp_path, monkeypatch, caplog
 ):
     outputs = tmp_path / "outputs"
-    holder = f"from hloc_reduce.io import Lock; from pathlib import Path; import time; \
+    holder = (
+        f"from hloc_reduce.runtime.outputs import Lock; from pathlib import Path; import time; \
 lock = Lock(Path({str(outputs)!r})); print('held', flush=True); time.sleep(60)"
+    )
     other = subprocess.Popen([sys.executable, "-c", holder], stdout=subprocess.PIPE, text=True)
     try:
         assert other.stdout.readline() == "held\n"
@@ -92,8 +94,8 @@ def test_an_interrupted_run_writes_what_is_done(tmp_path, kind, code):
 import time
 import numpy, pycolmap
 from pathlib import Path
-from hloc_reduce import cli
-from hloc_reduce.group_writer import GroupWriter
+from hloc_reduce.utils import cli
+from hloc_reduce.runtime.group_writer import GroupWriter
 
 def main():
     with GroupWriter(Path({str(tmp_path / "f.h5")!r}), {{}}) as writer:

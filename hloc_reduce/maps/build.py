@@ -130,6 +130,7 @@ def main(
         made_from,
         overwrite,
         inputs=[path for path in (image_dir, model, projection) if path is not None],
+        kept=(PLACE, FINGERPRINTS),
     ) as folder:
         if (map_dir / FINISHED).exists():
             built = Map(map_dir)
@@ -138,7 +139,7 @@ def main(
                     f"The map {map_dir} was made with --camera_mode {built.camera_mode}: give it "
                     "again, choose other --outputs, or --overwrite."
                 )
-            built.drop_others()  # which a killed run left
+            _drop_others(folder, built)  # which a killed run left
             return built
         if not (map_dir / PLACE).exists():
             with replacing(map_dir / PLACE) as temporary:
@@ -172,7 +173,7 @@ def main(
         }
         provenance.write(map_dir / FINISHED, summary)
         built = Map(map_dir)
-        built.drop_others()
+        _drop_others(folder, built)
         provenance.write(map_dir / FINISHED, {**summary, "bytes": folder.bytes()})
         return built
 
@@ -307,6 +308,16 @@ class _Building:
     def _match(self, pairs: Path, features: Path) -> Path:
         with self.folder.stage("match_map"):
             return match_features.main(self.matcher_conf, pairs, features.stem, self.map_dir)
+
+
+def _drop_others(folder: RunFolder, built: Map) -> None:
+    """Delete what other attempts to build a map wrote."""
+    kept = built.features.stem
+    plain = kept.removesuffix(MORE)
+    for name in {plain, f"{plain}{MORE}"} - {kept}:
+        begins = f"{name}.h5", f"{name}_matches", f"{RETRIEVAL['output']}_{name}."
+        folder.delete(other for other in folder.written if other.startswith(begins))
+    folder.delete({SFM, f"{SFM}{MORE}", f"{SFM}{FURTHER}"} - {built.sfm.name})
 
 
 def _keep_projection(conf: dict, folder: Path) -> dict:

@@ -1,8 +1,6 @@
 """Maps to localize in: the points, features and global descriptors of photos, kept in a folder."""
 
-import glob
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -144,19 +142,6 @@ class Map:
     def sfm(self) -> Path:
         """The folder of the COLMAP model."""
         return self.folder / self._sfm
-
-    def drop_others(self) -> None:
-        """Delete what other attempts to build the map left."""
-        kept = self._conf["output"]
-        plain = kept.removesuffix(MORE)
-        for name in {plain, f"{plain}{MORE}"} - {kept}:
-            escaped = glob.escape(name)
-            others = [f"{escaped}.h5*", f"{escaped}_matches*"]
-            others.append(f"{RETRIEVAL['output']}_{escaped}.*")
-            for path in [path for pattern in others for path in self.folder.glob(pattern)]:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-        for name in {SFM, f"{SFM}{MORE}", f"{SFM}{FURTHER}"} - {self._sfm}:
-            shutil.rmtree(self.folder / name, ignore_errors=True)
 
     @property
     def features(self) -> Path:

@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 
 from ..utils.cli import InputError
-from ..utils.files import replacing
+from ..utils.files import announce, replacing
 from ..utils.h5 import get_text, iterate_h5_names, open_h5, reading, set_text, write_h5
 from . import trace
 from .executors import Executor, Item
@@ -59,6 +59,8 @@ class GroupWriter:
     ):
         self.path = path
         self.folder = path.with_name(path.name + ".pieces")
+        announce(path)
+        announce(self.folder)
         path.parent.mkdir(parents=True, exist_ok=True)
         if overwrite:
             self._drop_pieces()

@@ -1,10 +1,10 @@
 """Outputs folders, each of one configuration."""
 
 import fcntl
+import glob
 import json
 import os
 import platform
-import shutil
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from .. import logger
 from ..utils.cli import InputError
-from ..utils.files import replacing
+from ..utils.files import delete, observing, replacing
 from . import provenance, trace
 
 LOCK = ".lock"  # in an outputs folder
@@ -46,8 +46,6 @@ class Lock:
             raise InputError(f"Another run is at work in {folder} ({who}).") from None
         except OSError as error:
             logger.warning("%s cannot be locked (%s): start no second run in it.", folder, error)
-        for left in folder.glob(".*.tmp"):  # by a killed run: only who has the lock makes these
-            shutil.rmtree(left) if left.is_dir() else left.unlink()
         with suppress(OSError):  # of a full disk: it is locked all the same
             self.file.truncate(0)
             self.file.write(f"process {os.getpid()} on {platform.node()}")
@@ -59,20 +57,10 @@ class Lock:
             self.file.close()
 
 
-# what a run leaves in its folder, first what says that it is whole; but for lists of pairs, which
-# are always written anew
-PRODUCTS = (
-    "map.json",
-    "*feats-*",
-    "points3D.h5*",
-    ".*.tmp",
-    "sfm*",
-    "*_hloc_*",
-    "queries.csv",
-    "s*.json",
-)
 STAGES = "stages.json"
-BOOKKEEPING = {"conf.json", STAGES, "summary.json", "queries.csv", "trace.json"}
+FILES = "files.json"  # names of what runs wrote in their folder, noted before it is written
+WHOLE = ("map.json", "queries.csv", "summary.json")  # say that a run is whole, so deleted first
+BOOKKEEPING = {"conf.json", STAGES, FILES, "summary.json", "queries.csv", "trace.json"}
 DELETING = {"is": "being deleted"}
 NAMED = 3  # differences that a message names
 SHORT = 40  # characters of values that it quotes
@@ -81,16 +69,20 @@ SHORT = 40  # characters of values that it quotes
 class RunFolder:
     """An output folder that belongs to one configuration and knows how long its stages took.
 
-    In a `with` block no other run can write to it.
+    In a `with` block no other run can write to it, and what is written in it is noted.
 
     Args:
         path: the folder; made if need be.
         conf: what determines the results.
-        overwrite: begin anew, with this configuration; what a run left in the folder is deleted
-            first, so that a run that is stopped can go on without `overwrite`.
+        overwrite: begin anew, with this configuration; what runs wrote in the folder, by its
+            record, is deleted first, so that a run that is stopped can go on without `overwrite`.
         inputs: files and folders that the run reads, which are not to be deleted.
         stale: where the configuration is the same, begin anew all the same: what the results
             were made from has changed.
+        kept: names of files that stay all the same.
+
+    Attributes:
+        written: names of the files and folders that runs wrote in it.
 
     Raises:
         InputError: when the folder holds results of another configuration, or an input that would
@@ -104,20 +96,61 @@ class RunFolder:
         overwrite: bool,
         inputs: Iterable[Path] = (),
         stale: bool = False,
+        kept: Iterable[str] = (),
     ):
-        self.path, self._stages_file = path, path / STAGES
+        self.path, self._stages_file, self.kept = path, path / STAGES, {*kept}
         self._lock = Lock(path)
         try:
+            self.written = self._read_written()
+            self._drop_temporaries()
             self._claim(conf, overwrite, inputs, stale)
         except BaseException:
             self._lock.release()
             raise
 
     def __enter__(self) -> "RunFolder":
+        self._observing = observing(self._note)
+        self._observing.__enter__()
         return self
 
     def __exit__(self, *_) -> None:
+        self._observing.__exit__(None, None, None)
         self._lock.release()
+
+    def _read_written(self) -> set[str]:
+        """Return the names of what runs wrote in the folder."""
+        noted = provenance.read(self.path / FILES).get("written")
+        if noted is None:  # of a run before there was this record
+            stages = provenance.read(self._stages_file).values()
+            noted = [name for stage in stages for name in stage["wrote"]]
+            noted += WHOLE if noted else ()
+        names = {str(name) for name in noted}
+        return {name for name in names if Path(name).name == name and name not in self.kept}
+
+    def _note(self, path: Path) -> None:
+        """Note, before it is written, the file or folder in this one that a path leads to."""
+        if not path.resolve().is_relative_to(self.path.resolve()):
+            return
+        name = path.resolve().relative_to(self.path.resolve()).parts[0]
+        if (
+            name not in self.written
+            and name not in self.kept
+            and name not in BOOKKEEPING - {*WHOLE}
+        ):
+            self.written.add(name)
+            provenance.write(self.path / FILES, {"written": sorted(self.written)})
+
+    def delete(self, names: Iterable[str]) -> None:
+        """Delete files and folders that runs wrote; those of other names are left alone."""
+        for name in [name for name in names if name in self.written]:
+            delete(self.path / name)
+            self.written.discard(name)
+
+    def _drop_temporaries(self) -> None:
+        """Delete what a killed run left: only who has the lock makes these."""
+        for name in (*self.written, *BOOKKEEPING):
+            for left in self.path.glob(f".{glob.escape(name)}.*tmp"):
+                delete(left)
 
     def _claim(self, conf: dict, overwrite: bool, inputs: Iterable[Path], stale: bool) -> None:
         """Check that the folder is of a configuration, or make it so."""
@@ -145,8 +178,9 @@ class RunFolder:
             # whoever finds this, because the deletion was cut short, deletes again
             with replacing(conf_file) as temporary:
                 temporary.write_text(json.dumps(DELETING))
-            for product in (file for pattern in PRODUCTS for file in path.glob(pattern)):
-                shutil.rmtree(product) if product.is_dir() else product.unlink()
+            self.delete(sorted(self.written, key=lambda name: name not in WHOLE))
+            for name in (STAGES, FILES):
+                delete(path / name)
         if overwrite or before is None:
             with replacing(conf_file) as temporary:
                 temporary.write_text(json.dumps(conf, indent=1))

@@ -5,9 +5,27 @@ import filecmp
 import hashlib
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+_observers: list[Callable[[Path], None]] = []
+
+
+@contextmanager
+def observing(observe: Callable[[Path], None]) -> Iterator[None]:
+    """Call a function with the path of each file and folder that is to be written in a block."""
+    _observers.append(observe)
+    try:
+        yield
+    finally:
+        _observers.remove(observe)
+
+
+def announce(path: Path) -> None:
+    """Tell observers of a file or folder that is to be written."""
+    for observe in _observers:
+        observe(path)
 
 
 @contextmanager
@@ -16,6 +34,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     A file that is replaced by an equal one keeps its time, so that nothing is made anew of it.
     """
+    announce(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -57,3 +76,11 @@ def file_sha256(path: Path) -> str:
     """Return the sha256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def delete(path: Path) -> None:
+    """Delete a file or a folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -17,6 +17,7 @@ from hloc_reduce.runtime.outputs import STAGES, RunFolder
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.files import delete
 from hloc_reduce.utils.h5 import get_text, open_h5
 
 from .. import common
@@ -200,7 +201,8 @@ class Shared:
                 ids[path.name] = get_text(file, "id")
         before = self._record.get("ids", {})
         if any(before.get(name, made) != made for name, made in ids.items()):
-            for derived in self.folder.glob(f"{aggregate_features.confs['vlad']['output']}*"):
-                derived.unlink()
+            for path in self.confs:
+                for derived in aggregate_features.files_of(path):
+                    delete(derived)
         self._record = {"vlad": self._vlad_features().name, "ids": before | ids}
         provenance.write(self.folder / RECORD, self._record)
