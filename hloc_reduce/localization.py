@@ -17,6 +17,7 @@ from .cli import InputError
 from .confidence import DEFAULT_GATE, RIVAL, Gate
 from .executors import SERIAL, Executor
 from .group_writer import failure_of, failures
+from .intrinsics import from_list, to_list
 from .io import (
     find_pair,
     get_colmap_keypoints,
@@ -282,17 +283,12 @@ def pose(record: dict) -> pycolmap.Rigid3d | None:
 
 def camera(record: dict) -> pycolmap.Camera:
     """Return the intrinsics of a query's record, as they were refined."""
-    model, width, height, *params = record["camera"]
-    return pycolmap.Camera(model=model, width=width, height=height, params=params)
+    return from_list(record["camera"])
 
 
 def to_stamp(queries: list[tuple[str, pycolmap.Camera | None]]) -> dict[str, list | None]:
     """Return the intrinsics of queries as a stamp has them."""
-    return {name: camera and _intrinsics(camera) for name, camera in queries}
-
-
-def _intrinsics(camera: pycolmap.Camera) -> list:
-    return [camera.model.name, camera.width, camera.height, *camera.params.tolist()]
+    return {name: camera and to_list(camera) for name, camera in queries}
 
 
 def read_records(path: Path) -> dict[str, dict]:
@@ -411,7 +407,7 @@ def _record(
         "agreement": info["agreement"],
         "qvec": qvec,
         "tvec": tvec,
-        "camera": _intrinsics(info["camera"]),
+        "camera": to_list(info["camera"]),
         "max_error": info["max_error"],
         **{key: info[key] for key in numbers},
         "db": info["db"] if localized else next(iter(names), None),

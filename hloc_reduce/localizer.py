@@ -52,7 +52,7 @@ class Localizer:
         built = Map(map_dir)
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.preprocessing = built.conf["preprocessing"]
-        self.storage = built.storage
+        self.storage, self.cameras = built.storage, built.cameras
         matcher = matchers_confs.confs[built.matcher]["model"]
         self.ratio_threshold = matcher.get("ratio_threshold")
         self.gate = gate.of_matches(matcher, dimension(built.features))
@@ -78,14 +78,14 @@ class Localizer:
 
         Args:
             image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-            camera: its intrinsics; default: from the EXIF data of the file, or guessed, and
-                estimated with the pose.
+            camera: its intrinsics; default: those of the map's camera if the file's EXIF data tell
+                that it took the photo, else EXIF's or guessed, and estimated with the pose.
 
         Returns:
             The pose, camera from world, in the units of the map, or None if the photo cannot be
             localized, for the `reason` in info; and info, as of `localization.localize`, with
             `points2D` (M, 2) in COLMAP's pixels, `retrieved`, names of map images, best first,
-            `intrinsics` ("given", "EXIF" or "guess"), and `seconds` by stage.
+            `intrinsics` ("given", "map", "EXIF" or "guess"), and `seconds` by stage.
 
         Raises:
             InputError: when the image cannot be read, or the camera is of another size.
@@ -98,7 +98,7 @@ class Localizer:
 
         source, refinement = "given", {}
         if camera is None:
-            camera, source = intrinsics.infer(image)
+            camera, source = intrinsics.infer(image, self.cameras)
             refinement = intrinsics.REFINEMENTS[source]
         features = extract_features.extract(self.extractor, image, self.preprocessing, self.device)
         width, height = map(int, features["image_size"])

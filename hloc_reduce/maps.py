@@ -19,6 +19,7 @@ from . import (
     colmap,
     extract_features,
     extractors,
+    intrinsics,
     logger,
     match_features,
     pairs_from_covisibility,
@@ -73,6 +74,8 @@ class Map:
             self.num_images = int(content["images_with_pose"])
             self.num_points3D = int(content["points3D"])
             self.camera_mode = content.get("camera_mode")  # None for the cameras of a model
+            known = content.get("cameras", {}).items()
+            self.cameras = {name: intrinsics.from_list(values) for name, values in known}
             conf = content["conf"]
             self._conf = {
                 "output": _file_name(conf["output"]),
@@ -326,6 +329,10 @@ def main(
             "images": len(building.names),
             "images_with_pose": sfm.num_reg_images(),
             "points3D": sfm.num_points3D(),
+            "cameras": {
+                name: intrinsics.to_list(camera)
+                for name, camera in intrinsics.of_map(sfm, image_dir).items()
+            },
             "seconds": folder.seconds(),
         }
         stamps.write(map_dir / FINISHED, summary)

@@ -16,6 +16,7 @@ from .cli import InputError
 from .confidence import focal_lengths
 from .extract_features import list_images
 from .io import list_h5_names
+from .overlays import drop_overlays
 from .paths import strings_as_paths
 from .triangulation import STAMP, read_matches, replacing_map
 
@@ -141,6 +142,7 @@ def reconstruct(
         "images": names,
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
+        "overlays": "dropped",
         "attempts": [{}, *attempts],
         "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
         "once": once,
@@ -153,6 +155,7 @@ def reconstruct(
 
     with replacing_map(sfm_dir, made_from) as building:
         keypoints, _, found = read_matches(names, pairs, features, matches, min_match_score)
+        found = drop_overlays(keypoints, found)
         verified = {
             pair: (indices, indices if skip_geometric_verification else None)
             for pair, indices in found.items()
