@@ -245,7 +245,7 @@ def _refusal(
             f"the inliers do not fix the pose: its position is uncertain by {100 * position:.0f} % "
             f"of their distance, its rotation by {rotation:.1f} degrees"
         )
-    if guessed:
+    if config.get("photo", {}).get("cropped"):  # perhaps
         position, rotation = uncertainty(*chosen, pose.cam_from_world, pose.camera, resection.ALL)
         if position > CROPPED * MAX_POSITION or rotation > CROPPED * MAX_ROTATION:
             return (

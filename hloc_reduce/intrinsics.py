@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -19,21 +20,37 @@ REFINEMENTS = {
     "map": {},
     "EXIF": {"refinement": _REFINED},
     "guess": {"estimation": {"estimate_focal_length": True}, "refinement": _REFINED},
+    "unknown": {
+        "estimation": {"estimate_focal_length": True},
+        "refinement": _REFINED,
+        "photo": {"cropped": True},
+    },
 }
 
 
-def infer(
-    image: Path | np.ndarray, known: Mapping[str, pycolmap.Camera] | None = None
-) -> tuple[pycolmap.Camera, str]:
+class MapCameras(NamedTuple):
+    """What a map tells of the intrinsics of other photos.
+
+    Args:
+        known: cameras that took several of its photos, by `colmap.exif_camera_model`.
+        sizes: (width, height) of its photos.
+    """
+
+    known: dict[str, pycolmap.Camera]
+    sizes: set[tuple[int, int]]
+
+
+def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera, str]:
     """Infer the intrinsics of a photo.
 
     Args:
         image: its file, or its pixels (H, W) or (H, W, 3).
-        known: cameras of the map, by `colmap.exif_camera_model`.
+        of_map: what the map tells.
 
     Returns:
         The camera and a key of `REFINEMENTS`: "map" for one that is known, else a SIMPLE_RADIAL
-        camera without distortion of "EXIF" data or a "guess".
+        camera without distortion, of "EXIF" data or guessed: a "guess" if the photo has the size
+        of photos of the map, so that it was hardly cropped, else "unknown".
 
     Raises:
         InputError: when the image cannot be read.
@@ -42,29 +59,34 @@ def infer(
         height, width = image.shape[:2]
         params = [GUESSED_FOCAL * max(width, height), width / 2, height / 2, 0]
         camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
-        return camera, "guess"
-    camera, has_focal_length = colmap.infer_camera(image)
-    if known and (same := known.get(colmap.exif_camera_model(image))):
-        return same, "map"
-    return camera, "EXIF" if has_focal_length else "guess"
+    else:
+        camera, has_focal_length = colmap.infer_camera(image)
+        if of_map.known and (same := of_map.known.get(colmap.exif_camera_model(image))):
+            return same, "map"
+        if has_focal_length:
+            return camera, "EXIF"
+    size = camera.width, camera.height
+    return camera, "guess" if {size, size[::-1]} & of_map.sizes else "unknown"
 
 
-def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> dict[str, pycolmap.Camera]:
-    """Return the cameras that took several photos of a map, by `colmap.exif_camera_model`.
+def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> MapCameras:
+    """Return what a map tells of the intrinsics of other photos.
 
     Args:
         reconstruction: the map.
         image_dir: the folder of its photos.
     """
+    sizes = {(camera.width, camera.height) for camera in reconstruction.cameras.values()}
     found: dict[str, list[int]] = {}
     for image in reconstruction.images.values():
         if (name := colmap.exif_camera_model(image_dir / image.name)) is not None:
             found.setdefault(name, []).append(image.camera_id)
-    return {
+    known = {
         name: reconstruction.cameras[ids[0]]
         for name, ids in found.items()
         if len(ids) >= WELL_KNOWN and len(set(ids)) == 1
     }
+    return MapCameras(known, sizes)
 
 
 def to_list(camera: pycolmap.Camera) -> list:

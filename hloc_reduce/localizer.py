@@ -85,7 +85,7 @@ class Localizer:
             The pose, camera from world, in the units of the map, or None if the photo cannot be
             localized, for the `reason` in info; and info, as of `localization.localize`, with
             `points2D` (M, 2) in COLMAP's pixels, `retrieved`, names of map images, best first,
-            `intrinsics` ("given", "map", "EXIF" or "guess"), and `seconds` by stage.
+            `intrinsics` ("given", or as `intrinsics.infer`), and `seconds` by stage.
 
         Raises:
             InputError: when the image cannot be read, or the camera is of another size.

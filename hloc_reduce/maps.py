@@ -75,7 +75,10 @@ class Map:
             self.num_points3D = int(content["points3D"])
             self.camera_mode = content.get("camera_mode")  # None for the cameras of a model
             known = content.get("cameras", {}).items()
-            self.cameras = {name: intrinsics.from_list(values) for name, values in known}
+            self.cameras = intrinsics.MapCameras(
+                {name: intrinsics.from_list(values) for name, values in known},
+                {(int(width), int(height)) for width, height in content.get("sizes", [])},
+            )
             conf = content["conf"]
             self._conf = {
                 "output": _file_name(conf["output"]),
@@ -316,6 +319,7 @@ def main(
             name, sfm = SFM, building.of_model(conf, model, reference)
         else:
             name, conf, sfm = building.of_photos_alone(conf)
+        cameras = intrinsics.of_map(sfm, image_dir)
         summary = {
             "id": uuid.uuid4().hex,
             "feature": feature,
@@ -329,10 +333,8 @@ def main(
             "images": len(building.names),
             "images_with_pose": sfm.num_reg_images(),
             "points3D": sfm.num_points3D(),
-            "cameras": {
-                name: intrinsics.to_list(camera)
-                for name, camera in intrinsics.of_map(sfm, image_dir).items()
-            },
+            "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
+            "sizes": sorted(cameras.sizes),
             "seconds": folder.seconds(),
         }
         stamps.write(map_dir / FINISHED, summary)

@@ -12,6 +12,7 @@ STILL = 4.0  # pixels that a keypoint of an overlay moves from photo to photo, a
 PHOTOS = 3  # others in which it is at the same place
 SHARE = 0.5  # of its matches that are so
 AROUND = 40.0  # pixels: what is so near is of the overlay, too, as the digits of a clock
+COVERED = 0.5  # of the keypoints of a photo, at most: else the camera has not moved
 
 Pair = tuple[str, str]
 
@@ -22,7 +23,8 @@ def drop_overlays(
     """Drop the matches of overlays.
 
     A keypoint is of an overlay if most of its matches are at its own place in other photos: what a
-    camera sees moves as the camera does.
+    camera sees moves as the camera does. Where that holds for most keypoints of a photo, it is the
+    camera that has not moved.
 
     Args:
         keypoints: from image to (N, 2).
@@ -47,7 +49,9 @@ def drop_overlays(
         overlay = (still[name] >= max(2, least)) & (still[name] >= SHARE * number[name])
         if overlay.any():
             distance, _ = cKDTree(points[overlay]).query(points)
-            covered[name] = distance <= AROUND
+            near = distance <= AROUND
+            if near.mean() <= COVERED:
+                covered[name] = near
     if not covered:
         return dict(matches)
     logger.info(

@@ -51,6 +51,7 @@ SOURCES = {
     "map": "those of the map's camera, which took them by EXIF data",
     "EXIF": "from EXIF data and refined with the pose",
     "guess": "guessed and refined with the pose",
+    "unknown": "guessed and refined with the pose, but sizes not of map photos: perhaps cropped",
 }
 NOT_IN_NAMES = r"[^\w.-]+"  # of a glob
 
@@ -266,13 +267,13 @@ def main(
 
 
 def _infer(
-    query_images: Path, names: list[str], known: dict[str, pycolmap.Camera], strict: bool
+    query_images: Path, names: list[str], of_map: intrinsics.MapCameras, strict: bool
 ) -> dict[str, tuple[pycolmap.Camera, str]]:
     """Infer the intrinsics of photos, unless `strict` without those that cannot be read."""
     cameras = {}
     for name in names:
         try:
-            cameras[name] = intrinsics.infer(query_images / name, known)
+            cameras[name] = intrinsics.infer(query_images / name, of_map)
         except InputError:
             if strict:
                 raise
