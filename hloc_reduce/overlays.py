@@ -8,8 +8,11 @@ from scipy.spatial import cKDTree
 from . import logger
 from .cli import some
 
-STILL = 4.0  # pixels that a keypoint of an overlay moves from photo to photo, at most
+# pixels that a keypoint of an overlay moves from photo to photo, at most: also what a camera that
+# circles around an object looks at stays nearly where it is
+STILL = 1.0
 PHOTOS = 3  # others in which it is at the same place
+LEAST = 5  # keypoints of an overlay
 SHARE = 0.5  # of its matches that are so
 AROUND = 40.0  # pixels: what is so near is of the overlay, too, as the digits of a clock
 COVERED = 0.5  # of the keypoints of a photo, at most: else the camera has not moved
@@ -47,7 +50,7 @@ def drop_overlays(
     covered = {}
     for name, points in keypoints.items():
         overlay = (still[name] >= max(2, least)) & (still[name] >= SHARE * number[name])
-        if overlay.any():
+        if overlay.sum() >= LEAST:
             distance, _ = cKDTree(points[overlay]).query(points)
             near = distance <= AROUND
             if near.mean() <= COVERED:
