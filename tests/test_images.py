@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from confs import features as features_confs
-from hloc_reduce import extract_features
+from hloc_reduce import cli, extract_features
 from hloc_reduce.cli import InputError
 from hloc_reduce.io import UnreadableImage, read_image
 
@@ -139,3 +139,16 @@ def test_other_failures_are_not_those_of_an_image(picture, tmp_path):
     conf = {**features_confs.confs["sift"], "preprocessing": {"resize_max": 1600}}  # in colour
     with pytest.raises(InputError, match="DoG needs grey images"):
         list(extract_features.extract_all({"": conf}, [(tmp_path / "a.png", [""])], strict=False))
+
+
+def test_images_of_other_types_are_named(tmp_path, picture, caplog, monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)
+    (tmp_path / "a.webp").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(
+        InputError, match="no image in .* It has a.webp, but only .jpeg, .jpg, .png"
+    ):
+        extract_features.list_images(tmp_path)
+    cv2.imwrite(str(tmp_path / "b.png"), picture)
+    assert extract_features.list_images(tmp_path) == ["b.png"]
+    assert "1 images in" in caplog.text and "a.webp" in caplog.text
