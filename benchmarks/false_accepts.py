@@ -30,12 +30,11 @@ from hloc_reduce.datasets import scans, true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.localization import query
+from hloc_reduce.localization import intrinsics, query
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.localization.query import merged
 from hloc_reduce.localization.references import Reference, ScanMap, SfmMap
 from hloc_reduce.localize_sfm import RANSAC_THRESH
-from hloc_reduce.maps import intrinsics
 from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
 from hloc_reduce.training.__main__ import parse_maps
 from hloc_reduce.utils import cli, colmap
@@ -252,6 +251,7 @@ def run(
     describe = Described(feature)
     with open_h5(place.features) as file:
         described = {name: describe(file, name) for name in place.names}
+        sizes = {get_image_size(file, name) for name in place.names}
     gate = DEFAULT_GATE.of_matches(model, described[place.names[0]].shape[1])
     for source, name, camera, truth, path, kind in tried:
         with open_h5(path) as file:
@@ -265,7 +265,9 @@ def run(
             matches[other] = torch.stack([found[matched], rows_of[matched]], 1).numpy()
         known = ("given", "off", "guess") if kind == "own" else ("given", "guess")
         for given in known if camera else ("guess",):
-            row = localize(place, keypoints, intrinsics_of(camera, size, given), matches, gate)
+            row = localize(
+                place, keypoints, intrinsics_of(camera, size, given, sizes), matches, gate
+            )
             cam_from_world = row.pop("cam_from_world")
             row |= outcome(place, row, cam_from_world, truth)
             first = {"feature": feature, "map": place.name, "place": source.name}
@@ -274,12 +276,23 @@ def run(
 
 
 def intrinsics_of(
-    camera: pycolmap.Camera | None, size: tuple[int, int], given: str
+    camera: pycolmap.Camera | None,
+    size: tuple[int, int],
+    given: str,
+    sizes: set[tuple[int, int]],
 ) -> tuple[pycolmap.Camera, dict]:
-    """Return intrinsics of a photo of a width and height, and how they are refined."""
+    """Return intrinsics of a photo of a width and height, and how they are refined.
+
+    Args:
+        camera: its own.
+        size: width and height.
+        given: how they are to be.
+        sizes: of the photos of the map.
+    """
     if given == "guess":
         width, height = size
-        guess, source = intrinsics.infer(np.empty((height, width), np.uint8))
+        of_map = intrinsics.MapCameras({}, sizes)
+        guess, source = intrinsics.infer(np.empty((height, width), np.uint8), of_map)
         return guess, intrinsics.REFINEMENTS[source]
     camera = copy.deepcopy(camera)
     if given == "off":

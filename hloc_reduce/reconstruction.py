@@ -17,6 +17,7 @@ from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.h5 import list_h5_names
 from .utils.images import list_images
+from .utils.overlays import drop_overlays
 from .utils.paths import strings_as_paths
 
 REGISTRATION = "registration.json"  # which images are in the model, and in other parts
@@ -141,6 +142,7 @@ def reconstruct(
         "images": names,
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
+        "overlays": "dropped",
         "attempts": [{}, *attempts],
         "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
         "once": once,
@@ -153,6 +155,7 @@ def reconstruct(
 
     with replacing_map(sfm_dir, made_from) as building:
         keypoints, _, found = read_matches(names, pairs, features, matches, min_match_score)
+        found = drop_overlays(keypoints, found)
         verified = {
             pair: (indices, indices if skip_geometric_verification else None)
             for pair, indices in found.items()

@@ -13,7 +13,7 @@ from . import logger
 from .runtime import provenance
 from .utils import cli, colmap
 from .utils.cli import InputError
-from .utils.feature_files import get_colmap_keypoints
+from .utils.feature_files import get_colmap_keypoints, get_image_size
 from .utils.files import announce
 from .utils.h5 import open_h5
 from .utils.match_files import get_matches
@@ -89,6 +89,7 @@ def main(
         database = building / "database.db"
         colmap.write_reference(database, reference)
         names = [image.name for image in reference.images.values()]
+        _check_sizes(reference, features)
         keypoints, uncertainty, found = read_matches(
             names, pairs, features, matches, min_match_score
         )
@@ -108,7 +109,7 @@ def main(
         if reconstruction.num_points3D() == 0:
             raise InputError(
                 f"The map is empty: COLMAP triangulated no point from the matches {matches}. "
-                "Do the poses belong to these images, and do the pairs overlap?"
+                "Do the poses belong to these images, of this size, and do the pairs overlap?"
             )
     logger.info("The map %s:\n%s", sfm_dir, reconstruction.summary())
     return reconstruction
@@ -189,6 +190,25 @@ def read_matches(
                     indices = indices[scores > min_match_score]
                 found[name0, name1] = indices
     return keypoints, uncertainty, found
+
+
+def _check_sizes(reference: pycolmap.Reconstruction, features: Path) -> None:
+    """Warn of photos of other sizes than their cameras in a model: these see nothing right."""
+    wrong = []
+    with open_h5(features) as file:
+        for image in reference.images.values():
+            camera = reference.cameras[image.camera_id]
+            if f"{image.name}/image_size" in file:
+                width, height = get_image_size(file, image.name)
+                if (width, height) != (camera.width, camera.height):
+                    size = f"{camera.width}x{camera.height}"
+                    wrong.append(f"{image.name} ({width}x{height}, its camera {size})")
+    if wrong:
+        logger.warning(
+            "%d of %d photos are of other sizes than their cameras in the model: %s. Take the "
+            "photos that the model was made of, or resize its cameras.",
+            *(len(wrong), len(reference.images), cli.some(wrong, 3)),
+        )
 
 
 def _verify_by_poses(

@@ -28,8 +28,8 @@ from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS
+from hloc_reduce.localization import intrinsics
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
-from hloc_reduce.maps import intrinsics
 from hloc_reduce.maps.map import RETRIEVAL, Map
 from hloc_reduce.runtime import provenance, trace
 from hloc_reduce.runtime.group_writer import failures
@@ -46,6 +46,12 @@ from . import common
 FEATURE, MATCHER = features_confs.RECOMMENDED, "NN-ratio"
 MADE_FROM = "made_from.json"  # the map and the photos of queries
 LISTED = "queries_with_intrinsics.txt"  # those of a folder
+SOURCES = {
+    "map": "those of the map's camera, which took them by EXIF data",
+    "EXIF": "from EXIF data and refined with the pose",
+    "guess": "guessed and refined with the pose",
+    "unknown": "guessed and refined with the pose, but sizes not of map photos: perhaps cropped",
+}
 NOT_IN_NAMES = r"[^\w.-]+"  # of a glob
 
 
@@ -143,7 +149,7 @@ def main(
     if given is None:
         names = list_images(query_images)
         lists = {query_images.resolve().name: names}
-        cameras = _infer(query_images, names, strict)
+        cameras = _infer(query_images, names, built.cameras, strict)
         queries = outputs / LISTED
     else:
         parts = parse_query_lists(queries)
@@ -184,12 +190,9 @@ def main(
         sources |= {name: source for name, (_, source) in cameras.items()}
         if given is None:
             intrinsics.write_queries(cameras, queries)
-        for source, said in (("EXIF", "from EXIF data"), ("guess", "guessed")):
+        for source, said in SOURCES.items():
             if some := [name for name in names if sources.get(name) == source]:
-                logger.info(
-                    "Intrinsics of %d queries are %s and refined with the pose: %s",
-                    *(len(some), said, cli.some(some)),
-                )
+                logger.info("Intrinsics of %d queries are %s: %s", len(some), said, cli.some(some))
         loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
         poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
 
@@ -261,13 +264,13 @@ def main(
 
 
 def _infer(
-    query_images: Path, names: list[str], strict: bool
+    query_images: Path, names: list[str], of_map: intrinsics.MapCameras, strict: bool
 ) -> dict[str, tuple[pycolmap.Camera, str]]:
     """Infer the intrinsics of photos, unless `strict` without those that cannot be read."""
     cameras = {}
     for name in names:
         try:
-            cameras[name] = intrinsics.infer(query_images / name)
+            cameras[name] = intrinsics.infer(query_images / name, of_map)
         except InputError:
             if strict:
                 raise

@@ -10,8 +10,9 @@ from PIL import Image
 
 from hloc_reduce import extract_features, extractors
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.images import UnreadableImage, read_image
+from hloc_reduce.utils.images import UnreadableImage, list_images, read_image
 
 
 @pytest.fixture
@@ -139,3 +140,15 @@ def test_other_failures_are_not_those_of_an_image(picture, tmp_path):
     conf = {**features_confs.confs["sift"], "preprocessing": {"resize_max": 1600}}  # in colour
     with pytest.raises(InputError, match="DoG needs grey images"):
         extract_features.main(conf, tmp_path, tmp_path / "o", strict=False)
+
+
+def test_images_of_other_types_are_named(tmp_path, picture, caplog, monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)
+    (tmp_path / "a.webp").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("")
+    message = "no image in .* It has a.webp, but only .jpeg, .jpg, .png"
+    with pytest.raises(InputError, match=message):
+        list_images(tmp_path)
+    cv2.imwrite(str(tmp_path / "b.png"), picture)
+    assert list_images(tmp_path) == ["b.png"]
+    assert "1 images in" in caplog.text and "a.webp" in caplog.text

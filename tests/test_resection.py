@@ -9,12 +9,13 @@ from hloc_reduce.localization import absolute_pose
 from hloc_reduce.localization.absolute_pose import Pose
 from hloc_reduce.localization.confidence import (
     DEFAULT_GATE,
+    INDEPENDENT,
     project,
     reprojection_errors,
     uncertainty,
 )
+from hloc_reduce.localization.intrinsics import REFINEMENTS
 from hloc_reduce.localization.resection import ALL, RADIAL, SKEW, resect, undistort
-from hloc_reduce.maps.intrinsics import REFINEMENTS
 
 TURN = pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04]))  # axis and angle
 POSE = pycolmap.Rigid3d(TURN, [0.3, 0.1, 8.0])
@@ -162,6 +163,7 @@ def test_a_pose_of_all_parameters_is_as_precise_as_measured():
         assert inliers.all() and lens.width == start.width and same is points2D
     measured = np.sqrt(np.var(centres, axis=0).sum()) / 8
     expected, _ = uncertainty(points2D, points3D, pose, lens, ALL)
+    expected /= np.sqrt(len(points2D) / INDEPENDENT)  # here the errors of all are independent
     assert 0.6 < expected / measured < 1.6
     assert resect(points2D[:9], points3D[:9], POSE, camera, 12.0, ALL) is None
 

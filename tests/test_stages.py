@@ -584,3 +584,12 @@ def test_the_gate_skips_images_without_descriptors(built, monkeypatch):
         for name in list_h5_names(built.features):
             file[name].pop("descriptors", None)
     assert dimension(built.features) == 0
+
+
+def test_photos_of_another_size_than_the_model_are_named(built, caplog, monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)
+    with h5py.File(built.features, "r+") as file:
+        file["db/0.jpg/image_size"] = np.array([320, 240])
+    arguments = (built.sfm, built.model, built.images, built.pairs, built.features, built.matches)
+    triangulation.main(*arguments)
+    assert "1 of" in caplog.text and "db/0.jpg (320x240, its camera 640x480)" in caplog.text

@@ -32,9 +32,10 @@ SAME_POSITION = 0.25  # of the inliers' median depth
 # confidence with other intrinsics, by that with the assumed ones: above these a distortion is
 # right, all others may be, and all others are
 DISTORTED, UNCLEAR, RIGHT = 1.02, 1.05, 1.1
-# times the limits of uncertainty: where all intrinsics are estimated, and by how much others than
-# given ones must move the pose to contradict them, as many lists give focal lengths of EXIF data
-STRICT, LENIENT = 0.5, 2.0
+# times the limits of uncertainty: by how much other intrinsics than given ones must move the pose
+# to contradict them, as many lists give focal lengths of EXIF data; and how uncertain a pose may be
+# if guessed intrinsics are all wrong, as those of a cropped photo
+LENIENT, CROPPED = 2.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -240,12 +241,19 @@ def _refusal(
     chosen = points2D[pose.inliers], points3D[pose.inliers]
     freedom = pose.degrees_of_freedom
     position, rotation = uncertainty(*chosen, pose.cam_from_world, pose.camera, freedom)
-    limit = STRICT if freedom == resection.ALL else 1
-    if position > limit * MAX_POSITION or rotation > limit * MAX_ROTATION:
+    if position > MAX_POSITION or rotation > MAX_ROTATION:
         return (
             f"the inliers do not fix the pose: its position is uncertain by {100 * position:.0f} % "
             f"of their distance, its rotation by {rotation:.1f} degrees"
         )
+    if config.get("photo", {}).get("cropped"):  # perhaps
+        position, rotation = uncertainty(*chosen, pose.cam_from_world, pose.camera, resection.ALL)
+        if position > CROPPED * MAX_POSITION or rotation > CROPPED * MAX_ROTATION:
+            return (
+                "it may be cropped: its intrinsics are not known, and without them its position is "
+                f"uncertain by {100 * position:.0f} % of the distance, its rotation by "
+                f"{rotation:.1f} degrees"
+            )
     least = gate.least_agreement(pose.confidence)
     if pose.agreement < least:
         return (

@@ -16,6 +16,8 @@ SAME_PLACE = 2.0  # pixels at least: keypoints of other scales or orientations t
 DETECTED = 1600  # the longer side in pixels, to which photos are reduced before detection
 NEIGHBORS = 8  # projected points that give the density around a keypoint
 LEAST_NOISE = 0.5  # pixels, the standard deviation of a keypoint at best
+# inliers whose errors are independent: maps are bent, so that more of them err alike
+INDEPENDENT = 30
 FOCAL_LENGTHS = (0.3, 5.0)  # of an estimated one, times the longer side: 11 to 180 mm on 35 mm film
 REFINED = 2.0  # by what factor a focal length of EXIF data may change
 MAX_POSITION = 0.05  # standard deviation of the position, times the median distance of the inliers
@@ -207,7 +209,8 @@ def uncertainty(
 
     Returns:
         The standard deviations of the position, in units of the inliers' median depth, and of the
-        rotation in degrees; infinite where the inliers do not fix the pose.
+        rotation in degrees; infinite where the inliers do not fix the pose. Those of more than
+        INDEPENDENT inliers are those of so many.
     """
     local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
     _, derivatives = project(local / np.median(local[:, 2]))
@@ -222,6 +225,7 @@ def uncertainty(
     )
     try:
         variance = noise * np.diag(np.linalg.inv(jacobian.T @ jacobian))
+        variance = variance * max(1, len(points2D) / INDEPENDENT)
     except np.linalg.LinAlgError:
         return np.inf, np.inf
     if not (variance > 0).all():

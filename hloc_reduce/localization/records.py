@@ -8,6 +8,7 @@ import pycolmap
 
 from ..utils.cli import InputError
 from ..utils.files import naming, replacing
+from .intrinsics import from_list, to_list
 from .references import Reference
 
 RECORDS = 8  # the version of what a record holds, and of the gate
@@ -23,18 +24,12 @@ def pose_of(record: dict) -> pycolmap.Rigid3d | None:
 
 def camera_of(record: dict) -> pycolmap.Camera:
     """Return the intrinsics of a query's record, as they were refined."""
-    model, width, height, *params = record["camera"]
-    return pycolmap.Camera(model=model, width=width, height=height, params=params)
+    return from_list(record["camera"])
 
 
 def to_stamp(queries: list[tuple[str, pycolmap.Camera | None]]) -> dict[str, list | None]:
     """Return the intrinsics of queries as a stamp has them."""
     return {name: camera and to_list(camera) for name, camera in queries}
-
-
-def to_list(camera: pycolmap.Camera) -> list:
-    """Return intrinsics as a record has them."""
-    return [camera.model.name, camera.width, camera.height, *camera.params.tolist()]
 
 
 def read_records(path: Path) -> dict[str, dict]:

@@ -25,6 +25,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
 from ..extract_features import keep_present, keep_readable
+from ..localization import intrinsics
 from ..runtime import provenance
 from ..runtime.outputs import RunFolder
 from ..utils import colmap
@@ -156,6 +157,7 @@ def main(
             name, sfm = SFM, building.of_model(conf, model, reference)
         else:
             name, conf, sfm = building.of_photos_alone(conf)
+        cameras = intrinsics.of_map(sfm, image_dir)
         summary = {
             "id": uuid.uuid4().hex,
             "feature": feature,
@@ -169,6 +171,8 @@ def main(
             "images": len(building.names),
             "images_with_pose": sfm.num_reg_images(),
             "points3D": sfm.num_points3D(),
+            "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
+            "sizes": sorted(cameras.sizes),
             "seconds": folder.seconds(),
         }
         provenance.write(map_dir / FINISHED, summary)

@@ -10,7 +10,7 @@ import torch
 from .. import aggregators, extractors
 from ..aggregators.vlad import read_vocabulary
 from ..confs import matchers as matchers_confs
-from ..localization import query
+from ..localization import intrinsics, query
 from ..localization.confidence import DEFAULT_GATE, Gate
 from ..localization.query import merged
 from ..localization.references import SfmMap
@@ -22,7 +22,6 @@ from ..utils import colmap
 from ..utils.cli import InputError
 from ..utils.feature_files import dimension, get_descriptors, restore, store, to_colmap
 from ..utils.h5 import open_h5
-from . import intrinsics
 from .map import RETRIEVAL, Map
 
 
@@ -56,7 +55,7 @@ class Localizer:
         built = Map(map_dir)
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.preprocessing = built.conf["preprocessing"]
-        self.storage = built.storage
+        self.storage, self.cameras = built.storage, built.cameras
         matcher = matchers_confs.confs[built.matcher]["model"]
         self.ratio_threshold = matcher.get("ratio_threshold")
         self.gate = gate.of_matches(matcher, dimension(built.features))
@@ -82,14 +81,14 @@ class Localizer:
 
         Args:
             image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-            camera: its intrinsics; default: from the EXIF data of the file, or guessed, and
-                estimated with the pose.
+            camera: its intrinsics; default: those of the map's camera if the file's EXIF data tell
+                that it took the photo, else EXIF's or guessed, and estimated with the pose.
 
         Returns:
             The pose, camera from world, in the units of the map, or None if the photo cannot be
             localized, for the `reason` in info; and info, as of `localization.localize`, with
             `points2D` (M, 2) in COLMAP's pixels, `retrieved`, names of map images, best first,
-            `intrinsics` ("given", "EXIF" or "guess"), and `seconds` by stage.
+            `intrinsics` ("given", or as `intrinsics.infer`), and `seconds` by stage.
 
         Raises:
             InputError: when the image cannot be read, or the camera is of another size.
@@ -102,7 +101,7 @@ class Localizer:
 
         source, refinement = "given", {}
         if camera is None:
-            camera, source = intrinsics.infer(image)
+            camera, source = intrinsics.infer(image, self.cameras)
             refinement = intrinsics.REFINEMENTS[source]
         features = extractors.extract(self.extractor, image, self.preprocessing, self.device)
         width, height = map(int, features["image_size"])

@@ -12,6 +12,7 @@ from .. import (
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
+from ..localization import intrinsics
 from ..utils import colmap
 from ..utils.cli import InputError, choose, no_folder
 from ..utils.feature_files import STORAGES
@@ -50,6 +51,11 @@ class Map:
             self.num_images = int(content["images_with_pose"])
             self.num_points3D = int(content["points3D"])
             self.camera_mode = content.get("camera_mode")  # None for the cameras of a model
+            known = content.get("cameras", {}).items()
+            self.cameras = intrinsics.MapCameras(
+                {name: intrinsics.from_list(values) for name, values in known},
+                {(int(width), int(height)) for width, height in content.get("sizes", [])},
+            )
             conf = content["conf"]
             self._conf = {
                 "output": _file_name(conf["output"]),

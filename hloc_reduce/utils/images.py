@@ -6,10 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .cli import InputError, no_folder
+from .. import logger
+from .cli import InputError, no_folder, some
 from .parsers import check_names, image_names
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
+# of images that are not read
+OTHER_SUFFIXES = {".bmp", ".gif", ".heic", ".jp2", ".ppm", ".tif", ".tiff", ".webp"}
 
 
 def list_images(
@@ -29,13 +32,18 @@ def list_images(
     if not within.is_dir():
         raise no_folder(within)
     if image_list is None:
-        names = sorted(
-            path.relative_to(image_dir).as_posix()
-            for path in within.rglob("*")
-            if path.suffix.lower() in IMAGE_SUFFIXES
-        )
+        files = sorted(path.relative_to(image_dir) for path in within.rglob("*"))
+        names = [file.as_posix() for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
+        others = [str(file) for file in files if file.suffix.lower() in OTHER_SUFFIXES]
+        read = ", ".join(sorted(IMAGE_SUFFIXES))
         if not names:
-            raise InputError(f"There is no image in {within}.")
+            there_are = f" It has {some(others)}, but only {read} are read." if others else ""
+            raise InputError(f"There is no image in {within}.{there_are}")
+        if others:
+            logger.warning(
+                "%d images in %s are ignored, as only %s are read: %s.",
+                *(len(others), within, read, some(others)),
+            )
         return check_names(names, within)
     names = image_names(image_list)
     missing = [name for name in names if not (image_dir / name).is_file()]

@@ -151,9 +151,10 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
                 raise ValueError("sizes and focal lengths are positive and finite")
         except (ValueError, TypeError, AttributeError, RuntimeError) as error:
             reason = str(error).strip().splitlines()[0]
+            spaced = not any(word in CAMERA_MODELS for word in words[1:2])
             raise InputError(
-                f"{place}: not a query `name MODEL width height params...` ({reason}); put a tab "
-                "after a name that has spaces."
+                f"{place}: not a query `name MODEL width height params...` ({reason})"
+                + ("; put a tab after a name that has spaces." if spaced else ".")
             ) from None
         if name in queries:
             raise InputError(f"{place}: query {name} is listed twice.")
