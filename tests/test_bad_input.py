@@ -764,7 +764,8 @@ def test_lists_of_hpatches_round_trip(tmp_path, rows):
 def test_lists_are_utf8_whatever_the_locale(tmp_path):
     code = (
         "import sys; from pathlib import Path; from pycolmap import Camera, Rigid3d; "
-        "from hloc_reduce.localization import intrinsics; from hloc_reduce.utils import files, parsers; "
+        "from hloc_reduce.localization import intrinsics; "
+        "from hloc_reduce.utils import files, parsers; "
         "name = '\\xe9\\u6771.jpg'; "
         "folder = Path(sys.argv[1]); "
         "camera = Camera(model='SIMPLE_PINHOLE', width=9, height=9, params=[9, 4, 4]); "
