@@ -112,6 +112,12 @@ def main(
                 "Do the poses belong to these images, of this size, and do the pairs overlap?"
             )
     logger.info("The map %s:\n%s", sfm_dir, reconstruction.summary())
+    images = reconstruction.images.values()
+    if alone := sorted(image.name for image in images if image.num_points3D == 0):
+        logger.warning(
+            "%d of %d photos have no point in the map, so that no query is localized by them: %s.",
+            *(len(alone), len(images), cli.some(alone)),
+        )
     return reconstruction
 
 

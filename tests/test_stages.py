@@ -139,13 +139,15 @@ def test_half_a_pixel_would_be_seen(built):
     assert len(errors) == 300 and max(errors) < 1e-2
 
 
-def test_map_is_built_once_and_again_when_its_inputs_change(built):
+def test_map_is_built_once_and_again_when_its_inputs_change(built, caplog, monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)
     written = (built.sfm / "points3D.bin").stat().st_mtime_ns
     arguments = (built.sfm, built.model, built.images, built.pairs, built.features, built.matches)
     assert triangulation.main(*arguments).num_points3D() == 300
     assert (built.sfm / "points3D.bin").stat().st_mtime_ns == written
     all_pairs(built, built.pairs, skip=[5])
     assert triangulation.main(*arguments).find_image_with_name("db/5.jpg").num_points3D == 0
+    assert "1 of 6 photos have no point in the map" in caplog.text and "db/5.jpg." in caplog.text
 
 
 def test_an_empty_map_is_loud_and_keeps_the_old_one(built):
