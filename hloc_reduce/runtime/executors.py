@@ -21,7 +21,8 @@ from ..utils.cli import InputError
 from ..utils.interrupts import interruptible, uninterrupted
 from . import parallel, processes
 
-Item, Result = TypeVar("Item"), TypeVar("Result")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 Work = Callable[[Iterable[Item]], Iterator[Result]]
 BACKLOG = 2  # chunks for each worker that are handed out
 RETRIES = 20  # of a chunk whose machine is gone

@@ -93,7 +93,7 @@ class GroupWriter:
     def __enter__(self) -> "GroupWriter":
         return self
 
-    def __exit__(self, error: type | None, *_) -> None:
+    def __exit__(self, error: type | None, *_: object) -> None:
         self.names.database.close()
         self.added.flush()
         if error is None:
@@ -336,7 +336,7 @@ def _set_header(file: h5py.File, header: dict[str, str]) -> None:
 
 def _failed(file: h5py.File) -> set[str]:
     try:
-        return set(map(str, json.loads(get_text(file, FAILURES, "[]"))))
+        return set(map(str, json.loads(get_text(file, FAILURES) or "[]")))
     except (ValueError, TypeError) as error:
         raise InputError(f"Cannot read {file.filename}: it is corrupted ({error}).") from error
 

@@ -113,7 +113,7 @@ class RunFolder:
         self._observing.__enter__()
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._observing.__exit__(None, None, None)
         self._lock.release()
 

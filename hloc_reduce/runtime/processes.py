@@ -50,7 +50,7 @@ class _Pool:
             self.number, env=env, initializer=_end_without, initargs=arguments
         )
 
-    def submit(self, function: Callable, *args) -> Future:
+    def submit(self, function: Callable, *args: object) -> Future:
         """Hand a function to a process, and start processes if need be, also when one was killed.
 
         They do not hear Ctrl-C, which is for this process, which ends them.

@@ -1,11 +1,11 @@
 """h5 files, of which a broken one is an error of its user's."""
 
-import io
 import os
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import h5py
 import numpy as np
@@ -76,7 +76,7 @@ def write_h5(path: Path) -> Iterator[h5py.File]:
 class _Disk:
     """A file for HDF5, which must not see an error: what cannot be written is kept in memory."""
 
-    def __init__(self, file: io.FileIO):
+    def __init__(self, file: IO[bytes]):
         self.file, self.place = file, 0
         self.error: OSError | None = None
         self.unwritten: list[tuple[int, bytes]] = []  # where, and what
@@ -93,18 +93,18 @@ class _Disk:
         self.readinto(data)
         return bytes(data)
 
-    def readinto(self, buffer: memoryview) -> int:
-        buffer = memoryview(buffer).cast("B")
+    def readinto(self, buffer: bytearray | memoryview) -> int:
+        view = memoryview(buffer).cast("B")
         self.file.seek(self.place)
-        number = self.file.readinto(buffer)
-        buffer[number:] = bytes(len(buffer) - number)
+        number = self.file.readinto(view) or 0
+        view[number:] = bytes(len(view) - number)
         for start, kept in self.unwritten:
             begin = max(start, self.place)
-            end = min(start + len(kept), self.place + len(buffer))
+            end = min(start + len(kept), self.place + len(view))
             if begin < end:
-                buffer[begin - self.place : end - self.place] = kept[begin - start : end - start]
-        self.place += len(buffer)
-        return len(buffer)
+                view[begin - self.place : end - self.place] = kept[begin - start : end - start]
+        self.place += len(view)
+        return len(view)
 
     def write(self, data: memoryview) -> int:
         data, written = memoryview(data).cast("B"), 0

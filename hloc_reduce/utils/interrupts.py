@@ -35,7 +35,7 @@ def while_importing() -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 
 
-def _quit(number: int, _) -> NoReturn:
+def _quit(number: int, _: object) -> NoReturn:
     logger.error(INTERRUPTED)
     os._exit(128 + number)  # an exception would be any import's to handle
 
@@ -65,7 +65,7 @@ def end(interrupt: KeyboardInterrupt) -> NoReturn:
     sys.exit(code)
 
 
-def interruptible(function: Callable[..., Result], *arguments, **options) -> Result:
+def interruptible(function: Callable[..., Result], *arguments: object, **options: object) -> Result:
     """Call a function that takes minutes outside of Python, where no signal would be heard."""
     result: Future[Result] = Future()
 
@@ -88,7 +88,8 @@ def interruptible(function: Callable[..., Result], *arguments, **options) -> Res
 @contextmanager
 def uninterrupted() -> Iterator[None]:
     """Have both signals wait for the end of a block; their handlers are then as they were."""
-    came, handlers = [], {}
+    came: list[int] = []
+    handlers: dict[int, object] = {}
     if threading.current_thread() is threading.main_thread():
         for number in STOPS:
             if signal.getsignal(number) is not None:
@@ -102,7 +103,7 @@ def uninterrupted() -> Iterator[None]:
             signal.raise_signal(number)
 
 
-def _stop(number: int, _) -> None:
+def _stop(number: int, _: object) -> None:
     """Interrupt the main thread, but not while it writes what is done because of the same."""
     global _stopped
     if time.monotonic() - _stopped > REPEATED:

@@ -12,7 +12,7 @@ from .h5 import get_array, get_text, reading
 def get_matcher(match_file: h5py.File) -> dict:
     """Return the configuration of the matcher's model of a match file, {} if it does not say."""
     try:
-        model = json.loads(get_text(match_file, "conf", "{}"))["model"]
+        model = json.loads(get_text(match_file, "conf") or "{}")["model"]
     except (ValueError, TypeError, KeyError):
         return {}
     return model if isinstance(model, dict) else {}

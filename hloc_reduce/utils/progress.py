@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 
 from tqdm import tqdm
 
@@ -49,19 +49,19 @@ class Lines:
         initial: int = 0,
     ):
         self.items, self.desc, self.unit, self.initial = items, desc, unit, initial
-        self.total = len(items) if total is None and hasattr(items, "__len__") else total
+        self.total = len(items) if total is None and isinstance(items, Sized) else total
         self.number, self.postfix = initial, ""
         self.begun = self.said = time.monotonic()
 
     def __iter__(self) -> Iterator:
-        for item in self.items:
+        for item in self.items or ():
             yield item
             self.update()
 
     def __enter__(self) -> "Lines":
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         pass
 
     def update(self, number: int = 1) -> None:
