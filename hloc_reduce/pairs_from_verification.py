@@ -16,6 +16,7 @@ from . import cli, colmap, io, logger, stamps
 from .cli import InputError
 from .extract_features import list_images
 from .io import list_h5_names, open_h5
+from .overlays import drop_overlays
 from .pairs_from_retrieval import rank, read_global
 from .parsers import parse_pairs, write_pairs
 from .paths import strings_as_paths
@@ -185,6 +186,7 @@ def _verify(
             images = sorted({name for pair in todo for name in pair})
             colmap.import_images(database, image_dir, images, camera_mode, {})
             keypoints, _, found = read_matches(images, listed, features, matches, None)
+            found = drop_overlays(keypoints, found)
             unverified = {pair: (indices, None) for pair, indices in found.items()}
             colmap.write_matches(database, keypoints, unverified)
             colmap.verify_matches(database, listed, False)
