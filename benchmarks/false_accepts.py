@@ -286,7 +286,7 @@ def intrinsics_of(
     Args:
         camera: its own.
         size: width and height.
-        given: how they are to be.
+        given: "given" as they are, "off" by a wrong focal length, or a "guess".
         sizes: of the photos of the map.
     """
     if given == "guess":

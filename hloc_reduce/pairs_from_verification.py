@@ -18,6 +18,7 @@ from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.h5 import file_provenance, list_h5_names, open_h5
 from .utils.images import list_images
+from .utils.overlays import drop_overlays
 from .utils.parsers import parse_pairs, write_pairs
 from .utils.paths import strings_as_paths
 
@@ -188,6 +189,7 @@ def _verify(
             images = sorted({name for pair in todo for name in pair})
             colmap.import_images(database, image_dir, images, camera_mode, {})
             keypoints, _, found = read_matches(images, listed, features, matches, None)
+            found = drop_overlays(keypoints, found)
             unverified = {pair: (indices, None) for pair, indices in found.items()}
             colmap.write_matches(database, keypoints, unverified)
             colmap.verify_matches(database, listed, False)

@@ -37,7 +37,7 @@ VERY_FEW = 30  # images of which some more take little; what comes of them is a 
 SEEDS = (1, 2, 3)
 MORE = 1.5  # times as many images tell that one camera took all
 MAX_DISTORTION = 1.0  # as COLMAP has it for images that it registers
-WELL_KNOWN = 3  # images of a camera from which on EXIF data do not bound its focal length
+MANY = 3  # images of a camera from which on EXIF data do not bound its focal length
 
 
 class NoModelError(InputError):
@@ -261,7 +261,7 @@ def _plausible(
         for image in images:
             given = cameras[image.camera_id]
             # many images tell the focal length of their camera better than EXIF data do
-            unknown = not given.has_prior_focal_length or shared[image.camera_id] >= WELL_KNOWN
+            unknown = not given.has_prior_focal_length or shared[image.camera_id] >= MANY
             low, high = focal_lengths(given, unknown)
             focal_length = image.camera.mean_focal_length()
             distortion = image.camera.params[list(image.camera.extra_params_idxs())]

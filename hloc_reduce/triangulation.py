@@ -204,11 +204,13 @@ def _check_sizes(reference: pycolmap.Reconstruction, features: Path) -> None:
     with open_h5(features) as file:
         for image in reference.images.values():
             camera = reference.cameras[image.camera_id]
-            if f"{image.name}/image_size" in file:
+            try:
                 width, height = get_image_size(file, image.name)
-                if (width, height) != (camera.width, camera.height):
-                    size = f"{camera.width}x{camera.height}"
-                    wrong.append(f"{image.name} ({width}x{height}, its camera {size})")
+            except InputError:  # of other programs, whose features have none
+                continue
+            if (width, height) != (camera.width, camera.height):
+                size = f"{camera.width}x{camera.height}"
+                wrong.append(f"{image.name} ({width}x{height}, its camera {size})")
     if wrong:
         logger.warning(
             "%d of %d photos are of other sizes than their cameras in the model: %s. Take the "

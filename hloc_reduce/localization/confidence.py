@@ -209,8 +209,8 @@ def uncertainty(
 
     Returns:
         The standard deviations of the position, in units of the inliers' median depth, and of the
-        rotation in degrees; infinite where the inliers do not fix the pose. Those of more than
-        INDEPENDENT inliers are those of so many.
+        rotation in degrees; infinite where the inliers do not fix the pose. More than
+        INDEPENDENT inliers do not reduce them further.
     """
     local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
     _, derivatives = project(local / np.median(local[:, 2]))

@@ -45,7 +45,7 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
 
     Args:
         image: its file, or its pixels (H, W) or (H, W, 3).
-        of_map: what the map tells.
+        of_map: cameras and photo sizes of the map.
 
     Returns:
         The camera and a key of `REFINEMENTS`: "map" for one that is known, else a SIMPLE_RADIAL

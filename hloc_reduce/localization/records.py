@@ -11,7 +11,7 @@ from ..utils.files import naming, replacing
 from .intrinsics import from_list, to_list
 from .references import Reference
 
-RECORDS = 8  # the version of what a record holds, and of the gate
+RECORDS = 9  # the version of what a record holds, and of the gate
 
 
 def pose_of(record: dict) -> pycolmap.Rigid3d | None:
