@@ -1,29 +1,33 @@
 """Building blocks: rectangles, boxes and prisms in the local frame of a wall."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from .surface import Surface, Texture
+from .surface import Points, Span, Surface, Texture, Vector
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A plane in the world: ``right`` and ``down`` as seen by who looks at it, metres."""
+    """A plane in the world, seen from its front; metres."""
 
     origin: np.ndarray  # (3,)
     right: np.ndarray  # (3,), unit
     down: np.ndarray  # (3,), unit, orthogonal to right
 
     @classmethod
-    def upright(cls, corner: np.ndarray, right: np.ndarray) -> Frame:
-        """A vertical plane with its origin at ``corner`` (3,) and ``right`` (2,) or (3,)."""
+    def upright(cls, corner: np.ndarray, right: np.ndarray) -> "Frame":
+        """Make a vertical plane with its origin at `corner` (3,) and `right` (2,) or (3,)."""
         right = np.array([right[0], right[1], 0.0])
         return cls(np.asarray(corner, float), right / np.linalg.norm(right), DOWN)
+
+    @classmethod
+    def level(cls, x: float, y: float, z: float) -> "Frame":
+        """Make a horizontal plane seen from above, `right` along x and `down` against y."""
+        return cls(np.array([x, y, z]), np.array([1.0, 0, 0]), np.array([0, -1.0, 0]))
 
     @property
     def out(self) -> np.ndarray:
@@ -31,7 +35,7 @@ class Frame:
         return -np.cross(self.right, self.down)
 
     def point(self, u: float, v: float, d: float = 0) -> np.ndarray:
-        """World point (3,) at ``u`` right, ``v`` down and ``d`` in front of the plane."""
+        """Return the world point (3,) at `u` right, `v` down and `d` in front of the plane."""
         return self.origin + u * self.right + v * self.down + d * self.out
 
 
@@ -41,91 +45,84 @@ class Builder:
     def __init__(self, rng: np.random.Generator):
         self.rng = rng
         self.surfaces: list[Surface] = []
-        self.lamps: list[tuple[float, float, float, float]] = []
+        self.lamps: list[tuple[float, ...]] = []  # x, y, z, strength
 
-    def polygon(self, frame: Frame, outline, texture: Texture, holes=(), glow: float = 0) -> None:
-        """A polygon in a frame, painted from the frame's origin on."""
+    def polygon(
+        self, frame: Frame, outline: Points, texture: Texture, holes: Sequence[Span] = ()
+    ) -> None:
+        """Add a polygon (n, 2) in a frame; the texture begins at the frame's origin."""
         axes = np.stack([frame.right, frame.down])
-        outline = np.asarray(outline, float)
-        self.surfaces.append(Surface(frame.origin, axes, outline, texture, list(holes), glow))
+        surface = Surface(frame.origin, axes, np.array(outline, float), texture, holes)
+        self.surfaces.append(surface)
 
     def rectangle(
-        self, corner, right, down, size, texture: Texture, anywhere: bool = False, glow: float = 0
+        self, frame: Frame, size: Vector, texture: Texture, anywhere: bool = False
     ) -> None:
-        """A rectangle of ``size`` (width, height) metres from its upper left ``corner`` (3,).
+        """Add a rectangle of `size` (width, height) with its upper left corner at the origin.
 
-        ``anywhere`` cuts it from a random place of the texture, so that the many pieces of one
+        `anywhere` cuts it from a random place of the texture, so that the many pieces of one
         stone do not look all the same.
         """
         shift = self.rng.uniform(0, 1, 2) if anywhere else np.zeros(2)
+        origin = frame.origin - shift @ np.stack([frame.right, frame.down])
         outline = shift + np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * size
-        axes = np.stack([right, down])
-        self.surfaces.append(Surface(corner - shift @ axes, axes, outline, texture, glow=glow))
+        self.polygon(Frame(origin, frame.right, frame.down), outline, texture)
 
-    def box(self, frame: Frame, span, depth, texture: Texture, front: Texture | None = None):
-        """A box on a wall.
+    def box(
+        self, frame: Frame, span: Span, depth: Vector, sides: Texture, front: Texture | None = None
+    ) -> None:
+        """Add a box on a wall.
 
         Args:
             frame: of the wall.
-            span: ``(u0, v0, u1, v1)`` on the wall.
-            depth: how far its back and its front are before the wall.
-            texture: of its sides.
-            front: of its front, else as the sides.
+            span: of the box on the wall.
+            depth: distances of its back and its front from the wall, outwards.
+            sides: texture of its sides.
+            front: texture of its front; default: `sides`.
         """
-        (u0, v0, u1, v1), (d0, d1) = span, depth
-        right, down, out = frame.right, frame.down, frame.out
-        width, height, deep = u1 - u0, v1 - v0, d1 - d0
-        self.rectangle(
-            frame.point(u0, v0, d1), right, down, (width, height), front or texture, front is None
-        )
-        for corner, across, along, size in (
-            (frame.point(u0, v0, d0), out, down, (deep, height)),
-            (frame.point(u1, v0, d1), -out, down, (deep, height)),
-            (frame.point(u0, v0, d0), right, out, (width, deep)),
-            (frame.point(u0, v1, d1), right, -out, (width, deep)),
-        ):
-            self.rectangle(corner, across, along, size, texture, True)
-
-    def recess(self, frame: Frame, span, depth: float, texture: Texture) -> None:
-        """The four reveals of an opening ``depth`` metres deep."""
         u0, v0, u1, v1 = span
-        right, down, out = frame.right, frame.down, frame.out
-        for corner, across, along, size in (
-            (frame.point(u0, v0), -out, down, (depth, v1 - v0)),
-            (frame.point(u1, v0, -depth), out, down, (depth, v1 - v0)),
-            (frame.point(u0, v0), right, -out, (u1 - u0, depth)),
-            (frame.point(u0, v1, -depth), right, out, (u1 - u0, depth)),
-        ):
-            self.rectangle(corner, across, along, size, texture, True)
+        face = Frame(frame.point(u0, v0, depth[1]), frame.right, frame.down)
+        self.rectangle(face, (u1 - u0, v1 - v0), front or sides, front is None)
+        self._sides(frame, span, depth, sides)
 
-    def block(self, center, size, bottom: float, top: float, texture: Texture, turn: float = 0):
-        """An upright box: ``center`` (2,), ``size`` (2,) metres, turned by radians."""
+    def recess(self, frame: Frame, span: Span, depth: float, texture: Texture) -> None:
+        """Add the four reveals of an opening `depth` metres deep."""
+        self._sides(frame, span, (0, -depth), texture)
+
+    def _sides(self, frame: Frame, span: Span, depth: Vector, texture: Texture) -> None:
+        """Add the sides between two depths: of a box if they increase, else of a recess."""
+        (u0, v0, u1, v1), (d0, d1) = span, depth
+        right, down, deep = frame.right, frame.down, abs(d1 - d0)
+        along = frame.out if d1 > d0 else -frame.out
+        for corner, across, downwards, size in (
+            (frame.point(u0, v0, d0), along, down, (deep, v1 - v0)),
+            (frame.point(u1, v0, d1), -along, down, (deep, v1 - v0)),
+            (frame.point(u0, v0, d0), right, along, (u1 - u0, deep)),
+            (frame.point(u0, v1, d1), right, -along, (u1 - u0, deep)),
+        ):
+            self.rectangle(Frame(corner, across, downwards), size, texture, True)
+
+    def block(
+        self, center: Vector, size: Vector, heights: Vector, texture: Texture, turn: float = 0
+    ) -> None:
+        """Add an upright box: `center`, `size`, and (bottom, top) in metres, turned by radians."""
+        bottom, top = heights
         right = np.array([np.cos(turn), np.sin(turn), 0])
         toward = np.array([np.sin(turn), -np.cos(turn), 0])
         corner = np.array([*center, top]) + (toward * size[1] - right * size[0]) / 2
         frame = Frame.upright(corner, right)
         self.box(frame, (0, 0, size[0], top - bottom), (-size[1], 0), texture)
-        back = frame.point(size[0], 0, -size[1])
-        self.rectangle(back, -right, DOWN, (size[0], top - bottom), texture, True)
+        back = Frame(frame.point(size[0], 0, -size[1]), -right, DOWN)
+        self.rectangle(back, (size[0], top - bottom), texture, True)
 
     def prism(
-        self,
-        center,
-        radius: float,
-        bottom: float,
-        top: float,
-        sides: list[Texture],
-        lid: Texture | None,
+        self, center: Vector, radius: float, heights: Vector, sides: list[Texture], lid: Texture
     ) -> None:
-        """An upright prism with one side per texture (at most 8) and a lid unless None."""
+        """Add an upright prism, from bottom to top, with a lid and at most 8 sides."""
+        (x, y), (bottom, top) = center, heights
         angles = np.arange(len(sides)) * 2 * np.pi / len(sides)
         ring = np.asarray(center) + radius * np.column_stack([np.cos(angles), np.sin(angles)])
         for p, q, texture in zip(ring, np.roll(ring, -1, axis=0), sides, strict=True):
             frame = Frame.upright(np.array([*p, top]), q - p)
-            width = np.linalg.norm(q - p)
-            self.polygon(
-                frame, [(0, 0), (width, 0), (width, top - bottom), (0, top - bottom)], texture
-            )
-        if lid is not None:
-            frame = Frame(np.array([*center, top]), np.array([1.0, 0, 0]), np.array([0, -1.0, 0]))
-            self.polygon(frame, (ring - center) * (1, -1), lid)
+            self.rectangle(frame, (float(np.linalg.norm(q - p)), top - bottom), texture)
+        self.polygon(Frame.level(x, y, top), (ring - center) * (1, -1), lid)

@@ -1,7 +1,5 @@
 """Where the photos are taken: the walk of the map, and queries between and beside it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +7,10 @@ import pycolmap
 
 from .town import OBSTACLES, OPEN_GROUND
 
-MAP, DAY, NIGHT = range(3)  # kinds of photos; part of the seed of each
+MAP, DAY, NIGHT = range(3)  # kinds of photos, which seed them
 QUERIES = 10  # of each kind
 
-# Camera and what it looks at, (x, y, x, y) in metres.
+# Positions of the camera and of its target, (x, y, x, y) in metres.
 WALK = [
     *((-8.5, -7, -9, 10), (-5.5, -7.5, -3, 10), (-1, -8, -1, 10), (4.5, -7, 1, 10)),  # northwards
     *((8.5, -6.5, 7, 10), (0, -6.5, 9, 10), (8.5, 1.5, -1, 10)),
@@ -24,12 +22,12 @@ WALK = [
     *((-8, -1, -28, -1), (-12.5, -2.6, -24, 1.5), (-12.5, 0.4, -24, -3.5), (-24, -1, -8, -1)),
     *((7.5, -7.2, 27, -7), (11.5, -5.4, 20, -10), (13, -8.3, 23, -4), (23.5, -7, 8, -6)),
 ]
-WINDOWS = {2: 4.6, 11: 5.2}  # photos taken from a window: their heights
+WINDOWS = {2: 4.6, 11: 5.2}  # from the index of a photo taken from a window to its height
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo to be taken; ``name`` is relative to the folder of the images."""
+    """A photo to be taken; `name` is relative to the folder of the images."""
 
     kind: int
     index: int
@@ -39,11 +37,9 @@ class Photo:
 
 
 def list_photos(seed: int) -> list[Photo]:
-    """All photos of the data set: of the map, then the queries by day, then by night."""
+    """List all photos of the data set: the map, then the queries by day, then by night."""
     photos = [_map_photo(seed, index) for index in range(len(WALK))]
-    for kind in (DAY, NIGHT):
-        photos += [_query(seed, kind, index) for index in range(QUERIES)]
-    return photos
+    return photos + [_query(seed, kind, i) for kind in (DAY, NIGHT) for i in range(QUERIES)]
 
 
 def _map_photo(seed: int, index: int) -> Photo:
@@ -51,11 +47,14 @@ def _map_photo(seed: int, index: int) -> Photo:
     x, y, x_target, y_target = WALK[index] + rng.uniform(-0.35, 0.35, 4)
     position = np.array([x, y, WINDOWS.get(index, rng.uniform(1.6, 1.9))])
     target = np.array([x_target, y_target, rng.uniform(2.8, 4.2)])
-    yaw = np.arctan2(*(target - position)[1::-1])
-    pitch = np.arctan((target - position)[2] / np.hypot(*(target - position)[:2]))
-    camera = (845.0, 846.0, 508.5, 387.0) if index % 3 else (890.0, 890.0, 512.0, 384.0)
+    ahead, aside, up = target - position
+    yaw, pitch = np.arctan2(aside, ahead), np.arctan(up / np.hypot(ahead, aside))
+    if index % 3:
+        camera = _pinhole(1, (845.0, 846.0, 508.5, 387.0))
+    else:
+        camera = _pinhole(2, (890.0, 890.0, 512.0, 384.0))
     pose = look(position, yaw, pitch, np.radians(rng.normal(0, 1.2)))
-    return Photo(MAP, index, f"db/{index:04}.jpg", _pinhole(1 + (index % 3 == 0), camera), pose)
+    return Photo(MAP, index, f"db/{index:04}.jpg", camera, pose)
 
 
 def _query(seed: int, kind: int, index: int) -> Photo:
@@ -83,7 +82,7 @@ def _pinhole(camera_id: int, params: tuple[float, ...]) -> pycolmap.Camera:
 
 
 def look(position: np.ndarray, yaw: float, pitch: float, roll: float) -> pycolmap.Rigid3d:
-    """The pose of a camera, cam_from_world.
+    """Return the pose of a camera, camera from world.
 
     Args:
         position: float (3,), metres.
@@ -94,23 +93,19 @@ def look(position: np.ndarray, yaw: float, pitch: float, roll: float) -> pycolma
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0])
     down = np.cross(forward, right)
-    right, down = (
-        np.cos(roll) * right + np.sin(roll) * down,
-        np.cos(roll) * down - np.sin(roll) * right,
-    )
-    rotation = np.stack([right, down, forward])
+    cos, sin = np.cos(roll), np.sin(roll)
+    rotation = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
     return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ position)
 
 
 def _free_view(x: float, y: float, yaw: float) -> bool:
-    """Whether one can stand here and has some metres of open ground in view."""
-    reach = {-0.4: 2.5, 0: 5, 0.4: 2.5}
-    for turn, needed in reach.items():
-        for step in np.arange(0, needed, 0.25):
-            at = x + step * np.cos(yaw + turn), y + step * np.sin(yaw + turn)
-            if not any(x0 < at[0] < x1 and y0 < at[1] < y1 for x0, y0, x1, y1 in OPEN_GROUND):
+    """Return whether one can stand here and has some metres of open ground in view."""
+    for turn, reach in ((-0.4, 2.5), (0, 5), (0.4, 2.5)):
+        for step in np.arange(0, reach, 0.25):
+            u, v = x + step * np.cos(yaw + turn), y + step * np.sin(yaw + turn)
+            if not any(x0 < u < x1 and y0 < v < y1 for x0, y0, x1, y1 in OPEN_GROUND):
                 return False
-            close = step < 2.5
-            if close and any(np.hypot(at[0] - u, at[1] - v) < r + 0.3 for u, v, r in OBSTACLES):
+            near = step < 2.5
+            if near and any(np.hypot(u - a, v - b) < r + 0.3 for a, b, r in OBSTACLES):
                 return False
     return True

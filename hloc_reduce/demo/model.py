@@ -1,6 +1,4 @@
-"""The reference model of the map photos: points on the true surfaces, seen for true."""
-
-from __future__ import annotations
+"""The reference model of the map photos: points on the true surfaces, with their true tracks."""
 
 from pathlib import Path
 
@@ -12,78 +10,31 @@ from .cameras import Photo
 from .render import Scene
 from .surface import View
 
+Buffers = tuple[np.ndarray, np.ndarray]  # of `rasterize`: surface, inverse depth
 POINTS = 550  # drawn per photo
 TOLERANCE = 0.01  # of the depth buffer, relative
 
 
-def sample_points(
-    scene: Scene, view: View, buffers: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
-) -> np.ndarray:
-    """Draw points evenly over an image and lift them to the surfaces they show.
-
-    Args:
-        scene: the town.
-        view: the camera, without supersampling.
-        buffers: from :func:`~.render.rasterize`.
-        rng: the generator of this photo.
-
-    Returns:
-        World points, float64 (n, 3), n <= :data:`POINTS` as the sky has none.
-    """
-    pixels = rng.uniform((2, 2), np.array(view.shape[::-1]) - 2, (POINTS, 2))
-    surface = buffers[0][tuple(pixels.astype(int).T[::-1])]
-    pixels, surface = pixels[surface >= 0], surface[surface >= 0]
-    inverses = np.linalg.inv(scene.homographies(view)[surface])
-    plane = inverses @ np.column_stack([pixels, np.ones(len(pixels))])[..., None]
-    return (scene.planes[surface] @ (plane / plane[:, 2:]))[..., 0]
-
-
-def visible(view: View, nearness: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which points a camera sees.
-
-    Args:
-        view: the camera.
-        nearness: its buffer of inverse depths, float32 (h, w).
-        points: in the world, float64 (n, 3).
-
-    Returns:
-        The indices of the points that are inside the image and agree with the buffer, (m,), and
-        their projections in COLMAP pixel coordinates, float64 (m, 2).
-    """
-    x, y, z = view.calibration @ (view.rotation @ points.T + view.translation[:, None])
-    inside = np.flatnonzero(z > 0.1)
-    pixels = (np.stack([x, y]) / z)[:, inside].T
-    kept = ((pixels >= 1) & (pixels < np.array(view.shape[::-1]) - 1)).all(axis=1)
-    inside, pixels = inside[kept], pixels[kept]
-    agreement = nearness[tuple(pixels.astype(int).T[::-1])] * z[inside]
-    kept = abs(agreement - 1) < TOLERANCE
-    return inside[kept], pixels[kept]
-
-
 def write_model(
-    folder: Path,
-    scene: Scene,
-    photos: list[Photo],
-    buffers: list[tuple[np.ndarray, np.ndarray]],
-    seed: int,
+    folder: Path, scene: Scene, photos: list[Photo], buffers: list[Buffers], seed: int
 ) -> None:
-    """Write ``cameras.bin``, ``images.bin`` and ``points3D.bin`` of an old COLMAP model.
+    """Write `cameras.bin`, `images.bin` and `points3D.bin`, as older COLMAPs do.
 
     Args:
         folder: of the model.
         scene: the town.
         photos: of the map.
-        buffers: from :func:`~.render.rasterize` without supersampling, of each photo.
+        buffers: of each photo, without supersampling.
         seed: of the choice of the points.
     """
     views = [View.of(photo.camera, photo.cam_from_world) for photo in photos]
     points = np.concatenate(
         [
-            sample_points(scene, view, pair, np.random.default_rng([seed, 40, photo.index]))
+            _sample_points(scene, view, pair[0], np.random.default_rng([seed, 40, photo.index]))
             for photo, view, pair in zip(photos, views, buffers, strict=True)
         ]
     )
-    seen = [visible(view, pair[1], points) for view, pair in zip(views, buffers, strict=True)]
+    seen = [_visible(view, pair[1], points) for view, pair in zip(views, buffers, strict=True)]
     counts = np.bincount(np.concatenate([inside for inside, _ in seen]), minlength=len(points))
     well_seen = counts >= 3
 
@@ -107,3 +58,31 @@ def write_model(
     model.write_binary(str(folder))
     for name in ("rigs.bin", "frames.bin"):  # Aachen's own model is older than these
         (folder / name).unlink(missing_ok=True)
+
+
+def _sample_points(
+    scene: Scene, view: View, surface: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw up to `POINTS` pixels evenly and lift them to the surfaces they show, world (n, 3)."""
+    pixels = rng.uniform((2, 2), np.array(view.shape[::-1]) - 2, (POINTS, 2))
+    shown = surface[tuple(pixels.astype(int).T[::-1])]
+    pixels, shown = pixels[shown >= 0], shown[shown >= 0]
+    inverses = np.linalg.inv(scene.homographies(view)[shown])
+    plane = inverses @ np.column_stack([pixels, np.ones(len(pixels))])[..., None]
+    return (scene.planes[shown] @ (plane / plane[:, 2:]))[..., 0]
+
+
+def _visible(view: View, nearness: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find the points (n, 3) that a camera sees, by its buffer of inverse depths (h, w).
+
+    Returns:
+        Their indices (m,) and their projections in COLMAP's pixels, float64 (m, 2).
+    """
+    x, y, z = view.calibration @ (view.rotation @ points.T + view.translation[:, None])
+    inside = np.flatnonzero(z > 0.1)
+    pixels = (np.stack([x, y]) / z)[:, inside].T
+    kept = ((pixels >= 1) & (pixels < np.array(view.shape[::-1]) - 1)).all(axis=1)
+    inside, pixels = inside[kept], pixels[kept]
+    agreement = nearness[tuple(pixels.astype(int).T[::-1])] * z[inside]
+    kept = abs(agreement - 1) < TOLERANCE
+    return inside[kept], pixels[kept]

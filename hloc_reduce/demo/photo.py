@@ -1,7 +1,5 @@
 """Taking a photo: the light of its hour, then lens, sensor and JPEG."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 
@@ -13,7 +11,7 @@ LAMP = np.array([1.0, 0.70, 0.38])  # colour of the lamps, linear
 
 
 def take(scene: Scene, photo: Photo, seed: int) -> bytes:
-    """The photo as a JPEG file; it depends only on the scene, the photo and the seed."""
+    """Return the photo as a JPEG file; it depends only on the scene, the photo and the seed."""
     rng = np.random.default_rng([seed, 20 + photo.kind, photo.index])
     view = View.of(photo.camera, photo.cam_from_world, SUPERSAMPLING)
     if photo.kind == NIGHT:
@@ -31,7 +29,7 @@ def take(scene: Scene, photo: Photo, seed: int) -> bytes:
 
 
 def _daylight(rng: np.random.Generator) -> Light:
-    """Sun between bright and veiled, from one of the two sides."""
+    """Draw the light of a day: one of the suns, bright to veiled."""
     return Light(
         sun=int(rng.integers(2)),
         sun_color=rng.uniform(0.4, 1.3) * np.array([1.0, 0.94, 0.84]),
@@ -42,7 +40,7 @@ def _daylight(rng: np.random.Generator) -> Light:
 
 
 def _day(rng: np.random.Generator, image: np.ndarray, phone: bool) -> np.ndarray:
-    """Exposure and white balance of a camera by day; a phone's are worse."""
+    """Apply exposure, white balance and noise of a camera by day; a phone's are worse."""
     spread = 2 if phone else 1
     image = image * (0.30 / np.mean(image) * np.exp(rng.normal(0, 0.10 * spread)))
     image *= np.exp(rng.normal(0, 0.03 * spread, 3)).astype(np.float32)
@@ -52,7 +50,7 @@ def _day(rng: np.random.Generator, image: np.ndarray, phone: bool) -> np.ndarray
 
 
 def _moonlight(rng: np.random.Generator) -> Light:
-    """Hardly any light from the sky, and the lamps."""
+    """Draw the light of a night: the lamps, and hardly any from the sky."""
     return Light(
         sun=0,
         sun_color=np.zeros(3),
@@ -63,7 +61,7 @@ def _moonlight(rng: np.random.Generator) -> Light:
 
 
 def _night(rng: np.random.Generator, image: np.ndarray, difficulty: float) -> np.ndarray:
-    """Glowing lamps, blur and noise; all but the glow grow with ``difficulty``, in [0, 1]."""
+    """Apply the glow of lamps, then blur and noise that grow with `difficulty`, in [0, 1]."""
     for sigma, share in ((4, 0.04), (18, 0.03)):
         image = image + share * cv2.GaussianBlur(np.minimum(image, 2), (0, 0), sigma)
     blur = rng.uniform(0.2, 0.5) + 2.0 * difficulty
@@ -79,7 +77,7 @@ def _night(rng: np.random.Generator, image: np.ndarray, difficulty: float) -> np
 
 
 def _motion(rng: np.random.Generator, length: float) -> np.ndarray:
-    """Kernel of a straight motion of ``length`` pixels, centred, float32 of odd size."""
+    """Draw the blur kernel of a straight motion of `length` pixels, float32 of odd size."""
     size = 2 * int(np.ceil(length / 2)) + 1
     angle = rng.uniform(0, np.pi)
     t = np.linspace(-0.5, 0.5, 64) * length

@@ -1,19 +1,17 @@
 """The renderer: planar textured surfaces, a depth buffer, sunlight with shadows, lamps.
 
 World in metres, z up. Pixel coordinates are COLMAP's: the centre of the first pixel is
-(0.5, 0.5). For a surface ``M = K [R u | R v | R o + t]`` takes plane coordinates in metres to
-homogeneous pixels, and ``M^-1 (x, y, 1) = (u, v, 1) / z``: the texture coordinates and the inverse
+(0.5, 0.5). For a surface `M = K [R u | R v | R o + t]` maps plane coordinates in metres to
+homogeneous pixels, and `M^-1 (x, y, 1) = (u, v, 1) / z`: the texture coordinates and the inverse
 depth are linear in the pixel, hence exact at every pixel centre.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from .surface import View, remap
+from .surface import Points, Surface, View, remap
 
 NEAR = 0.05  # metres
 SUPERSAMPLING = 2
@@ -23,13 +21,13 @@ LINEAR = ((np.arange(256) / 255) ** 2.2).astype(np.float32)  # sRGB level to lin
 
 @dataclass(frozen=True)
 class Light:
-    """Colours in linear light, (3,): of the sun number ``sun``, of the sky, and of the lamps."""
+    """Colours in linear light, (3,), of the sun with index `sun`, the sky and the lamps."""
 
     sun: int
     sun_color: np.ndarray
     sky_color: np.ndarray
     lamp_color: np.ndarray
-    sky_shift: float = 0.0  # which clouds are up, in [0, 1)
+    sky_shift: float = 0.0  # turns the sky, in [0, 1)
 
 
 class Scene:
@@ -37,44 +35,45 @@ class Scene:
 
     Args:
         surfaces: the surfaces.
-        lamps: positions and strengths of the lamps, float (n, 4).
+        lamps: their positions and strengths, float (n, 4).
         suns: unit vectors towards the possible suns, float (n, 3).
         sky: uint8 RGB (H, W, 3), from the zenith down to the horizon, all around.
-        extent: radius in metres, around the origin, of what can throw shadows.
+        extent: radius in metres, around the origin, of the region with shadows.
     """
 
-    def __init__(self, surfaces, lamps, suns, sky, extent):
-        self.surfaces = surfaces
-        self.lamps, self.sky = np.asarray(lamps), sky
+    def __init__(
+        self, surfaces: list[Surface], lamps: Points, suns: Points, sky: np.ndarray, extent: float
+    ):
+        self.surfaces, self.sky = surfaces, sky
+        self.lamps, self.suns = np.asarray(lamps), np.asarray(suns)
         self.planes = np.stack([np.column_stack([*s.axes, s.origin]) for s in surfaces])
         self.normals = -np.cross(self.planes[:, :, 0], self.planes[:, :, 1])
-        padded = [s.outline[np.minimum(np.arange(8), len(s.outline) - 1)] for s in surfaces]
-        padded = np.dstack([padded, np.ones((len(surfaces), 8))])
+        outlines = [s.outline[np.minimum(np.arange(8), len(s.outline) - 1)] for s in surfaces]
+        padded = np.dstack([np.array(outlines), np.ones((len(surfaces), 8))])
         self.corners = padded @ self.planes.transpose(0, 2, 1)  # (n, 8, 3)
         self.centers = self.corners.mean(axis=1)
         self.radii = np.linalg.norm(self.corners - self.centers[:, None], axis=2).max(axis=1)
-        self.suns = np.asarray(suns)
         self.sun_views = [_sun_view(sun, extent) for sun in self.suns]
-        # Of the surfaces slightly raised, lest they throw shadows on themselves.
+        # The surfaces are slightly raised, lest they throw shadows on themselves.
         raised = self.planes.copy()
         raised[:, :, 2] += 0.06 * self.normals
         self.sun_homographies = [view.calibration @ _moved(view, raised) for view in self.sun_views]
         self.sun_buffers = [rasterize(self, view)[1] for view in self.sun_views]
 
     def homographies(self, view: View) -> np.ndarray:
-        """Per surface from plane coordinates to homogeneous pixels, (n, 3, 3)."""
+        """Return the maps from plane coordinates to homogeneous pixels, (n, 3, 3)."""
         return view.calibration @ _moved(view, self.planes)
 
 
 def _moved(view: View, planes: np.ndarray) -> np.ndarray:
-    """Planes (n, 3, 3) from the world to the camera."""
+    """Transform planes (n, 3, 3) from the world to the camera."""
     moved = view.rotation @ planes
     moved[:, :, 2] += view.translation
     return moved
 
 
 def _sun_view(sun: np.ndarray, extent: float) -> View:
-    """A sun so far away that its rays are nearly parallel: shadows need no other camera model."""
+    """Return the view from a sun, so far away that its rays are nearly parallel."""
     distance, size = 40 * extent, 2048
     right = np.cross(sun, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -84,8 +83,15 @@ def _sun_view(sun: np.ndarray, extent: float) -> View:
     return View(calibration, rotation, -rotation @ (sun * distance), (size, size))
 
 
-def _spans(matrix: np.ndarray, outline: np.ndarray, shape: tuple[int, int]):
-    """Pixels whose centres lie in the projected convex outline: first row, column ranges."""
+def _spans(
+    matrix: np.ndarray, outline: np.ndarray, shape: tuple[int, int]
+) -> tuple[int, np.ndarray, np.ndarray] | None:
+    """Find the pixels whose centres lie in a projected convex outline (n, 2).
+
+    Returns:
+        The first row and, for each row from there on, the first column and the end of the columns,
+        int32; None if there is no pixel.
+    """
     points = np.column_stack([outline, np.ones(len(outline))]) @ matrix.T
     if points[:, 2].min() < NEAR:  # clip, keeping the order of the corners
         kept = []
@@ -103,23 +109,28 @@ def _spans(matrix: np.ndarray, outline: np.ndarray, shape: tuple[int, int]):
     if last < first:
         return None
     rows = np.arange(first, last + 1) + 0.5
-    following = np.arange(1, len(x) + 1) % len(x)
-    dx, dy = x[following] - x, y[following] - y
+    next_x, next_y = np.roll(x, -1, axis=0), np.roll(y, -1, axis=0)
+    dx, dy = next_x - x, next_y - y
     crossing = x + (rows - y) * (dx / np.where(dy == 0, np.inf, dy))
-    crossed = (rows >= y) != (rows >= y[following])
+    crossed = (rows >= y) != (rows >= next_y)
     left = np.where(crossed, crossing, np.inf).min(axis=0)
     right = np.where(crossed, crossing, -np.inf).max(axis=0)
-    left = np.clip(np.ceil(left - 0.5), 0, shape[1]).astype(np.int32)
-    right = np.clip(np.ceil(right - 0.5), 0, shape[1]).astype(np.int32)
+    left, right = (
+        np.clip(np.ceil(ends - 0.5), 0, shape[1]).astype(np.int32) for ends in (left, right)
+    )
     return (first, left, right) if (left < right).any() else None
 
 
+def _between(columns: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return which columns (n,) lie in the range of each row (m,), bool (m, n)."""
+    return (columns >= left[:, None]) & (columns < right[:, None])
+
+
 def rasterize(scene: Scene, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """What is seen at every pixel centre.
+    """Find the surface seen at every pixel centre.
 
     Returns:
-        The index of the surface, int16 (h, w), -1 for the sky; the inverse depth, float32 (h, w),
-        0 for the sky.
+        Its index, int16 (h, w), -1 for the sky; its inverse depth, float32 (h, w), 0 for the sky.
     """
     surface = np.full(view.shape, -1, np.int16)
     nearness = np.zeros(view.shape, np.float32)
@@ -131,23 +142,19 @@ def rasterize(scene: Scene, view: View) -> tuple[np.ndarray, np.ndarray]:
         if spans is None:
             continue
         first, left, right = spans
-        x0, x1 = left.min(), right.max()
-        columns = np.arange(x0, x1)
-        mask = (columns >= left[:, None]) & (columns < right[:, None])
+        columns = np.arange(left.min(), right.max())
+        mask = _between(columns, left, right)
         for u0, v0, u1, v1 in scene.surfaces[k].holes:
             corners = np.array([(u0, v0), (u1, v0), (u1, v1), (u0, v1)])
             hole = _spans(homographies[k], corners, view.shape)
             if hole is not None:
-                a, b = hole[1].min(), hole[2].max()
-                inside = columns[max(a - x0, 0) : b - x0]
-                inside = (inside >= hole[1][:, None]) & (inside < hole[2][:, None])
-                rows = slice(hole[0] - first, hole[0] - first + len(inside))
-                mask[rows, max(a - x0, 0) : b - x0] &= ~inside
+                top = hole[0] - first
+                mask[top : top + len(hole[1])] &= ~_between(columns, *hole[1:])
         a, b, c = inverse[2]
         rows = np.arange(first, first + len(left))
         depth = (b * (rows + 0.5) + c).astype(np.float32)[:, None]
         depth = depth + (a * (columns + 0.5)).astype(np.float32)
-        box = slice(first, first + len(left)), slice(x0, x1)
+        box = slice(first, first + len(left)), slice(columns[0], columns[-1] + 1)
         mask &= depth > nearness[box]
         np.copyto(nearness[box], depth, where=mask)
         np.copyto(surface[box], np.int16(k), where=mask)
@@ -155,7 +162,7 @@ def rasterize(scene: Scene, view: View) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _candidates(scene: Scene, view: View) -> np.ndarray:
-    """Indices of the surfaces that face the camera and are not wholly outside its image."""
+    """Return the indices of surfaces that face the camera and may be in its image."""
     facing = ((view.center - scene.planes[:, :, 2]) * scene.normals).sum(axis=1) > 1e-6
     points = (scene.corners @ view.rotation.T + view.translation) @ view.calibration.T
     x, y, z = np.moveaxis(points, 2, 0)
@@ -165,7 +172,7 @@ def _candidates(scene: Scene, view: View) -> np.ndarray:
 
 
 def render(scene: Scene, view: View, light: Light) -> np.ndarray:
-    """Linear light at every pixel, float32 RGB (h, w, 3), without supersampling."""
+    """Compute the linear light at every pixel, float32 RGB (h, w, 3)."""
     surface, _ = rasterize(scene, view)
     order = np.argsort(surface, axis=None, kind="stable").astype(np.int32)
     ends = np.cumsum(np.bincount(surface.ravel() + 1, minlength=len(scene.surfaces) + 1))
@@ -177,8 +184,8 @@ def render(scene: Scene, view: View, light: Light) -> np.ndarray:
     scales = abs(np.linalg.det(inverses))
     for k, inverse, scale in zip(seen, inverses, scales, strict=True):
         pixels = order[ends[k] : ends[k + 1]]
-        y = pixels // view.shape[1]
-        x, y = pixels - y * view.shape[1] + 0.5, y + 0.5
+        row, column = np.divmod(pixels, view.shape[1])
+        x, y = column + 0.5, row + 0.5
         z = 1 / (inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2])
         u = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) * z
         v = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) * z
@@ -188,7 +195,7 @@ def render(scene: Scene, view: View, light: Light) -> np.ndarray:
 
 
 def _sky(scene: Scene, view: View, light: Light, pixels: np.ndarray) -> np.ndarray:
-    """Linear light of the sky, float32 (N, 3)."""
+    """Return the linear light of the sky at pixels (N,), (N, 3)."""
     y, x = np.divmod(pixels, view.shape[1])
     rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))])
     rays = view.rotation.T @ np.linalg.inv(view.calibration) @ rays
@@ -199,8 +206,8 @@ def _sky(scene: Scene, view: View, light: Light, pixels: np.ndarray) -> np.ndarr
     return LINEAR[remap(scene.sky, azimuth * width, row)] * (1.6 * light.sky_color)
 
 
-def _irradiance(scene: Scene, k: int, u: np.ndarray, v: np.ndarray, light: Light) -> np.ndarray:
-    """Light that falls on points of surface ``k``, or leaves it by itself, float32 (N, 3)."""
+def _irradiance(scene: Scene, k: np.intp, u: np.ndarray, v: np.ndarray, light: Light) -> np.ndarray:
+    """Return the light that falls on points of surface `k` or that it emits, float32 (N, 3)."""
     normal, (right, down, origin) = scene.normals[k], scene.planes[k].T
     total = np.broadcast_to((0.72 + 0.28 * normal[2]) * light.sky_color, (len(u), 3))
     total = total.astype(np.float32)
@@ -209,7 +216,7 @@ def _irradiance(scene: Scene, k: int, u: np.ndarray, v: np.ndarray, light: Light
         lit = _sunlit(scene, k, u, v, light.sun)
         total += lit[:, None] * (slope * light.sun_color).astype(np.float32)
     if light.lamp_color.any():
-        received = np.full(len(u), scene.surfaces[k].glow, np.float32)
+        received = np.full(len(u), scene.surfaces[k].texture.glow, np.float32)
         u, v = u.astype(np.float32), v.astype(np.float32)
         distances = np.linalg.norm(scene.lamps[:, :3] - scene.centers[k], axis=1)
         near = distances < scene.radii[k] + LAMP_REACH * np.sqrt(scene.lamps[:, 3])
@@ -223,15 +230,15 @@ def _irradiance(scene: Scene, k: int, u: np.ndarray, v: np.ndarray, light: Light
     return total
 
 
-def _sunlit(scene: Scene, k: int, u: np.ndarray, v: np.ndarray, sun: int) -> np.ndarray:
-    """Part of the sun that points of surface ``k`` see, float32 (N,), from its depth buffer."""
+def _sunlit(scene: Scene, k: np.intp, u: np.ndarray, v: np.ndarray, sun: int) -> np.ndarray:
+    """Return the share of the sun that points of surface `k` see, float32 (N,)."""
     view, buffer = scene.sun_views[sun], scene.sun_buffers[sun]
     (a, b, c), (d, e, f), (g, h, i) = scene.sun_homographies[sun][k]
     z = g * u + h * v + i
     x, y = (a * u + b * v + c) / z, (d * u + e * v + f) / z
     nearness = (1 / z).astype(np.float32)
-    column = np.minimum(np.maximum(x, 1), view.shape[1] - 2).astype(np.float32)
-    row = np.minimum(np.maximum(y, 1), view.shape[0] - 2).astype(np.float32)
+    column = np.clip(x, 1, view.shape[1] - 2).astype(np.float32)
+    row = np.clip(y, 1, view.shape[0] - 2).astype(np.float32)
     lit = np.zeros(len(u), np.float32)
     for dx, dy in ((-0.7, -0.3), (0.3, -0.7), (0.7, 0.3), (-0.3, 0.7)):  # softens the edge
         texel = (row + np.float32(dy)).astype(np.int32) * view.shape[1]
@@ -241,6 +248,6 @@ def _sunlit(scene: Scene, k: int, u: np.ndarray, v: np.ndarray, sun: int) -> np.
 
 
 def downsample(image: np.ndarray) -> np.ndarray:
-    """Mean of every block of supersampled pixels; centres map to centres."""
+    """Average every block of supersampled pixels; centres map to centres."""
     size = image.shape[1] // SUPERSAMPLING, image.shape[0] // SUPERSAMPLING
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -3,13 +3,17 @@
 World in metres, z up. Pixel coordinates are COLMAP's: the centre of the first pixel is (0.5, 0.5).
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import pycolmap
+
+Vector = Sequence[float] | np.ndarray
+Points = Sequence[Vector] | np.ndarray
+Color = Sequence[float] | np.ndarray  # RGB in [0, 1]
+Span = tuple[float, float, float, float]  # a rectangle in a plane: u0, v0, u1, v1 in metres
 
 
 class Texture:
@@ -18,10 +22,11 @@ class Texture:
     Args:
         image: uint8 RGB (H, W, 3); its upper left corner lies at plane coordinates (0, 0).
         density: texels per metre.
+        glow: light it emits at night, times its colours.
     """
 
-    def __init__(self, image: np.ndarray, density: float):
-        self.density = density
+    def __init__(self, image: np.ndarray, density: float, glow: float = 0.0):
+        self.density, self.glow = density, glow
         self.levels = [image]
         while min(image.shape[:2]) > 1:
             size = (image.shape[1] + 1) // 2, (image.shape[0] + 1) // 2
@@ -30,7 +35,7 @@ class Texture:
             self.levels.append(image)
 
     def sample(self, u: np.ndarray, v: np.ndarray, area: np.ndarray) -> np.ndarray:
-        """Colours at plane coordinates.
+        """Look up colours at plane coordinates.
 
         Args:
             u: float (N,), metres to the right.
@@ -41,14 +46,11 @@ class Texture:
             uint8 (N, 3).
         """
         level = np.rint(np.log2(self.density**2 * area) / 2)
-        level = np.minimum(np.maximum(level, 0), len(self.levels) - 1).astype(np.int8)
-        first, last = int(level.min()), int(level.max())
+        level = np.clip(level, 0, len(self.levels) - 1).astype(np.int8)
         colors = np.empty((len(u), 3), np.uint8)
         height, width = self.levels[0].shape[:2]
-        for k in range(first, last + 1):
-            chosen = slice(None) if first == last else np.flatnonzero(level == k)
-            if first != last and not len(chosen):
-                continue
+        for k in np.flatnonzero(np.bincount(level)):
+            chosen = np.flatnonzero(level == k)
             image = self.levels[k]
             # cv2.remap has the centre of the first texel at 0.
             x = u[chosen] * (self.density * image.shape[1] / width) - 0.5
@@ -58,12 +60,12 @@ class Texture:
 
 
 def remap(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Bilinear interpolation at (N,) positions; cv2.remap wants its maps less than 32768 long."""
-    rows = -(-len(x) // 4096)
+    """Interpolate an image (H, W, 3), which repeats, bilinearly at (N,) positions."""
+    rows = -(-len(x) // 4096)  # cv2.remap takes no map of 32768 columns or more
     maps = np.zeros((2, rows * 4096), np.float32)
     maps[:, : len(x)] = x, y
-    maps = maps.reshape(2, rows, 4096)
-    sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    map_x, map_y = maps.reshape(2, rows, 4096)
+    sampled = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     return sampled.reshape(-1, 3)[: len(x)]
 
 
@@ -71,16 +73,15 @@ def remap(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 class Surface:
     """A planar convex polygon with rectangular holes.
 
-    Its points are ``origin + u * axes[0] + v * axes[1]`` in metres; it is seen from the side from
-    which ``axes[0]`` points right and ``axes[1]`` down.
+    Its points are `origin + u * axes[0] + v * axes[1]` in metres; it is visible only from the side
+    where `axes[0]` points right and `axes[1]` down.
     """
 
     origin: np.ndarray  # (3,)
     axes: np.ndarray  # (2, 3), orthonormal
     outline: np.ndarray  # (n, 2), n <= 8
     texture: Texture
-    holes: list[tuple[float, float, float, float]] = field(default_factory=list)
-    glow: float = 0.0  # light it emits at night, times its texture
+    holes: Sequence[Span] = ()
 
 
 @dataclass(frozen=True)
@@ -95,8 +96,8 @@ class View:
     @classmethod
     def of(
         cls, camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d, scale: float = 1
-    ) -> View:
-        """The view of a camera whose image is magnified by ``scale``."""
+    ) -> "View":
+        """Make the view of a camera whose image is magnified by `scale`."""
         calibration = np.diag((scale, scale, 1.0)) @ camera.calibration_matrix()
         pose = cam_from_world.matrix()
         shape = (round(camera.height * scale), round(camera.width * scale))

@@ -1,6 +1,4 @@
-"""The town: houses around a market square with three streets, and what stands in them."""
-
-from __future__ import annotations
+"""The town: houses, a market square with three streets, a fountain, a stall and lamps."""
 
 import functools
 
@@ -41,7 +39,7 @@ HOUSES = [
     House(18, (27, -2.5, 27, -11.5), 7, 3, 4, "half_timber", gabled=True),
 ]
 
-# Where a camera may stand, (x0, y0, x1, y1), and what is in the way there, (x, y, radius).
+# Where a camera may stand, (x0, y0, x1, y1), and obstacles there, (x, y, radius).
 OPEN_GROUND = [(-10.5, -8.5, 10.5, 8.5), (4, 5, 8, 24), (-25, -3, -5, 1), (5, -9, 24, -5)]
 FOUNTAIN, PILLAR, STALL = (-3.5, -1.0, 2.3), (6.0, 4.5, 0.8), (3.6, -4.2, 1.6)
 STANDING_LAMPS = [(-7.5, 5.0), (1.2, 5.8), (8.6, -2.5), (-6.8, -7.4), (7.6, 16.5), (-18.0, 0.6)]
@@ -56,8 +54,8 @@ def build_town(seed: int) -> Scene:
     _fountain(builder)
     _pillar(builder)
     _stall(builder)
-    for x, y in [*STANDING_LAMPS, (20.0, -8.6)]:
-        _street_lamp(builder, (x, y))
+    for spot in [*STANDING_LAMPS, (20.0, -8.6)]:
+        _street_lamp(builder, spot)
     _clutter(builder)
     sky = _sky(builder.rng)
     for number, house in enumerate(HOUSES):
@@ -69,142 +67,126 @@ def build_town(seed: int) -> Scene:
     return Scene(builder.surfaces, builder.lamps, suns, sky, extent=42)
 
 
-def _flat(builder: Builder, area, height: float, texture: Texture) -> None:
-    """A horizontal rectangle ``(x0, y0, x1, y1)``."""
-    x0, y0, x1, y1 = area
-    frame = Frame(np.array([x0, y1, height]), np.array([1.0, 0, 0]), np.array([0, -1.0, 0]))
-    outline = [(0, 0), (x1 - x0, 0), (x1 - x0, y1 - y0), (0, y1 - y0)]
-    builder.polygon(frame, outline, texture)
-
-
 def _ground(builder: Builder) -> None:
-    """Cobbles in the square and in the streets, pavements along the fronts."""
+    """Add cobbles in the square and in the streets, pavements along the fronts."""
     rng = builder.rng
-    for area, stone in (
+    for (x0, y0, x1, y1), stone in (
         ((-12, -10, 12, 10), (0.13, 0.17)),
         ((3, 10, 9, 27), (0.11, 0.12)),
         ((-28, -4, -12, 2), (0.11, 0.12)),
         ((12, -10, 27, -4), (0.15, 0.26)),
     ):
-        cobbles = paint.cobbles(rng, area[2] - area[0], area[3] - area[1], stone)
-        _flat(builder, area, 0.0, Texture(cobbles, 72))
-    earth = Texture(paint.trim(rng, (0.35, 0.32, 0.27)), 20)
-    _flat(builder, (-60, -60, 60, 60), -0.05, earth)
-    kerb = Texture(paint.trim(rng, (0.55, 0.54, 0.52)), paint.FINE)
+        cobbles = paint.cobbles(rng, x1 - x0, y1 - y0, stone)
+        builder.rectangle(Frame.level(x0, y1, 0.0), (x1 - x0, y1 - y0), cobbles)
+    earth = paint.trim(rng, (0.35, 0.32, 0.27), density=20)
+    builder.rectangle(Frame.level(-60, 60, -0.05), (120, 120), earth)
+    kerb = paint.trim(rng, (0.55, 0.54, 0.52))
     for number, house in enumerate(HOUSES):
         p, q = np.array(house.front[:2]), np.array(house.front[2:])
         frame = Frame.upright(np.array([*p, 0.12 + 0.004 * number]), q - p)
         width = float(np.linalg.norm(q - p))
         slabs = paint.ashlar(rng, (115, round(width * 96)), (0.50, 0.49, 0.47))
-        slabs = Texture(paint.finish(slabs), paint.DENSITY)
-        builder.rectangle(frame.origin, frame.right, frame.out, (width, 1.05), slabs)
+        pavement = Frame(frame.origin, frame.right, frame.out)
+        builder.rectangle(pavement, (width, 1.05), paint.texture(slabs, paint.DENSITY))
         builder.box(frame, (0, 0, width, 0.3), (1.05, 1.2), kerb)
 
 
 def _fountain(builder: Builder) -> None:
-    """An octagonal basin with a statue, of a kind, on a pedestal."""
+    """Add an octagonal basin with a statue, of a kind, on a pedestal."""
     rng, center = builder.rng, np.array(FOUNTAIN[:2])
     sides = []
     for _ in range(8):
         side = paint.ashlar(rng, (112, 200), (0.58, 0.55, 0.48))
         paint.spot(rng, side, rng.uniform((30, 20), (170, 80)), (16, 11), (0.4, 0.38, 0.33))
-        sides.append(Texture(paint.finish(side), 120))
-    stone = Texture(paint.trim(rng, (0.60, 0.57, 0.50)), paint.FINE)
-    water = Texture(paint.trim(rng, (0.16, 0.24, 0.24), 3), 60)
-    builder.prism(center, 1.9, 0, 0.75, sides, water)
+        sides.append(paint.texture(side, 120))
+    stone = paint.trim(rng, (0.60, 0.57, 0.50))
+    water = paint.trim(rng, (0.16, 0.24, 0.24), 3, density=60)
+    builder.prism(center, 1.9, (0, 0.75), sides, water)
     for k in range(8):
         angle = (k + 0.5) * np.pi / 4
         spot = center + 1.74 * np.array([np.cos(angle), np.sin(angle)])
-        builder.block(spot, (1.4, 0.24), 0.7, 0.86 + 0.003 * k, stone, angle + np.pi / 2)
-    for size, bottom, top in ((1.1, 0.7, 1.1), (0.8, 1.1, 2.3), (0.95, 2.3, 2.45)):
-        carved = Texture(sign(rng, 1, 1, 5), paint.FINE) if size == 0.8 else stone
-        builder.block(center, (size, size), bottom, top, carved, 0.3)
-    bronze = Texture(paint.trim(rng, (0.25, 0.36, 0.31)), paint.FINE)
-    for size, bottom, top, turn in (
-        ((0.5, 0.35), 2.45, 3.2, 0.5),
-        ((0.62, 0.3), 3.2, 3.75, 0.8),
-        ((0.28, 0.28), 3.75, 4.1, 1.1),
-        ((0.9, 0.12), 3.55, 3.68, 0.2),
-    ):
-        builder.block(center, size, bottom, top, bronze, turn)
+        heights = (0.7, 0.86 + 0.003 * k)
+        builder.block(spot, (1.4, 0.24), heights, stone, angle + np.pi / 2)
+    for size, heights in ((1.1, (0.7, 1.1)), (0.8, (1.1, 2.3)), (0.95, (2.3, 2.45))):
+        carved = sign(rng, 1, 1, 5) if size == 0.8 else stone
+        builder.block(center, (size, size), heights, carved, 0.3)
+    bronze = paint.trim(rng, (0.25, 0.36, 0.31))
+    builder.block(center, (0.5, 0.35), (2.45, 3.2), bronze, 0.5)
+    builder.block(center, (0.62, 0.3), (3.2, 3.75), bronze, 0.8)
+    builder.block(center, (0.28, 0.28), (3.75, 4.1), bronze, 1.1)
+    builder.block(center, (0.9, 0.12), (3.55, 3.68), bronze, 0.2)
 
 
 def _pillar(builder: Builder) -> None:
-    """A round advertising pillar, pasted with posters."""
-    rng, center = builder.rng, np.array(PILLAR[:2])
-    sides = [Texture(sign(rng, 0.55, 2.6, int(rng.integers(4, 8))), paint.FINE) for _ in "8" * 8]
-    wood = Texture(paint.trim(rng, (0.22, 0.30, 0.24)), paint.FINE)
-    builder.prism(center, 0.7, 0.25, 2.8, sides, wood)
-    builder.prism(center, 0.8, 0, 0.25, [wood] * 8, wood)
-    builder.prism(center, 0.85, 2.8, 3.0, [wood] * 8, wood)
+    """Add a round advertising pillar, pasted with posters."""
+    rng, center = builder.rng, PILLAR[:2]
+    sides = [sign(rng, 0.55, 2.6, int(rng.integers(4, 8))) for _ in range(8)]
+    wood = paint.trim(rng, (0.22, 0.30, 0.24))
+    builder.prism(center, 0.7, (0.25, 2.8), sides, wood)
+    builder.prism(center, 0.8, (0, 0.25), [wood] * 8, wood)
+    builder.prism(center, 0.85, (2.8, 3.0), [wood] * 8, wood)
 
 
 def _stall(builder: Builder) -> None:
-    """A market stall under a striped awning, with crates of fruit."""
+    """Add a market stall under a striped awning, with crates of fruit."""
     rng, (x, y) = builder.rng, STALL[:2]
-    wood = Texture(paint.trim(rng, (0.45, 0.33, 0.22), 5), paint.FINE)
+    wood = paint.trim(rng, (0.45, 0.33, 0.22), 5)
     for dx in (-1.3, 1.3):
         for dy in (-0.8, 0.8):
-            builder.block((x + dx, y + dy), (0.09, 0.09), 0, 2.2, wood)
-    builder.block((x, y), (2.5, 1.3), 0.1, 0.85, wood)
+            builder.block((x + dx, y + dy), (0.09, 0.09), (0, 2.2), wood)
+    builder.block((x, y), (2.5, 1.3), (0.1, 0.85), wood)
     cloth = paint.tinted((0.75, 0.72, 0.66), 0.06 * paint.fractal(rng, (160, 480), 50, 5))
-    stripes = np.arange(480) // 30 % 2 == 1
-    cloth[:, stripes] *= np.float32((0.8, 0.25, 0.22))
-    cloth = Texture(paint.finish(cloth), paint.FINE)
+    cloth[:, np.arange(480) // 30 % 2 == 1] *= np.array((0.8, 0.25, 0.22), np.float32)  # stripes
+    awning = paint.texture(cloth)
     for side in (-1, 1):
         right = np.array([-side * 1.0, 0, 0])
         corner = np.array([x + side * 1.5, y, 2.85])
         down = np.array([0, side * 1.0, -0.6]) / np.hypot(1, 0.6)
-        builder.rectangle(corner, right, down, (3.0, 1.25), cloth)
-        builder.rectangle(corner + 3 * right, -right, down, (3.0, 1.25), cloth)
+        builder.rectangle(Frame(corner, right, down), (3.0, 1.25), awning)
+        builder.rectangle(Frame(corner + 3 * right, -right, down), (3.0, 1.25), awning)
     for k in range(5):
         goods = paint.tinted((0.4, 0.3, 0.2), 0.2 * paint.fractal(rng, (64, 64), 20, 3))
         color = rng.uniform(0.2, 0.9, 3)
         for _ in range(40):
             paint.spot(rng, goods, rng.uniform(0, 64, 2), (6, 6), color * rng.uniform(0.6, 1.1))
-        goods = Texture(paint.finish(goods), paint.FINE)
-        builder.block((x - 1 + 0.5 * k, y), (0.42, 1.0), 0.85, rng.uniform(1.0, 1.15), goods)
+        heights = (0.85, rng.uniform(1.0, 1.15))
+        builder.block((x - 1 + 0.5 * k, y), (0.42, 1.0), heights, paint.texture(goods))
 
 
-def _street_lamp(builder: Builder, spot) -> None:
-    """A lamp post."""
-    iron = Texture(paint.trim(builder.rng, (0.10, 0.13, 0.12)), paint.FINE)
-    builder.prism(spot, 0.17, 0, 0.7, [iron] * 8, iron)
-    builder.prism(spot, 0.06, 0.7, 3.5, [iron] * 8, iron)
-    glass = np.full((16, 16, 3), (255, 240, 205), np.uint8)
-    first = len(builder.surfaces)
-    builder.block(spot, (0.3, 0.3), 3.5, 3.95, Texture(glass, 16), 0.4)
-    for surface in builder.surfaces[first:]:
-        object.__setattr__(surface, "glow", 25.0)
-    builder.block(spot, (0.42, 0.42), 3.95, 4.05, iron, 0.4)
+def _street_lamp(builder: Builder, spot: tuple[float, float]) -> None:
+    """Add a lamp post."""
+    iron = paint.trim(builder.rng, (0.10, 0.13, 0.12))
+    builder.prism(spot, 0.17, (0, 0.7), [iron] * 8, iron)
+    builder.prism(spot, 0.06, (0.7, 3.5), [iron] * 8, iron)
+    glass = Texture(np.full((16, 16, 3), (255, 240, 205), np.uint8), 16, glow=25.0)
+    builder.block(spot, (0.3, 0.3), (3.5, 3.95), glass, 0.4)
+    builder.block(spot, (0.42, 0.42), (3.95, 4.05), iron, 0.4)
     builder.lamps.append((*spot, 3.72, 6.0))
 
 
 def _clutter(builder: Builder) -> None:
-    """Barrels, crates and planters along the walls."""
+    """Add barrels and stacks of crates along the walls."""
     rng = builder.rng
     spots = [(-11, 6), (-10.2, -9), (-9, 9), (10.8, 8.6), (10.9, 0.5), (-1, -9), (8, -9)]
     spots += [(3.6, 20), (8.5, 22.5), (8.4, 12), (-20, 1.5), (-15, -3.5), (18, -9.3), (22, -4.7)]
-    for x, y in spots:
+    for spot in spots:
         wood = paint.trim(rng, rng.uniform(0.2, 0.5) * np.array((1.3, 1.0, 0.75)), 4)
-        wood = Texture(wood, paint.FINE)
         if rng.random() < 0.4:
-            bands = [wood] * 8
-            builder.prism((x, y), 0.36, 0, 0.95, bands, wood)
+            builder.prism(spot, 0.36, (0, 0.95), [wood] * 8, wood)
         else:
             for k in range(rng.integers(1, 4)):
-                label = Texture(sign(rng, 0.7, 0.5, 2), paint.FINE)
+                label = sign(rng, 0.7, 0.5, 2)
                 size, turn = rng.uniform(0.5, 0.7), rng.uniform(0, 1.5)
-                builder.block((x, y), (size, size), 0.5 * k, 0.5 * k + 0.48, label, turn)
+                builder.block(spot, (size, size), (0.5 * k, 0.5 * k + 0.48), label, turn)
 
 
 def _sky(rng: np.random.Generator) -> np.ndarray:
-    """Soft clouds on blue, uint8 (256, 2048, 3), from the zenith to the horizon."""
+    """Paint soft clouds on blue, uint8 (256, 2048, 3), from the zenith to the horizon."""
     shape = (256, 2048)
     y = np.linspace(0, 1, shape[0], dtype=np.float32)[:, None, None]
-    paint_blue = (1 - y) * np.float32((0.38, 0.55, 0.80)) + y * np.float32((0.74, 0.81, 0.88))
-    clouds = sum(0.55**k * paint.noise(rng, shape, (60 / 2**k, 160 / 2**k)) for k in range(5))
-    cover = 0.9 * paint.soft_step(clouds, 0.3, 2.2)[..., None]
-    blend = np.linspace(0, 1, 256, dtype=np.float32)[None, :, None]  # closes the circle
-    cover[:, :256] = blend * cover[:, :256] + (1 - blend) * cover[:, -1:]
-    return paint.finish(paint_blue + cover * (np.float32((0.95, 0.95, 0.96)) - paint_blue))
+    zenith, horizon = np.array([(0.38, 0.55, 0.80), (0.74, 0.81, 0.88)], np.float32)
+    clouds = paint.fractal(rng, shape, (60, 160), 5, 0.55)
+    cover = 0.9 * paint.soft_step(clouds, 0.3, 2.2)
+    fade = np.linspace(0, 1, 256, dtype=np.float32)  # closes the circle
+    cover[:, :256] = fade * cover[:, :256] + (1 - fade) * cover[:, -1:]
+    return paint.finish(paint.mixed((1 - y) * zenith + y * horizon, (0.95, 0.95, 0.96), cover))

@@ -1,7 +1,7 @@
 """Train projections on COLMAP maps or on PhotoTour patches.
 
 Extracts, matches and triangulates the images of each map with the poses of its model, and learns
-from the tracks. A map of one's own that pipelines.localize built will do.
+from the tracks. A map built by pipelines.localize works, too.
 """
 
 import argparse
@@ -26,8 +26,8 @@ from . import nested, patch_tracks, pca, ss, sv, tracks, us
 
 SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
 RECIPE_NAMES = ("best", "paper", "tune")
-# hidden layers of projections of an extractor's own descriptors; COLMAP's are so soon computed that
-# larger ones would take 5 % of the time
+# hidden layers for descriptors that are not of patches; COLMAP's are computed so fast that larger
+# layers would take 5 % of the time
 HIDDEN = {COLMAP: (256, 256)}
 HIDDEN_BY_DEFAULT = (512, 512)
 
@@ -50,90 +50,83 @@ def main(
     Args:
         maps: from the name of each map to the folders of its images and its COLMAP model.
         sequences: folders of PhotoTour.
-        descriptor: base descriptor, or what the projections of `conf` are called after.
+        descriptor: base descriptor; with `conf`, a name for its descriptors.
         scheme: a key of `SCHEMES`.
-        dims: numbers of output dimensions; not of "nested", which has its own.
+        dims: numbers of output dimensions; ignored by "nested", which has its own.
         output: folder for `<descriptor>_<scheme><dim>.safetensors`.
-        cache: folder for what is computed of maps and sequences, used again by later trainings.
-        recipe: "best", "paper" for its losses, layers and hyper-parameters, or "tune" to begin
-            with the projection that ships and learn what is particular to a place of one's own.
+        cache: folder for the tracks, which later trainings use again.
+        recipe: "best", "paper" for the paper's losses, layers and hyper-parameters, or "tune" to
+            adapt the shipped projection to a single place.
         seed: of everything random.
-        conf: of a feature, to train projections of its descriptors on maps.
+        conf: configuration of a feature, to train projections of its descriptors on maps.
 
     Returns:
         The files.
 
     Raises:
-        InputError: when a map or a sequence cannot be used, or has descriptors of fewer dimensions.
+        InputError: when a map or a sequence cannot be used, or a dimension is too large.
     """
-    trainer, sequences = SCHEMES[scheme], [Path(folder) for folder in sequences]
+    trainer, name = SCHEMES[scheme], f"{descriptor}_{scheme}"
+    names = {dim: f"{name}{dim}" for dim in dims}
     if trainer is nested:
-        paths = {nested.PREFIXES[0]: output / f"{descriptor}_nested.safetensors"}
-    else:
-        paths = {dim: output / f"{descriptor}_{scheme}{dim}.safetensors" for dim in dims}
-    base = {"descriptor": descriptor}
-    if conf:
-        base = {"descriptor": extractors.load(conf["model"]).descriptor, "base": conf}
-    settings = {
-        path: complete_recipe(scheme, recipe, base["descriptor"], path.stem)
-        for path in paths.values()
-    }
-    files = {
-        folder.resolve().name: patch_tracks.main(
-            folder, cache / folder.resolve().name, descriptor, seed
-        )
-        for folder in sequences
-    } | {
-        name: tracks.main(images, model, cache / name, descriptor, seed, conf)
-        for name, (images, model) in maps.items()
-    }
-    checksums = {name: file_sha256(file) for name, file in files.items()}
+        names = {nested.PREFIXES[0]: name}
+    trained = extractors.load(conf["model"]).descriptor if conf else descriptor
+    settings = {dim: complete_recipe(scheme, recipe, trained, name) for dim, name in names.items()}
+    files = {}
+    for folder in map(Path, sequences):
+        place = folder.resolve().name
+        files[place] = patch_tracks.main(folder, cache / place, descriptor, seed)
+    for place, (images, model) in maps.items():
+        files[place] = tracks.main(images, model, cache / place, descriptor, seed, conf)
     data = [tracks.load(file) for file in files.values()]
+    training_data = {
+        place: {
+            "points": part.num_tracks,
+            "observations": len(part.track),
+            "sha256": file_sha256(file),
+        }
+        for (place, file), part in zip(files.items(), data, strict=True)
+    }
     size = data[0].descriptors.shape[-1]
-    if max(paths) > size:
-        raise InputError(f"{descriptor} has {size} dimensions, which {max(paths)} do not reduce.")
-    for dim, path in paths.items():
+    if max(names) > size:
+        raise InputError(f"{descriptor} descriptors are {size}-D: --dim {max(names)} is too large.")
+    paths = [output / f"{name}.safetensors" for name in names.values()]
+    for dim, path in zip(names, paths, strict=True):
         metadata = {
-            **base,
+            "descriptor": trained,
+            **({"base": conf} if conf else {}),
             "input": "descriptors of unit L2 norm",
             "scheme": scheme,
             "dim": dim,
-            "training_data": {
-                name: {
-                    "points": part.num_tracks,
-                    "observations": len(part.track),
-                    "sha256": checksums[name],
-                }
-                for name, part in zip(files, data, strict=True)
-            },
-            "recipe": {"name": recipe, **settings[path]},
+            "training_data": training_data,
+            "recipe": {"name": recipe, **settings[dim]},
             "seed": seed,
             "versions": versions(),
         }
-        if path.exists():
-            before = projections.load(path).metadata
-            changed = [key for key in metadata if before.get(key) != metadata[key]]
-            if not changed:
-                logger.info("%s is there already.", path)
-                continue
-            raise InputError(
-                f"{path} is there already, of another {' and '.join(changed)}. "
-                "Choose another --output, or move it away."
-            )
-        checkpoint = path.with_suffix(".ckpt")
-        mlp = trainer.train(
-            data,
-            dim,
-            settings[path],
-            seed,
-            checkpoint=checkpoint,
-            made_from=json.dumps(metadata, sort_keys=True),
+        if not _exists(path, metadata):
+            checkpoint = path.with_suffix(".ckpt")
+            made_from = json.dumps(metadata, sort_keys=True)
+            mlp = trainer.train(data, dim, settings[dim], seed, checkpoint, made_from)
+            network.save(mlp, metadata, path)
+            for file in (checkpoint, ss.clusters_of(checkpoint)):
+                file.unlink(missing_ok=True)
+            logger.info("Saved %s.", path)
+    return paths
+
+
+def _exists(path: Path, metadata: dict) -> bool:
+    """Return whether a projection exists; raise an InputError if its metadata differ."""
+    if not path.exists():
+        return False
+    before = projections.load(path).metadata
+    changed = [key for key in metadata if before.get(key) != metadata[key]]
+    if changed:
+        raise InputError(
+            f"{path} exists, trained with another {' and '.join(changed)}. "
+            "Choose another --output, or move it away."
         )
-        network.save(mlp, metadata, path)
-        for file in (checkpoint, ss.clusters_of(checkpoint)):
-            file.unlink(missing_ok=True)
-        logger.info("Saved %s.", path)
-    return list(paths.values())
+    logger.info("%s exists, trained from the same.", path)
+    return True
 
 
 def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dict:
@@ -141,22 +134,19 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
 
     Args:
         scheme: a key of `SCHEMES`.
-        recipe: of `RECIPE_NAMES`.
+        recipe: one of `RECIPE_NAMES`.
         descriptor: base descriptor, or another.
-        name: of the projection; "tune" begins with the one of this name that ships.
+        name: of the shipped projection that "tune" begins with.
 
     Raises:
-        InputError: when the scheme has no such recipe, or there is nothing to begin with.
+        InputError: when the scheme has no such recipe, or no such projection ships.
     """
     trainer = SCHEMES[scheme]
     if trainer is pca:
         return {}
+    base = DESCRIPTORS.get(descriptor)
     settings = {
-        "hidden": list(
-            DESCRIPTORS[descriptor].hidden
-            if descriptor in DESCRIPTORS
-            else HIDDEN.get(descriptor, HIDDEN_BY_DEFAULT)
-        ),
+        "hidden": list(base.hidden if base else HIDDEN.get(descriptor, HIDDEN_BY_DEFAULT)),
         "distance_weight": trainer.DISTANCE_WEIGHTS.get(descriptor, 0.0),
         **trainer.RECIPES[cli.choose(f"recipe of {scheme}", recipe, trainer.RECIPES)],
     }
@@ -165,74 +155,67 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
     return settings
 
 
-def base_of(conf: dict) -> dict:
-    """Return the configuration of the feature that a reduced one is made from."""
-    return {**conf, "model": features_confs.base_of(conf["model"])}
-
-
 def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
     """Parse `images:model`, or folders of maps of `pipelines.localize`.
 
-    A map is named after the folder that its images folder, or the folder of the map, lies in.
+    A map is named after the parent of its images folder, or of the folder of the built map.
 
     Returns:
         From name to the folders of images and of the COLMAP model.
 
     Raises:
-        InputError: when a folder is not there, or two maps have one name.
+        InputError: when a folder does not exist, or two maps have the same name.
     """
-    folders = {}
+    folders: dict[str, tuple[Path, Path]] = {}
     for value in values:
         if is_map(Path(value)):
             built = Map(Path(value))
-            images, model = built.images, built.sfm
-            name = built.folder.resolve().parent.name
+            images, model, folder = built.images, built.sfm, built.folder
         else:
-            images, separator, model = value.rpartition(":")
+            before, separator, after = value.rpartition(":")
             if not separator:
                 raise InputError(f"--map {value}: neither a map nor of the form images:model.")
-            images, model = Path(images), Path(model)
-            name = images.resolve().parent.name
-        for folder in (images, model):
-            if not folder.is_dir():
-                raise InputError(f"--map {value}: there is no folder {folder}.")
+            images, model, folder = Path(before), Path(after), Path(before)
+        for part in (images, model):
+            if not part.is_dir():
+                raise InputError(f"--map {value}: there is no folder {part}.")
+        name = folder.resolve().parent.name
         if name in folders:
-            raise InputError(f"--map {value}: another map is called {name} too.")
+            raise InputError(f"--map {value}: another map is called {name}, too.")
         folders[name] = images, model
     return folders
 
 
-def _main() -> None:
+def validate(folder: Path, outputs: Path, descriptor: str, paths: list[Path]) -> None:
+    """Print the FPR95 of a base descriptor and its projections on a PhotoTour sequence."""
+    projects: dict[str, torch.nn.Module] = {descriptor: torch.nn.Identity()}
+    projects |= {path.stem: projections.load(path) for path in paths}
+    found = verification.main(folder, outputs, descriptor, projects)
+    for name, value in found.items():
+        print(f"FPR95 of {name} on {folder.resolve().name}: {100 * value:.2f} %")
+
+
+def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: python -m hloc_reduce.training --descriptor sift --scheme sv --dim 64 "
         "--map town/images:town/sparse --output weights",
         formatter_class=cli.HelpFormatter,
     )
+    add = parser.add_argument
     base = parser.add_mutually_exclusive_group()
     base.add_argument(
-        "--descriptor",
-        nargs="+",
-        default=["sift"],
-        help=f"base descriptors, of {', '.join(BASES)}",
+        "--descriptor", nargs="+", default=["sift"], help=f"base descriptors: {', '.join(BASES)}"
     )
     base.add_argument(
         "--base",
         type=Path,
         metavar="FILE",
-        help="YAML file of a feature of any extractor, also of hloc's, to project instead",
+        help="YAML file of a feature of any extractor, hloc's included, to project instead",
     )
-    parser.add_argument(
-        "--scheme", nargs="+", default=["sv"], help=f"schemes, of {', '.join(SCHEMES)}"
-    )
-    parser.add_argument(
-        "--dim",
-        type=int,
-        nargs="+",
-        default=[64],
-        help="output dimensions, of all schemes but nested",
-    )
-    parser.add_argument(
+    add("--scheme", nargs="+", default=["sv"], help=f"schemes: {', '.join(SCHEMES)}")
+    add("--dim", type=int, nargs="+", default=[64], help="output dimensions; not for nested")
+    add(
         "--map",
         action="append",
         default=[],
@@ -240,7 +223,7 @@ def _main() -> None:
         help="folder of images and folder of their COLMAP model, or a map of pipelines.localize; "
         "may be repeated",
     )
-    parser.add_argument(
+    add(
         "--phototour",
         type=Path,
         action="append",
@@ -248,33 +231,32 @@ def _main() -> None:
         metavar="DIR",
         help="folder of a PhotoTour sequence to train on; may be repeated",
     )
-    parser.add_argument(
+    add(
         "--validate",
         type=Path,
         metavar="DIR",
-        help="folder of another PhotoTour sequence, to print the FPR95 of its pairs",
+        help="folder of another PhotoTour sequence: print the FPR95 of its pairs",
     )
-    parser.add_argument(
+    add(
         "--recipe",
         default="best",
-        help=f"one of {', '.join(RECIPE_NAMES)}; tune is for one's own map and begins with the "
-        "projection that ships",
+        help=f"one of {', '.join(RECIPE_NAMES)}; tune adapts the shipped projection to one's own "
+        "map",
     )
-    parser.add_argument(
-        "--output", type=Path, default=Path("outputs/training"), help="folder for the projections"
-    )
-    parser.add_argument(
-        "--cache", type=Path, default=Path("outputs/training/maps"), help="folder for the tracks"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="seed of everything random")
-    args = parser.parse_args()
-    conf = None
-    if args.base:
-        if args.phototour or args.validate:
-            raise InputError("--base describes photos, not the patches of PhotoTour.")
-        args.descriptor, conf = [args.base.stem], base_of(features_confs.read(args.base))
-        extractors.load(conf["model"])  # is wrong before any work is done, if it is
+    outputs = Path("outputs/training")
+    add("--output", type=Path, default=outputs, help="folder for the projections")
+    add("--cache", type=Path, default=outputs / "maps", help="folder for the tracks")
+    add("--seed", type=int, default=0, help="seed of everything random")
+    return parser.parse_args()
+
+
+def _check(args: argparse.Namespace, conf: dict | None) -> None:
+    """Raise an InputError for wrong options, before any work is done."""
     of_patches = args.phototour or args.validate
+    if conf:
+        if of_patches:
+            raise InputError("--base describes photos, not the patches of PhotoTour.")
+        extractors.load(conf["model"])
     for descriptor in [] if conf else args.descriptor:
         if of_patches and descriptor == COLMAP:
             raise InputError(f"{descriptor} describes photos, not the patches of PhotoTour.")
@@ -296,40 +278,28 @@ def _main() -> None:
     for dim in args.dim:
         if dim < 1 or (dim > DIM and conf is None):
             raise InputError(f"--dim {dim}: choose 1 to {DIM}.")
+
+
+def _main() -> None:
+    args, conf = _parse(), None
+    if args.base:
+        conf = features_confs.read(args.base)
+        conf["model"] = features_confs.base_of(conf["model"])
+        args.descriptor = [args.base.stem]
+    _check(args, conf)
     maps = parse_maps(args.map)
     names = [*maps, *(folder.resolve().name for folder in args.phototour)]
-    for name in set(names):
+    for name in names:
         if names.count(name) > 1:
             raise InputError(f"Two of the maps and sequences are called {name}. Rename a folder.")
     for descriptor in args.descriptor:
-        paths = [
-            path
-            for scheme in args.scheme
-            for path in main(
-                maps,
-                args.phototour,
-                descriptor,
-                scheme,
-                args.dim,
-                args.output,
-                args.cache,
-                args.recipe,
-                args.seed,
-                conf,
-            )
-        ]
+        paths = []
+        for scheme in args.scheme:
+            arguments = maps, args.phototour, descriptor, scheme, args.dim, args.output, args.cache
+            paths += main(*arguments, args.recipe, args.seed, conf)
         if args.validate:
             folder = args.cache / args.validate.resolve().name
             validate(args.validate, folder, descriptor, paths)
-
-
-def validate(folder: Path, outputs: Path, descriptor: str, paths: list[Path]) -> None:
-    """Print the FPR95 of a base descriptor and projections of it on a PhotoTour sequence."""
-    projects = {descriptor: torch.nn.Identity()}
-    projects |= {path.stem: projections.load(path) for path in paths}
-    found = verification.main(folder, outputs, descriptor, projects)
-    for name, value in found.items():
-        print(f"FPR95 of {name} on {folder.resolve().name}: {100 * value:.2f} %")
 
 
 if __name__ == "__main__":

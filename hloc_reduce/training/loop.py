@@ -1,11 +1,11 @@
-"""The loop that all learned schemes share."""
+"""The training loop that all learned schemes share."""
 
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import torch
-from torch import nn
+from torch import nn, optim
 
 from .. import logger
 from ..utils.files import replacing
@@ -15,7 +15,7 @@ CHECKPOINT_STEPS, CHECKPOINT_SECONDS = 500, 30.0  # whichever comes first
 
 
 def device() -> torch.device:
-    """Return the device that trainings run on: a GPU when there is one."""
+    """Return the device to train on: a GPU when there is one."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
@@ -32,26 +32,30 @@ def fit(
 
     Args:
         network: everything that is learned, on its device.
-        loss: returns the scalar loss of a step, given its number; depends on nothing else but the
-            network, so that a killed training that goes on is the same as an undisturbed one.
+        loss: returns the scalar loss of a step, given its number; it depends on nothing but that
+            and the network, so that a resumed training equals an uninterrupted one.
         steps: their number.
-        recipe: `lr`, `weight_decay` (L2) and `final_lr`, the share of `lr` that the learning rate
-            falls to, linearly.
-        checkpoint: file from which a killed training goes on; the caller deletes it.
-        made_from: says what the training is made from; a checkpoint of another is not used.
-        before: called before each step with its number, may change the network and returns the
-            parameters that were set anew, of which the optimizer knows nothing then. As this may
-            take long, a checkpoint follows.
+        recipe: `lr`, `weight_decay` (L2) and `final_lr`: the learning rate falls linearly from
+            `lr` to `final_lr * lr`.
+        checkpoint: file to resume from; the caller deletes it.
+        made_from: provenance of the training; a stale checkpoint is ignored.
+        before: called before each step with its number. It may change the network, and returns
+            the parameters that it reset, for which the optimizer's state is dropped. It may take
+            long, so a checkpoint follows if it returns any.
     """
-    optimizer = torch.optim.Adam(
+    optimizer = optim.Adam(
         network.parameters(), lr=recipe["lr"], weight_decay=recipe["weight_decay"]
     )
-    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, recipe["final_lr"], steps)
-    parts = {"network": network, "optimizer": optimizer, "schedule": schedule}
-    start, prepared = 0, None  # the step before which `before` was called already
+    schedule = optim.lr_scheduler.LinearLR(optimizer, 1.0, recipe["final_lr"], steps)
+    parts: dict[str, nn.Module | optim.Optimizer | optim.lr_scheduler.LRScheduler] = {
+        "network": network,
+        "optimizer": optimizer,
+        "schedule": schedule,
+    }
+    start, prepared = 0, None  # `prepared` is a step whose `before` was called already
 
     def save(step: int, prepared: bool = False) -> None:
-        state = {key: part.state_dict() for key, part in parts.items()}
+        state: dict[str, object] = {key: part.state_dict() for key, part in parts.items()}
         state |= {"step": step, "prepared": prepared, "made_from": made_from}
         with replacing(checkpoint) as temporary:
             torch.save(state, temporary)
@@ -63,7 +67,7 @@ def fit(
             prepared = start if state.get("prepared") else None
             for key, part in parts.items():
                 part.load_state_dict(state[key])
-            logger.info("Going on from step %d of %s.", start, checkpoint)
+            logger.info("Resuming from step %d of %s.", start, checkpoint)
     mean_loss, saved = None, time.monotonic()
     shown = progress(range(start, steps), "Training", "step", steps, start)
     for step in shown:

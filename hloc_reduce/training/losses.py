@@ -1,8 +1,8 @@
-"""Losses that schemes share."""
+"""Losses of the schemes."""
 
 import torch
 
-DUPLICATE_DISTANCE = 0.008  # HardNet takes what is nearer than this for the same patch
+DUPLICATE_DISTANCE = 0.008  # nearer descriptors count as the same patch, as in HardNet
 
 
 def triplet_loss(anchors: torch.Tensor, positives: torch.Tensor, margin: float) -> torch.Tensor:
@@ -15,7 +15,7 @@ def triplet_loss(anchors: torch.Tensor, positives: torch.Tensor, margin: float) 
 
     Returns:
         The mean over i of max(0, m + d(a_i, p_i) - d(a_i, n_i)), a scalar, where d(a_i, n_i) is
-        the least distance of anchor i or positive i to a row of the other side that is not i.
+        the least distance of anchor i or positive i to a row of the other side other than i.
     """
     distances = (2 - 2 * anchors @ positives.T).clamp(min=1e-8).sqrt()
     positive = distances.diagonal()
@@ -26,7 +26,7 @@ def triplet_loss(anchors: torch.Tensor, positives: torch.Tensor, margin: float) 
 
 
 def distance_loss(descriptors: torch.Tensor, embedded: torch.Tensor) -> torch.Tensor:
-    """Compute how much a projection changes the distances between descriptors (Eq. 2).
+    """Measure how much a projection changes the distances between descriptors (Eq. 2).
 
     Args:
         descriptors: (N, 128) of unit norm.
@@ -39,6 +39,5 @@ def distance_loss(descriptors: torch.Tensor, embedded: torch.Tensor) -> torch.Te
         (2 - 2 * rows @ rows.T).clamp(min=1e-8).sqrt() for rows in (descriptors, embedded)
     )
     changes = (before - after).square()
-    number = len(descriptors)
     total = changes.sum() - changes.diagonal().sum()
-    return total.clamp(min=1e-12).sqrt() / (number * (number - 1))
+    return total.clamp(min=1e-12).sqrt() / (len(descriptors) * (len(descriptors) - 1))

@@ -1,4 +1,4 @@
-"""Supervised reduction to 64 numbers whose first 32, 24 or 16 are good descriptors themselves."""
+"""Supervised reduction to 64 dimensions whose first 32, 24 or 16 are good descriptors, too."""
 
 from . import sv
 

@@ -1,4 +1,4 @@
-"""UBC PhotoTour patches as training data."""
+"""Tracks of UBC PhotoTour patches."""
 
 from pathlib import Path
 
@@ -8,12 +8,19 @@ import torch
 from ..datasets.phototour import SHEET, read_points, read_sheet, sheets
 from ..descriptors import DIM
 from ..descriptors.model import Descriptor
-from ..runtime import provenance
 from ..runtime.group_writer import resume_or_replace
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
 from .loop import device
-from .tracks import VARIANTS, describe_mirrored, parts_of, photometric_variant, save_parts, stamp
+from .tracks import (
+    VARIANTS,
+    describe_mirrored,
+    is_current,
+    parts_of,
+    photometric_variant,
+    save,
+    stamp,
+)
 
 
 @strings_as_paths
@@ -22,12 +29,12 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
 
     Args:
         folder: the sequence.
-        output: folder for the file; one that is there already, made from the same, is used.
+        output: folder for the file, which is used again unless it is stale.
         descriptor: the base descriptor.
         seed: of the photometric variants.
 
     Returns:
-        The file of `tracks.load`; every patch counts as an image of its own.
+        The file for `tracks.load`; every patch counts as an image of its own.
 
     Raises:
         InputError: when the folder is not a sequence.
@@ -35,7 +42,7 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
     path = output / f"tracks_{descriptor}.safetensors"
     points = read_points(folder)
     made_from = stamp(descriptor, seed, [folder / "info.txt", *sheets(folder)])
-    if path.exists() and provenance.is_current(path.with_suffix(".json"), made_from):
+    if is_current(path, made_from):
         return path
     describe = Descriptor(descriptor).to(device())
     files = sheets(folder)[: -(-len(points) // SHEET**2)]  # those with listed patches
@@ -44,15 +51,15 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
         done = len(files) - len(todo)
         for number in progress(todo, "Describing patches", "sheet", len(files), done):
             rows = np.arange(len(points))[number * SHEET**2 : (number + 1) * SHEET**2]
-            patches = read_sheet(files[number])[: len(rows)]
+            patches = views = read_sheet(files[number])[: len(rows)]
             generator = np.random.default_rng([seed, number])
             described = np.empty((len(rows), 2, VARIANTS, DIM), np.float16)
             for variant in range(VARIANTS):
-                views = patches
                 if variant:
                     views = np.stack([photometric_variant(patch, generator) for patch in patches])
-                views = torch.from_numpy(views)[:, None]
-                described[:, :, variant] = describe_mirrored(views, describe)
+                described[:, :, variant] = describe_mirrored(
+                    torch.from_numpy(views)[:, None], describe
+                )
             arrays = {
                 "descriptors": described,
                 "points": points[rows],
@@ -61,4 +68,4 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
                 "matched": np.ones(len(rows), bool),
             }
             writer.add(files[number].stem, arrays)
-    return save_parts(path, made_from, [sheet.stem for sheet in files])
+    return save(path, made_from, [sheet.stem for sheet in files])

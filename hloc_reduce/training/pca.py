@@ -9,28 +9,17 @@ from ..utils.cli import InputError
 from .tracks import Tracks
 
 
-def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, **_) -> MLP:
-    """Fit the observations as they were seen.
-
-    Args:
-        maps: tracks of one or more maps.
-        dim: number of output dimensions.
-        recipe: has no entries.
-        seed: of scikit-learn's solver.
+def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, *_: object) -> MLP:
+    """Fit the descriptors of the unchanged photos; arguments as in `sv`, most of them not used.
 
     Raises:
         InputError: when there are fewer observations than dimensions.
-
-    Returns:
-        One linear layer: the projection of the centred descriptors.
     """
-    descriptors = np.concatenate([tracks.descriptors[:, 0, 0] for tracks in maps]).astype(
-        np.float32
-    )
-    if len(descriptors) < dim:
-        raise InputError(f"{len(descriptors)} observations are too few for {dim} dimensions.")
-    pca = PCA(dim, random_state=seed).fit(descriptors)
-    mlp = MLP([descriptors.shape[1], dim])
+    views = np.concatenate([tracks.descriptors[:, 0, 0] for tracks in maps]).astype(np.float32)
+    if len(views) < dim:
+        raise InputError(f"{len(views)} observations are too few for {dim} dimensions.")
+    pca = PCA(dim, random_state=seed).fit(views)
+    mlp = MLP([views.shape[1], dim])
     mlp.linears[0].weight.data = torch.from_numpy(pca.components_).float()
     mlp.linears[0].bias.data = torch.from_numpy(-pca.components_ @ pca.mean_).float()
     return mlp.eval()

@@ -14,9 +14,9 @@ class PairSampler:
         augment: the share of views that are photometric variants, in [0, 1]; if it is not 0, half
             of the pairs are mirrored too.
         balanced: draw a map with a probability proportional to the square root of its number of
-            tracks, not to the number, so that no large place outweighs the others.
-        maps_per_batch: draw each batch from so many maps at most, whose points look more alike
-            than those of many; None draws from all.
+            tracks, not to that number, so that no large place outweighs the others.
+        maps_per_batch: number of maps per batch at most, whose points look more alike than those
+            of many; None draws from all.
         seed: a batch depends on it and on its number only.
     """
 
@@ -29,22 +29,14 @@ class PairSampler:
         seed: int,
     ):
         self.augment, self.maps_per_batch, self.seed = augment, maps_per_batch, seed
-        self.maps, self.starts, self.lengths = [], [], []
-        for tracks in maps:
-            kept, starts, lengths = matchable(tracks)
-            self.maps.append((tracks.descriptors, kept))
-            self.starts.append(starts)
-            self.lengths.append(lengths)
-        sizes = np.array([len(starts) for starts in self.starts], float)
+        self.maps = [(tracks.descriptors, *matchable(tracks)) for tracks in maps]
+        sizes = np.array([len(starts) for _, _, starts, _ in self.maps], float)
         weights = np.sqrt(sizes) if balanced else sizes
         self.shares = weights / weights.sum()
-        self.num_observations = int(sum(lengths.sum() for lengths in self.lengths))
+        self.num_observations = int(sum(lengths.sum() for *_, lengths in self.maps))
 
     def batch(self, number: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw batch `number`: anchors and positives, each (at most size, D) float32.
-
-        Every point is drawn once at most, so that the other rows are negatives.
-        """
+        """Draw anchors and positives, each (at most size, D) float32, of different points."""
         generator = np.random.default_rng([self.seed, number])
         shares = self.shares
         if self.maps_per_batch:
@@ -55,10 +47,8 @@ class PairSampler:
         anchors, positives = (np.concatenate(part) for part in zip(*parts, strict=True))
         return torch.from_numpy(anchors).float(), torch.from_numpy(positives).float()
 
-    def _draw(
-        self, i: int, count: int, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        (descriptors, kept), starts, lengths = self.maps[i], self.starts[i], self.lengths[i]
+    def _draw(self, i: int, count: int, generator: np.random.Generator) -> list[np.ndarray]:
+        descriptors, kept, starts, lengths = self.maps[i]
         track = generator.choice(len(starts), min(count, len(starts)), replace=False)
         first = generator.integers(lengths[track])
         second = (first + generator.integers(1, lengths[track])) % lengths[track]
@@ -68,7 +58,7 @@ class PairSampler:
             variants = generator.integers(1, descriptors.shape[2], size=len(track))
             variants *= generator.random(len(track)) < self.augment  # 0 is the photo itself
             views.append(descriptors[kept[starts[track] + which], mirrored, variants])
-        return views[0], views[1]
+        return views
 
 
 class DescriptorSampler:
@@ -78,8 +68,8 @@ class DescriptorSampler:
         maps: tracks of one or more maps.
         augment: the share of views that are photometric variants, in [0, 1].
         mirror: mirror half of the views.
-        balanced: draw a map with a probability proportional to the square root of its number of
-            observations, and of it any; otherwise an epoch goes once through all observations.
+        balanced: draw maps with probabilities proportional to the square root of their numbers of
+            observations; otherwise an epoch goes once through all observations.
         seed: a batch depends on it and on its number only.
     """
 
@@ -92,12 +82,12 @@ class DescriptorSampler:
         self.num_observations = int(sizes.sum())
 
     def batch(self, number: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw batch `number`: views, augmented or not, and the photos of the same, (N, 128)."""
+        """Draw a batch as `views` returns it."""
         generator = np.random.default_rng([self.seed, number])
         return self.views(self.indices(number, size), generator)
 
     def indices(self, number: int, size: int) -> np.ndarray:
-        """Draw the observations (N,) of batch `number`, counted through all maps."""
+        """Draw the observations (N,) of a batch, counted through all maps."""
         if self.balanced:
             generator = np.random.default_rng([self.seed, number, 1])
             place = generator.choice(len(self.maps), size, p=self.shares)
@@ -107,18 +97,14 @@ class DescriptorSampler:
         return order[number * size : (number + 1) * size]
 
     def per_epoch(self, size: int) -> int:
-        """Return the number of batches of an epoch.
-
-        A last one of a single observation, which a batch normalization cannot learn from, is left
-        out.
-        """
+        """Return the number of batches of an epoch."""
         full, rest = divmod(self.num_observations, size)
-        return full + (rest > 1)
+        return full + (rest > 1)  # batch normalization cannot learn from a single observation
 
     def views(
         self, indices: np.ndarray, generator: np.random.Generator
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return views of observations, augmented or not, and the photos of the same."""
+        """Return views (N, D), augmented or not, and the same unaugmented, both float32."""
         variant = generator.random(len(indices)) < self.augment
         mirrored = generator.integers(2, size=len(indices)) * self.mirror
         shape = len(indices), self.maps[0].descriptors.shape[-1]
@@ -137,8 +123,8 @@ def matchable(tracks: Tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the points that are seen in several images, and one observation for each image.
 
     Returns:
-        Indices of observations, sorted by track; and for each track of two or more of them, the
-        first, as a position in these indices, and their number.
+        Indices of observations, sorted by track; and for each track of two or more, where its
+        observations start in these indices, and their number.
     """
     _, kept = np.unique(np.stack([tracks.track, tracks.image], 1), axis=0, return_index=True)
     _, starts, lengths = np.unique(tracks.track[kept], return_index=True, return_counts=True)

@@ -19,10 +19,10 @@ from .sampling import DescriptorSampler
 from .tracks import Tracks
 
 # "paper" is Sec. III-D: 100,000 clusters for the 450,092 patches of Liberty, 200 epochs, clustered
-# anew every 10; the classification layer is the one that it cites, with the margin in radians, the
-# first scale and the iterations of k-means of the authors' code. "best" clusters once, each map for
-# itself and within cells of about so many descriptors, and then learns as the supervised scheme.
-RECIPES = {
+# again every 10. Its classification layer has the margin (radians), the initial scale and the
+# iterations of k-means of the authors' code. "best" clusters each map once, within cells of about
+# `per_cell` descriptors, and then learns as the supervised scheme.
+RECIPES: dict[str, dict] = {
     "paper": {
         "loss": "classification",
         "per_cluster": 450_092 / 100_000,
@@ -46,7 +46,7 @@ RECIPES = {
         "steps": 3000,
     },
 }
-DISTANCE_WEIGHTS = {}
+DISTANCE_WEIGHTS: dict[str, float] = {}
 
 
 class ArcClassifier(nn.Module):
@@ -56,7 +56,7 @@ class ArcClassifier(nn.Module):
         num_classes: the number of classes.
         dim: of the descriptors.
         margin: radians.
-        scale: of the logits, at first; it is learned.
+        scale: initial scale of the logits, which is learned.
     """
 
     def __init__(self, num_classes: int, dim: int, margin: float, scale: float):
@@ -67,7 +67,7 @@ class ArcClassifier(nn.Module):
         self.reset()
 
     def reset(self) -> list[nn.Parameter]:
-        """Forget everything and return what has been set anew."""
+        """Initialize the parameters again and return them."""
         nn.init.xavier_uniform_(self.weight)
         nn.init.constant_(self.scale, self.first_scale)
         return [self.weight, self.scale]
@@ -82,11 +82,7 @@ class ArcClassifier(nn.Module):
 
 
 def check() -> None:
-    """Make sure that all is there that the scheme needs.
-
-    Raises:
-        InputError: when faiss is not installed.
-    """
+    """Raise an InputError if faiss is not installed."""
     if not importlib.util.find_spec("faiss"):
         raise InputError("The scheme ss needs faiss: pip install faiss-cpu.")
 
@@ -118,7 +114,7 @@ def cluster_in_cells(
         per_cluster: the mean number of descriptors of a cluster.
         per_cell: the mean number of descriptors of a cell.
         iterations: of k-means.
-        seed: of the first centres.
+        seed: of the initial centres.
 
     Returns:
         Labels (N,) int64, from 0 on.
@@ -137,32 +133,8 @@ def train(
     maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path, made_from: str = ""
 ) -> MLP:
     """Train a projection to tell clusters of descriptors apart; arguments as in `sv`."""
-    trainer = {"classification": classify, "triplet": match}[recipe["loss"]]
+    trainer = {"classification": _classify, "triplet": _match}[recipe["loss"]]
     return trainer(maps, dim, recipe, seed, checkpoint, made_from)
-
-
-def match(
-    maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path, made_from: str
-) -> MLP:
-    """Learn as the supervised scheme does, with clusters of base descriptors for points.
-
-    The clusters of each map are kept in `clusters_of(checkpoint)`.
-    """
-    kept = clusters_of(checkpoint)
-    with resume_or_replace(kept, {"made_from": made_from, "seed": seed}) as writer:
-        for number, tracks in enumerate(maps):
-            if str(number) not in writer:
-                logger.info("Clustering %d descriptors.", len(tracks.track))
-                descriptors = tracks.descriptors[:, 0, 0].astype(np.float32)
-                how = (recipe[key] for key in ("per_cluster", "per_cell", "iterations"))
-                labels = cluster_in_cells(descriptors, *how, seed)
-                writer.add(str(number), {"labels": labels})
-    with open_h5(kept) as file:
-        clustered = [
-            by_cluster(tracks, get_dataset(file, str(number), "labels")[()])
-            for number, tracks in enumerate(maps)
-        ]
-    return sv.train(clustered, dim, recipe, seed, checkpoint, made_from)
 
 
 def clusters_of(checkpoint: Path) -> Path:
@@ -170,20 +142,41 @@ def clusters_of(checkpoint: Path) -> Path:
     return checkpoint.with_name(f"{checkpoint.name}.clusters.h5")
 
 
-def by_cluster(tracks: Tracks, labels: np.ndarray) -> Tracks:
-    """Take clusters (M,) of the observations of a map for its points, whatever they see."""
+def _match(
+    maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path, made_from: str
+) -> MLP:
+    """Learn as the supervised scheme does, with clusters of base descriptors as points."""
+    kept = clusters_of(checkpoint)
+    with resume_or_replace(kept, {"made_from": made_from, "seed": seed}) as writer:
+        for number, tracks in enumerate(maps):
+            if str(number) not in writer:
+                logger.info("Clustering %d descriptors.", len(tracks.track))
+                descriptors = tracks.descriptors[:, 0, 0].astype(np.float32)
+                how = {key: recipe[key] for key in ("per_cluster", "per_cell", "iterations")}
+                labels = cluster_in_cells(descriptors, **how, seed=seed)
+                writer.add(str(number), {"labels": labels})
+    with open_h5(kept) as file:
+        clustered = [
+            _by_cluster(tracks, get_dataset(file, str(number), "labels")[()])
+            for number, tracks in enumerate(maps)
+        ]
+    return sv.train(clustered, dim, recipe, seed, checkpoint, made_from)
+
+
+def _by_cluster(tracks: Tracks, labels: np.ndarray) -> Tracks:
+    """Make one track of each cluster, given the labels (M,) of the observations."""
     order = np.argsort(labels, kind="stable")
     views = np.arange(len(labels))  # each counts as an image of its own
     return replace(tracks.only(order), track=labels[order], image=views)
 
 
-def classify(
+def _classify(
     maps: list[Tracks], dim: int, recipe: dict, seed: int, checkpoint: Path, made_from: str
 ) -> MLP:
     """Learn a classification layer behind the projection.
 
-    The first clusters are those of the base descriptors, the later ones of the projected; each
-    time the classification layer begins anew.
+    It clusters the base descriptors first, later the projected ones, and resets the classification
+    layer each time.
     """
     torch.manual_seed(seed)
     sampler = DescriptorSampler(maps, recipe["augment"], mirror=False, balanced=False, seed=seed)
@@ -193,38 +186,34 @@ def classify(
     per_epoch = sampler.per_epoch(size)
     num_clusters = max(1, int(number / recipe["per_cluster"]))
     mlp = MLP([descriptors.shape[1], *recipe["hidden"], dim])
-    network = nn.Module()
-    network.mlp, network.classifier = (
-        mlp,
-        ArcClassifier(num_clusters, dim, recipe["margin"], recipe["scale"]),
-    )
-    network.register_buffer("labels", torch.zeros(number, dtype=torch.int64))
-    network.train().to(place)
+    classifier = ArcClassifier(num_clusters, dim, recipe["margin"], recipe["scale"])
+    labels = torch.zeros(number, dtype=torch.int64, device=place)
+    network = nn.ModuleDict({"mlp": mlp, "classifier": classifier}).train().to(place)
+    network.register_buffer("labels", labels)  # kept in the checkpoint
 
-    def cluster_anew(step: int) -> list[nn.Parameter]:
+    def recluster(step: int) -> list[nn.Parameter]:
         if step % (recipe["cluster_epochs"] * per_epoch):
             return []
         logger.info("Clustering %d descriptors.", number)
-        rows = embed(mlp, descriptors, place) if step else descriptors
-        labels = cluster(rows.numpy(), num_clusters, recipe["iterations"], seed + step)
-        network.labels.copy_(torch.from_numpy(labels))
+        rows = _embed(mlp, descriptors, place) if step else descriptors
+        found = cluster(rows.numpy(), num_clusters, recipe["iterations"], seed + step)
+        labels.copy_(torch.from_numpy(found))
         torch.manual_seed(seed + step)
-        return network.classifier.reset()
+        return classifier.reset()
 
     def loss(step: int) -> torch.Tensor:
         drawn = sampler.indices(step, size)
         seen, _ = sampler.views(drawn, np.random.default_rng([seed, step, 1]))
-        labels = network.labels[torch.from_numpy(drawn).to(place)]
-        return network.classifier(mlp(seen.to(place)), labels)
+        return classifier(mlp(seen.to(place)), labels[torch.from_numpy(drawn).to(place)])
 
     steps = recipe.get("steps") or recipe["epochs"] * per_epoch
-    fit(network, loss, steps, recipe, checkpoint, made_from, cluster_anew)
+    fit(network, loss, steps, recipe, checkpoint, made_from, recluster)
     return mlp.eval().cpu()
 
 
 @torch.no_grad()
-def embed(mlp: MLP, descriptors: torch.Tensor, place: torch.device) -> torch.Tensor:
-    """Project descriptors (N, 128) with the running statistics."""
+def _embed(mlp: MLP, descriptors: torch.Tensor, place: torch.device) -> torch.Tensor:
+    """Project descriptors (N, 128) as a frozen projection does."""
     mlp.eval()
     embedded = torch.cat([mlp(rows.to(place)).cpu() for rows in descriptors.split(16384)])
     mlp.train()

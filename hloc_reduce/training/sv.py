@@ -11,9 +11,9 @@ from .losses import distance_loss, triplet_loss
 from .sampling import PairSampler
 from .tracks import Tracks
 
-# "paper" is Sec. III-D; an epoch goes once through as many pairs as there are observations.
-# "best" adds what helped on places kept out of training (docs/training.md).
-RECIPES = {
+# "paper" is Sec. III-D; an epoch has as many pairs as there are observations. "best" adds what
+# helped on places kept out of training (docs/training.md). "tune" begins with a shipped projection.
+RECIPES: dict[str, dict] = {
     "paper": {
         "epochs": 10,
         "batch_size": 1024,
@@ -37,7 +37,6 @@ RECIPES = {
         "maps_per_batch": 2,
     },
 }
-# begins with a projection that ships, for one's own map
 RECIPES["tune"] = {**RECIPES["best"], "steps": 1000, "lr": 1e-3}
 DISTANCE_WEIGHTS = {"hardnet": 3.0}  # beta
 
@@ -50,13 +49,13 @@ def train(
     Args:
         maps: tracks of one or more maps.
         dim: number of output dimensions.
-        recipe: an entry of `RECIPES` with `hidden`, the sizes of the hidden layers,
-            `distance_weight`, that of the distance loss, and perhaps `prefixes`: numbers of
-            dimensions, the first so many of which are to be good descriptors too; and
-            `begin_with`: a projection to begin with, as of `projections.find`.
+        recipe: an entry of `RECIPES` with `hidden`, the sizes of the hidden layers, and
+            `distance_weight`, the weight of the distance loss. Optional: `prefixes`, the lengths
+            of leading parts of a descriptor that are trained to match, too; `begin_with`, name or
+            path of a projection to begin with.
         seed: of the initial weights and the batches.
-        checkpoint: file from which a killed training goes on; the caller deletes it.
-        made_from: says what the training is made from; a checkpoint of another is not used.
+        checkpoint: file to resume from; the caller deletes it.
+        made_from: provenance of the training; a stale checkpoint is ignored.
 
     Returns:
         The trained network.

@@ -1,4 +1,4 @@
-"""Training data: base descriptors of the observations of a map's points, labelled by point."""
+"""Training data: descriptors of the observations of a map's points."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -38,12 +38,11 @@ from .completion import Completion
 from .loop import device
 
 NUM_COVIS = 20
-MATCHED = "sift"  # which descriptor finds the tracks, whatever they are described with
-KEYPOINTS = "hloc"  # settings of DoG, which the projections that ship were trained with
-# The photo as it is and three photometric variants, each as seen and mirrored.
-VARIANTS = 4
-MAX_SHIFT = 1.5  # pixels between a keypoint and the same one of a variant
-NEIGHBORS = 4  # keypoints looked at there
+MATCHED = "sift"  # finds the tracks of all descriptors of patches
+KEYPOINTS = "hloc"  # settings of DoG that the shipped projections were trained with
+VARIANTS = 4  # the photo and three photometric variants, each as seen and mirrored
+MAX_SHIFT = 1.5  # pixels between a keypoint of the photo and the same one of a variant
+NEIGHBORS = 4  # candidates for it
 
 
 @dataclass
@@ -53,9 +52,9 @@ class Tracks:
     Args:
         descriptors: (M, 2, V, D) float16 of unit norm: M observations, as seen and mirrored, in
             V photometric variants, the first of which is the photo itself.
-        track: (M,) int64, which of the map's points an observation sees, sorted, from 0 on.
-        image: (M,) int64, in which image, numbered by name; a patch of PhotoTour is one of its own.
-        xy: (M, 2) float32, where in it, in pixels.
+        track: (M,) int64, the observed point, sorted, from 0 on.
+        image: (M,) int64, the image, numbered by name; a patch of PhotoTour is one of its own.
+        xy: (M, 2) float32, place in the image, in pixels.
         matched: (M,) bool, whether descriptors matched it; the others were found by geometry.
     """
 
@@ -71,7 +70,7 @@ class Tracks:
         return int(self.track[-1]) + 1
 
     def only(self, kept: np.ndarray) -> "Tracks":
-        """Leave out observations; `kept` indexes or masks them. Points keep their numbers."""
+        """Select observations by indices or a mask. Points keep their numbers."""
         return Tracks(**{key: value[kept] for key, value in vars(self).items()})
 
 
@@ -89,51 +88,34 @@ def main(
     Args:
         images: folder of the images.
         model: COLMAP model with their poses.
-        output: folder for all files; what it holds already is used.
-        descriptor: the base descriptor; one that takes no patches has keypoints of its own.
+        output: folder for all files, which are used again unless they are stale.
+        descriptor: the base descriptor; with `conf`, a name for its descriptors.
         seed: of the photometric variants.
-        conf: of the feature whose keypoints and descriptors are used, in place of those of `sift`
-            described by `descriptor`, which is then but what its files are called after.
+        conf: configuration of a feature whose keypoints and descriptors are used instead.
 
     Returns:
-        The file of `load`.
+        The file for `load`.
 
     Raises:
         InputError: for an unknown descriptor, or when the map cannot be read or gives no tracks.
     """
     if conf is None:
         choose("descriptor", descriptor, BASES)
-    source = {"images": str(images.resolve()), "model": str(model.resolve())}
-    if is_map(model.parent):  # which may have been built anew, of other photos
-        source["map"] = Map(model.parent).id
-    if (output / "source.json").exists() and not provenance.is_current(
-        output / "source.json", source
-    ):
-        raise InputError(f"{output} holds the tracks of another map. Choose another folder.")
-    provenance.write(output / "source.json", source)
-    if conf is None and descriptor not in DESCRIPTORS:
-        conf = features_confs.get(descriptor, keypoints=KEYPOINTS)[1]
-    found_by, patches = (descriptor, False) if conf else (MATCHED, True)
-    conf = conf or features_confs.get(MATCHED, keypoints=KEYPOINTS)[1]
-    pairs = pairs_from_covisibility.main(
-        model, output / f"pairs-db-covis{NUM_COVIS}.txt", NUM_COVIS
-    )
+    _check_source(images, model, output / "source.json")
+    patches = conf is None and descriptor in DESCRIPTORS
+    found_by = MATCHED if patches else descriptor
+    conf = conf or features_confs.get(found_by, keypoints=KEYPOINTS)[1]
     names = sorted(image.name for image in colmap.read_model(model).images.values())
-    features = extract_features.main(conf, images, output, image_list=names)
-    # no ratio test: the poses tell right from wrong, and what is ambiguous is worth learning
-    matcher = match_features.confs["NN-mutual"]
-    matches = match_features.main(matcher, pairs, features.stem, output)
     sfm = output / f"sfm_{found_by}"
-    reconstruction = triangulation.main(sfm, model, images, pairs, features, matches)
+    features, reconstruction = _triangulate(images, model, names, conf, sfm)
 
     tracks = output / f"tracks_{descriptor}.safetensors"
     made_from = stamp(descriptor, seed, [sfm / "points3D.bin", features])
-    if tracks.exists() and provenance.is_current(tracks.with_suffix(".json"), made_from):
+    if is_current(tracks, made_from):
         return tracks
     complete, matched, keypoints = _observations(reconstruction, features, names)
     describe = PatchDescriber(descriptor) if patches else FeatureDescriber(conf["model"])
-    parts = parts_of(tracks)
-    with resume_or_replace(parts, made_from) as writer, open_h5(features) as file:
+    with resume_or_replace(parts_of(tracks), made_from) as writer, open_h5(features) as file:
         todo = [(number, name) for number, name in enumerate(names) if name not in writer]
         done = len(names) - len(todo)
         for number, name in progress(todo, "Describing tracks", "image", len(names), done):
@@ -141,13 +123,15 @@ def main(
             kept = np.flatnonzero(observed >= 0)
             if not len(kept):
                 continue
-            generator = np.random.default_rng([seed, number])
             image, size = extractors.load_image(images / name, conf["preprocessing"])
             ratio = np.array(image.shape[:1:-1]) / size
             scaled = keypoints[name][kept]  # in pixels of the resized image
             scaled[:, :2] = (scaled[:, :2] + 0.5) * ratio - 0.5
             scaled[:, 2:3] *= ratio.mean()
-            known = get_descriptors(file, name)[kept]
+            known, generator = (
+                get_descriptors(file, name)[kept],
+                np.random.default_rng([seed, number]),
+            )
             arrays = {
                 "descriptors": describe(image, scaled, known, generator),
                 "points": observed[kept],
@@ -159,7 +143,31 @@ def main(
         described = [name for name in names if name in writer]
     if not described:
         raise InputError(f"The map {model} gives no tracks.")
-    return save_parts(tracks, made_from, described)
+    return save(tracks, made_from, described)
+
+
+def _check_source(images: Path, model: Path, path: Path) -> None:
+    """Write which map a folder is for; raise an InputError if it is for another one."""
+    source = {"images": str(images.resolve()), "model": str(model.resolve())}
+    if is_map(model.parent):  # it may have been rebuilt from other photos
+        source["map"] = Map(model.parent).id
+    if path.exists() and not provenance.is_current(path, source):
+        raise InputError(f"{path.parent} holds the tracks of another map. Choose another folder.")
+    provenance.write(path, source)
+
+
+def _triangulate(
+    images: Path, model: Path, names: list[str], conf: dict, sfm: Path
+) -> tuple[Path, pycolmap.Reconstruction]:
+    """Return the feature file of a map and its points, triangulated with known poses."""
+    output = sfm.parent
+    pairs = output / f"pairs-db-covis{NUM_COVIS}.txt"
+    pairs_from_covisibility.main(model, pairs, NUM_COVIS)
+    features = extract_features.main(conf, images, output, image_list=names)
+    # no ratio test: the poses tell right from wrong, and ambiguous matches are worth learning
+    matcher = match_features.confs["NN-mutual"]
+    matches = match_features.main(matcher, pairs, features.stem, output)
+    return features, triangulation.main(sfm, model, images, pairs, features, matches)
 
 
 def _observations(
@@ -168,57 +176,60 @@ def _observations(
     """Find which points the keypoints of the images observe.
 
     Returns:
-        What completes the tracks: from image name to the id of the point of each keypoint (N,), -1
-        where none; the same as matched; and from image name to the keypoints (N, 4): x, y, scale
-        (pixels), orientation (degrees), or (N, 2) where they have no more, whose tracks cannot be
-        completed.
+        A function that completes the tracks: from image name to the id of the point of each
+        keypoint (N,), -1 where none; from image name to the same ids as matched; and from image
+        name to the keypoints (N, 4): x, y, scale (pixels), orientation (degrees). Without scales
+        and orientations they are (N, 2), and nothing is completed.
     """
     images = {image.name: image for image in reconstruction.images.values()}
     matched = {name: point3D_ids(images[name]) for name in names}
+    keypoints, in_colmap = {}, {}
     with open_h5(features) as file:
         oriented = {"scales", "oris"} <= file[names[0]].keys()
         columns = ("keypoints", "scales", "oris") if oriented else ("keypoints",)
-        keypoints = {
-            name: np.column_stack([get_dataset(file, name, key)[()] for key in columns])
-            for name in names
-        }
-        keypoints = {name: array.astype(np.float32) for name, array in keypoints.items()}
-        places = {name: get_colmap_keypoints(file, name)[0] for name in names}
+        for name in names:
+            arrays = [get_dataset(file, name, key)[()] for key in columns]
+            keypoints[name] = np.column_stack(arrays).astype(np.float32)
+            places = get_colmap_keypoints(file, name)[0]
+            in_colmap[name] = np.column_stack([places, keypoints[name][:, 2:]])
     if not oriented:
         return matched.__getitem__, matched, keypoints
-    shaped = {name: np.column_stack([places[name], keypoints[name][:, 2:]]) for name in names}
-    return Completion(reconstruction, shaped, matched), matched, keypoints
+    return Completion(reconstruction, in_colmap, matched), matched, keypoints
 
 
 def stamp(descriptor: str, seed: int, inputs: list[Path]) -> dict:
-    """Describe what a file of `load` is made from."""
+    """Return the provenance of a file for `load`."""
     options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "format": 2}
-    return provenance.stamp(options, inputs)
+    return provenance.of_inputs(options, inputs)
 
 
-def save(
-    path: Path,
-    made_from: dict,
-    descriptors: np.ndarray,
-    points: np.ndarray,
-    image: np.ndarray,
-    xy: np.ndarray,
-    matched: np.ndarray,
-) -> Path:
-    """Write the file of `load` and its stamp.
+def is_current(path: Path, made_from: dict) -> bool:
+    """Return whether a file for `load` exists and is not stale."""
+    return path.exists() and provenance.is_current(path.with_suffix(".json"), made_from)
+
+
+def parts_of(path: Path) -> Path:
+    """Return the h5 file of the observations described so far, for a file for `load`."""
+    return path.with_suffix(".parts.h5")
+
+
+def save(path: Path, made_from: dict, names: list[str]) -> Path:
+    """Write the file for `load` and its provenance from `parts_of`, and delete these.
 
     Args:
         path: of the file.
-        made_from: its stamp.
-        descriptors: as in `Tracks`, in any order.
-        points: (M,) which points the observations see, by any numbers.
-        image: as in `Tracks`.
-        xy: as in `Tracks`.
-        matched: as in `Tracks`.
+        made_from: its provenance.
+        names: groups of the parts, in order, with the arrays of `Tracks`, but in place of `track`
+            the ids of the observed `points`, (M,), in any order.
 
     Returns:
         The path.
     """
+    with open_h5(parts_of(path)) as file:
+        descriptors, points, image, xy, matched = (
+            np.concatenate([get_dataset(file, name, key)[()] for name in names])
+            for key in ("descriptors", "points", "image", "xy", "matched")
+        )
     _, track = np.unique(points, return_inverse=True)
     order = np.argsort(track, kind="stable")
     tracks = Tracks(descriptors, track, image, xy, matched).only(order)
@@ -226,32 +237,6 @@ def save(
         save_file(vars(tracks), temporary)
     provenance.write(path.with_suffix(".json"), made_from)
     logger.info("%d observations of %d points: %s", len(track), tracks.num_tracks, path)
-    return path
-
-
-def parts_of(path: Path) -> Path:
-    """Return the h5 file of the observations described so far, while the file of `load` is made."""
-    return path.with_suffix(".parts.h5")
-
-
-def save_parts(path: Path, made_from: dict, names: list[str]) -> Path:
-    """Write the file of `load` from the groups of `parts_of`, which is then deleted.
-
-    Args:
-        path: of the file.
-        made_from: its stamp.
-        names: the groups, in order; each has the arrays that `save` takes.
-
-    Returns:
-        The path.
-    """
-    keys = ("descriptors", "points", "image", "xy", "matched")
-    with open_h5(parts_of(path)) as file:
-        arrays = {
-            key: np.concatenate([get_dataset(file, name, key)[()] for name in names])
-            for key in keys
-        }
-    save(path, made_from, **arrays)
     parts_of(path).unlink()
     return path
 
@@ -262,7 +247,7 @@ def load(path: Path) -> Tracks:
 
 
 class PatchDescriber:
-    """Describes keypoints by the patches around them, in a photo and in variants of it."""
+    """Describes keypoints by the patches around them, in a photo and its variants."""
 
     def __init__(self, descriptor: str):
         self.describe = Descriptor(descriptor).to(device())
@@ -280,7 +265,7 @@ class PatchDescriber:
         Args:
             image: (1, 1, H, W) float32 in [0, 1].
             keypoints: (N, 4) x, y, scale (pixels), orientation (degrees).
-            known: the descriptors that the keypoints were found with, not used.
+            known: not used.
             generator: draws the variants.
 
         Returns:
@@ -296,7 +281,7 @@ class PatchDescriber:
 
 
 class FeatureDescriber:
-    """Describes keypoints by an extractor, which finds them anew in each variant of a photo."""
+    """Describes keypoints by an extractor, which detects them again in each variant."""
 
     def __init__(self, model: dict):
         self.extract = extractors.load(model).eval().to(device())
@@ -312,8 +297,8 @@ class FeatureDescriber:
     ) -> np.ndarray:
         """Describe the keypoints of a photo (1, C, H, W) as `PatchDescriber` does.
 
-        What is not found anew within MAX_SHIFT pixels keeps its `known` descriptor (N, D). Without
-        patches nothing but COLMAP's SIFT is mirrored: both views are as seen.
+        A keypoint that is not found within `MAX_SHIFT` pixels in a variant keeps its `known`
+        descriptor (N, D). Only COLMAP's SIFT is mirrored; of others both views are as seen.
         """
         described = np.repeat(known[:, None, None].astype(np.float16), VARIANTS, axis=2)
         photo = image[0].numpy().transpose(1, 2, 0)
@@ -324,7 +309,7 @@ class FeatureDescriber:
             if not len(found):
                 continue
             descriptors = features["descriptors"][0].T.cpu().numpy()
-            # of several at one place, such as of other orientations, the one most alike
+            # several keypoints may lie at one place with different orientations: take the best
             distance, near = cKDTree(found).query(
                 keypoints[:, :2], k=range(1, NEIGHBORS + 1), distance_upper_bound=MAX_SHIFT
             )
@@ -337,7 +322,7 @@ class FeatureDescriber:
 
 
 def mirror_colmap_sift(descriptors: np.ndarray) -> np.ndarray:
-    """Return COLMAP's SIFT (..., 128) of keypoints mirrored as by `describe_mirrored`."""
+    """Mirror COLMAP's SIFT descriptors (..., 128) as `describe_mirrored` does patches."""
     bins = descriptors.reshape(*descriptors.shape[:-1], 4, 4, 8)  # rows, columns, orientations
     mirrored = np.roll(bins[..., ::-1, :, ::-1], 1, axis=-1)  # orientation 0 stays
     return mirrored.reshape(descriptors.shape)
@@ -349,21 +334,21 @@ MIRRORS = {COLMAP: mirror_colmap_sift}
 def describe_mirrored(patches: torch.Tensor, describe: Descriptor) -> np.ndarray:
     """Describe patches (N, 1, 32, 32) as seen and mirrored, (N, 2, 128) float32.
 
-    Mirrored is across the axis of the orientation: a mirrored world, oriented alike.
+    They are mirrored across the axis of the keypoint's orientation, which stays the same.
     """
     views = (patches.to(device()), patches.flip(2).to(device()))
     return np.stack([describe(view).cpu().numpy() for view in views], axis=1)
 
 
 def photometric_variant(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Draw how a camera would see the same under another light: darker, blurred, noisy, 8 bit.
+    """Draw another photo of the same under other light: darker or brighter, blurred, noisy, 8 bit.
 
     Args:
         image: (H, W) or (H, W, C) float32 in [0, 1].
         generator: draws gamma 0.5-2, gain 0.08-1.2, blur up to 1.5 px and noise up to 2 %.
 
     Returns:
-        As the image, without the last axis if C is 1.
+        Like the image, without the last axis if C is 1.
     """
     gamma = 2 ** generator.uniform(-1, 1)
     gain = np.exp(generator.uniform(np.log(0.08), np.log(1.2)))

@@ -12,7 +12,7 @@ from .sampling import DescriptorSampler
 from .tracks import Tracks
 
 # "paper" is Sec. III-D; an epoch goes once through all descriptors.
-RECIPES = {
+RECIPES: dict[str, dict] = {
     "paper": {
         "epochs": 5,
         "batch_size": 1024,
@@ -35,7 +35,7 @@ RECIPES = {
         "distance_weight": 1000.0,
     },
 }
-DISTANCE_WEIGHTS = {"hardnet": 0.1}  # alpha; of recipes that have none themselves
+DISTANCE_WEIGHTS = {"hardnet": 0.1}  # alpha, unless the recipe has one
 
 
 def train(
@@ -43,8 +43,8 @@ def train(
 ) -> MLP:
     """Train an encoder whose mirrored decoder recovers the descriptors; arguments as in `sv`.
 
-    The loss is Eq. 3: the mean of ||x - x'||, and for some the distance loss. What an augmented
-    view is to become again is the photo as it is.
+    The loss is Eq. 3: the mean of ||x - x'||, plus the distance loss if it has a weight. The target
+    of an augmented view is the descriptor of the photo itself.
     """
     torch.manual_seed(seed)
     drawing = {key: recipe[key] for key in ("augment", "mirror", "balanced")}
