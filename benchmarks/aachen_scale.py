@@ -1,14 +1,15 @@
-"""Run pairs, matching and their files at shares of the size of Aachen Day-Night v1.1.
+"""Measure pairs, matching and their files at fractions of the size of Aachen Day-Night v1.1.
 
 The names of images and queries and hloc's 50 retrieved images of each query are the real ones; the
-features are synthesized. A part of the keypoints of an image are looks at landmarks, of which it
-sees a window of a long row; its neighbours in the order of names see much of the same, and a query
-what the first image retrieved for it sees. The other keypoints are clutter. For each share a new
-process writes the features, counts covisible landmarks, makes the pairs (40 of each map image, of
-which every other is another's reverse, so that 20 are left; 50 of each query, others standing in
-for map images that are left out), matches them and checks the matches. The cache of descriptors is
-scaled with the share, so that it misses as often as at full size. Prints a Markdown table, last the
-lines through the first and the last share, along images and pairs, continued to the whole data set.
+features are synthetic. Some keypoints of an image show landmarks: a window of a long row, which
+overlaps with the windows of images with similar names. A query shows the landmarks of the first
+image retrieved for it. All other keypoints are clutter.
+
+For each fraction, a new process writes the features, counts covisible landmarks, makes the pairs
+(40 for each map image, half of which are reversed duplicates; 50 for each query, where other map
+images replace those that are left out), matches them and checks the matches. The cache of
+descriptors shrinks with the data, so that it misses as often as at full size. The result is a
+Markdown table, whose last row extrapolates linearly to the whole data set.
 """
 
 import argparse
@@ -42,13 +43,13 @@ from hloc_reduce.utils.parsers import (
 )
 
 NUM_COVIS, NUM_LOC = 40, 50
-SEEN = 0.15  # of the keypoints show landmarks
-STEP = 0.04  # of these are left behind from one image of the row to the next
-NOISE = 0.2  # length of what one look adds to the descriptor of a landmark
+SEEN = 0.15  # share of the keypoints that show landmarks
+STEP = 0.04  # share of these that the next image in the row does not show
+NOISE = 0.2  # length of the noise vector that is added to the descriptor of a landmark
 CHECKED = 200  # pairs whose matches are checked
-MIN_KEYPOINTS = 10  # of which one shows a landmark
+MIN_KEYPOINTS = 10  # so that at least one shows a landmark
 WHOLE = {"images": 6697 + 1015, "pairs": 20 * 6697 + 50 * 1015}
-# what grows with the images, and with the pairs
+# columns that are proportional to the number of images, or of pairs
 GROWING = {
     "images": ("features_s", "feature_MB"),
     "pairs": ("matching_s", "match_MB"),
@@ -56,7 +57,7 @@ GROWING = {
 
 
 def ids_of(place: int, number: int) -> np.ndarray:
-    """Return the landmarks that the image at a place in the row sees."""
+    """Return the ids of the landmarks that the image at a place in the row shows."""
     seen = int(SEEN * number)
     return np.arange(seen) + int(place * STEP * seen)
 
@@ -68,36 +69,36 @@ def unit(generator: np.random.Generator, number: int, dim: int) -> np.ndarray:
 
 
 def synthesize(places: dict[str, int], path: Path, dim: int, number: int, storage: str) -> None:
-    """Write the features of images, given their places in the row, and beside them landmarks."""
+    """Write the features of images, given their places in the row, and the ids of landmarks."""
     made_by = {"synthesized": [dim, number, storage]}
     with GroupWriter(path, made_by) as writer, GroupWriter(shown(path), made_by) as known:
         for name, place in places.items():
             ids = ids_of(place, number)
-            blocks = [  # of 1,000 landmarks, which are the same in all images
+            blocks = [  # of 1,000 landmarks, each drawn from a seed of its own
                 unit(np.random.default_rng([0, block]), 1000, dim)
                 for block in range(ids[0] // 1000, ids[-1] // 1000 + 1)
             ]
             landmarks = np.concatenate(blocks)[ids[0] % 1000 :][: len(ids)]
             generator = np.random.default_rng([1, *name.encode()])
-            looks = landmarks + NOISE * unit(generator, len(ids), dim)
-            looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+            views = landmarks + NOISE * unit(generator, len(ids), dim)
+            views /= np.linalg.norm(views, axis=1, keepdims=True)
             clutter = unit(generator, number - len(ids), dim)
             order = generator.permutation(number)
             features = {key: np.zeros(number, np.float32) for key in ("scales", "oris", "scores")}
             features["keypoints"] = np.zeros((number, 2), np.float32)
-            features["descriptors"] = np.concatenate([looks, clutter])[order].T
+            features["descriptors"] = np.concatenate([views, clutter])[order].T
             writer.add(name, *store(features, storage))
             ids = np.concatenate([ids, np.full(number - len(ids), -1)])[order]
             known.add(name, {"ids": ids})
 
 
 def shown(features: Path) -> Path:
-    """Return the file of the landmarks that the features of images show."""
+    """Return the file of the ids of the landmarks that keypoints show, -1 for clutter."""
     return features.with_name(f"{features.stem}_ids.h5")
 
 
 def make_pairs(data: Path, folder: Path, share: float, number: int) -> tuple[dict[str, int], Path]:
-    """Write the pairs of a share of the map images and queries; return their places in the row."""
+    """Write the pairs of a share of the images; return their places in the row and the file."""
     database = image_names(data / "database_images.txt")
     database = database[: max(NUM_LOC, round(share * len(database)))]
     lists = sorted(data.glob("*_time_queries_with_intrinsics.txt"))
@@ -124,19 +125,19 @@ def make_pairs(data: Path, folder: Path, share: float, number: int) -> tuple[dic
 
 
 def hash_of(name: str) -> int:
-    """Return a number that is the same for a name in every run."""
+    """Return a number for a name, the same in every run."""
     return int.from_bytes(name.encode()[-8:], "big")
 
 
 def check(features: Path, matches: Path, pairs: Iterable[tuple[str, str]]) -> tuple[float, float]:
-    """Return which share of common landmarks is matched, and of the matches is right."""
+    """Return the recall and the precision of the matches of pairs, in [0, 1]."""
     common = found = right = 0
     with open_h5(shown(features)) as file, open_h5(matches) as match_file:
         for names in pairs:
             ids = [get_dataset(file, name, "ids")[()] for name in names]
             common += len(np.intersect1d(*(part[part >= 0] for part in ids)))
             if find_pair(match_file, *names)[0] is None:
-                raise InputError(f"The pair {names} is not there.")
+                raise InputError(f"The pair {names} was not matched.")
             indices, _ = get_matches(match_file, *names)
             first, second = ids[0][indices[:, 0]], ids[1][indices[:, 1]]
             found += len(indices)
@@ -145,7 +146,7 @@ def check(features: Path, matches: Path, pairs: Iterable[tuple[str, str]]) -> tu
 
 
 def run(data: Path, share: float, dim: int, number: int, storage: str) -> dict:
-    """Run everything once and measure it."""
+    """Measure one share of the data set."""
     match_features.CACHE_BYTES = int(share * match_features.CACHE_BYTES)
     with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as temporary:
         folder, start = Path(temporary), time.perf_counter()
@@ -178,7 +179,7 @@ def run(data: Path, share: float, dim: int, number: int, storage: str) -> dict:
 
 
 def line(rows: list[dict]) -> dict:
-    """Continue the lines through the first and the last row to the whole data set."""
+    """Extrapolate linearly from the first and the last row to the whole data set."""
     first, last = rows[0], rows[-1]
     continued = {"share": 1, **WHOLE}
     for number, columns in GROWING.items():
@@ -202,7 +203,9 @@ def _main() -> None:
     parser.add_argument(
         "--data", type=Path, required=True, help="folder of database_images.txt and query lists"
     )
-    parser.add_argument("--share", type=float, nargs="+", default=[0.01, 0.02], help="of the size")
+    parser.add_argument(
+        "--share", type=float, nargs="+", default=[0.01, 0.02], help="of the data set, in (0, 1]"
+    )
     parser.add_argument("--dim", type=int, default=64, help="numbers of a descriptor")
     parser.add_argument("--keypoints", type=int, default=8000, help="of each image")
     parser.add_argument("--storage", default=STORAGES[0], help=f"one of {', '.join(STORAGES)}")

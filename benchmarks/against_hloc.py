@@ -1,10 +1,10 @@
-"""Time this project and hloc on a place in Aachen's layout, stage by stage, all images paired.
+"""Time this project and hloc stage by stage on a data set in Aachen's layout, all images paired.
 
-hloc extracts `sift` and matches with NN-ratio; this project does so with each --feature. All begin
-with nothing and end with poses, each time in a new process; they take turns, and of several rounds
-the fastest of each is shown. Needs the real hloc and the pycolmap that it is made for. Prints a
-Markdown table: seconds of each stage and of all, how many times faster than hloc; then bytes,
-recall at the finest threshold and inliers.
+hloc extracts `sift` and matches with NN-ratio; this project does the same with each --feature. Each
+run is a new process that starts with an empty folder and ends with poses. The runs take turns, and
+the fastest of several rounds counts. Needs hloc and a pycolmap that it works with. Prints two
+Markdown tables: seconds of each stage and in total, with the speedup over hloc; and points, file
+sizes and recall at the finest threshold.
 """
 
 import argparse
@@ -16,8 +16,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-
-import numpy as np
 
 from hloc_reduce.datasets import thresholds, true_poses
 from hloc_reduce.datasets.aachen import Aachen
@@ -31,7 +29,7 @@ HLOC = "hloc"
 
 
 def stages_of(name: str) -> dict[str, Callable]:
-    """Return the functions of the stages, hloc's or this project's, and the features' conf."""
+    """Return the stages of hloc or of this project, and the configurations they run with."""
     if name == HLOC:
         from hloc import extract_features, localize_sfm, match_features, triangulation
 
@@ -52,7 +50,7 @@ def stages_of(name: str) -> dict[str, Callable]:
 
 
 def run(name: str, dataset: Path, outputs: Path) -> dict:
-    """Localize the queries of a place and measure how long each stage takes."""
+    """Localize the queries of a data set and time each stage."""
     place = Aachen(dataset)
     database = place.map_names()
     lists = {key: [query for query, _ in part] for key, part in place.query_lists().items()}
@@ -77,7 +75,7 @@ def run(name: str, dataset: Path, outputs: Path) -> dict:
     sfm = outputs / "sfm"
     used["triangulate"](sfm, place.reference_model, place.images, sfm_pairs, features, matches)
     lap("triangulation")
-    # one list after the other: base names may be the same by day and by night
+    # each list by itself: a base name may be in both
     for key in lists:
         given = place.queries.with_name(f"{key}.txt")
         used["localize"](sfm, given, loc_pairs, features, loc_matches, outputs / f"{key}.txt")
@@ -86,12 +84,7 @@ def run(name: str, dataset: Path, outputs: Path) -> dict:
     finest = []
     for key, part in lists.items():
         estimates = parse_poses(outputs / f"{key}.txt")
-        errors = [
-            pose_error(estimates[Path(query).name], truth[query])
-            if Path(query).name in estimates
-            else (np.inf, np.inf)
-            for query in part
-        ]
+        errors = [pose_error(estimates.get(Path(query).name), truth[query]) for query in part]
         finest.append(recall(errors, thresholds(key)[:1])[0])
     return {
         "seconds": seconds,
@@ -112,7 +105,7 @@ def _main() -> None:
     parser.add_argument(
         "--feature", nargs="+", default=["sift_sv64", "colmap_sift_sv64"], help="of this project"
     )
-    parser.add_argument("--rounds", type=int, default=2, help="in which all take turns")
+    parser.add_argument("--rounds", type=int, default=2, help="rounds in which all take turns")
     parser.add_argument("--once", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.once:

@@ -1,9 +1,9 @@
-"""Would matching nested descriptors coarse to fine pay? First by 16 numbers, decided by all 64.
+"""Measure whether matching nested descriptors coarse to fine pays: first in 16-D, then in 64-D.
 
-Coarse to fine: keypoints whose nearest neighbour by the first 16 numbers passes a looser ratio test
-are matched by all 64, mutually and with the ratio test. Compared, in one thread: exact matching by
-all 64, by the first 32 and by the first 16. Prints a Markdown table: milliseconds a pair, the least
-of several rounds, matches, and which share of the exact 64-D matches they are.
+Keypoints whose nearest neighbour in 16-D passes a looser ratio test are matched in 64-D, mutually
+and with the ratio test. This is compared with exact matching in 64-D, 32-D and 16-D, in one thread.
+Prints a Markdown table: milliseconds per pair (the least of several rounds), the number of matches,
+and the share of the exact 64-D matches that is found.
 """
 
 import argparse
@@ -26,14 +26,14 @@ COARSE = 16
 
 
 def first(descriptors: torch.Tensor, number: int) -> torch.Tensor:
-    """Return the first numbers of descriptors (N, D), of unit norm again."""
+    """Return the first numbers of descriptors (N, D), normalized again."""
     return torch.nn.functional.normalize(descriptors[:, :number], dim=1)
 
 
 def coarse_to_fine(
     descriptors0: torch.Tensor, descriptors1: torch.Tensor, ratio: float
 ) -> torch.Tensor:
-    """Match what the first numbers do not rule out."""
+    """Match the descriptors that the first numbers do not rule out; return matches0 (N,)."""
     coarse, _ = nearest(first(descriptors0, COARSE), first(descriptors1, COARSE), ratio)
     rows = torch.nonzero(coarse >= 0)[:, 0]
     matches = torch.full((len(descriptors0),), -1)
@@ -42,7 +42,7 @@ def coarse_to_fine(
 
 
 def methods() -> dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]]:
-    """Return what is compared, the exact 64-D matching first."""
+    """Return the compared methods, exact 64-D matching first."""
     compared = {
         f"first {number}": lambda a, b, number=number: mutual_nearest(
             first(a, number), first(b, number), RATIO
@@ -62,9 +62,9 @@ def _main() -> None:
         epilog="example: python benchmarks/coarse_to_fine.py --features feats-dog-sift_nested.h5",
         formatter_class=cli.HelpFormatter,
     )
-    parser.add_argument("--features", type=Path, required=True, help="of sift_nested")
-    parser.add_argument("--images", type=int, default=8, help="of which all pairs are matched")
-    parser.add_argument("--rounds", type=int, default=3, help="in which all take turns")
+    parser.add_argument("--features", type=Path, required=True, help="feature file of sift_nested")
+    parser.add_argument("--images", type=int, default=8, help="images whose pairs are matched")
+    parser.add_argument("--rounds", type=int, default=3, help="rounds in which all take turns")
     args = parser.parse_args()
     torch.set_num_threads(1)
     names = list_h5_names(args.features)[: args.images]

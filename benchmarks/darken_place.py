@@ -1,10 +1,8 @@
-"""Make a place with strongly darkened queries, in the layout of Aachen Day-Night, from a map.
+"""Make a data set with strongly darkened queries from a map, in the layout of Aachen Day-Night.
 
-Every third photo of the map becomes a query, the others stay the map. The 8-bit values of each
-query are multiplied by a gain, blurred, made noisy and rounded to 8 bits again; all is drawn from
-a seed. Run pipelines.aachen on the result, with the features of benchmarks/features: where photos
-have a tenth of the contrast, keypoints need a tenth of the threshold. Then benchmarks/summaries.py
-prints the table.
+Every third photo of the map becomes a query; the others stay in the map. Each query is multiplied
+by a gain, blurred, made noisy and rounded to 8 bits again, with parameters that are drawn from a
+seed. Run pipelines.aachen on the data set; benchmarks/summaries.py then prints the table.
 """
 
 import argparse
@@ -26,12 +24,12 @@ from hloc_reduce.utils.images import read_image
 EVERY = 3
 GAIN = (0.06, 0.12)
 BLUR = (0.3, 1.2)  # standard deviation in pixels
-NOISE = 0.003  # standard deviation, of full scale
+NOISE = 0.003  # standard deviation, relative to full scale
 Vary = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 
 def resize(image: np.ndarray, scale: float) -> np.ndarray:
-    """Resize a photo, smaller or larger."""
+    """Resize a photo by a factor."""
     if scale == 1:
         return image
     method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
@@ -39,7 +37,7 @@ def resize(image: np.ndarray, scale: float) -> np.ndarray:
 
 
 def fit(camera: pycolmap.Camera, image: np.ndarray) -> None:
-    """Make intrinsics, which photos may share, those of a photo of another size."""
+    """Rescale intrinsics to the size of a photo; those that photos share are rescaled once."""
     height, width = image.shape[:2]
     if (camera.width, camera.height) != (width, height):
         camera.rescale(width, height)
@@ -48,7 +46,7 @@ def fit(camera: pycolmap.Camera, image: np.ndarray) -> None:
 def darken(
     image: np.ndarray, generator: np.random.Generator, gain: tuple[float, float] = GAIN
 ) -> np.ndarray:
-    """Darken, blur and add noise to an 8-bit image; the gain is drawn evenly in its logarithm."""
+    """Darken, blur and add noise to an 8-bit image; the gain is drawn log-uniformly."""
     view = image / 255 * np.exp(generator.uniform(*np.log(gain)))
     view = cv2.GaussianBlur(view, (0, 0), generator.uniform(*BLUR))
     view += NOISE * generator.standard_normal(view.shape)
@@ -56,14 +54,14 @@ def darken(
 
 
 def main(images: Path, model: Path, output: Path, vary: Vary, scale: float = 1.0) -> None:
-    """Write a place whose queries are varied.
+    """Write a data set with altered queries.
 
     Args:
         images: folder of the photos.
         model: COLMAP model of them.
-        output: new folder of the place.
-        vary: makes the query of an 8-bit photo, drawing from a generator.
-        scale: of all photos, those of the map and the queries.
+        output: new folder of the data set.
+        vary: returns the query for an 8-bit photo, given a random generator.
+        scale: factor of the size of all photos, map and queries.
     """
     reconstruction = colmap.read_model(model)
     photos = sorted(reconstruction.images.values(), key=lambda image: image.name)
@@ -121,9 +119,9 @@ def _main() -> None:
         nargs=2,
         default=GAIN,
         metavar=("LEAST", "MOST"),
-        help="of the queries",
+        help="range of the gain of the queries",
     )
-    parser.add_argument("--output", type=Path, required=True, help="new folder of the place")
+    parser.add_argument("--output", type=Path, required=True, help="new folder of the data set")
     args = parser.parse_args()
     if not 0 < args.gain[0] <= args.gain[1]:
         raise InputError("--gain: give two numbers above 0, the smaller first.")

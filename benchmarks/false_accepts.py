@@ -1,10 +1,10 @@
-"""Count wrong poses that are called localized, and true ones that are refused.
+"""Count wrong poses that are accepted as localized, and true poses that are refused.
 
-Every map is tried with photos of its own that it was not built from, with photos of all other
-places, and with its own blurred, mirrored, black and noisy; each with its intrinsics and without,
-its own also with a wrong focal length. Its own are cropped and squeezed, too, and tried without
-intrinsics. Of a COLMAP model every third photo is kept out of the map. Keypoints and maps are those
-of colmap_sift_sv64, whatever descriptors are matched. Another --seed keeps out other photos, builds
+Each map is tried with held-out photos of its place, with photos of all other places, and with
+blurred, mirrored, black and noisy versions of its own; all with their intrinsics and without, its
+own also with a wrong focal length. Cropped and squeezed versions of its own are tried without
+intrinsics. In a COLMAP model, every third photo is held out. Keypoints and maps come from
+colmap_sift_sv64, whatever descriptors are matched. Another --seed holds out other photos, builds
 other maps, and draws other photos of other places. Results go to trials.csv, and as a curve to
 false_accepts.svg; an interrupted run resumes with the next place.
 """
@@ -54,14 +54,14 @@ EVERY = 3
 ALTERED = ("blurred", "mirrored", "black", "noise")
 BLUR = 6.0  # standard deviation in pixels
 RESHAPED = ("cropped", "squeezed")
-CROPPED, SQUEEZED = 0.7, 0.75  # a corner of width and height, and what remains of the height
-OFF = 1.15  # times the focal length
-# a pose is true within both, or the second one within a share of the extent of the cameras
+CROPPED, SQUEEZED = 0.7, 0.75  # share of width and height, share of the height
+OFF = 1.15  # factor of a wrong focal length
+# a pose is true within metres, or a share of the extent of the cameras, and degrees
 TRUE_METRES, TRUE_EXTENT, TRUE_DEGREES = 0.25, 0.01, 2.0
-# a pose that is neither true nor farther off than this share of the distance is left out
+# a pose that is not true is near within this share of the scene's depth and these degrees
 NEAR, NEAR_DEGREES = 0.1, 5.0
 LEVELS = (0, 2, 4, 6, 8, 10, 15, 20, 30)
-OLD_GATE = 8  # inliers, whatever their number among all
+OLD_GATE = 8  # inliers, whatever the number of matches
 COLUMNS = (
     *("feature", "map", "place", "photo", "kind", "intrinsics", "matches", "inliers", "confidence"),
     *("agreement", "refusal", "position_error", "rotation_error_deg", "outcome"),
@@ -73,13 +73,14 @@ class Place:
     """A map and its own queries.
 
     Args:
-        name: of the place.
+        name: name of the place.
         images: folder of all its photos.
         queries: names, intrinsics and true poses, camera from world.
-        reference: the map, and `names`, its images.
-        features: of the photos of the map and of the queries, by the base descriptor.
+        reference: the map.
+        names: the images of the map.
+        features: base descriptors of the images of the map and of the queries.
         metric: whether units are metres.
-        extent: of the positions of its images, the norm of their standard deviations.
+        extent: norm of the standard deviations of the positions of the images.
     """
 
     name: str
@@ -93,11 +94,11 @@ class Place:
 
 
 def split(name: str, images: Path, model: Path, output: Path, seed: int) -> Place:
-    """Build a map of two thirds of the photos of a COLMAP model."""
+    """Build a map of two thirds of the photos of a COLMAP model; the others are its queries."""
     reconstruction = colmap.read_model(model)
     photos = sorted(reconstruction.images.values(), key=lambda image: image.name)
     held_out = photos[(EVERY // 2 + seed) % EVERY :: EVERY]
-    # copies, as the originals end with the model
+    # copies, which outlive the model
     queries = [
         (photo.name, copy.deepcopy(photo.camera), photo.cam_from_world()) for photo in held_out
     ]
@@ -110,7 +111,7 @@ def split(name: str, images: Path, model: Path, output: Path, seed: int) -> Plac
 
 
 def of_dataset(root: Path, output: Path, _seed: int) -> Place:
-    """Take a place in the layout of Aachen Day-Night or of InLoc, and its queries."""
+    """Build the map of a data set in the layout of Aachen Day-Night or of InLoc."""
     if (root / "database/cutouts").is_dir():
         return _of_scans(InLoc(root), output)
     place = Aachen(root)
@@ -155,7 +156,7 @@ def alter(
     """Write altered photos of a place's queries, and extract their features.
 
     Returns:
-        Names, intrinsics, of cropped and squeezed ones None, and true poses, if there are any.
+        Names; intrinsics, None for cropped and squeezed photos; and true poses, None if unknown.
     """
     noise = np.random.default_rng(seed)
     altered = []
@@ -194,10 +195,10 @@ def alter(
 
 
 class Described:
-    """Reads base descriptors as those of a feature, at the precision they are kept in.
+    """Reads base descriptors as those of a feature, with the precision of its storage.
 
     Args:
-        feature: `<name>` or `<name>:<storage>`, a projection of the base descriptor or itself.
+        feature: `<name>` or `<name>:<storage>`, the base descriptor or a projection of it.
     """
 
     def __init__(self, feature: str):
@@ -217,7 +218,7 @@ class Described:
 def trials(
     place: Place, others: list[Place], output: Path, number: int, seed: int
 ) -> Iterator[tuple]:
-    """Yield the photos to try a map with: place, photo, camera, truth or None, features, kind."""
+    """Yield the photos to try a map with: place, name, camera, true pose, features and kind."""
     for name, camera, truth in place.queries:
         yield place, name, camera, truth, place.features, "own"
     for name, camera, truth in alter(place, output, seed):
@@ -281,13 +282,13 @@ def intrinsics_of(
     given: str,
     sizes: set[tuple[int, int]],
 ) -> tuple[pycolmap.Camera, dict]:
-    """Return intrinsics of a photo of a width and height, and how they are refined.
+    """Return the intrinsics to try a photo with, and the configuration that refines them.
 
     Args:
-        camera: its own.
-        size: width and height.
-        given: "given" as they are, "off" by a wrong focal length, or a "guess".
-        sizes: of the photos of the map.
+        camera: its true intrinsics.
+        size: its width and height.
+        given: "given", the true ones; "off", with a wrong focal length; or "guess".
+        sizes: widths and heights of the images of the map.
     """
     if given == "guess":
         width, height = size
@@ -309,7 +310,7 @@ def localize(
     matches: dict,
     gate: Gate,
 ) -> dict:
-    """Localize a query with intrinsics that are refined in a way."""
+    """Localize a query, given its intrinsics and the configuration that refines them."""
     camera, refinement = camera
     config = merged({"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}, refinement)
     cam_from_world, info = query.localize(place.reference, keypoints, camera, matches, config, gate)
@@ -331,7 +332,7 @@ def localize(
 def outcome(
     place: Place, row: dict, cam_from_world: pycolmap.Rigid3d | None, truth: pycolmap.Rigid3d | None
 ) -> dict:
-    """Tell true poses from wrong ones; those between are near, and of no pose there is none."""
+    """Return the errors of a pose, and whether it is true, near, wrong or none."""
     depth = row.pop("depth")
     if cam_from_world is None:
         return {"position_error": "", "rotation_error_deg": "", "outcome": "none"}
@@ -349,12 +350,12 @@ def outcome(
 
 
 def same_place(row: dict, same: list[set[str]]) -> bool:
-    """Tell whether the photo of a trial is of the place of the map, or of one beside it."""
+    """Tell whether a photo is of the place of the map, or of one that sees it."""
     return any({row["map"], row["place"]} <= names for names in same)
 
 
 def table(rows: list[dict], same: list[set[str]]) -> str:
-    """Format what is accepted and refused by feature."""
+    """Format how many poses are accepted and refused, by feature."""
     lines = [
         "| feature | wrong place | accepted | with 8 inliers | highest confidence "
         "| own, wrong pose | accepted | true pose | refused | lowest confidence |",
@@ -376,7 +377,7 @@ def table(rows: list[dict], same: list[set[str]]) -> str:
 
 
 def own_table(rows: list[dict]) -> str:
-    """Format what becomes of photos of the place itself."""
+    """Format the outcomes of photos of the place itself."""
     lines = [
         "| feature | photo | intrinsics | number | right | near | wrong | true pose refused |",
         "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: |",
@@ -399,17 +400,17 @@ def own_table(rows: list[dict]) -> str:
 
 
 def is_plain(row: dict) -> bool:
-    """Tell whether a photo is of the place, in its own shape, and its focal length not wrong."""
+    """Tell whether a photo is of the place, not reshaped, and without a wrong focal length."""
     return row["kind"] in ("own", "blurred") and row["intrinsics"] != "off"
 
 
 def is_true(row: dict) -> bool:
-    """Tell whether a trial is one of `is_plain` that found the true pose."""
+    """Tell whether a plain trial found the true pose."""
     return is_plain(row) and row["outcome"] == "true"
 
 
 def is_away(row: dict, same: list[set[str]]) -> bool:
-    """Tell whether a trial is of a photo that no pose in the map is right for."""
+    """Tell whether a photo shows nothing of the map, so that every pose is wrong."""
     if row["kind"] == "other":
         return not same_place(row, same)
     return row["kind"] in ("mirrored", "black", "noise")
@@ -420,7 +421,7 @@ def _accepted(rows: list[dict]) -> int:
 
 
 def levels(rows: list[dict], same: list[set[str]]) -> str:
-    """Format what each --min_confidence would accept and refuse, all features together."""
+    """Format how many poses each --min_confidence accepts and refuses, for all features."""
     away = np.array([float(r["confidence"]) for r in rows if is_away(r, same)])
     true = np.array([float(r["confidence"]) for r in rows if is_true(r)])
     lines = [
@@ -478,9 +479,13 @@ def _main() -> None:
         default=[MAP_FEATURE],
         help=f"{BASE} or projections of it, NAME or NAME:uint8",
     )
-    parser.add_argument("--matcher", default="NN-ratio", help="how to match")
-    parser.add_argument("--trials", type=int, default=85, help="photos of other places, a map")
-    parser.add_argument("--seed", type=int, default=0, help="of the maps and the photos drawn")
+    parser.add_argument(
+        "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
+    )
+    parser.add_argument("--trials", type=int, default=85, help="photos of other places, per map")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the maps and of the drawn photos"
+    )
     parser.add_argument(
         "--same",
         nargs="+",

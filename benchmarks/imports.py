@@ -1,7 +1,7 @@
-"""Print which rooms of the code import which, and fail if an import points up or in a circle.
+"""Print which rooms of the code import which, and fail if an import points up or in a cycle.
 
-A room is a package of hloc_reduce, its stages, or another top-level package. Each may import those
-below it.
+A room is a package of hloc_reduce, its stages, or another top-level package. A room may import the
+rooms before it in `ROOMS`.
 """
 
 import ast
@@ -13,7 +13,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 STAGES = "stages"  # the modules at the top level of hloc_reduce
-# from the lowest up
+# the lowest first
 ROOMS = (
     *("utils", "runtime", "detectors", "descriptors", "projections", "extractors", "aggregators"),
     *("matchers", "confs", "datasets", "localization", STAGES, "maps", "evaluation", "report"),
@@ -22,7 +22,7 @@ ROOMS = (
 
 
 def modules(root: Path = ROOT) -> dict[str, Path]:
-    """Return the files of all modules by their dotted names."""
+    """Return the file of each module by dotted name."""
     files = {}
     for package in ("hloc_reduce", "pipelines", "confs"):
         for path in sorted((root / package).rglob("*.py")):
@@ -32,7 +32,7 @@ def modules(root: Path = ROOT) -> dict[str, Path]:
 
 
 def imports(files: dict[str, Path]) -> dict[str, set[str]]:
-    """Return for each module those that it imports, at its top or in a function."""
+    """Return the modules that each module imports, at its top or in a function."""
     return {name: set(_imported(name, path, files)) - {name} for name, path in files.items()}
 
 
@@ -46,7 +46,7 @@ def _imported(name: str, path: Path, files: dict[str, Path]) -> Iterator[str]:
             source = ".".join([*above, *([node.module] if node.module else [])])
             for alias in node.names:
                 found = f"{source}.{alias.name}" if f"{source}.{alias.name}" in files else source
-                # its logger, version and errors of users are for all
+                # every room may import the logger and the version from hloc_reduce itself
                 if found in files and found != "hloc_reduce":
                     yield found
 
@@ -62,7 +62,7 @@ def room(module: str) -> str:
 
 
 def upward(graph: dict[str, set[str]]) -> list[str]:
-    """Return the imports from a room of one above it."""
+    """Return the imports of modules in higher rooms, as text."""
     return [
         f"{module} -> {other}"
         for module, others in graph.items()
@@ -72,7 +72,7 @@ def upward(graph: dict[str, set[str]]) -> list[str]:
 
 
 def cycle(graph: dict[str, set[str]]) -> list[str]:
-    """Return modules that import each other in a circle, none if there is no such circle."""
+    """Return the modules of an import cycle, none if there is no cycle."""
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -87,10 +87,10 @@ def _main() -> None:
         used = [f"{other} {edges[name, other]}" for other in ROOMS if edges[name, other]]
         inside = sum(room(module) == name for module in graph)
         print(f"{name} ({inside} modules): {', '.join(used) or 'nothing'}")
-    wrong = [*(f"points up: {edge}" for edge in upward(graph))]
-    if circle := cycle(graph):
-        wrong.append(f"in a circle: {' <- '.join(circle)}")
-    print("\n".join(wrong) or "No import points up, and none is in a circle.")
+    wrong = [f"points up: {edge}" for edge in upward(graph)]
+    if found := cycle(graph):
+        wrong.append(f"in a cycle: {' <- '.join(found)}")
+    print("\n".join(wrong) or "No import points up or is in a cycle.")
     sys.exit(1 if wrong else 0)
 
 

@@ -1,8 +1,8 @@
-"""Measure what DoG settings that follow the photo are worth, beside hloc's settings.
+"""Compare adaptive DoG settings with hloc's.
 
-Each place is made anew with all photos of another size, or with queries that are darker, blurred or
-noisy, every third photo a query, and run with --keypoints hloc and adaptive; data sets are run as
-they are. Prints inliers, map points, seconds and memory.
+From each map, data sets are made with every third photo as a query: with photos of other sizes, and
+with darker, blurred or noisy queries. These and the given data sets are run with --keypoints hloc
+and adaptive. Prints a Markdown table of keypoints, points, recall, inliers, seconds and memory.
 """
 
 import argparse
@@ -26,9 +26,9 @@ from pipelines.layouts import pipeline_of
 MEGAPIXELS = (0.3, 0.5, 1.0, 2.0, 12.0)
 GAINS = (0.06, 0.12, 0.25, 0.5)
 BLURS = (1.5, 3.0)  # standard deviations in pixels
-NOISES = (0.02, 0.05)  # standard deviations, of full scale
+NOISES = (0.02, 0.05)  # standard deviations, relative to full scale
 COMPARED = ("hloc", "adaptive")
-KEPT = "as they are"
+UNCHANGED = "as they are"
 HEADINGS = (
     *("place", "photos", "--keypoints", "keypoints a photo", "points", "localized", "recall [%]"),
     *("median error", "mean inliers", "extraction [s]", "all [s]", "memory [MiB]"),
@@ -41,7 +41,7 @@ def keep(image: np.ndarray, _: np.random.Generator) -> np.ndarray:
 
 
 def dim(image: np.ndarray, generator: np.random.Generator, gain: float) -> np.ndarray:
-    """Darken a photo as `darken_place.darken` does, by a gain."""
+    """Darken a photo by a gain, with the blur and noise of `darken_place.darken`."""
     return darken_place.darken(image, generator, (gain, gain * 1.0001))
 
 
@@ -51,25 +51,25 @@ def blur(image: np.ndarray, _: np.random.Generator, sigma: float) -> np.ndarray:
 
 
 def add_noise(image: np.ndarray, generator: np.random.Generator, sigma: float) -> np.ndarray:
-    """Add noise to a photo, of each pixel and channel its own."""
+    """Add noise to each pixel and channel of a photo."""
     view = image / 255 + sigma * generator.standard_normal(image.shape)
     return np.round(255 * view.clip(0, 1)).astype(np.uint8)
 
 
 def conditions(images: Path) -> dict[str, tuple[Callable, float]]:
-    """Return by name what is done with queries, and the scale of all photos."""
-    height, width = read_image(next(path for path in sorted(images.iterdir()))).shape[:2]
+    """Return by name how queries are altered, and the scale of all photos."""
+    height, width = read_image(min(images.iterdir())).shape[:2]
     sizes = {f"{size:g} MP": (keep, (size * 1e6 / (width * height)) ** 0.5) for size in MEGAPIXELS}
     varied = {f"gain {gain:g}": (partial(dim, gain=gain), 1.0) for gain in GAINS}
     varied |= {f"blur {sigma:g} px": (partial(blur, sigma=sigma), 1.0) for sigma in BLURS}
     varied |= {f"noise {sigma:g}": (partial(add_noise, sigma=sigma), 1.0) for sigma in NOISES}
-    return {**sizes, KEPT: (keep, 1.0), **varied}
+    return {**sizes, UNCHANGED: (keep, 1.0), **varied}
 
 
 def datasets(
     maps: dict[str, tuple[Path, Path]], given: list[Path], output: Path
 ) -> Iterator[tuple[str, str, Path]]:
-    """Yield the place, the condition and the folder of each data set, made where it is missing."""
+    """Yield the place, condition and folder of each data set; make those that are missing."""
     for place, (images, model) in maps.items():
         for name, (vary, scale) in conditions(images).items():
             dataset = output / place / name.replace(" ", "_")
@@ -77,11 +77,11 @@ def datasets(
                 darken_place.main(images, model, dataset, vary, scale)
             yield place, name, dataset
     for dataset in given:
-        yield dataset.name, KEPT, dataset
+        yield dataset.name, UNCHANGED, dataset
 
 
 def run(dataset: Path, outputs: Path, feature: str, keypoints: str) -> tuple[dict, float]:
-    """Run a place's pipeline, and return its summary and the memory of its process in MiB."""
+    """Run the pipeline of a data set; return its summary and its peak memory in MiB."""
     options = {"dataset": dataset, "outputs": outputs, "feature": feature, "keypoints": keypoints}
     command = [sys.executable, "-m", pipeline_of(dataset).__name__]
     command += [word for key, value in options.items() for word in (f"--{key}", str(value))]

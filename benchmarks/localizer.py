@@ -1,4 +1,4 @@
-"""Print how long a Localizer takes for photos, one at a time, by stage."""
+"""Time a Localizer on photos, one at a time, stage by stage."""
 
 import argparse
 from pathlib import Path
@@ -26,7 +26,7 @@ def _main() -> None:
     args = parser.parse_args()
     localizer = Localizer(args.map)
     photos = [args.query_images / name for name in list_images(args.query_images)]
-    localizer.localize(photos[0])  # what is done once only
+    localizer.localize(photos[0])  # warm up
     seconds = []
     for photo in progress(photos, "Localizing", "photo"):
         _, info = localizer.localize(photo)

@@ -1,10 +1,10 @@
 """Time the matching of image pairs: mutual nearest neighbours with a ratio test.
 
-Columns: hloc's nearest_neighbor (the installed hloc's, or else the same computation in torch); ours
-for one pair at a time and for a run of pairs, each core on one of its own; faiss's exact search,
-both ways; the bare matrix product into memory that is there already, which no exact search that
-uses it can be faster than. Milliseconds a pair, the least of several rounds in which all take
-turns; then how many times faster than hloc. A tenth of the descriptors of a pair match.
+Compares the nearest_neighbor of the installed hloc (or else the same computation in torch); ours,
+for one pair at a time and for a run of pairs, one per core; exact search by faiss in both
+directions; and the bare matrix product, a lower bound for every search that computes it.
+Prints milliseconds per pair, the least of several rounds in which all take turns, and the speedups
+over hloc. A tenth of the descriptors of a pair match.
 """
 
 import argparse
@@ -22,14 +22,14 @@ from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 
 RATIO = 0.8
-MATCHING = 0.1  # of the descriptors
+MATCHING = 0.1  # share of the descriptors
 DIMS = (128, 64, 32, 24, 16)
 
 Pair = tuple[torch.Tensor, torch.Tensor]
 
 
 def make_pair(number: int, dim: int, seed: int, device: str) -> Pair:
-    """Draw two images' descriptors (N, D) of unit norm."""
+    """Draw the descriptors (N, D) of two images, of unit norm."""
     generator = torch.Generator().manual_seed(seed)
     first, second = (
         torch.nn.functional.normalize(torch.randn(number, dim, generator=generator), dim=1)
@@ -42,7 +42,7 @@ def make_pair(number: int, dim: int, seed: int, device: str) -> Pair:
 
 
 def hloc_matcher(device: str) -> tuple[str, Callable[[Pair], torch.Tensor]]:
-    """Return hloc's matcher and what it is called, or the same computation where hloc is not."""
+    """Return the name and the function of hloc's matcher, or of `plain` without hloc."""
     try:
         from hloc.matchers.nearest_neighbor import NearestNeighbor as Original
     except ImportError:
@@ -57,7 +57,7 @@ def hloc_matcher(device: str) -> tuple[str, Callable[[Pair], torch.Tensor]]:
 
 
 def plain(pair: Pair) -> torch.Tensor:
-    """Match as hloc does: the whole similarity matrix, and the best two of rows and columns."""
+    """Match as hloc does: compute all similarities, and the best two of each row and column."""
     similarity = pair[0] @ pair[1].T
     nearest = []
     for view in (similarity, similarity.T):
@@ -70,7 +70,7 @@ def plain(pair: Pair) -> torch.Tensor:
 
 
 def faiss_both_ways(pair: Pair) -> torch.Tensor:
-    """Match by exact searches for the best two, forth and back."""
+    """Match by exact searches for the best two, in both directions."""
     import faiss
 
     nearest = []
@@ -84,7 +84,7 @@ def faiss_both_ways(pair: Pair) -> torch.Tensor:
 
 
 def methods(number: int, device: str) -> dict[str, Callable[[list[Pair]], list]]:
-    """Return what is compared, each a function of a list of pairs."""
+    """Return the compared methods, functions of a list of pairs."""
     reference, match = hloc_matcher(device)
     ours = NearestNeighbor({"ratio_threshold": RATIO})
     memory = torch.empty(number, number, device=device)
@@ -110,7 +110,7 @@ def methods(number: int, device: str) -> dict[str, Callable[[list[Pair]], list]]
 
 @torch.no_grad()
 def measure(number: int, dim: int, pairs: int, rounds: int, device: str) -> dict[str, float]:
-    """Return the least seconds a pair of each method; check that they find the same."""
+    """Return the least seconds per pair of each method; check that all find the same matches."""
     data = [make_pair(number, dim, seed, device) for seed in range(pairs)]
     compared = methods(number, device)
     seconds = dict.fromkeys(compared, np.inf)
@@ -137,8 +137,8 @@ def _main() -> None:
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument("--keypoints", type=int, default=8000, help="of each image")
-    parser.add_argument("--pairs", type=int, default=8, help="in a run")
-    parser.add_argument("--rounds", type=int, default=5, help="in which all take turns")
+    parser.add_argument("--pairs", type=int, default=8, help="pairs in a run")
+    parser.add_argument("--rounds", type=int, default=5, help="rounds in which all take turns")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     args = parser.parse_args()
     if min(args.keypoints, args.pairs, args.rounds) < 1:

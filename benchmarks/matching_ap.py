@@ -1,15 +1,16 @@
-"""Average precision of nearest-neighbour matching on the tracks of maps kept out of training.
+"""Measure the average precision (AP) of nearest-neighbour matching on tracks of held-out maps.
 
-From each point of a map two observations in different images are drawn. All first descriptors are
-ranked by the distance to their nearest second descriptor; correct is the same point. The columns of
-the maps and their mean are for tracks as triangulated from the mutual nearest neighbours of `sift`,
-or of `colmap_sift` for that, which has keypoints of its own. "completed" adds the observations that
-it missed and geometry found, and "dark" takes photometric variants (darkness, blur, noise) of the
-second photos, too. "photo pairs" is as hloc matches, one photo with another, completed: the
-observations in one of the points that both see, with all observations in the other; mean over the
-pairs of photos. Prints Markdown tables of percentages, means over several draws: for each base
-descriptor one with a row for itself, each projection of it that ships and each `--projection` whose
-name begins with its name; then one of the means by number of dimensions.
+Two observations of each point of a map are drawn, in different images. All first descriptors are
+ranked by the distance to their nearest second descriptor; a match is correct if it is of the same
+point. The columns of the maps and their mean use the tracks as triangulated from mutual nearest
+neighbours of `sift` (or of `colmap_sift`, which has its own keypoints). "completed" adds the
+observations that matching missed and geometry found; "dark" also takes photometric variants
+(darkness, blur, noise) of the second photos. "photo pairs" matches one photo with another, as hloc
+does: the observations of the points that both see with all observations in the other photo.
+
+Prints Markdown tables of percentages, means over several draws: one for each base descriptor, with
+its own row and one for each shipped projection and each `--projection` whose name begins with the
+name of the descriptor; then one of the means by number of dimensions.
 """
 
 import argparse
@@ -23,7 +24,7 @@ import torch
 
 from hloc_reduce import projections
 from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, DIM
-from hloc_reduce.evaluation.matching import average_precision
+from hloc_reduce.evaluation.ranking import nearest_neighbor_ap
 from hloc_reduce.training import nested, tracks
 from hloc_reduce.training.__main__ import parse_maps
 from hloc_reduce.training.sampling import matchable
@@ -35,7 +36,7 @@ MIN_SHARED = 30  # points that a pair of photos must share
 
 
 def draw_pairs(data: tracks.Tracks, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Draw two observations of each point: base descriptors (N, 128) as seen, seen and dark."""
+    """Draw two observations of each point: base descriptors (N, 128) of both, and a dark second."""
     generator = np.random.default_rng(seed)
     kept, starts, lengths = matchable(data)
     first = generator.integers(lengths)
@@ -47,7 +48,7 @@ def draw_pairs(data: tracks.Tracks, seed: int) -> tuple[torch.Tensor, torch.Tens
 
 
 def photo_pairs(data: tracks.Tracks) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """List base descriptors (N, 128), (M, 128) of pairs of photos, the first N of common points."""
+    """List base descriptors (N, 128), (M, 128) of photo pairs, the first N of common points."""
     photos = []
     for image in np.unique(data.image):
         seen = np.flatnonzero(data.image == image)
@@ -65,7 +66,7 @@ def photo_pairs(data: tracks.Tracks) -> list[tuple[torch.Tensor, torch.Tensor]]:
 
 
 def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.Module]:
-    """Load what projects a descriptor, by name, nested ones at each of their sizes."""
+    """Load the projections of a descriptor by name, nested ones at each of their dimensions."""
     names = [name for name in projections.names() if name.rpartition("_")[0] == descriptor]
     nested_name = f"{descriptor}_nested"
     if nested_name in names:
@@ -79,12 +80,12 @@ def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.M
 
 
 def family(name: str) -> str:
-    """Return what the projections to several numbers of dimensions have in common."""
+    """Return the name of a projection without its dimension."""
     return re.sub(r"(@|_dim)?\d*(?=(\.\w+)?$)", "", name)
 
 
 def draw_all(data: tracks.Tracks, draws: int) -> dict[str, list]:
-    """Pair the descriptors of a map in each of KINDS."""
+    """Draw pairs of descriptors of a map, of each of `KINDS`."""
     matched = data.only(data.matched)
     completed = [draw_pairs(data, seed) for seed in range(draws)]
     return {
@@ -96,8 +97,8 @@ def draw_all(data: tracks.Tracks, draws: int) -> dict[str, list]:
 
 
 def measure(project: torch.nn.Module, draws: list) -> float:
-    """Return the mean AP in percent."""
-    return np.mean([100 * average_precision(*map(project, views)) for views in draws])
+    """Return the mean AP of projected pairs in percent."""
+    return np.mean([100 * nearest_neighbor_ap(*map(project, views)) for views in draws])
 
 
 def _main() -> None:
@@ -123,7 +124,7 @@ def _main() -> None:
         cli.choose("descriptor", descriptor, [*DESCRIPTORS, COLMAP])
     for file in args.projection:
         if not file.name.lower().startswith(tuple(args.descriptor)):
-            raise InputError(f"{file}: its name does not begin with a descriptor's.")
+            raise InputError(f"{file}: its name must begin with one of --descriptor.")
     if args.draws < 1:
         raise InputError("--draws: at least 1.")
     maps = parse_maps(args.map)

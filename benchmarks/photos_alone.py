@@ -1,9 +1,9 @@
-"""Compare maps of photos alone with stock pycolmap and with given poses.
+"""Compare maps of photos without poses with given poses, and with maps of stock pycolmap.
 
-Builds a map from the photos of each place, or of consecutive ones by name, and on demand one by
-stock pycolmap: its own SIFT, exhaustive matching and the incremental mapper, all by default. The
-positions of a map are aligned with the given ones by a similarity; their errors are in percent of
-the extent of the given positions, the largest distance between two of them.
+Builds a map from all photos of each place, or from subsets that are consecutive by name, and with
+--stock also one by stock pycolmap: its own SIFT, exhaustive matching and incremental mapper, with
+default options. A similarity aligns the positions of a map with the given ones. Position errors are
+in percent of the largest distance between two given positions.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 
 COLUMNS = ("registered", "points", "reprojection error", "positions", "rotations", "seconds")
-ROBUST = 10  # rounds of reweighting
+REWEIGHTINGS = 10
 
 
 def choose_photos(names: list[str], size: int, number: int) -> list[list[str]]:
@@ -36,13 +36,13 @@ def choose_photos(names: list[str], size: int, number: int) -> list[list[str]]:
 
 
 def ours(images: Path, folder: Path, feature: str, options: dict) -> pycolmap.Reconstruction:
-    """Build a map of photos alone."""
+    """Build a map of photos without poses."""
     built = maps.main(folder, images, feature=feature, accept_partial=True, **options)
     return colmap.read_model(built.sfm)
 
 
 def stock(images: Path, folder: Path) -> pycolmap.Reconstruction:
-    """Reconstruct by pycolmap alone, in one thread, and return the model of most images."""
+    """Reconstruct by stock pycolmap in one thread; return the model with the most images."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     database = folder / "database.db"
@@ -69,21 +69,21 @@ def pose_errors(
     """Align a model with another by a similarity and compare the poses of its images.
 
     Args:
-        model: to align.
-        reference: with the same images and perhaps more.
+        model: the model to align.
+        reference: has the images of the model, and perhaps more.
 
     Returns:
-        Errors of the positions (N,), in percent of the extent of those of the reference, and of
-        the rotations (N,), in degrees.
+        Position errors (N,), in percent of the extent of the reference, and rotation errors (N,),
+        in degrees.
     """
     true = {image.name: image.cam_from_world() for image in reference.images.values()}
     known = {image.name: image.cam_from_world() for image in model.images.values()}
     names = sorted(known)
     source = np.array([known[name].inverse().translation for name in names])
     target = np.array([true[name].inverse().translation for name in names])
-    # the similarity of least absolute errors, so that one wrong pose does not spoil the others
+    # least absolute errors: one wrong pose does not spoil the others
     weights = np.ones(len(names))
-    for _ in range(ROBUST):
+    for _ in range(REWEIGHTINGS):
         scale, rotation, shift = fit_similarity(source, target, weights)
         errors = np.linalg.norm(scale * source @ rotation.T + shift - target, axis=1)
         weights = 1 / np.maximum(errors, max(np.median(errors), 1e-9) / 10)
@@ -111,7 +111,7 @@ def fit_similarity(
 
 
 def row(model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction, number: int) -> list:
-    """Return the cells of a model but for the seconds."""
+    """Return the cells of a model, without the seconds."""
     positions, rotations = pose_errors(model, reference)
     return [
         f"{model.num_reg_images()} of {number}",
@@ -177,16 +177,18 @@ def _main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="folder of the maps")
     parser.add_argument("--feature", default=features_confs.RECOMMENDED, help="name or YAML file")
     features_confs.add_keypoints_option(parser)
-    parser.add_argument("--subset", type=int, default=0, help="photos of each place; 0: all")
-    parser.add_argument("--subsets", type=int, default=1, help="how many such subsets")
-    parser.add_argument("--stock", action="store_true", help="run stock pycolmap too")
+    parser.add_argument("--subset", type=int, default=0, help="photos per subset; 0: all")
+    parser.add_argument("--subsets", type=int, default=1, help="subsets of each place")
+    parser.add_argument("--stock", action="store_true", help="also run stock pycolmap")
     parser.add_argument("--camera_mode", default="auto", help="which photos share a camera")
-    parser.add_argument("--num_covis", type=int, default=20, help="pairs of a photo, where not all")
+    parser.add_argument(
+        "--num_covis", type=int, default=20, help="pairs of each photo, unless all are matched"
+    )
     parser.add_argument(
         "--max_exhaustive",
         type=int,
         default=build.MAX_EXHAUSTIVE,
-        help="photos of which all pairs are matched",
+        help="largest number of photos whose pairs are all matched",
     )
     args = parser.parse_args()
     build.MAX_EXHAUSTIVE = args.max_exhaustive

@@ -1,8 +1,8 @@
-"""What one byte a number costs: matching AP of descriptors kept as float16 and as uint8.
+"""Measure the matching AP of descriptors that are stored as float16 and as uint8.
 
-On the tracks of maps, drawn as by matching_ap.py; the descriptors of a draw, or of a photo, are
-quantized together, as those of an image are in a file. Prints a Markdown table of bytes a keypoint
-and percentages, means over the maps.
+Pairs are drawn from the tracks of maps as by matching_ap.py. The descriptors of a draw, or of a
+photo, are quantized together, like those of an image in a feature file. Prints a Markdown table of
+bytes per keypoint and percentages, means over the maps.
 """
 
 import argparse
@@ -20,11 +20,11 @@ from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.feature_files import restore, store
 
-KEPT = ("float16", "uint8")
+COMPARED = ("float16", "uint8")
 
 
-def kept(project: Callable[[torch.Tensor], torch.Tensor], storage: str) -> Callable:
-    """Return the projection followed by what a file does to descriptors."""
+def through_file(project: Callable[[torch.Tensor], torch.Tensor], storage: str) -> Callable:
+    """Return a projection that also quantizes descriptors as a feature file does."""
 
     def stored(descriptors: torch.Tensor) -> torch.Tensor:
         arrays, attrs = store({"descriptors": project(descriptors).numpy().T}, storage)
@@ -62,10 +62,10 @@ def _main() -> None:
     ]
     print(f"| feature | bytes | {' | '.join(KINDS)} |\n| --- | ---: |" + " ---: |" * len(KINDS))
     for name, project in loaded.items():
-        for storage in KEPT:
+        for storage in COMPARED:
             size = np.dtype(storage).itemsize * project.dim
             values = [
-                np.mean([measure(kept(project, storage), kinds[kind]) for kinds in data])
+                np.mean([measure(through_file(project, storage), kinds[kind]) for kinds in data])
                 for kind in KINDS
             ]
             cells = " | ".join(f"{value:.2f}" for value in values)

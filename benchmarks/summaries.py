@@ -1,4 +1,4 @@
-"""Print a Markdown table of the summary.json of finished runs of any pipeline."""
+"""Print a Markdown table of finished runs of any pipeline."""
 
 import argparse
 import json
@@ -13,7 +13,7 @@ HEADER = (
 
 
 def rows(summary: dict) -> list[str]:
-    """Format the lists of a summary, a row each."""
+    """Format a row for each query list of a summary."""
     lines = []
     for name, result in summary["lists"].items():
         recall = " / ".join(f"{value:.1f}" for value in result.get("recall_percent", []))
@@ -44,7 +44,7 @@ def _main() -> None:
         epilog="example: python benchmarks/summaries.py outputs/demo_town/*",
         formatter_class=cli.HelpFormatter,
     )
-    parser.add_argument("outputs", type=Path, nargs="+", help="output folders of runs")
+    parser.add_argument("outputs", type=Path, nargs="+", help="outputs folders of runs")
     args = parser.parse_args()
     lines = [HEADER, "| --- | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
     for folder in args.outputs:

@@ -1,7 +1,7 @@
-"""Plots of results, by matplotlib, which the extra `report` installs."""
+"""Plots of results with matplotlib, which the extra `report` installs."""
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.util import find_spec
 from itertools import cycle, product
@@ -18,54 +18,54 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    Panel = Callable[[Axes], None]  # draws into axes
+    Panel = Callable[[Axes], None]  # draws a plot into axes
 
 INSTALL = "pip install 'hloc-reduce[report]'"
-FINEST = 1e-4  # metres, degrees: the least error on a logarithmic axis
+MIN_ERROR = 1e-4  # metres, degrees: smaller errors are drawn here on the logarithmic axis
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#a6761d")
-INCHES = 1.6  # of an entry of a legend
-AXES = np.array([220, 140])  # of a panel, in points, about
+LEGEND_ENTRY = 1.6  # width in inches
+AXES = np.array([220, 140])  # approximate size of a panel in points
+SIDES = np.array([(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)])
 NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-LINES = (("-", "o"), ("--", "s"), (":", "^"))  # of lists, with their markers
+LINES = (("-", "o"), ("--", "s"), (":", "^"))  # style and marker of each query list
 NOISE_COLOURS = {"easy": "#009e73", "hard": "#e69f00", "tough": "#d55e00"}
-STYLE = {
+STYLE: dict = {
     "axes.grid": True,
     "axes.spines.right": False,
     "axes.spines.top": False,
     "font.size": 9,
     "grid.alpha": 0.3,
-    "svg.fonttype": "none",  # text in the font of the page
-    "svg.hashsalt": "hloc_reduce",  # the same file in every run
+    "svg.fonttype": "none",  # text stays text, in the font of the page
+    "svg.hashsalt": "hloc_reduce",  # every run writes the same file
 }
 
 
 def available(what: str | Path) -> bool:
-    """Return whether plots can be made; say how, if not, and that `what` will be missing."""
+    """Return whether matplotlib is installed; warn that `what` will be missing if it is not."""
     if find_spec("matplotlib") is None:
-        logger.warning("Without matplotlib there is no %s: %s.", what, INSTALL)
+        logger.warning("%s is not written without matplotlib: %s.", what, INSTALL)
         return False
     return True
 
 
 def figure(
-    panels: "list[Panel]", columns: int = 1, width: float = 3.8, height: float = 2.7
+    panels: "Sequence[Panel]", columns: int = 1, width: float = 3.8, height: float = 2.7
 ) -> "Figure":
-    """Draw panels into a figure, row by row, of so many inches each."""
+    """Draw panels into a figure, row by row; `width` and `height` of each are in inches."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
         rows = -(-len(panels) // columns)
         drawn = Figure((columns * width, rows * height), layout="constrained")
-        for axis, panel in zip(
-            drawn.subplots(rows, columns, squeeze=False).flat, panels, strict=True
-        ):
+        axes = drawn.subplots(rows, columns, squeeze=False).flat
+        for axis, panel in zip(axes, panels, strict=True):
             panel(axis)
         handles, labels = drawn.axes[0].get_legend_handles_labels()
-        beside = min(len(labels), max(1, round(columns * width / INCHES)))
-        drawn.set_figheight(drawn.get_figheight() + 0.17 * -(-len(labels) // beside))
+        ncols = min(len(labels), max(1, round(columns * width / LEGEND_ENTRY)))
+        drawn.set_figheight(drawn.get_figheight() + 0.17 * -(-len(labels) // ncols))
         drawn.legend(
-            handles, labels, loc="outside lower center", ncols=beside, fontsize=7.5, frameon=False
+            handles, labels, loc="outside lower center", ncols=ncols, fontsize=7.5, frameon=False
         )
         return drawn
 
@@ -82,7 +82,7 @@ def svg(figure: "Figure") -> str:
 
 
 def save(figure: "Figure", path: Path) -> None:
-    """Write a figure in the format that the suffix of its path names."""
+    """Write a figure; the suffix of the path sets the format."""
     from matplotlib import rc_context
 
     with replacing(path) as temporary, rc_context(STYLE):
@@ -93,10 +93,13 @@ def save(figure: "Figure", path: Path) -> None:
 def error_curves(
     curves: Mapping[str, Mapping[str, list[tuple[float, float]]]],
 ) -> "dict[str, Panel]":
-    """Plot cumulative errors of poses, of position and of rotation for each list.
+    """Plot cumulative position and rotation errors for each list.
 
     Args:
-        curves: from list of queries and run to the errors, metres and degrees, of its queries.
+        curves: from list and run to the errors of the queries, metres and degrees.
+
+    Returns:
+        Panels by name, such as `position_day`.
     """
     units = ("position error [m]", "rotation error [°]")
     return {
@@ -106,8 +109,8 @@ def error_curves(
     }
 
 
-def _shown(name: str) -> str:
-    """Return a name as a label that matplotlib neither hides nor takes for mathematics."""
+def _label(name: str) -> str:
+    """Return a label that matplotlib neither hides (a leading _) nor reads as TeX ($)."""
     return f" {name}".replace("$", r"\$")
 
 
@@ -115,23 +118,24 @@ def _curves(axis: "Axes", name: str, runs: Mapping, place: int, unit: str) -> No
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     styles = product([line for line, _ in LINES], COLOURS)
-    widths = np.linspace(1.3 + 0.5 * min(len(runs) - 1, 5), 1.3, len(runs))  # none hides another
+    # thinner and thinner, so that equal curves do not hide each other
+    widths = np.linspace(1.3 + 0.5 * min(len(runs) - 1, 5), 1.3, len(runs))
     curves = {run: cumulative(error[place] for error in errors) for run, errors in runs.items()}
     end = max((values[-1] for values, _ in curves.values() if len(values)), default=1.0)
     for (line, colour), width, (run, (values, percent)) in zip(
         cycle(styles), widths, curves.items(), strict=False
     ):
         axis.step(
-            np.array([*values[:1], *values, end]).clip(FINEST),
+            np.array([*values[:1], *values, end]).clip(MIN_ERROR),
             [0, *percent, percent[-1]] if len(percent) else [0],
             where="post",
             color=colour,
             linestyle=line,
-            label=_shown(run),
+            label=_label(run),
             linewidth=width,
         )
     axis.set(
-        xscale="log", xlabel=unit, ylabel="queries within [%]", ylim=(0, 102), title=_shown(name)
+        xscale="log", xlabel=unit, ylabel="queries within [%]", ylim=(0, 102), title=_label(name)
     )
     low, high = axis.get_xlim()
     steps = (1, 2, 5) if high < 50 * low else (1, 3) if high < 1000 * low else (1,)
@@ -144,8 +148,11 @@ def size_and_time(points: Mapping[str, Mapping[str, list[dict]]]) -> "dict[str, 
     """Plot accuracy against the size of descriptors and against time, for each measure.
 
     Args:
-        points: from measure of accuracy and list of queries to a dict for each run: `family`, of
-            which the runs are joined by a line, `bytes` of a descriptor, `seconds`, `value`.
+        points: from measure and query list to a dict for each run: `bytes` of a descriptor,
+            `seconds`, `value` of the measure, and `family`, whose runs a line joins.
+
+    Returns:
+        Panels by name, such as `mean_inliers_bytes`.
     """
     labels = {"bytes": "bytes a descriptor", "seconds": "seconds, whole run"}
     return {
@@ -171,7 +178,7 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
                 linestyle=line if key == "bytes" else "",
                 linewidth=1.2,
                 color=colour,
-                label=_shown(f"{family}, {name}"),
+                label=_label(f"{family}, {name}"),
             )
             marked += [(run[key], run["value"], f"{run['bytes']} B", colour) for run in own]
     values = [run["value"] for runs in lists.values() for run in runs]
@@ -192,13 +199,13 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
 
 
 def _mark(axis: "Axes", marked: list[tuple[float, float, str, str]]) -> None:
-    """Write the text beside each point (x, y, text, colour), if there is a place that is free."""
+    """Write the text of each point (x, y, text, colour) beside it, where there is room."""
     to_points = axis.transScale + axis.transLimits
     places = to_points.transform([mark[:2] for mark in marked]) * AXES
-    taken = [(place, (4, 4)) for place in places]
-    for place, (*point, text, colour) in zip(places, marked, strict=True):
+    taken = [(place, np.array([4, 4])) for place in places]  # centres and half sizes
+    for place, (x, y, text, colour) in zip(places, marked, strict=True):
         half = np.array([2.2 * len(text), 4])
-        for side in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)):
+        for side in SIDES:
             offset = side * (half + 5)
             centre = place + offset
             apart = all((abs(centre - other) >= half + size).any() for other, size in taken)
@@ -206,8 +213,8 @@ def _mark(axis: "Axes", marked: list[tuple[float, float, str, str]]) -> None:
                 taken.append((centre, half))
                 axis.annotate(
                     text,
-                    point,
-                    xytext=offset,
+                    (x, y),
+                    xytext=(offset[0], offset[1]),
                     textcoords="offset points",
                     ha="center",
                     va="center",
@@ -218,10 +225,10 @@ def _mark(axis: "Axes", marked: list[tuple[float, float, str, str]]) -> None:
 
 
 def hpatches_bars(rows: list[dict]) -> "Figure":
-    """Plot the means of features in the tasks of HPatches, with markers for each noise.
+    """Plot the means of features in the tasks of HPatches, with a marker for each noise.
 
     Args:
-        rows: as of `evaluation.hpatches.main`.
+        rows: from `evaluation.hpatches.main`.
     """
     tasks = [key.removesuffix("_easy") for key in rows[0] if key.endswith("_easy")]
     panels = [partial(_bars, rows=rows, task=task) for task in tasks]
@@ -242,5 +249,5 @@ def _bars(axis: "Axes", rows: list[dict], task: str) -> None:
     if not np.isnan(paper).all():
         axis.plot(paper, places, "|", markersize=11, color="black", label="mean in the paper")
     axis.set(title=f"{task} mAP [%]", xlim=(0, 100))
-    axis.set_yticks(places, [_shown(row["feature"]) for row in rows])
+    axis.set_yticks(places, [_label(row["feature"]) for row in rows])
     axis.grid(axis="y", visible=False)

@@ -1,4 +1,4 @@
-"""What a localization run leaves behind: queries.csv, summary.json and the recall table."""
+"""Results of a localization run: queries.csv, summary.json and the recall table."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -12,24 +12,7 @@ from ..utils.feature_files import stored_descriptors
 from ..utils.files import replacing
 from ..utils.h5 import list_h5_names, open_h5
 from ..utils.tables import aligned
-from .poses import FAILED, pose_error, summarize_errors
-
-COLUMNS = (
-    "query",
-    "list",
-    "status",
-    "num_matches",
-    "num_without_point",
-    "num_correspondences",
-    "num_inliers",
-    "inlier_ratio",
-    "confidence",
-    "agreement",
-    "position_error_m",
-    "rotation_error_deg",
-    "retrieved",
-    "reason",
-)
+from .poses import ERRORS, pose_error, status, summarize_errors
 
 
 def query_table(
@@ -42,69 +25,63 @@ def query_table(
     Args:
         lists: the queries of each list.
         records: of each query, as from `localization.main`.
-        truth: true poses, camera from world, by full name; may lack some or all.
+        truth: true poses, camera from world, by full name, of all, some or no queries.
 
     Returns:
-        A dict of `COLUMNS` for each query. The error of a query is that of the submitted pose,
-        be it localized or a fallback, and infinite if there is none; it is None where the truth
-        is not known.
+        A dict for each query. Its errors are of the submitted pose, even if that is a fallback:
+        infinite without a pose, None without a true pose.
     """
-    rows = []
-    for list_name, queries in lists.items():
-        for name in queries:
-            record = records[name]
-            correspondences, inliers = record["num_correspondences"], record["num_inliers"]
-            estimate = pose_of(record)
-            errors = (None, None)
-            if name in truth:
-                errors = pose_error(estimate, truth[name]) if estimate else FAILED
-            values = (
-                name,
-                list_name,
-                "localized" if record["localized"] else "fallback" if estimate else "failed",
-                record["num_matches"],
-                record["num_without_point"],
-                correspondences,
-                inliers,
-                round(inliers / correspondences, 4) if correspondences else 0.0,
-                record["confidence"],
-                record["agreement"],
-                *errors,
-                record["db"],
-                record["reason"],
-            )
-            rows.append(dict(zip(COLUMNS, values, strict=True)))
-    return rows
+    return [
+        _query_row(name, list_name, records[name], truth.get(name))
+        for list_name, queries in lists.items()
+        for name in queries
+    ]
+
+
+def _query_row(
+    name: str, list_name: str, record: dict, true: pycolmap.Rigid3d | None
+) -> dict[str, object]:
+    correspondences, inliers = record["num_correspondences"], record["num_inliers"]
+    pose = pose_of(record)
+    return {
+        "query": name,
+        "list": list_name,
+        "status": status(pose, record["localized"]),
+        "num_matches": record["num_matches"],
+        "num_without_point": record["num_without_point"],
+        "num_correspondences": correspondences,
+        "num_inliers": inliers,
+        "inlier_ratio": round(inliers / correspondences, 4) if correspondences else 0.0,
+        "confidence": record["confidence"],
+        "agreement": record["agreement"],
+        **dict(zip(ERRORS, (None, None) if true is None else pose_error(pose, true), strict=True)),
+        "retrieved": record["db"],
+        "reason": record["reason"],
+    }
 
 
 def summarize_list(rows: list[dict], thresholds: tuple[tuple[float, float], ...]) -> dict:
     """Summarize the rows of one list.
 
     Returns:
-        Counts, mean inliers, and where the truth is known recall in percent at each of the
-        thresholds, and median errors. Recall counts a fallback as a failure; medians are of the
-        submitted poses, None if half of the queries have none.
+        Counts and mean inliers, and `summarize_errors` of the queries with known true poses, if
+        there are any.
     """
     summary = {
         "queries": len(rows),
         "localized": sum(row["status"] == "localized" for row in rows),
         "mean_inliers": round(float(np.mean([row["num_inliers"] for row in rows])), 1),
     }
-    known = [row for row in rows if row["position_error_m"] is not None]
-    if known:
-        errors = [(row["position_error_m"], row["rotation_error_deg"]) for row in known]
-        counted = [
-            error if row["status"] == "localized" else FAILED
-            for row, error in zip(known, errors, strict=True)
-        ]
-        summary |= summarize_errors(errors, counted, thresholds)
-    return summary
+    known = [row for row in rows if row[ERRORS[0]] is not None]
+    return {**summary, **(summarize_errors(known, thresholds) if known else {})}
 
 
 def bytes_per_keypoint(features: Path) -> dict:
-    """Measure the size of a feature file: bytes of one descriptor, and of all per keypoint.
+    """Measure the size of descriptors and of a feature file.
 
-    `storage` is the type of the numbers of a descriptor.
+    Returns:
+        `descriptor`, bytes of one; `storage`, the type of its numbers; `feature_file`, bytes of the
+        file for each keypoint; and `keypoints`, of all images.
     """
     names = list_h5_names(features)
     with open_h5(features) as file:
@@ -126,7 +103,7 @@ def write_summary(summary: dict, path: Path) -> None:
 
 
 def recall_table(feature: str, lists: Mapping[str, dict]) -> str:
-    """Format recall in the form of the paper's tables, a column for each list."""
+    """Format recall like the paper's tables, with a column for each list."""
     columns = [[feature, "distance [m]", "orient. [deg]", "recall [%]"]]
     for name, summary in lists.items():
         if "recall_percent" in summary:

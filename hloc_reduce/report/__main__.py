@@ -1,4 +1,4 @@
-"""Write a page about one run of a pipeline, or several side by side, to open in a browser."""
+"""Write an HTML page about one run of a pipeline, or several side by side."""
 
 import argparse
 from pathlib import Path
@@ -18,21 +18,21 @@ def _main() -> None:
         type=Path,
         nargs="+",
         metavar="OUTPUTS",
-        help="outputs folders of runs, or a folder with finished runs at most two levels below, as "
-        "of a batch",
+        help="outputs folders of runs, or folders with finished runs at most two levels below, "
+        "such as the outputs folder of a batch",
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("report.html"), help="the HTML file"
     )
-    parser.add_argument("--queries", nargs="+", help="whose matches are shown")
+    parser.add_argument("--queries", nargs="+", help="queries whose matches are shown")
     parser.add_argument(
         "--num_queries",
         type=int,
         default=NUM_QUERIES,
-        help="without --queries: so many, evenly from the worst to the best",
+        help="number of queries without --queries, evenly from the worst to the best",
     )
     parser.add_argument(
-        "--pictures_dir", type=Path, help="write plots and pictures of matches there as files, too"
+        "--pictures_dir", type=Path, help="also write plots and pictures of matches to this folder"
     )
     args = parser.parse_args()
     cli.check_positive(args, "num_queries")

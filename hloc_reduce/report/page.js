@@ -2,7 +2,7 @@
 (() => {
   const byId = (id) => document.getElementById(id);
 
-  // the table of queries: sorted by its heads, filtered by run and name
+  // the table of queries: sorted by column, filtered by run and name
   const body = byId("table").tBodies[0];
   const rows = [...body.rows];
   const heads = [...byId("table").tHead.rows[0].cells];
@@ -76,13 +76,13 @@
     redraw();
   }
 
-  // two level axes
+  // two horizontal axes
   function ground() {
     const east = unit(cross(scene.up, Math.abs(scene.up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
     return [east, cross(scene.up, east)];
   }
 
-  // of the eye: right, up and forward axes in the world
+  // right, up and forward axes of the viewer in the world
   function axes() {
     const up = scene.up;
     const [east, north] = ground();

@@ -1,8 +1,11 @@
 """The picture of a query beside its best retrieved map image, with their matches."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 
+from ..localization.projection import reprojection_errors
 from ..localization.records import camera_of, pose_of
 from ..utils.feature_files import get_keypoints
 from ..utils.h5 import open_h5
@@ -14,20 +17,20 @@ HEIGHT = 320  # pixels of both images
 GAP = 8
 BORDER = 5
 LINES = 80  # of each colour, at most
-GREEN, RED, WHITE = (40, 170, 60), (225, 50, 40), (255, 255, 255)
+GREEN, RED = (40, 170, 60), (225, 50, 40)
 QUALITY = 80  # of JPEG
 
 
 def matched(run: Run, query: str) -> dict | None:
-    """Find the matches of a query with the retrieved map image that has most inliers.
+    """Find the retrieved map image with the most inliers of a query, and their matches.
 
-    Of scans it is of the floor that the query was localized on. Where the query was not localized
-    it is the first retrieved one.
+    Among scans it is one of the floor that the query was localized on. If the query was not
+    localized, it is the first retrieved image.
 
     Returns:
         `name` of the map image; keypoints `first` and `second` (M, 2) of the matches, pixel
-        centres at integers; and `inliers` (M,) bool, those whose point reprojects within the
-        threshold of the query's pose, none if it was not localized. None if nothing was retrieved.
+        centres at integers; and `inliers` (M,) bool: matches whose point reprojects within the
+        inlier threshold, none if the query was not localized. None if nothing was retrieved.
     """
     record = run.records[query]
     if record["db"] is None:
@@ -39,15 +42,14 @@ def matched(run: Run, query: str) -> dict | None:
         names = next((part for part in clusters if record["db"] in part), names)
     with open_h5(run.files["features"]) as file:
         keypoints, _ = get_keypoints(file, query)
-    best = None
+    found = []
     with open_h5(run.files["matches"]) as file:
         for name in names:
             sizes = len(keypoints), run.reference.num_keypoints(name)
             matches, _ = get_matches(file, query, name, sizes)
             inliers = _inliers(run, record, name, keypoints[matches[:, 0]], matches[:, 1])
-            if best is None or inliers.sum() > best[2].sum():
-                best = name, matches, inliers
-    name, matches, inliers = best
+            found.append((name, matches, inliers))
+    name, matches, inliers = max(found, key=lambda item: item[2].sum())
     with open_h5(run.files["map_features"]) as file:
         map_keypoints, _ = get_keypoints(file, name)
     first, second = keypoints[matches[:, 0]], map_keypoints[matches[:, 1]]
@@ -55,26 +57,33 @@ def matched(run: Run, query: str) -> dict | None:
 
 
 def _inliers(
-    run: Run, record: dict, name: str, matched_to: np.ndarray, keypoints: np.ndarray
+    run: Run, record: dict, name: str, keypoints: np.ndarray, map_keypoints: np.ndarray
 ) -> np.ndarray:
-    """Tell which points that keypoints (M,) of a map image show reproject to those (M, 2)."""
+    """Tell which matches are inliers (M,).
+
+    Args:
+        run: the run.
+        record: of the query.
+        name: of the map image.
+        keypoints: (M, 2) of the query, pixel centres at integers.
+        map_keypoints: (M,) indices of the keypoints of the map image.
+    """
     inliers = np.zeros(len(keypoints), bool)
-    if record["localized"]:
-        pose = pose_of(record)
-        ids, points = run.reference.lift(name, keypoints)
-        known = np.flatnonzero(ids >= 0)
-        in_camera = points[known] @ pose.rotation.matrix().T + pose.translation
-        projected = camera_of(record).img_from_cam(in_camera)
-        apart = np.linalg.norm(projected - (matched_to[known] + 0.5), axis=1)
-        inliers[known] = (apart <= record["max_error"]) & (in_camera[:, 2] > 0)
+    pose = pose_of(record)
+    if record["localized"] and pose is not None:
+        ids, points = run.reference.lift(name, map_keypoints)
+        known = ids >= 0
+        errors, _ = reprojection_errors(
+            keypoints[known] + 0.5, points[known], pose, camera_of(record)
+        )
+        inliers[known] = errors <= record["max_error"]
     return inliers
 
 
 def draw(run: Run, query: str, found: dict) -> np.ndarray:
     """Draw a query and the map image of `matched` side by side.
 
-    Matches that are inliers are green, others red; so is the frame, by whether the query was
-    localized.
+    Inliers are green, other matches red. The frame is green if the query was localized, else red.
 
     Returns:
         (H, W, 3) RGB uint8.
@@ -86,23 +95,23 @@ def draw(run: Run, query: str, found: dict) -> np.ndarray:
     canvas = np.ascontiguousarray(np.concatenate([first, gap, second], axis=1))
     starts = (found["first"] + 0.5) * scale0
     ends = (found["second"] + 0.5) * scale1 + [shift, 0]
-    # inliers last, which are above the others
+    eighths = np.round(8 * np.stack([starts, ends], axis=1)).astype(int)
+    # inliers last, on top of the others
     for colour, chosen in ((RED, ~found["inliers"]), (GREEN, found["inliers"])):
         rows = np.flatnonzero(chosen)
         rows = rows[np.linspace(0, len(rows) - 1, min(LINES, len(rows))).astype(int)]
-        for start, end in zip(starts[rows], ends[rows], strict=True):
-            ends_of_line = [
-                tuple(np.round(8 * place).astype(int).tolist()) for place in (start, end)
-            ]
-            cv2.line(canvas, *ends_of_line, colour, 1, cv2.LINE_AA, shift=3)
-            for place in ends_of_line:
+        for start, end in eighths[rows].tolist():
+            cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA, shift=3)
+            for place in (start, end):
                 cv2.circle(canvas, place, 16, colour, -1, cv2.LINE_AA, shift=3)
     frame = GREEN if run.records[query]["localized"] else RED
-    return cv2.copyMakeBorder(canvas, *[BORDER] * 4, cv2.BORDER_CONSTANT, value=frame)
+    return cv2.copyMakeBorder(
+        canvas, BORDER, BORDER, BORDER, BORDER, cv2.BORDER_CONSTANT, value=frame
+    )
 
 
-def _resized(path) -> tuple[np.ndarray, np.ndarray]:
-    """Read an image and resize it to HEIGHT; return the factors of x and y, too."""
+def _resized(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read an image and resize it to HEIGHT; return the image and its scale in x and y (2,)."""
     image = read_image(path)
     height, width = image.shape[:2]
     size = max(1, round(width * HEIGHT / height)), HEIGHT

@@ -1,4 +1,4 @@
-"""The map in 3D with its cameras and those of the queries, for the page to turn."""
+"""The 3D view of a report: points, map cameras and query cameras."""
 
 import base64
 
@@ -7,35 +7,38 @@ import pycolmap
 
 from ..datasets import scans
 from ..localization.records import pose_of
+from ..localization.references import SfmMap
 from ..utils.cli import InputError
 from ..utils.feature_files import get_keypoints
 from ..utils.h5 import open_h5
 from ..utils.images import read_image
 from .runs import Run
 
-POINTS = 6000  # shown, at most
-IMAGES = 24  # map images that give points their colours
-CAMERAS = 1000  # map cameras shown, at most
-GREY = 120
+POINTS = 6000  # at most
+IMAGES = 24  # map images that the points and their colours are taken from
+CAMERAS = 1000  # of the map, about and at most
+GREY = 120  # colour of points if there is no photo
 
 
 def scenes(run: Run) -> dict[str, dict]:
-    """Return what the page shows of a run, by label: of scans each floor, which has its own frame.
+    """Return the 3D view of a run by label, or of each floor, as the scans of each have a frame.
 
-    Of each: `points` (N, 3) float32 in metres and `colours` (N, 3) uint8, as of `_packed`; cameras
-    or scans as (centre, right, down, forward) in `map`; `queries`, each with its name, status,
-    camera `pose` and, where it is known, `truth`; `up` and the `centre` and `radius` of what is
-    worth seeing.
+    Returns:
+        For each view: `points` (N, 3) float32 in metres and `colours` (N, 3) uint8, in base64;
+        `map`, cameras or scans as (centre, right, down, forward) (12,); `queries`, dicts of `name`,
+        `status`, and the cameras `pose` and `truth` or None; `up`, the vertical; and `centre` and
+        `radius` of what to look at.
 
     Raises:
-        InputError: when the map is not there.
+        InputError: when the files of the map are missing or broken.
     """
-    if run.reconstruction is not None:
-        images = run.reconstruction.images.values()
-        cameras = {image.name: _axes(image.cam_from_world()) for image in images}
+    reference = run.reference
+    if isinstance(reference, SfmMap):
+        images = reference.images.items()
+        cameras = {name: _axes(image.cam_from_world()) for name, image in images}
         return {run.label: _scene(run, cameras, run.records)}
     floors: dict[str, dict] = {}
-    for name, pose in run.reference.poses.items():
+    for name, pose in reference.poses.items():
         floors.setdefault(scans.floor_of(name), {})[name] = [*pose[:3, 3], *pose[:3, :3].T.ravel()]
     found = {}
     for floor, cameras in floors.items():
@@ -64,7 +67,7 @@ def _scene(run: Run, cameras: dict[str, list[float]], records: dict[str, dict]) 
         )
     shown = list(cameras.values())[:: -(-len(cameras) // CAMERAS)]
     looks = np.array([*shown, *(q["truth"] or q["pose"] for q in queries if q["pose"])])
-    # points and cameras alike, without what is far from all others
+    # points and cameras count alike; a tenth of them may be far off
     groups = [part for part in (points, looks[:, :3]) if len(part)]
     centre = np.mean([np.median(part, axis=0) for part in groups], axis=0)
     radius = max(np.quantile(np.linalg.norm(part - centre, axis=1), 0.9) for part in groups)
@@ -86,27 +89,28 @@ def _packed(array: np.ndarray, kind: type) -> str:
 
 
 def _axes(pose: pycolmap.Rigid3d) -> list[float]:
-    """Return the centre of a camera and its axes right, down and forward, in the world."""
+    """Return (centre, right, down, forward) of a camera in the world (12,)."""
     rotation = pose.rotation.matrix()
     values = [*(-rotation.T @ pose.translation), *rotation.ravel()]
     return [round(float(value), 5) for value in values]
 
 
 def _points(run: Run, names: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (N, 3) that some of the map images see, spread, and their colours (N, 3)."""
+    """Return points (N, 3) that some of the map images see and their colours (N, 3)."""
     chosen = [names[i] for i in np.linspace(0, len(names) - 1, IMAGES).astype(int)]
-    points, colours, seen = [], [], set()
+    points, colours = [], []
+    seen: set[int] = set()
     with open_h5(run.files["map_features"]) as file:
         for name in dict.fromkeys(chosen):
             keypoints, _ = get_keypoints(file, name)
             ids, xyz = run.reference.lift(name, np.arange(len(keypoints)))
-            rows = [row for row in np.flatnonzero(ids >= 0) if ids[row] not in seen]
-            rows = np.array(rows[:: max(1, -(-len(rows) // (POINTS // IMAGES)))], int)
+            new = [row for row in np.flatnonzero(ids >= 0) if ids[row] not in seen]
+            rows = np.array(new[:: max(1, -(-len(new) // (POINTS // IMAGES)))], int)
             seen.update(ids[rows].tolist())
             points.append(xyz[rows])
             try:
                 image = read_image(run.files["map_images"] / name)
-            except InputError:  # the photos are elsewhere
+            except InputError:  # a photo that was moved, for example
                 colours.append(np.full((len(rows), 3), GREY))
                 continue
             x, y = keypoints[rows].round().astype(int).T

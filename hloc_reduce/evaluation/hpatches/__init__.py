@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +16,15 @@ from ...utils import cli
 from ...utils.files import write_csv
 from ...utils.h5 import file_provenance, open_h5
 from ...utils.paths import strings_as_paths
+from ...utils.tables import aligned
 from .. import published
-from . import data, lists, tasks
+from . import data, tasks
 from .data import NOISE, Descriptors
+from .lists import TaskLists
 
-# what the one number of a task, which the paper has, is the mean of
-VARIANTS = {
-    "matching": lambda variant: True,
-    "verification": lambda variant: variant.endswith("imbalanced"),
-    "retrieval": lambda variant: True,
-}
-TASKS = tuple(VARIANTS)
-PAPERS = "a"  # the split that the paper has numbers of
+TASKS = ("matching", "verification", "retrieval")
+NOT_IN_MEAN = " balanced"  # the paper's mean of verification is of the imbalanced protocol
+PAPER_SPLIT = "a"
 
 
 @strings_as_paths
@@ -44,19 +41,18 @@ def main(
     Args:
         root: the folder of HPatches' sequences.
         features: names, or YAML files, of features of patches.
-        outputs: folder for the descriptors, the lists that are drawn, and the scores.
+        outputs: folder for the descriptors, the drawn lists and the scores.
         split: one of `data.SPLITS`.
         task_lists: the folder `tasks` of the benchmark; default: `root`/tasks.
         chosen: tasks.
 
     Returns:
-        A dict for each feature: `feature`, of each task the mean average precision [%], of each
-        noise as `<task>_easy` and so on, and as `<task>_paper` the paper's, or None.
-        `<outputs>/<split>.csv` has the same, and `<outputs>/<split>_scores.csv` what it is the
-        mean of.
+        A dict for each feature: `feature` and, for each task, the mean average precision [%]:
+        `<task>`; `<task>_easy`, `_hard` and `_tough`; and `<task>_paper`, or None. This is also
+        written to `<outputs>/<split>.csv`, and the scores to `<outputs>/<split>_scores.csv`.
 
     Raises:
-        InputError: when the data or a feature is not there, or broken.
+        InputError: when the data or a feature is missing or broken.
     """
     task_lists = task_lists or root / "tasks"
     sequences = data.test_sequences(root, task_lists, split)
@@ -69,22 +65,25 @@ def main(
         known[features_confs.get(feature)[0]] = base, projection, checksum
     scores = {}
     for name, (base, projection, checksum) in known.items():
-        file = outputs / f"descriptors_{base}.h5"
-        data.describe(root, sequences, base, file)
-        with open_h5(file) as described:
+        descriptors = outputs / f"descriptors_{base}.h5"
+        data.describe(root, sequences, base, descriptors)
+        with open_h5(descriptors) as file:
             made_from = {
-                "descriptors": file_provenance(described),
+                "descriptors": file_provenance(file),
                 "projection": checksum,
                 "sequences": sequences,
-                "lists": provenance.stamp({}, sorted(task_lists.glob(f"*_split-{split}.csv"))),
+                "lists": provenance.of_inputs({}, sorted(task_lists.glob(f"*_split-{split}.csv"))),
             }
-        scores[name] = _score(
-            outputs / split / f"{name}.json",
-            made_from,
-            chosen,
-            _evaluations(root, task_lists, outputs, split, file, sequences, projection),
-        )
-    paper = published.hpatches() if split == PAPERS else {}
+        path = outputs / split / f"{name}.json"
+        found = _read_scores(path, made_from)
+        if missing := [task for task in chosen if task not in found]:
+            project = torch.nn.Identity() if projection is None else projections.load(projection)
+            projected = Descriptors(descriptors, sequences, project)
+            for task in missing:
+                found[task] = list(_evaluate(task, projected, root, task_lists, outputs, split))
+                provenance.write(path, {"made_from": made_from, "scores": found})
+        scores[name] = {task: found[task] for task in chosen}
+    paper = published.hpatches() if split == PAPER_SPLIT else {}
     rows = [
         {"feature": name, **_means(found, paper.get(name, {}))} for name, found in scores.items()
     ]
@@ -93,100 +92,63 @@ def main(
     return rows
 
 
-def _evaluations(
-    root: Path,
-    task_lists: Path,
-    outputs: Path,
-    split: str,
-    file: Path,
-    sequences: list[str],
-    projection: str | None,
-) -> Callable[[str], Iterator[tuple[str, str, float]]]:
-    """Return what evaluates a feature in a task; its descriptors are read once."""
-    read = {}
+def _read_scores(path: Path, made_from: dict) -> dict[str, list]:
+    """Read the scores that an earlier run left, none if they are stale."""
+    before = provenance.read(path)
+    current = before.get("made_from") == json.loads(json.dumps(made_from))
+    return before["scores"] if current else {}
+
+
+def _evaluate(
+    task: str, descriptors: Descriptors, root: Path, task_lists: Path, outputs: Path, split: str
+) -> Iterator[tuple[str, str, float]]:
+    """Evaluate a task: yield noise, variant and score."""
+    if task == "matching":
+        return tasks.matching(descriptors)
+    sizes = json.dumps(list(descriptors.sizes.items()))  # which lists depend on
+    drawn = outputs / "tasks" / hashlib.sha256(sizes.encode()).hexdigest()[:8]
+    listed = TaskLists(task_lists, drawn, split, descriptors.sizes)
+    if task == "verification":
+        return tasks.verification(descriptors, listed.pairs())
 
     def contrast(sequence: str) -> np.ndarray:
         return data.read_patches(root / sequence / "ref.png").std(axis=(1, 2))
 
-    def evaluate(task: str) -> Iterator[tuple[str, str, float]]:
-        if not read:
-            project = torch.nn.Identity() if projection is None else projections.load(projection)
-            read["descriptors"] = Descriptors(file, sequences, project)
-        descriptors = read["descriptors"]
-        sizes = descriptors.sizes
-        made_of = hashlib.sha256(json.dumps(list(sizes.items())).encode()).hexdigest()[:8]
-        where = task_lists, outputs / "tasks" / made_of, split, sizes
-        if task == "matching":
-            return tasks.matching(descriptors)
-        if task == "verification":
-            return tasks.verification(descriptors, lists.pairs(*where))
-        return tasks.retrieval(descriptors, *lists.pools(*where, contrast))
-
-    return evaluate
-
-
-def _score(
-    path: Path,
-    made_from: dict,
-    chosen: list[str],
-    evaluate: Callable[[str], Iterator[tuple[str, str, float]]],
-) -> dict[str, list]:
-    """Return the scores of a feature in each task, those that a file has and those computed now."""
-    before = provenance.read(path)
-    current = before.get("made_from") == json.loads(json.dumps(made_from))
-    scores = before["scores"] if current else {}
-    for task in chosen:
-        if task not in scores:
-            scores[task] = list(evaluate(task))
-            provenance.write(path, {"made_from": made_from, "scores": scores})
-    return {task: scores[task] for task in chosen}
+    return tasks.retrieval(descriptors, *listed.pools(contrast))
 
 
 def _score_rows(scores: dict[str, dict[str, list]]) -> list[dict]:
+    keys = ("feature", "task", "noise", "variant", "score")
     return [
-        {
-            "feature": feature,
-            "task": task,
-            "noise": NOISE[noise],
-            "variant": variant,
-            "score": score,
-        }
+        dict(zip(keys, (feature, task, NOISE[noise], variant, score), strict=True))
         for feature, by_task in scores.items()
         for task, rows in by_task.items()
         for noise, variant, score in rows
     ]
 
 
-def _means(scores: dict[str, list], paper: dict[str, float]) -> dict:
+def _means(scores: dict[str, list], paper: dict[str, float]) -> dict[str, float | None]:
     """Return the means [%] of a feature's scores in each task, next to the paper's."""
-    means = {}
+    means: dict[str, float | None] = {}
     for task, found in scores.items():
-        by_noise = of_noise(task, found)
+        by_noise = {
+            noise: float(
+                np.mean([s for n, v, s in found if n == noise and not v.endswith(NOT_IN_MEAN)])
+            )
+            for noise in NOISE
+        }
         means[task] = 100 * float(np.mean(list(by_noise.values())))
-        means |= {f"{task}_{NOISE[key]}": 100 * value for key, value in by_noise.items()}
+        means |= {f"{task}_{NOISE[noise]}": 100 * mean for noise, mean in by_noise.items()}
         means[f"{task}_paper"] = paper.get(task)
     return means
 
 
-def of_noise(task: str, scores: list[tuple[str, str, float]]) -> dict[str, float]:
-    """Return the mean average precision in [0, 1] of each noise, of a task's scores."""
-    counted = [score for score in scores if VARIANTS[task](score[1])]
-    return {
-        noise: float(np.mean([value for other, _, value in counted if other == noise]))
-        for noise in NOISE
-    }
-
-
 def table(rows: list[dict]) -> str:
-    """Format the means of features, of each task next to the paper's, in percent."""
+    """Format the means [%] of features in each task, next to the paper's."""
     names = [task for task in TASKS if task in rows[0]]
+    keys = [key for name in names for key in (name, f"{name}_paper")]
     lines = [["feature", *(cell for name in names for cell in (name, "paper"))]]
     for row in rows:
-        values = [row[key] for name in names for key in (name, f"{name}_paper")]
-        shown = ["-" if value is None else f"{value:.2f}" for value in values]
-        lines.append([row["feature"], *shown])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        "  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(cells))
-        for cells in (list(zip(line, widths, strict=True)) for line in lines)
-    )
+        means = ("-" if row[key] is None else f"{row[key]:.2f}" for key in keys)
+        lines.append([row["feature"], *means])
+    return aligned(lines)

@@ -1,4 +1,4 @@
-"""The three tasks of HPatches (Balntas et al., CVPR 2017), as its Python benchmark defines them."""
+"""The three tasks of HPatches (Balntas et al., CVPR 2017), as in its Python benchmark."""
 
 from collections.abc import Iterator
 
@@ -11,9 +11,9 @@ from ..ranking import average_precision, roc_area
 from .data import IMAGES, NOISE, TYPES, Descriptors
 
 POOLS = (100, 500, 1000, 5000, 10000, 15000, 20000)
-IMBALANCE = 0.2  # of the right pairs are left in the imbalanced protocol
-OWN = len(IMAGES)  # right items of a query in the retrieval task
-PAIRS, QUERIES = 2**16, 2**8  # computed at once
+IMBALANCE = 0.2  # share of the positive pairs in the imbalanced protocol
+OWN = len(IMAGES)  # noisy patches of a query in the retrieval task
+PAIRS, QUERIES = 2**16, 2**8  # per block
 
 
 def matching_ap(reference: np.ndarray, target: np.ndarray) -> float:
@@ -21,13 +21,13 @@ def matching_ap(reference: np.ndarray, target: np.ndarray) -> float:
 
     Args:
         reference: descriptors (N, D).
-        target: (N, D), row i showing what row i of the reference does.
+        target: descriptors (N, D); row i matches row i of the reference.
 
     Returns:
-        The average precision of "the nearest, of equal ones the first, is the same row", with N
-        right items.
+        The average precision of "the nearest row, the first one of a tie, is the match". All N
+        matches count: one that is not found is missed.
     """
-    # summed in one order, unlike a matrix product, so that equal descriptors are equally far
+    # unlike a matrix product, it sums in a fixed order: equal descriptors are equally far
     apart = cdist(reference, target)
     nearest = apart.argmin(axis=1)
     order = np.argsort(apart.min(axis=1), kind="stable")
@@ -36,10 +36,10 @@ def matching_ap(reference: np.ndarray, target: np.ndarray) -> float:
 
 
 def matching(descriptors: Descriptors) -> Iterator[tuple[str, str, float]]:
-    """Match the reference image of each sequence with the others.
+    """Match the reference image of each sequence with its other images.
 
     Yields:
-        Noise, the sequence and image, and the average precision.
+        The noise, the sequence and image, and the average precision.
     """
     images = [(s, noise, i) for s in descriptors.sizes for noise in NOISE for i in IMAGES]
 
@@ -56,15 +56,16 @@ def matching(descriptors: Descriptors) -> Iterator[tuple[str, str, float]]:
 def verification(
     descriptors: Descriptors, pairs: dict[str, np.ndarray]
 ) -> Iterator[tuple[str, str, float]]:
-    """Tell pairs of the same patch from others.
+    """Tell pairs of the same patch from pairs of different patches.
 
     Args:
         descriptors: of the split.
-        pairs: as of `lists.pairs`.
+        pairs: from `TaskLists.pairs`.
 
     Yields:
-        Noise; which negatives and which protocol; and the area under the ROC curve (balanced) or
-        the average precision of all negatives and the first fifth of the positives (imbalanced).
+        The noise; the kind of negatives and the protocol; and the score: the area under the ROC
+        curve (balanced), or the average precision of the first fifth of the positives among all
+        negatives (imbalanced).
     """
     for noise in progress(NOISE, "Verification", "noise"):
         right = pair_distances(descriptors, pairs["pos"], noise)
@@ -72,14 +73,14 @@ def verification(
         for kind in ("inter", "intra"):
             wrong = pair_distances(descriptors, pairs[f"neg_{kind}"], noise)
             yield noise, f"{kind} balanced", roc_area(right, wrong)
-            # of equal ones the wrong are first
+            # in a tie the wrong pair comes first
             nearer = np.searchsorted(np.sort(wrong), few, side="right")
             ranks = np.arange(1, len(few) + 1) + nearer
             yield noise, f"{kind} imbalanced", float(average_precision(ranks, len(few)))
 
 
 def pair_distances(descriptors: Descriptors, pairs: np.ndarray, noise: str) -> np.ndarray:
-    """Return the L2 distances (P,) of pairs (P, 2, 2) of images and patches, with a noise."""
+    """Return the L2 distances (P,) of pairs (P, 2, 2) of images and patches at a noise."""
     apart = []
     for part in np.array_split(pairs, -(-len(pairs) // PAIRS)):
         first, second = (
@@ -97,17 +98,17 @@ def retrieval(
     Args:
         descriptors: of the split.
         queries: (Q,) reference patches.
-        distractors: (N,) reference patches; those of a query's own sequence are left out.
+        distractors: (N,) reference patches; a query skips those of its own sequence.
 
     Yields:
-        Noise, the size of the pool and the mean average precision.
+        The noise, the size of the pool and the mean average precision.
     """
     pool, sequence = descriptors.rows(distractors, "ref"), descriptors.sequence
 
     def rank(block: np.ndarray) -> np.ndarray:
         described = descriptors.rows(block, "ref")
         own = np.stack([descriptors.rows(block, kind) for kind in TYPES[1:]], axis=1)
-        # both by the same sums, so that equal descriptors are equally far
+        # summed as in the pool, so that equal descriptors are equally far
         right = np.stack([cdist(described[i : i + 1], own[i])[0] for i in range(len(block))])
         right = np.sort(right.reshape(len(block), len(NOISE), OWN))
         apart = cdist(described, pool)
@@ -130,13 +131,13 @@ def ranks_in_pools(right: np.ndarray, wrong: np.ndarray) -> np.ndarray:
     """Rank a query's own patches in pools of these and the first distractors.
 
     Args:
-        right: (3, 5) ascending distances of its own, which come before equal distractors.
-        wrong: (N,) distances of distractors.
+        right: (3, 5) ascending distances of its own patches, which come first in a tie.
+        wrong: (N,) distances of the distractors.
 
     Returns:
-        (3, P, 5) places, from 1 on, in each of `POOLS`.
+        (3, P, 5) ranks, from 1 on, in each of `POOLS`.
     """
-    # how many of the first 0, 1, 2, ... distractors are nearer
+    # row n: how many of the first n distractors are nearer
     nearer = np.zeros((len(wrong) + 1, right.size), np.int64)
     np.cumsum(wrong[:, None] < right.reshape(-1), axis=0, out=nearer[1:])
     number = np.minimum(np.array(POOLS) - OWN, len(wrong))

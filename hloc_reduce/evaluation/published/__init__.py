@@ -1,4 +1,4 @@
-"""The paper's own numbers: its tables of localization and the means of its HPatches figures."""
+"""The paper's own numbers: its localization tables and the means of its HPatches figures."""
 
 import csv
 from collections.abc import Collection, Mapping
@@ -8,36 +8,13 @@ from ... import datasets
 from ...datasets import INLOC_THRESHOLDS
 
 FOLDER = Path(__file__).parent
-# of the lists of queries of each data set: how their names begin, how many queries they have and
-# how the names of these begin
+# data set -> beginning of a list's name -> number of its queries, beginning of their names
 DATASETS = {
     "Aachen Day-Night v1.1": {"day": (824, "query/day/"), "night": (191, "query/night/")},
     "InLoc": {"DUC1": (198, "query/iphone7/"), "DUC2": (131, "query/iphone7/")},
 }
-# how the columns of the table begin
-COLUMNS = {
-    "day": "aachen_day_",
-    "night": "aachen_night_",
-    "DUC1": "inloc_duc1_",
-    "DUC2": "inloc_duc2_",
-}
-
-
-def feature_name(descriptor: str, scheme: str, dim: str) -> str:
-    """Return this project's name of a feature of the paper."""
-    return descriptor if scheme == "raw" else f"{descriptor}_{scheme}{dim}"
-
-
-def _read(name: str) -> dict[str, dict[str, float]]:
-    with (FOLDER / name).open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    keys = ("descriptor", "scheme", "dim")
-    return {
-        feature_name(*(row.pop(key) for key in keys)): {
-            column: float(value) for column, value in row.items() if value
-        }
-        for row in rows
-    }
+# beginning of a list's name -> beginning of its columns in localization_recall.csv
+COLUMNS = {"day": "aachen_day", "night": "aachen_night", "DUC1": "inloc_duc1", "DUC2": "inloc_duc2"}
 
 
 def hpatches() -> dict[str, dict[str, float]]:
@@ -46,19 +23,19 @@ def hpatches() -> dict[str, dict[str, float]]:
 
 
 def localization() -> dict[str, dict[str, float]]:
-    """Return the recall [%] of each feature, a column for each list of queries and threshold."""
+    """Return the recall [%] of each feature, by columns: one for each query list and threshold."""
     return _read("localization_recall.csv")
 
 
 def dataset(lists: Mapping[str, Collection[str]]) -> str | None:
-    """Return which data set of the paper lists of queries are, however its folder is called.
+    """Return which data set of the paper query lists are from, whatever its folder is called.
 
     Args:
         lists: from the name of each list, such as day_time_queries_with_intrinsics or DUC1, to the
             names of its queries.
 
     Returns:
-        A key of `DATASETS`, or None for another place, such as one in the layout of Aachen.
+        A key of `DATASETS`, or None for another data set, even if its layout is Aachen's.
     """
 
     def is_list(name: str, number: int, folder: str) -> bool:
@@ -72,11 +49,12 @@ def dataset(lists: Mapping[str, Collection[str]]) -> str | None:
 
 
 def recall(feature: str, query_list: str) -> list[float] | None:
-    """Return the recall [%] at three thresholds of a feature on a list of Aachen or InLoc.
+    """Return the recall [%] of a feature at three thresholds, or None if the paper has none.
 
     Args:
-        feature: a name.
-        query_list: a list's name, such as day_time_queries_with_intrinsics or DUC1.
+        feature: name of the feature.
+        query_list: name of a list of Aachen or InLoc, such as
+            day_time_queries_with_intrinsics or DUC1.
     """
     prefix = next((COLUMNS[key] for key in COLUMNS if query_list.startswith(key)), None)
     row = localization().get(feature, {})
@@ -87,3 +65,14 @@ def recall(feature: str, query_list: str) -> list[float] | None:
 def thresholds(query_list: str) -> tuple[tuple[float, float], ...]:
     """Return the thresholds, metres and degrees, of the paper's recall on a list."""
     return INLOC_THRESHOLDS if query_list.startswith("DUC") else datasets.thresholds(query_list)
+
+
+def _read(name: str) -> dict[str, dict[str, float]]:
+    """Read a table: from this project's name of each feature to its numbers, by column."""
+    table = {}
+    with (FOLDER / name).open(newline="") as file:
+        for row in csv.DictReader(file):
+            descriptor, scheme, dim = (row.pop(key) for key in ("descriptor", "scheme", "dim"))
+            feature = descriptor if scheme == "raw" else f"{descriptor}_{scheme}{dim}"
+            table[feature] = {column: float(value) for column, value in row.items() if value}
+    return table
