@@ -2,7 +2,7 @@
 
 import argparse
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -15,8 +15,8 @@ from . import logger
 from .datasets import scans
 from .datasets.inloc import RANSAC_SIZE, RANSAC_THRESH, by_iphone7
 from .localization import stage
-from .localization.confidence import DEFAULT_GATE, Gate, add_gate_options
-from .localization.records import to_stamp
+from .localization.confidence import DEFAULT_GATE, Gate
+from .localization.intrinsics import to_lists
 from .localization.references import ScanMap, point_group
 from .runtime import provenance
 from .runtime.executors import SERIAL, Executor
@@ -25,7 +25,7 @@ from .utils import cli
 from .utils.cli import InputError
 from .utils.feature_files import get_image_size, get_keypoints
 from .utils.h5 import open_h5
-from .utils.parsers import parse_query_lists, parse_retrieval
+from .utils.parsers import parse_retrieval
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
@@ -49,8 +49,9 @@ def main(
 ) -> dict[str, dict]:
     """Localize queries in a data set of InLoc's layout.
 
-    Takes what hloc's `localize_inloc.main` takes. Each floor has a frame of its own, so the
-    cutouts of each floor are matched together, and the pose of the highest confidence is kept.
+    Takes the arguments of hloc's `localize_inloc.main`. Each floor has a frame of its own, so
+    queries are localized on each floor separately, and the pose with the highest confidence is
+    kept.
 
     Args:
         dataset_dir: the folder that image names are relative to.
@@ -59,28 +60,28 @@ def main(
         matches: match file of the pairs.
         results: text file of poses, camera from world, one line for every query that has one.
         skip_matches: leave out cutouts with fewer matches.
-        queries: names and intrinsics, or the list of them, or a glob of lists; default: all
-            queries of the pairs, with the intrinsics of `by_iphone7`.
+        queries: names and intrinsics, or a query list, or a glob of several; default: all queries
+            of the pairs, with the intrinsics of `by_iphone7`.
         ransac_thresh: RANSAC inlier threshold in pixels of a photo of 4032 pixels, of others
             in proportion.
-        overwrite: localize anew what is there.
+        overwrite: localize all queries again.
         executor: does the work.
-        points: keeps what the keypoints of cutouts show, for later runs, and if it is given for
-            other features of the same keypoints, too; default: `points_file(features)`.
+        points: file of the points that keypoints of cutouts show, for later runs and for other
+            features with the same keypoints; default: `points_file(features)`.
         gate: what a pose must have for the query to be called localized.
 
     Returns:
-        A record for each query, as `localization.main`; a query with too few inliers has the pose
-        that PnP found all the same, if any.
+        A record for each query, as `localization.stage.main` returns it. A query that is not
+        localized has the pose that PnP found, if any.
 
     Raises:
-        InputError: when an input is missing or broken.
+        InputError: if an input is missing or broken.
     """
     if ransac_thresh <= 0:
         raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
     retrieved = parse_retrieval(retrieval)
     if isinstance(queries, Path):
-        queries = [query for part in parse_query_lists(queries).values() for query in part]
+        queries = stage.read_queries(queries)
     elif queries is None:
         queries = by_iphone7(features, retrieved)
     cutouts = sorted({cutout for name, _ in queries for cutout in retrieved.get(name, [])})
@@ -90,27 +91,26 @@ def main(
     points = points or points_file(features)
     lift_keypoints(dataset_dir, features, cutouts, points, overwrite, executor)
 
-    options = {"ransac_thresh": ransac_thresh, "skip_matches": skip_matches}
-    options["queries"] = to_stamp(queries)
     poses = {cutout: scans.read_pose(dataset_dir, cutout) for cutout in cutouts}
-    options["scans"] = hashlib.sha256(np.array(list(poses.values())).tobytes()).hexdigest()
+    options = {
+        "ransac_thresh": ransac_thresh,
+        "skip_matches": skip_matches,
+        "queries": to_lists(queries),
+        "scans": hashlib.sha256(np.array(list(poses.values())).tobytes()).hexdigest(),
+    }
     return stage.main(
         partial(_load, points, features, poses),
-        queries,
-        retrieved,
-        features,
-        matches,
-        results,
+        *(queries, retrieved, features, matches, results),
         partial(_config, ransac_thresh),
-        provenance.stamp(options, [p for p in (retrieval, features, matches) if p.exists()]),
+        provenance.of_inputs(options, [p for p in (retrieval, features, matches) if p.exists()]),
         overwrite,
-        skip_matches=skip_matches,
+        skip_matches=skip_matches or 0,
         executor=executor,
         gate=gate,
     )
 
 
-def _load(points: Path, features: Path, poses: Mapping[str, np.ndarray]) -> "ScanMap":
+def _load(points: Path, features: Path, poses: Mapping[str, np.ndarray]) -> ScanMap:
     return ScanMap(h5py.File(points), h5py.File(features), poses)
 
 
@@ -120,7 +120,7 @@ def _config(ransac_thresh: float, _: str, camera: pycolmap.Camera) -> dict:
 
 
 def points_file(features: Path) -> Path:
-    """Return the file of the points that the keypoints of a feature file show."""
+    """Return the default file of the points that the keypoints of a feature file show."""
     return features.with_name(f"{features.stem}-points3D.h5")
 
 
@@ -140,15 +140,15 @@ def lift_keypoints(
         features: feature file.
         cutouts: names of images.
         output: h5 file, `points3D` (N, 3) float32 in the `point_group` of each cutout: metres in
-            the frame of its scan, NaN where that has no depth.
-        overwrite: compute anew what is there.
+            the frame of its scan, NaN where that has no depth. Cutouts in it are skipped.
+        overwrite: compute all points again.
         executor: does the work.
 
     Returns:
-        `output`; cutouts it holds already are skipped.
+        `output`.
 
     Raises:
-        InputError: when a scan is missing or broken.
+        InputError: if a scan is missing or broken.
     """
     with GroupWriter(output, {"dataset": str(dataset_dir.resolve())}, overwrite) as writer:
         with open_h5(features) as file:
@@ -162,7 +162,7 @@ def lift_keypoints(
 
 def _lift(
     dataset_dir: Path, features: Path, cutouts: Iterable[str]
-) -> Iterator[tuple[None, Group]]:
+) -> Generator[tuple[None, Group], None, None]:
     """Yield the points that the keypoints of cutouts show."""
     with open_h5(features) as file:
         for name in cutouts:
@@ -185,29 +185,17 @@ def _main() -> None:
         formatter_class=cli.HelpFormatter,
     )
     parser.add_argument("--dataset_dir", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--retrieval", type=Path, required=True, help="pairs of queries, cutouts")
-    parser.add_argument("--features", type=Path, required=True, help="feature file")
-    parser.add_argument("--matches", type=Path, required=True, help="match file")
-    parser.add_argument("--results", type=Path, required=True, help="text file of poses")
-    parser.add_argument(
-        "--skip_matches", type=int, help="leave out cutouts with fewer matches with the query"
-    )
     parser.add_argument(
         "--queries",
         type=Path,
         help="query list with intrinsics, or a glob (default: those of the pairs, by an iPhone 7)",
     )
     parser.add_argument(
-        "--ransac_thresh",
-        type=float,
-        default=RANSAC_THRESH,
-        help="RANSAC inlier threshold in pixels of a photo of 4032 pixels, of others in proportion",
+        "--skip_matches", type=int, help="leave out cutouts with fewer matches with the query"
     )
-    add_gate_options(parser)
-    parser.add_argument("--overwrite", action="store_true", help="localize anew what is there")
-    args = vars(parser.parse_args())
-    gate = Gate(args.pop("min_confidence"), args.pop("min_inliers"))
-    main(**args, gate=gate)
+    pixels = "pixels of a photo of 4032 pixels, of others in proportion"
+    stage.add_options(parser, RANSAC_THRESH, pixels)
+    stage.run(parser, main)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The data sets that pipelines know, in their own layouts."""
+"""The layouts of data sets."""
 
 from pathlib import Path
 
@@ -21,10 +21,10 @@ def true_poses(names: list[str], path: Path, required: bool) -> dict[str, pycolm
     Args:
         names: the queries.
         path: the file, with full names.
-        required: refuse that it is not there; else nothing is known then.
+        required: refuse a missing file, instead of returning no pose.
 
     Raises:
-        InputError: for a file that has none of the queries.
+        InputError: if the file has none of the queries.
     """
     if not required and not path.is_file():
         return {}
@@ -38,11 +38,11 @@ def true_poses(names: list[str], path: Path, required: bool) -> dict[str, pycolm
 
 
 def refuse(root: Path, missing: list[Path], source: str) -> None:
-    """Raise an InputError that names what a data set lacks, if anything, and its source."""
+    """Raise an InputError with the missing parts of a data set, if any, and its source."""
     if missing:
         raise InputError(f"The data set {root} lacks {', '.join(map(str, missing))}. {source}")
 
 
 def thresholds(query_list: str) -> tuple[tuple[float, float], ...]:
-    """Return the thresholds for a query list by its name: those of night, or else of day."""
+    """Return the thresholds for the name of a query list: those of night or, if not, of day."""
     return NIGHT_THRESHOLDS if query_list.startswith("night") else DAY_THRESHOLDS

@@ -1,4 +1,4 @@
-"""Aachen Day-Night v1.1, and places in its layout."""
+"""Aachen Day-Night v1.1, and other places in its layout."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,36 +22,30 @@ class Aachen:
         root: the folder with images_upright, 3D-models/aachen_v_1_1 and queries.
 
     Raises:
-        InputError: naming every part that is missing.
+        InputError: naming every missing part.
     """
 
     root: Path
-    whole_map: ClassVar[bool] = True  # is needed, not only the map images that are retrieved
+    whole_map: ClassVar[bool] = True  # all map images are needed, not only the retrieved ones
 
     def __post_init__(self) -> None:
         folders = (self.images, self.reference_model, self.queries.parent)
         missing = [path for path in folders if not path.is_dir()]
-        for folder, patterns in (
-            (self.reference_model, ("cameras.*", "images.*", "points3D.*")),
-            (self.queries.parent, (self.queries.name,)),
-        ):
-            absent = [name for name in patterns if not any(folder.glob(name))]
-            missing += [folder / name for name in absent if folder.is_dir()]
+        parts = [self.reference_model / f"{part}.*" for part in ("cameras", "images", "points3D")]
+        for path in (*parts, self.queries):
+            if path.parent.is_dir() and not any(path.parent.glob(path.name)):
+                missing.append(path)
         refuse(self.root, missing, AACHEN_SOURCE)
 
     def check(self, map_names: list[str]) -> None:
-        """Check that the folders of all images are there, before any work is done.
-
-        Args:
-            map_names: the map images that are needed.
+        """Check before any work that the folders of map images and of all queries exist.
 
         Raises:
-            InputError: naming every folder that is missing.
+            InputError: naming every missing folder.
         """
         names = [*map_names, *self.query_names()]
         folders = sorted({(self.images / name).parent for name in names})
-        missing = [folder for folder in folders if not folder.is_dir()]
-        refuse(self.root, missing, AACHEN_SOURCE)
+        refuse(self.root, [path for path in folders if not path.is_dir()], AACHEN_SOURCE)
 
     @property
     def images(self) -> Path:
@@ -70,7 +64,7 @@ class Aachen:
 
     @property
     def ground_truth(self) -> Path:
-        """The file with the true poses of the queries, which the original does not have."""
+        """The true poses of the queries, which the original does not have."""
         return self.root / "queries/ground_truth_poses.txt"
 
     def query_lists(self) -> dict[str, list[tuple[str, pycolmap.Camera]]]:

@@ -1,4 +1,4 @@
-"""InLoc, and RGB-D places in its layout."""
+"""InLoc, and other RGB-D places in its layout."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -17,8 +17,9 @@ from ..utils.parsers import parse_query_list
 from . import SOURCE, refuse, scans
 
 INLOC_SOURCE = f"{SOURCE} (InLoc)."
-# of calibrated photos of the longer side of 4032 pixels: 12 pixels at 1600, as for Aachen
-CALIBRATED_THRESH = 30.0
+RANSAC_SIZE = 4032  # the longer side of an iPhone 7's photo, for which thresholds are
+RANSAC_THRESH = 48.0  # pixels, with the intrinsics of the benchmark, as in hloc
+CALIBRATED_THRESH = 30.0  # pixels, with calibrated intrinsics: 12 at 1600, as for Aachen
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class InLoc:
             are relative to.
 
     Raises:
-        InputError: naming every part that is missing.
+        InputError: naming every missing part.
     """
 
     root: Path
@@ -57,19 +58,19 @@ class InLoc:
 
     @property
     def query_list(self) -> Path:
-        """The list of queries with intrinsics, which the original does not have."""
+        """The query list with intrinsics, which the original does not have."""
         return self.root / "queries_with_intrinsics.txt"
 
     @property
     def ground_truth(self) -> Path:
-        """The file with the true poses of the queries, which the original does not have."""
+        """The true poses of the queries, which the original does not have."""
         return self.root / "ground_truth_poses.txt"
 
     def map_names(self) -> list[str]:
         """List the cutouts.
 
         Raises:
-            InputError: when there is none.
+            InputError: if there is none.
         """
         paths = sorted(self.cutouts.glob("*/*/*_cutout_*.jpg"))
         if not paths:
@@ -77,13 +78,10 @@ class InLoc:
         return [path.relative_to(self.root).as_posix() for path in paths]
 
     def check(self, map_names: list[str]) -> None:
-        """Check that the scans of cutouts are there, before any work is done.
-
-        Args:
-            map_names: the cutouts that are needed.
+        """Check before any work that the scans of cutouts exist.
 
         Raises:
-            InputError: naming a file that is missing.
+            InputError: naming a missing file.
         """
         files = {self.root / f"{name}.mat" for name in map_names}
         files |= {scans.transformation_file(self.root, name) for name in map_names}
@@ -94,33 +92,32 @@ class InLoc:
             )
 
     def query_names(self) -> list[str]:
-        """List the queries: those of `query_list` where there is one, else all photos."""
+        """List the queries: those of `query_list` if it exists, else all photos."""
         if self.query_list.is_file():
             return [name for name, _ in parse_query_list(self.query_list)]
         return list_images(self.root, folder="query")
 
     def queries(self, features: Path) -> list[tuple[str, pycolmap.Camera]]:
-        """Return the queries with the intrinsics of `query_list`, or else of the benchmark."""
+        """Return the queries with the intrinsics of `query_list`, or without it those of InLoc."""
         if not self.query_list.is_file():
-            logger.info("There is no %s: queries are taken for an iPhone 7's.", self.query_list)
+            logger.info("There is no %s: assuming queries by an iPhone 7.", self.query_list)
             return by_iphone7(features, self.query_names())
         return parse_query_list(self.query_list)
 
     @property
     def ransac_thresh(self) -> float:
-        """The threshold of `main` that goes with the intrinsics of the queries."""
-        calibrated = self.query_list.is_file()
-        return CALIBRATED_THRESH if calibrated else RANSAC_THRESH
+        """The inlier threshold that suits the intrinsics of the queries."""
+        return CALIBRATED_THRESH if self.query_list.is_file() else RANSAC_THRESH
 
     def buildings(
         self, names: list[str], truth: Mapping[str, pycolmap.Rigid3d], map_names: list[str]
     ) -> dict[str, list[str]]:
-        """Group queries by floor, such as DUC1, if there are several.
+        """Group queries by floor, such as DUC1.
 
         Args:
             names: the queries.
-            truth: their true poses. A query belongs to the floor of the scan that is nearest to
-                its true position, or if that is not known, to the group "query".
+            truth: their true poses. A query belongs to the floor of the scan nearest to its true
+                position. Without a true pose it belongs to the only floor, or to "query".
             map_names: cutouts.
         """
         floors = sorted({scans.floor_of(name) for name in map_names})
@@ -138,12 +135,8 @@ class InLoc:
         return {floor: group for floor, group in groups.items() if group}
 
 
-RANSAC_THRESH = 48.0  # pixels of a photo of the iPhone 7, as in hloc
-RANSAC_SIZE = 4032  # the longer side of such a photo
-
-
 def by_iphone7(features: Path, names: Iterable[str]) -> list[tuple[str, pycolmap.Camera]]:
-    """Give queries of a feature file the intrinsics of the benchmark's: 28 mm on 35 mm film."""
+    """Return queries in a feature file with the intrinsics of InLoc's: 28 mm on 35 mm film."""
     queries = []
     with open_h5(features) as file:
         for name in names:

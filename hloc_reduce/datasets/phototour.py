@@ -1,8 +1,8 @@
 """UBC PhotoTour patches (Winder and Brown, 2007), in the layout of its zip files.
 
 Each sequence is a folder of sheets `patches0000.bmp`, ... of 16x16 patches of 64x64 pixels;
-`info.txt`, whose lines begin with the 3D point that a patch shows; and lists of pairs
-`m50_100000_100000_0.txt`, or of other numbers of matching and other pairs.
+`info.txt`, whose lines begin with the number of the 3D point that a patch shows; and lists of pairs
+`m50_100000_100000_0.txt`, or with other numbers of matching and other pairs.
 """
 
 from pathlib import Path
@@ -14,14 +14,14 @@ from ..descriptors import PATCH_SIZE
 from ..utils.cli import InputError
 
 SHEET, SIDE = 16, 64
-PAIRS = "m50_100000_100000_0.txt"  # read before any other of its kind
+PAIRS = "m50_100000_100000_0.txt"  # preferred to other lists
 
 
 def read_points(folder: Path) -> np.ndarray:
-    """Read which point each patch shows, (N,) int64.
+    """Read the number of the point that each patch shows, (N,) int64.
 
     Raises:
-        InputError: when the folder is not a sequence.
+        InputError: if the folder is not a sequence.
     """
     info = folder / "info.txt"
     if not info.is_file():
@@ -39,12 +39,12 @@ def read_points(folder: Path) -> np.ndarray:
         raise InputError(f"{info}: no two patches show the same point.")
     missing = -(-len(points) // SHEET**2) - len(sheets(folder))
     if missing > 0:
-        raise InputError(f"{folder}: {info} names {len(points)} patches, {missing} sheets miss.")
+        raise InputError(f"{info} names {len(points)} patches, {missing} sheets are missing.")
     return np.array(points)
 
 
 def sheets(folder: Path) -> list[Path]:
-    """Return the sheets of patches in order."""
+    """Return the sheets of patches, in order."""
     return sorted(folder.glob("patches[0-9][0-9][0-9][0-9].bmp"))
 
 
@@ -52,7 +52,7 @@ def read_sheet(path: Path) -> np.ndarray:
     """Read the patches (256, 32, 32) float32 in [0, 1] of a sheet, row by row.
 
     Raises:
-        InputError: when it is not one.
+        InputError: if it is not a sheet.
     """
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None or image.shape != (SHEET * SIDE,) * 2:
@@ -64,24 +64,24 @@ def read_sheet(path: Path) -> np.ndarray:
 
 
 def read_pairs(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the pairs of patches (P, 2) int64 that are listed to verify with, and which match.
+    """Read the pairs of patches (P, 2) int64 for verification, and whether they match (P,) bool.
 
     Raises:
-        InputError: when the list is missing or broken.
+        InputError: if the list is missing or broken.
     """
     path = folder / PAIRS
-    others = sorted(folder.glob("m50_*_*_0.txt"))
-    if not path.is_file() and not others:
+    if not path.is_file():
+        path = max(folder.glob("m50_*_*_0.txt"), default=path)
+    if not path.is_file():
         raise InputError(f"There is no list of pairs {path}.")
-    path = path if path.is_file() else others[-1]
-    pairs = []
+    rows = []
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
         try:
             values = np.array(line.split(), np.int64)
-            pairs.append((values[0], values[3], values[1] == values[4]))
+            rows.append((values[0], values[3], values[1] == values[4]))
         except (ValueError, IndexError, OverflowError):
             raise InputError(f"{path}, line {number}: not a pair of patches and points.") from None
-    pairs = np.array(pairs, np.int64).reshape(-1, 3)
+    pairs = np.array(rows, np.int64).reshape(-1, 3)
     matches = pairs[:, 2] == 1
     if matches.all() or not matches.any():
         raise InputError(f"{path} needs both matching pairs and others.")

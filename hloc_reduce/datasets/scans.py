@@ -1,4 +1,4 @@
-"""The RGB-D scans of InLoc: what each pixel of a cutout shows, and where the scan is."""
+"""The RGB-D scans of InLoc: their poses, and the 3D points of the pixels of cutouts."""
 
 from pathlib import Path
 
@@ -6,23 +6,23 @@ import numpy as np
 
 from ..utils.cli import InputError
 
-TRANSFORMATION = slice(7, 11)  # the lines "after GICP" of a file with two matrices
+TRANSFORMATION = slice(7, 11)  # lines of the second one of two matrices, "after GICP"
 
 
 def floor_of(cutout: str) -> str:
-    """Return the floor of a cutout by its name, .../<floor>/<scan>/<cutout>.jpg.
+    """Return the floor of a cutout from its name.
 
     Raises:
-        InputError: when the name is of another form.
+        InputError: as for `transformation_file`.
     """
     return _parts(cutout)[0]
 
 
 def transformation_file(root: Path, cutout: str) -> Path:
-    """Return the file that says where the scan of a cutout is.
+    """Return the file with the pose of a cutout's scan.
 
     Raises:
-        InputError: when the name is of another form than
+        InputError: if the name does not have the form
             database/cutouts/<floor>/<scan>/<building>_cutout_<scan>_<yaw>_<pitch>.jpg.
     """
     floor, scan, name = _parts(cutout)
@@ -42,16 +42,16 @@ def _parts(cutout: str) -> list[str]:
 
 
 def read_pose(root: Path, cutout: str) -> np.ndarray:
-    """Read the pose of the scan of a cutout, floor from scan (4, 4) in metres, "after GICP".
+    """Read the pose of a cutout's scan, floor from scan (4, 4) in metres, "after GICP".
 
     Raises:
-        InputError: when its file is not there or has no such matrix.
+        InputError: if its file is missing or has no such matrix.
     """
     return read_transformation(transformation_file(root, cutout))
 
 
 def read_transformation(path: Path) -> np.ndarray:
-    """Read the pose of a scan from its file, as `read_pose`."""
+    """Read the pose of a scan from its file, as `read_pose` returns it."""
     try:
         lines = path.read_text().splitlines()[TRANSFORMATION]
         matrix = np.array([[float(word) for word in line.split()] for line in lines])
@@ -68,7 +68,7 @@ def read_scan(path: Path) -> np.ndarray:
     Pixels without depth are NaN.
 
     Raises:
-        InputError: when the file is not there or holds no such array.
+        InputError: if the file is missing or has no such array.
     """
     from scipy.io import loadmat
 
@@ -85,17 +85,17 @@ def read_scan(path: Path) -> np.ndarray:
 
 
 def interpolate(scan: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
-    """Find the points of a scan that keypoints show.
+    """Interpolate the points of a scan at keypoints.
 
-    Bilinear where all four pixels around have depth, else that of the nearest of them that has.
+    The result is bilinear if all four pixels around a keypoint have depth, else the point of the
+    nearest one of them that has.
 
     Args:
         scan: (H, W, 3), NaN where there is no depth.
-        keypoints: (N, 2) x, y in pixels of the scan, centres at integers; those outside count as
-            on the border.
+        keypoints: (N, 2) x, y in pixels of the scan, centres at integers; clipped to its border.
 
     Returns:
-        (N, 3) float64, NaN where none of the four has depth.
+        (N, 3) float64, NaN where none of the four pixels has depth.
     """
     last = np.array(scan.shape[1::-1]) - 1
     place = np.clip(keypoints, 0, last)

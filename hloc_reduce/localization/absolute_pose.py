@@ -11,31 +11,32 @@ from . import resection
 from .confidence import (
     MAX_POSITION,
     MAX_ROTATION,
+    MIN_MATCHES,
     RIVAL,
     Gate,
     agreement,
     confidence,
     focal_lengths,
-    reprojection_errors,
     uncertainty,
 )
+from .projection import ALL, FOCAL, POSE, RADIAL, SKEW, reprojection_errors
+from .resection import Resection
 
 SEED = 0
 MAX_ERROR = 12.0  # pixels, pycolmap's default
-CLEAR = 0.25  # inlier ratio above which images are not tried by themselves
-MAX_IMAGES = 20  # tried by themselves, those with most matches
-MIN_MATCHES = 6  # of an image that is tried
+CLEAR = 0.25  # inlier ratio above which no image is tried by itself
+MAX_IMAGES = 20  # tried by themselves, those with the most matches
 ROUNDS = 3  # of estimation from the inliers among all matches
-# two poses that differ by more are rivals
+# poses that differ by more are rivals
 SAME_ROTATION = 10.0  # degrees
-SAME_POSITION = 0.25  # of the inliers' median depth
-# confidence with other intrinsics, by that with the assumed ones: above these a distortion is
-# right, all others may be, and all others are
-DISTORTED, UNCLEAR, RIGHT = 1.02, 1.05, 1.1
-# times the limits of uncertainty: by how much other intrinsics than given ones must move the pose
-# to contradict them, as many lists give focal lengths of EXIF data; and how uncertain a pose may be
-# if guessed intrinsics are all wrong, as those of a cropped photo
-LENIENT, CROPPED = 2.0, 3.0
+SAME_POSITION = 0.25  # of the median depth of the inliers
+# ratios of the confidence with other intrinsics to the confidence with the assumed ones
+DISTORTED = 1.02  # above it, the lens has a radial distortion
+UNCLEAR = 1.05  # above it, the other intrinsics may be right
+RIGHT = 1.1  # above it, the other intrinsics are right
+# multiples of MAX_POSITION and MAX_ROTATION
+LENIENT = 2.0  # between poses of contradicting intrinsics: many lists have those of EXIF data
+CROPPED = 3.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
 
 
 @dataclass(frozen=True)
@@ -43,14 +44,13 @@ class Pose:
     """A pose and how the matches agree with it.
 
     Args:
-        cam_from_world: the pose, None where there is none.
-        camera: intrinsics, refined where the configuration says so.
+        cam_from_world: the pose, None if there is none.
+        camera: intrinsics, refined if the configuration says so.
         inliers: (M,) bool.
-        confidence: `confidence.confidence`.
-        agreement: `confidence.agreement`.
-        refusal: why it is not to be trusted, None if it is.
-        degrees_of_freedom: 6 for the pose alone, 7 with the focal length, 8 with a distortion too,
-            11 with the aspect ratio and the principal point too.
+        confidence: see `confidence.confidence`.
+        agreement: see `confidence.agreement`.
+        refusal: why it is not trusted, None if it is.
+        degrees_of_freedom: the number of estimated parameters, see `projection`.
     """
 
     cam_from_world: pycolmap.Rigid3d | None
@@ -59,12 +59,38 @@ class Pose:
     confidence: float = -np.inf
     agreement: float = 0.0
     refusal: str | None = None
-    degrees_of_freedom: int = 6
+    degrees_of_freedom: int = POSE
 
     @property
     def num_inliers(self) -> int:
         """The number of inliers."""
         return int(self.inliers.sum())
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """All matches of a query, and its intrinsics with the configuration; see `estimate`."""
+
+    points2D: np.ndarray
+    points3D: np.ndarray
+    camera: pycolmap.Camera
+    config: dict
+
+    def __len__(self) -> int:
+        return len(self.points2D)
+
+    @property
+    def max_error(self) -> float:
+        return self.config.get("estimation", {}).get("ransac", {}).get("max_error", MAX_ERROR)
+
+    @property
+    def is_focal_length_guessed(self) -> bool:
+        return bool(self.config.get("estimation", {}).get("estimate_focal_length"))
+
+    @property
+    def is_focal_length_free(self) -> bool:
+        refined = self.config.get("refinement", {}).get("refine_focal_length")
+        return self.is_focal_length_guessed or bool(refined)
 
 
 def estimate(
@@ -77,107 +103,111 @@ def estimate(
 ) -> Pose:
     """Estimate an absolute pose and judge it.
 
-    Where few of all matches agree with a pose, RANSAC may have missed the right one, so the matches
+    If few of all matches agree with a pose, RANSAC may have missed the right one. So the matches
     of each image are tried by themselves, too: those of an image that shows the same place agree
-    much more often. The pose of the highest confidence among all matches wins.
+    much more often. The pose with the highest confidence among all matches wins.
 
     Args:
         points2D: (M, 2) image points of all matches, COLMAP's pixels.
         points3D: (M, 3) their world points.
         images: of each map image the indices of its matches.
         camera: intrinsics.
-        config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
-        gate: what is trusted.
+        config: hloc's dict of options of pycolmap, under "estimation" and "refinement"; under
+            "photo", whether it may be "cropped".
+        gate: what a pose must have to be trusted.
     """
-    number = len(points2D)
-    poses = [_estimate(points2D, points3D, np.arange(number), camera, config)]
+    matches = _Matches(points2D, points3D, camera, config)
+    number = len(matches)
+    poses = [_estimate(matches, np.arange(number))]
     if poses[0].num_inliers < CLEAR * number:
-        tried = [matches for matches in images if MIN_MATCHES <= len(matches) < number]
-        for chosen in sorted(tried, key=len, reverse=True)[:MAX_IMAGES]:
-            poses.append(_estimate(points2D, points3D, chosen, camera, config))
+        tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
+        tried = sorted(tried, key=len, reverse=True)[:MAX_IMAGES]
+        poses += [_estimate(matches, chosen) for chosen in tried]
     best = max(poses, key=_quality)
     if 0 < best.num_inliers < number / (1 + RIVAL):  # then a rival may be among the others
-        others = np.flatnonzero(~best.inliers)
-        poses.append(_estimate(points2D, points3D, others, camera, config))
+        poses.append(_estimate(matches, np.flatnonzero(~best.inliers)))
         best = max(poses, key=_quality)
     rivals = [pose for pose in poses if differ(best, pose, points3D)]
-    best, doubt = _calibrate(best, points2D, points3D, config)
+    best, doubt = _calibrate(matches, best)
     best = replace(best, agreement=agreement(best.inliers, images))
-    refusal = _refusal(best, rivals, points2D, points3D, camera, config, gate) or doubt
-    return replace(best, refusal=refusal)
+    return replace(best, refusal=_refusal(matches, best, rivals, gate) or doubt)
 
 
 def _quality(pose: Pose) -> tuple[float, int]:
     return pose.confidence, pose.num_inliers
 
 
-def _estimate(
-    points2D: np.ndarray,
-    points3D: np.ndarray,
-    chosen: np.ndarray,
-    camera: pycolmap.Camera,
-    config: dict,
-) -> Pose:
-    """Estimate a pose from chosen matches, then from those of all that agree with it."""
-    number, found = len(points2D), None
-    threshold = _max_error(config)
-    pose = Pose(None, camera, np.zeros(number, bool))
+def _estimate(matches: _Matches, chosen: np.ndarray) -> Pose:
+    """Estimate a pose from chosen matches, then from all matches that agree with it."""
+    points2D, points3D, number = matches.points2D, matches.points3D, len(matches)
+    pose = Pose(None, matches.camera, np.zeros(number, bool))
     for _ in range(1 if len(chosen) == number else ROUNDS):
-        refined = copy.deepcopy(pose.camera)
-        found = colmap.estimate_pose(points2D[chosen], points3D[chosen], refined, config, SEED)
+        camera = copy.deepcopy(pose.camera)
+        chosen_points = points2D[chosen], points3D[chosen]
+        found = colmap.estimate_pose(*chosen_points, camera, matches.config, SEED)
         if not found:
             break
         cam_from_world = found["cam_from_world"]
         if len(chosen) == number:
             inliers = np.asarray(found["inlier_mask"], bool)
         else:
-            errors, _ = reprojection_errors(points2D, points3D, cam_from_world, refined)
-            inliers = errors <= threshold
+            errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
+            inliers = errors <= matches.max_error
         if inliers.sum() <= pose.num_inliers:
             break
-        pose, chosen = Pose(cam_from_world, refined, inliers), np.flatnonzero(inliers)
+        pose, chosen = Pose(cam_from_world, camera, inliers), np.flatnonzero(inliers)
     if pose.cam_from_world is None:
         return pose
-    arguments = points2D, points3D, pose.cam_from_world, pose.camera
-    freedom = 6 + _is_focal_length_free(config)
-    value = confidence(*arguments, threshold, freedom)
+    freedom = FOCAL if matches.is_focal_length_free else POSE
+    view = pose.cam_from_world, pose.camera
+    value = confidence(points2D, points3D, *view, matches.max_error, freedom)
     return replace(pose, confidence=value, degrees_of_freedom=freedom)
 
 
-def _calibrate(
-    pose: Pose, points2D: np.ndarray, points3D: np.ndarray, config: dict
-) -> tuple[Pose, str | None]:
-    """Look whether other intrinsics than those of a pose fit the matches better.
+def _calibrate(matches: _Matches, pose: Pose) -> tuple[Pose, str | None]:
+    """Test whether other intrinsics than those of a pose fit the matches better.
 
-    Where the focal length is not known, a distortion is estimated, too, and if that fits much
-    better aspect ratio and principal point: the photo was cropped or stretched. Where it is known,
-    such a fit contradicts it. A skew, which no lens has, tells a photo that shows a picture.
+    If the focal length is unknown, they replace them: a distortion, or the aspect ratio and the
+    principal point, too, of a photo that was cropped or stretched. If it is known, they contradict
+    it. A skew, which no lens has, reveals a photo of a picture.
 
     Returns:
-        The pose that is likelier, and a reason not to trust it, if any.
+        The likelier pose, and a reason not to trust it, if any.
     """
-    if pose.num_inliers < resection.ALL or pose.camera.mean_focal_length() <= 0:
+    if pose.cam_from_world is None or pose.num_inliers < ALL:
         return pose, None
-    threshold = _max_error(config)
-    image, pinhole = resection.undistort(points2D, pose.camera)
-    matches, start = (image, points3D), (pose.cam_from_world, pinhole, threshold)
+    if pose.camera.mean_focal_length() <= 0:  # as RANSAC may estimate it
+        return pose, None
+    image, pinhole = resection.undistort(matches.points2D, pose.camera)
+    points, start = (image, matches.points3D), (pose.cam_from_world, pinhole)
+    threshold = matches.max_error
 
-    def judged(found: resection.Resection | None, freedom: int) -> Pose:
+    def judged(found: Resection | None, freedom: int) -> Pose:
         if found is None:
             return replace(pose, camera=pinhole)
-        cam_from_world, lens, inliers, points = found
-        value = confidence(points, points3D, cam_from_world, lens, threshold, freedom)
-        return Pose(cam_from_world, lens, inliers, value, degrees_of_freedom=freedom)
+        pose_and_camera, image = found[:2], found.points2D
+        value = confidence(image, matches.points3D, *pose_and_camera, threshold, freedom)
+        return Pose(*found[:3], confidence=value, degrees_of_freedom=freedom)
 
-    free = _is_focal_length_free(config) and not resection.is_distorted(pose.camera)
+    free = matches.is_focal_length_free and not resection.is_distorted(pose.camera)
     assumed = pose
     if free:
-        radial = judged(resection.resect(*matches, *start, resection.RADIAL), resection.RADIAL)
+        radial = judged(resection.resect(*points, *start, threshold, RADIAL), RADIAL)
         if radial.confidence > DISTORTED * pose.confidence:
             assumed = radial
-    other = judged(resection.resect_anew(*matches, *start), resection.ALL)
-    near = other.cam_from_world, other.camera, threshold
-    skewed = judged(resection.resect(*matches, *near, resection.SKEW), resection.SKEW)
+    found = resection.resect_anew(*points, *start, threshold)
+    near = found[:2] if found else start
+    skewed = resection.resect(*points, *near, threshold, SKEW)
+    return _choose(assumed, judged(found, ALL), judged(skewed, SKEW), free, matches.points3D)
+
+
+def _choose(
+    assumed: Pose, other: Pose, skewed: Pose, free: bool, points3D: np.ndarray
+) -> tuple[Pose, str | None]:
+    """Choose between poses with assumed, other and skewed intrinsics, as `_calibrate` returns them.
+
+    Unless the assumed intrinsics are `free`, others do not replace them but contradict them.
+    """
     likelier = max(assumed, other, key=_quality)
     if skewed.confidence > RIGHT * likelier.confidence and differ(
         skewed, likelier, points3D, MAX_POSITION, MAX_ROTATION
@@ -200,60 +230,25 @@ def _calibrate(
     return assumed, reason
 
 
-def _max_error(config: dict) -> float:
-    """Return RANSAC's inlier threshold in pixels."""
-    return config.get("estimation", {}).get("ransac", {}).get("max_error", MAX_ERROR)
-
-
-def _is_focal_length_free(config: dict) -> bool:
-    return bool(
-        config.get("estimation", {}).get("estimate_focal_length")
-        or config.get("refinement", {}).get("refine_focal_length")
-    )
-
-
-def _refusal(
-    pose: Pose,
-    rivals: list[Pose],
-    points2D: np.ndarray,
-    points3D: np.ndarray,
-    camera: pycolmap.Camera,
-    config: dict,
-    gate: Gate,
-) -> str | None:
-    """Say why a pose is not to be trusted, if it is not."""
+def _refusal(matches: _Matches, pose: Pose, rivals: list[Pose], gate: Gate) -> str | None:
+    """Return why a pose is not trusted, None if it is."""
     number = pose.num_inliers
     if number < gate.min_inliers:
         return f"too few inliers: {number}, at least {gate.min_inliers} are needed"
-    if pose.confidence < gate.min_confidence:
+    if pose.cam_from_world is None or pose.confidence < gate.min_confidence:
         return (
-            f"{number} inliers of {len(points2D)} matches may be chance: confidence "
+            f"{number} inliers of {len(matches)} matches may be chance: confidence "
             f"{max(0, pose.confidence):.1f}, at least {gate.min_confidence:g} is needed"
         )
     focal_length = pose.camera.mean_focal_length()
-    guessed = bool(config.get("estimation", {}).get("estimate_focal_length"))
-    low, high = focal_lengths(camera, guessed)
-    if _is_focal_length_free(config) and not low <= focal_length <= high:
+    low, high = focal_lengths(matches.camera, matches.is_focal_length_guessed)
+    if matches.is_focal_length_free and not low <= focal_length <= high:
         return (
             f"no plausible focal length: {focal_length:.0f} pixels, {low:.0f} to {high:.0f} were "
             "expected"
         )
-    chosen = points2D[pose.inliers], points3D[pose.inliers]
-    freedom = pose.degrees_of_freedom
-    position, rotation = uncertainty(*chosen, pose.cam_from_world, pose.camera, freedom)
-    if position > MAX_POSITION or rotation > MAX_ROTATION:
-        return (
-            f"the inliers do not fix the pose: its position is uncertain by {100 * position:.0f} % "
-            f"of their distance, its rotation by {rotation:.1f} degrees"
-        )
-    if config.get("photo", {}).get("cropped"):  # perhaps
-        position, rotation = uncertainty(*chosen, pose.cam_from_world, pose.camera, resection.ALL)
-        if position > CROPPED * MAX_POSITION or rotation > CROPPED * MAX_ROTATION:
-            return (
-                "it may be cropped: its intrinsics are not known, and without them its position is "
-                f"uncertain by {100 * position:.0f} % of the distance, its rotation by "
-                f"{rotation:.1f} degrees"
-            )
+    if reason := _imprecision(matches, pose, pose.cam_from_world):
+        return reason
     least = gate.least_agreement(pose.confidence)
     if pose.agreement < least:
         return (
@@ -261,8 +256,25 @@ def _refusal(
             f"{pose.agreement:.2f}, at least {least:g} is needed"
         )
     for rival in rivals:
-        if rival.num_inliers >= RIVAL * number and differ(pose, rival, points3D):
+        if rival.num_inliers >= RIVAL * number and differ(pose, rival, matches.points3D):
             return f"ambiguous: another pose has {rival.num_inliers} inliers, this one {number}"
+    return None
+
+
+def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d) -> str | None:
+    """Return how the inliers fail to determine a pose, None if they determine it."""
+    inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
+    limits = [(pose.degrees_of_freedom, 1.0, "the inliers do not fix the pose: its")]
+    if matches.config.get("photo", {}).get("cropped"):
+        reason = "it may be cropped: its intrinsics are not known, and without them its"
+        limits.append((ALL, CROPPED, reason))
+    for freedom, limit, reason in limits:
+        position, rotation = uncertainty(*inliers, cam_from_world, pose.camera, freedom)
+        if position > limit * MAX_POSITION or rotation > limit * MAX_ROTATION:
+            return (
+                f"{reason} position is uncertain by {100 * position:.0f} % of the distance, its "
+                f"rotation by {rotation:.1f} degrees"
+            )
     return None
 
 
@@ -273,7 +285,7 @@ def differ(
     position: float = SAME_POSITION,
     rotation: float = SAME_ROTATION,
 ) -> bool:
-    """Tell whether two poses differ by more than a position or a rotation.
+    """Return whether two poses differ by more than a position or a rotation.
 
     Args:
         pose: one of them.

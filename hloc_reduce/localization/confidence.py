@@ -1,4 +1,4 @@
-"""Tell a pose from chance, and one that is known precisely from one that is not."""
+"""Tell right poses from chance, and precise poses from uncertain ones."""
 
 from argparse import ArgumentParser
 from dataclasses import dataclass, replace
@@ -8,27 +8,31 @@ import numpy as np
 import pycolmap
 
 from ..utils.cli import InputError
+from .projection import POSE, photo_scale, project, reprojection_errors
 
 SOLUTIONS = 4  # poses that a minimal sample may have
 THRESHOLDS = 8  # inlier thresholds that are tried, from FINEST to RANSAC's
 FINEST = 1.0  # pixel
-SAME_PLACE = 2.0  # pixels at least: keypoints of other scales or orientations that count once
-DETECTED = 1600  # the longer side in pixels, to which photos are reduced before detection
-NEIGHBORS = 8  # projected points that give the density around a keypoint
-LEAST_NOISE = 0.5  # pixels, the standard deviation of a keypoint at best
-# inliers whose errors are independent: maps are bent, so that more of them err alike
-INDEPENDENT = 30
-FOCAL_LENGTHS = (0.3, 5.0)  # of an estimated one, times the longer side: 11 to 180 mm on 35 mm film
-REFINED = 2.0  # by what factor a focal length of EXIF data may change
-MAX_POSITION = 0.05  # standard deviation of the position, times the median distance of the inliers
+# pixels; keypoints of other scales or orientations that are nearer count once
+SAME_PLACE = 2.0
+NEIGHBORS = 8  # projections from which the density around a keypoint is estimated
+LEAST_NOISE = 0.5  # pixels, the least standard deviation of a keypoint
+INDEPENDENT = 30  # inliers with independent errors: in a bent map neighbors err alike
+FOCAL_LENGTHS = (0.3, 5.0)  # range of estimated ones, in longer sides: 11 to 180 mm on 35 mm film
+REFINED = 2.0  # factor by which a focal length from EXIF data may change
+MAX_POSITION = 0.05  # standard deviation of the position, in median depths of the inliers
 MAX_ROTATION = 2.0  # standard deviation in degrees
-MIN_MATCHES = 6  # of an image whose matches are asked whether they agree with a pose
-# least agreement without a ratio test, with one, and with one below FEW dimensions; the second
-# number of each is for confidences in DOUBTFUL, which copies of repeated structure reach: of fewer
-# matches the share is known less well, and with more confidence it was lower in noisy scans only
-AGREEMENT, AGREEMENT_RATIO, AGREEMENT_FEW, FEW = (0.17, 0.17), (0.76, 0.86), (0.55, 0.72), 32
+MIN_MATCHES = 6  # of an image whose matches may tell whether a pose is right
+RIVAL = 0.8  # a pose is ambiguous if another one has this share of its inliers
+
+# The least agreement of a pose, in general and for a DOUBTFUL confidence. Wrong poses at copies of
+# repeated structures have agreements up to the second one, and confidences in this range. Below it
+# there are few matches, so that the agreement is less certain; above it, low agreements occurred
+# only in noisy scans.
+AGREEMENT = (0.17, 0.17)  # of matches without a ratio test
+AGREEMENT_RATIO = (0.76, 0.86)  # with a ratio test
+AGREEMENT_FEW, FEW = (0.55, 0.72), 32  # with a ratio test, and fewer than 32 dimensions
 DOUBTFUL = (50.0, 300.0)
-RIVAL = 0.8  # a pose is ambiguous if another has this share of its inliers
 
 
 def confidence(
@@ -37,20 +41,20 @@ def confidence(
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
     max_error: float,
-    degrees_of_freedom: int = 6,
+    degrees_of_freedom: int = POSE,
 ) -> float:
     """Measure how unlikely it is that wrong matches agree with a pose as well as these do.
 
     An a-contrario test in the manner of AC-RANSAC (Moulon, Monasse and Marlet, ACCV 2012). The
-    number of false alarms is how many poses with as many inliers are expected if all matches are
-    wrong: the number of poses that can be computed from them, times the probability that one has so
-    many inliers. The inlier threshold is the one, up to RANSAC's, that makes it least.
+    number of false alarms is the expected number of poses with at least as many inliers if all
+    matches are wrong: the number of poses that can be computed from them, times the probability
+    that a pose has so many inliers. It is the minimum over inlier thresholds up to RANSAC's.
 
-    A wrong match pairs a keypoint with any of the matched points. So the probability that it is an
-    inlier is the density of their projections around the keypoint, or if larger that of points
-    spread evenly over the image: a pose that projects all points into a small part of the image
-    is no evidence. Matches are counted by the places of keypoints, cells of the threshold's size,
-    or by their points, whichever are fewer; a place with several matches has as many chances.
+    A wrong match pairs a keypoint with a random one of the matched points. It is an inlier with the
+    density of their projections around the keypoint, or of points spread evenly over the image,
+    whichever is larger: a pose that projects all points into a small part of the image is no
+    evidence. Keypoints in the same cell of the threshold's size count once, and so do equal points;
+    the smaller one of the two counts is used. A cell with several matches has as many chances.
 
     Args:
         points2D: (M, 2) image points of all matches, COLMAP's pixels.
@@ -58,8 +62,7 @@ def confidence(
         cam_from_world: the pose.
         camera: intrinsics.
         max_error: RANSAC's inlier threshold in pixels.
-        degrees_of_freedom: 6 for the pose alone, 7 with the focal length, 8 with a distortion too,
-            11 with the aspect ratio and the principal point too.
+        degrees_of_freedom: the number of estimated parameters, see `projection`.
 
     Returns:
         Minus the decimal logarithm of the number of false alarms. Above 0 the pose is not expected
@@ -67,9 +70,9 @@ def confidence(
     """
     errors, projected = reprojection_errors(points2D, points3D, cam_from_world, camera)
     density = _density(points2D, projected, camera)
-    # equal points have equal projections, and hardly ever do others
+    # one number tells points apart: hardly any two points have equal ones
     point, scale = points3D @ [1, np.sqrt(2), np.sqrt(3)], photo_scale(camera)
-    sample = -(-degrees_of_freedom // 2)  # matches that fix a pose
+    sample = -(-degrees_of_freedom // 2)  # matches that determine a pose
 
     def log10_false_alarms(threshold: float) -> float:
         side = max(SAME_PLACE * scale, threshold)
@@ -90,86 +93,15 @@ def confidence(
     return float(-min(map(log10_false_alarms, thresholds)))
 
 
-def photo_scale(camera: pycolmap.Camera) -> float:
-    """Return how many pixels of a photo are one of those that keypoints are detected in."""
-    return max(1.0, max(camera.width, camera.height) / DETECTED)
-
-
-def focal_lengths(camera: pycolmap.Camera, guessed: bool) -> tuple[float, float]:
-    """Return between which focal lengths in pixels an estimated one is plausible.
-
-    Args:
-        camera: intrinsics before the estimation.
-        guessed: they say nothing about the focal length; else it is known roughly.
-    """
-    size, given = max(camera.width, camera.height), camera.mean_focal_length()
-    low, high = FOCAL_LENGTHS
-    return (low * size, high * size) if guessed else (given / REFINED, given * REFINED)
-
-
-def reprojection_errors(
-    points2D: np.ndarray,
-    points3D: np.ndarray,
-    cam_from_world: pycolmap.Rigid3d,
-    camera: pycolmap.Camera,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points into an image.
-
-    Args:
-        points2D: (M, 2) image points, COLMAP's pixels.
-        points3D: (M, 3) world points.
-        cam_from_world: the pose.
-        camera: intrinsics.
-
-    Returns:
-        Their distances (M,) in pixels from the image points, infinite behind the camera, and the
-        projections (M, 2), there NaN.
-    """
-    local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
-    projected = np.full((len(local), 2), np.nan)
-    front = local[:, 2] > 0
-    if front.any():
-        projected[front] = camera.img_from_cam(local[front])
-    errors = np.linalg.norm(projected - points2D, axis=1)
-    return np.nan_to_num(errors, nan=np.inf, posinf=np.inf), projected
-
-
-def project(local: np.ndarray, distortion: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Project points with a focal length of 1 and a radial distortion.
-
-    Args:
-        local: (M, 3) points in front of the camera, in its frame.
-        distortion: coefficient of COLMAP's RADIAL.
-
-    Returns:
-        The image points (2, M), and their derivatives (2, 12, M) by a rotation about x, y, z, a
-        translation along them, and the intrinsics in the order of the degrees of freedom.
-    """
-    x, y, z = local.T
-    u, v, zero, one = x / z, y / z, np.zeros_like(z), np.ones_like(z)
-    r2 = u * u + v * v
-    scale, across = 1 + distortion * r2, 2 * distortion * u * v
-    du = np.array([-u * v, 1 + u * u, -v, 1 / z, zero, -u / z])
-    dv = np.array([-1 - v * v, u * v, u, zero, 1 / z, -v / z])
-    # focal length, distortion, aspect ratio, principal point, skew
-    along_x = [scale * u, u * r2, zero, one, zero, scale * v]
-    along_y = [scale * v, v * r2, scale * v, zero, one, zero]
-    derivatives = [
-        [*((scale + 2 * distortion * u * u) * du + across * dv), *along_x],
-        [*(across * du + (scale + 2 * distortion * v * v) * dv), *along_y],
-    ]
-    return scale * [u, v], np.array(derivatives)
-
-
 def _density(points2D: np.ndarray, projected: np.ndarray, camera: pycolmap.Camera) -> np.ndarray:
-    """Return the probability (N,), by pixel, that a wrong match projects to image points (N, 2)."""
+    """Return the probability per pixel that a wrong match projects to image points (N, 2)."""
     uniform = 1 / (camera.width * camera.height)
     visible = np.unique(projected[np.isfinite(projected).all(axis=1)].round(), axis=0)
     if len(visible) <= NEIGHBORS:
         return np.full(len(points2D), uniform)
     from scipy.spatial import cKDTree
 
-    # the nearest may be the keypoint's own
+    # one more, as the nearest one may be the projection of the keypoint's own match
     distance = cKDTree(visible).query(points2D, k=[NEIGHBORS + 1])[0][:, 0]
     share = NEIGHBORS / len(projected)
     return np.maximum(uniform, share / (np.pi * np.maximum(distance, 1) ** 2))
@@ -180,7 +112,7 @@ def _log10_choose(n: int, k: int) -> float:
 
 
 def _log10_tail(successes: int, trials: int, probability: float) -> float:
-    """Bound the probability of as many successes or more (Hoeffding, 1963), as a logarithm."""
+    """Bound the probability of at least as many successes (Hoeffding, 1963), as a logarithm."""
     rate = successes / trials
     if rate <= probability:
         return 0.0
@@ -195,22 +127,22 @@ def uncertainty(
     points3D: np.ndarray,
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
-    degrees_of_freedom: int = 6,
+    degrees_of_freedom: int = POSE,
 ) -> tuple[float, float]:
-    """Estimate how precisely inliers fix a pose, to first order from their errors.
+    """Estimate how precisely inliers determine a pose, to first order from their errors.
+
+    More than INDEPENDENT inliers do not make it more precise.
 
     Args:
         points2D: (M, 2) image points of the inliers, COLMAP's pixels.
         points3D: (M, 3) their world points.
         cam_from_world: the pose.
         camera: intrinsics.
-        degrees_of_freedom: 6 for the pose alone, 7 with the focal length, 8 with a distortion too,
-            11 with the aspect ratio and the principal point too.
+        degrees_of_freedom: the number of unknown parameters, see `projection`.
 
     Returns:
         The standard deviations of the position, in units of the inliers' median depth, and of the
-        rotation in degrees; infinite where the inliers do not fix the pose. More than
-        INDEPENDENT inliers do not reduce them further.
+        rotation in degrees; infinite if the inliers do not determine the pose.
     """
     local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
     _, derivatives = project(local / np.median(local[:, 2]))
@@ -220,28 +152,39 @@ def uncertainty(
     if equations <= unknowns:
         return np.inf, np.inf
     errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
-    noise = max(
-        (LEAST_NOISE * photo_scale(camera)) ** 2, (errors**2).sum() / (equations - unknowns)
-    )
+    measured = (errors**2).sum() / (equations - unknowns)
+    noise = max((LEAST_NOISE * photo_scale(camera)) ** 2, measured)
     try:
         variance = noise * np.diag(np.linalg.inv(jacobian.T @ jacobian))
-        variance = variance * max(1, len(points2D) / INDEPENDENT)
     except np.linalg.LinAlgError:
         return np.inf, np.inf
+    variance = variance * max(1, len(points2D) / INDEPENDENT)
     if not (variance > 0).all():
         return np.inf, np.inf
     return float(np.sqrt(variance[3:6].sum())), float(np.degrees(np.sqrt(variance[:3].sum())))
 
 
-def agreement(inliers: np.ndarray, images: list[np.ndarray]) -> float:
-    """Measure how well the matches of the image that agrees most agree with a pose.
-
-    An image that shows the place of a query has mostly right matches. A pose that symmetric or
-    repeated structure makes up agrees with some matches of several images, but of none with most:
-    that of a mirrored photo of a symmetric facade, for example.
+def focal_lengths(camera: pycolmap.Camera, guessed: bool) -> tuple[float, float]:
+    """Return the range of plausible focal lengths in pixels.
 
     Args:
-        inliers: (M,) bool, which matches agree with the pose.
+        camera: intrinsics before the estimation.
+        guessed: their focal length is unknown rather than approximate.
+    """
+    size, given = max(camera.width, camera.height), camera.mean_focal_length()
+    low, high = FOCAL_LENGTHS
+    return (low * size, high * size) if guessed else (given / REFINED, given * REFINED)
+
+
+def agreement(inliers: np.ndarray, images: list[np.ndarray]) -> float:
+    """Measure how many matches agree with a pose, in the image where most do.
+
+    Most matches with an image of the right place are right. A wrong pose, for example of a
+    mirrored photo of a symmetric facade, agrees with some matches of several images, but of none
+    with most.
+
+    Args:
+        inliers: (M,) bool, whether a match agrees with the pose.
         images: of each map image the indices of its matches.
 
     Returns:
@@ -249,16 +192,10 @@ def agreement(inliers: np.ndarray, images: list[np.ndarray]) -> float:
         its lower bound, by one standard deviation (Wilson, 1927), so that a few tell little.
     """
     parts = [inliers, *(inliers[chosen] for chosen in images if len(chosen) >= MIN_MATCHES)]
-    return max(_lower_bound(part.sum(), len(part)) for part in parts)
-
-
-def _lower_bound(successes: int, trials: int) -> float:
-    """Return the lower bound of a rate, by one standard deviation."""
-    if not trials:
-        return 0.0
-    rate = successes / trials
-    deviation = np.sqrt(rate * (1 - rate) / trials + 0.25 / trials**2)
-    return float((rate + 0.5 / trials - deviation) / (1 + 1 / trials))
+    number = np.array([len(part) for part in parts if len(part)])
+    rate = np.array([part.sum() for part in parts if len(part)]) / number
+    deviation = np.sqrt(rate * (1 - rate) / number + 0.25 / number**2)
+    return float(max((rate + 0.5 / number - deviation) / (1 + 1 / number), default=0.0))
 
 
 @dataclass(frozen=True)
@@ -266,10 +203,10 @@ class Gate:
     """What a pose must have for the query to be called localized.
 
     Args:
-        min_confidence: `confidence`.
-        min_inliers: inliers of RANSAC.
-        min_agreement: `agreement`, in general and where the confidence is doubtful; default: that
-            of `of_matches`.
+        min_confidence: the least `confidence`.
+        min_inliers: the least number of RANSAC's inliers.
+        min_agreement: the least `agreement`, in general and for a doubtful confidence; default: by
+            the matches, see `of_matches`.
 
     Raises:
         InputError: for a confidence that is not finite or a negative number of inliers.
@@ -288,7 +225,7 @@ class Gate:
             raise InputError(f"min_inliers is {self.min_inliers}: at least 0.")
 
     def of_matches(self, matcher: dict, dim: int) -> "Gate":
-        """Return the gate for matches of descriptors, whose agreement differs.
+        """Return the gate with the least agreement for a matcher and descriptors.
 
         Args:
             matcher: configuration of the matcher's model.
@@ -301,7 +238,7 @@ class Gate:
         return replace(self, min_agreement=least)
 
     def least_agreement(self, confidence: float) -> float:
-        """Return the agreement that a pose of a confidence must have."""
+        """Return the least agreement of a pose with a confidence."""
         general, doubtful = self.min_agreement or AGREEMENT
         low, high = DOUBTFUL
         return doubtful if low <= confidence < high else general
@@ -316,12 +253,12 @@ def add_gate_options(parser: ArgumentParser) -> None:
         "--min_confidence",
         type=float,
         default=DEFAULT_GATE.min_confidence,
-        help="confidence that a pose must have for the query to be called localized: minus the "
-        "decimal logarithm of how many such poses are expected by chance",
+        help="least confidence of a localized query: minus the decimal logarithm of the number of "
+        "such poses that are expected by chance",
     )
     parser.add_argument(
         "--min_inliers",
         type=int,
         default=DEFAULT_GATE.min_inliers,
-        help="inliers that a pose must have for the query to be called localized",
+        help="least number of inliers of a localized query",
     )

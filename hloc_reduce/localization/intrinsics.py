@@ -1,6 +1,6 @@
-"""Intrinsics of queries that no list gives: the map's, from EXIF data, or guessed."""
+"""Intrinsics of queries without a list: those of the map's camera, from EXIF data, or guessed."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,9 +12,9 @@ from ..utils.files import replacing
 from ..utils.parsers import to_line
 
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
-WELL_KNOWN = 3  # map images that tell the intrinsics of their camera
+WELL_KNOWN = 3  # images from which the map knows the intrinsics of their camera
 _REFINED = {"refine_focal_length": True}
-# where intrinsics come from -> options of `localize_sfm.main` that make up for their errors
+# source of intrinsics -> options of `localize_sfm.main` that make up for their errors
 REFINEMENTS = {
     "list": {},
     "map": {},
@@ -29,10 +29,10 @@ REFINEMENTS = {
 
 
 class MapCameras(NamedTuple):
-    """What a map tells of the intrinsics of other photos.
+    """What a map tells about the intrinsics of other photos.
 
     Args:
-        known: cameras that took several of its photos, by `colmap.exif_camera_model`.
+        known: cameras that took several of its photos, by their `colmap.exif_camera_model`.
         sizes: (width, height) of its photos.
     """
 
@@ -48,12 +48,12 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         of_map: cameras and photo sizes of the map.
 
     Returns:
-        The camera and a key of `REFINEMENTS`: "map" for one that is known, else a SIMPLE_RADIAL
-        camera without distortion, of "EXIF" data or guessed: a "guess" if the photo has the size
-        of photos of the map, so that it was hardly cropped, else "unknown".
+        The camera and its source, a key of `REFINEMENTS`: "map" for a camera that the map knows,
+        else a SIMPLE_RADIAL camera without distortion, from "EXIF" data or guessed. It is a "guess"
+        if map photos have the size of the photo, which then is hardly cropped, else "unknown".
 
     Raises:
-        InputError: when the image cannot be read.
+        InputError: if the image cannot be read.
     """
     if isinstance(image, np.ndarray):
         height, width = image.shape[:2]
@@ -61,7 +61,7 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
     else:
         camera, has_focal_length = colmap.infer_camera(image)
-        if of_map.known and (same := of_map.known.get(colmap.exif_camera_model(image))):
+        if of_map.known and (same := of_map.known.get(colmap.exif_camera_model(image) or "")):
             return same, "map"
         if has_focal_length:
             return camera, "EXIF"
@@ -70,7 +70,7 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
 
 
 def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> MapCameras:
-    """Return what a map tells of the intrinsics of other photos.
+    """Return what a map tells about the intrinsics of other photos.
 
     Args:
         reconstruction: the map.
@@ -90,23 +90,27 @@ def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> MapCamer
 
 
 def to_list(camera: pycolmap.Camera) -> list:
-    """Return intrinsics as JSON has them: model, width, height and parameters."""
+    """Return intrinsics as JSON values: model, width, height and parameters."""
     return [camera.model.name, camera.width, camera.height, *camera.params.tolist()]
 
 
+def to_lists(queries: Sequence[tuple[str, pycolmap.Camera | None]]) -> dict[str, list | None]:
+    """Return the intrinsics of queries as JSON values, None if they are not known."""
+    return {name: None if camera is None else to_list(camera) for name, camera in queries}
+
+
 def from_list(values: list) -> pycolmap.Camera:
-    """Return the intrinsics that `to_list` made a list of."""
+    """Return the intrinsics in a list from `to_list`."""
     model, width, height, *params = values
     return pycolmap.Camera(model=model, width=width, height=height, params=params)
 
 
 def write_queries(cameras: Mapping[str, tuple[pycolmap.Camera, str]], path: Path) -> None:
-    """Write a query list with intrinsics; comments say where they come from."""
+    """Write a query list with intrinsics, and their sources in comments."""
     lines = []
     for name, (camera, source) in cameras.items():
         params = map(repr, camera.params.tolist())
         lines.append(f"# {source}\n")
         lines.append(to_line(name, camera.model.name, camera.width, camera.height, *params))
-    text = "".join(lines)
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text("".join(lines), encoding="utf-8")

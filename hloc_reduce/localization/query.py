@@ -30,13 +30,13 @@ def localize(
         gate: what a pose must have to be trusted.
 
     Returns:
-        The pose (camera from world) or None, and info: `reason`, why the pose is not to be trusted,
-        None if it is; `confidence`, as of `confidence.confidence` and at least 0; `agreement`, as
-        of `confidence.agreement`; `num_inliers`; `num_matches`, with a 3D point, of
-        `num_correspondences` different ones (M); `num_without_point`, the other matches; `camera`,
-        the intrinsics, refined where `config` says so; `db`, the image retrieved first, of the
-        cluster that was localized in; and of that cluster `keypoints` (M,), indices of the query's,
-        `point3D_ids` (M,), `points3D` (M, 3) and `inliers` (M,) bool.
+        The pose (camera from world) or None, and info on the cluster of map images with the best
+        pose: `reason`, why the pose is not trusted, None if it is; `confidence`, at least 0, and
+        `agreement`, see `confidence`; `num_inliers`; `num_matches`, matches with a 3D point, and
+        `num_correspondences`, the different ones of these (M); `num_without_point`, the other
+        matches; `camera`, the intrinsics, refined if `config` says so; `db`, the best retrieved
+        image; `keypoints` (M,), indices of the query's; `point3D_ids` (M,); `points3D` (M, 3);
+        `inliers` (M,) bool.
     """
     solved = []
     for names in reference.clusters(list(matches)) if matches else [[]]:
@@ -70,7 +70,7 @@ def _quality(info: dict) -> tuple[bool, float, int]:
 
 
 def _reason(num_keypoints: int, names: list[str], info: dict) -> str | None:
-    """Say why a query has no matches to localize it by, if it has none."""
+    """Return why a query has no correspondences, None if it has some."""
     if not num_keypoints:
         return "no keypoints"
     if not names:
@@ -84,24 +84,22 @@ def _correspondences(
     """Collect the different 2D-3D matches through some images, sorted.
 
     Returns:
-        Parts of `info` of `localize`, and of each image the indices of its matches.
+        The first part of the info of `localize`, and of each image the indices of its matches.
     """
-    keypoints, ids, points = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 3))]
+    pairs, points = [np.zeros((0, 2), np.int64)], [np.zeros((0, 3))]
     for name in names:
-        shown, xyz = reference.lift(name, matches[name][:, 1])
-        keypoints.append(matches[name][:, 0])
-        ids.append(shown)
+        ids, xyz = reference.lift(name, matches[name][:, 1])
+        pairs.append(np.stack([matches[name][:, 0], ids], axis=1))
         points.append(xyz)
-    pairs = np.stack([np.concatenate(keypoints), np.concatenate(ids)], 1)
-    known = np.flatnonzero(pairs[:, 1] >= 0)
-    different, first, which = np.unique(
-        pairs[known], axis=0, return_index=True, return_inverse=True
-    )
-    image = np.repeat(np.arange(len(names)), [len(matches[name]) for name in names])[known]
-    images = [np.unique(which.reshape(-1)[image == i]) for i in range(len(names))]
+    pair = np.concatenate(pairs)
+    image = np.repeat(np.arange(len(names)), [len(matches[name]) for name in names])
+    known = np.flatnonzero(pair[:, 1] >= 0)
+    different, first, which = np.unique(pair[known], axis=0, return_index=True, return_inverse=True)
+    which = which.reshape(-1)  # numpy 2.0 returns a column
+    images = [np.unique(which[image[known] == i]) for i in range(len(names))]
     return {
         "num_matches": len(known),
-        "num_without_point": len(pairs) - len(known),
+        "num_without_point": len(pair) - len(known),
         "num_correspondences": len(different),
         "keypoints": different[:, 0],
         "point3D_ids": different[:, 1],

@@ -1,4 +1,4 @@
-"""What is kept of each query."""
+"""The record of each query: its pose, or why it has none, and how well it fits."""
 
 import json
 from pathlib import Path
@@ -11,11 +11,12 @@ from ..utils.files import naming, replacing
 from .intrinsics import from_list, to_list
 from .references import Reference
 
-RECORDS = 9  # the version of what a record holds, and of the gate
+RECORDS = 9  # the version of the content of records, and of the gate
+NUMBERS = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
 
 
 def pose_of(record: dict) -> pycolmap.Rigid3d | None:
-    """Return the pose of a query's record, camera from world."""
+    """Return the pose in a record, camera from world."""
     if record["qvec"] is None:
         return None
     w, x, y, z = record["qvec"]
@@ -23,20 +24,15 @@ def pose_of(record: dict) -> pycolmap.Rigid3d | None:
 
 
 def camera_of(record: dict) -> pycolmap.Camera:
-    """Return the intrinsics of a query's record, as they were refined."""
+    """Return the refined intrinsics in a record."""
     return from_list(record["camera"])
 
 
-def to_stamp(queries: list[tuple[str, pycolmap.Camera | None]]) -> dict[str, list | None]:
-    """Return the intrinsics of queries as a stamp has them."""
-    return {name: camera and to_list(camera) for name, camera in queries}
-
-
 def read_records(path: Path) -> dict[str, dict]:
-    """Read the records of queries that `main` left in `log_file`.
+    """Read the records of queries from a `log_file`.
 
     Raises:
-        InputError: when they are not there, broken, or of another version.
+        InputError: if it is missing, broken, or of another version.
     """
     try:
         header, *lines = path.read_text().splitlines()
@@ -52,14 +48,21 @@ def read_records(path: Path) -> dict[str, dict]:
 
 
 def log_file(results: Path) -> Path:
-    """Return the file of the records of queries, beside that of poses."""
+    """Return the file of the records of queries, next to their poses."""
     return Path(f"{results}_logs.jsonl")
 
 
 def to_record(
     reference: Reference, names: list[str], cam_from_world: pycolmap.Rigid3d | None, info: dict
 ) -> dict:
-    """Return the record of a query, from its pose and the info of `query.localize`."""
+    """Return the record of a query.
+
+    Args:
+        reference: the map.
+        names: the retrieved images, best first.
+        cam_from_world: the pose.
+        info: as `query.localize` returns it, with `max_error`.
+    """
     localized = info["reason"] is None
     if not localized:
         cam_from_world = reference.fallback(names) or cam_from_world
@@ -68,7 +71,6 @@ def to_record(
         x, y, z, w = cam_from_world.rotation.quat
         qvec = [float(value) for value in (w, x, y, z)]
         tvec = [float(value) for value in cam_from_world.translation]
-    numbers = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
     return {
         "localized": localized,
         "reason": info["reason"],
@@ -76,31 +78,47 @@ def to_record(
         "agreement": info["agreement"],
         "qvec": qvec,
         "tvec": tvec,
-        "camera": to_list(info["camera"]),
+        "camera": info["camera"] and to_list(info["camera"]),
         "max_error": info["max_error"],
-        **{key: info[key] for key in numbers},
+        **{key: info[key] for key in NUMBERS},
         "db": info["db"] if localized else next(iter(names), None),
     }
 
 
+def refused(
+    reference: Reference, names: list[str], camera: pycolmap.Camera | None, reason: str
+) -> dict:
+    """Return the record of a query that is not to be localized."""
+    info = {"reason": reason, "confidence": 0.0, "agreement": 0.0, "max_error": None}
+    return to_record(reference, names, None, info | dict.fromkeys(NUMBERS, 0) | {"camera": camera})
+
+
 class Log:
-    """Records of queries, one JSON line each, under a first line that says what made them."""
+    """Records of queries, one JSON line each, after a first line with their provenance.
+
+    Args:
+        path: the file.
+        made_from: the provenance; stale records are dropped.
+        overwrite: drop all records.
+    """
 
     def __init__(self, path: Path, made_from: dict, overwrite: bool):
-        self.path, self.records = path, {}
+        self.path = path
+        self.records: dict[str, dict] = {}
         header = json.dumps(made_from, sort_keys=True)
         lines = [] if overwrite or not path.exists() else path.read_text().split("\n")
         if lines and lines[0] == header:
-            # what follows the last line end was cut off by a kill
+            # a killed run may have cut off the last line, after the last line end
             self.records = dict(json.loads(line) for line in lines[1:-1])
         kept = [json.dumps(item) for item in self.records.items()]
         with replacing(path) as temporary:
             temporary.write_text("\n".join([header, *kept]) + "\n")
 
-    def __enter__(self) -> None:
+    def __enter__(self) -> "Log":
         self.file = self.path.open("a")
+        return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         with naming(self.path):
             self.file.close()
 

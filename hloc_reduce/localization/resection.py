@@ -1,9 +1,7 @@
-"""Camera resectioning: a pose together with the intrinsics that fit its matches.
+"""Camera resectioning: estimate intrinsics together with the pose.
 
-The parameters have an order, and the first ones are free: the pose (6), the focal length (7), a
-radial distortion (8), the aspect ratio (9), the principal point (11), the skew (12). So the number
-of degrees of freedom says which they are. With all twelve any homography of a photo can be undone:
-a lens has no skew, but the photo of a picture has.
+`projection` orders the parameters and counts degrees of freedom. All twelve parameters undo any
+homography of a photo: no lens has a skew, but the photo of a picture does.
 """
 
 from typing import NamedTuple
@@ -12,32 +10,31 @@ import numpy as np
 import pycolmap
 
 from ..utils.colmap import cam_from_img
-from .confidence import photo_scale, project, reprojection_errors
+from .projection import ALL, ASPECT, POSE, RADIAL, SKEW, photo_scale, project, reprojection_errors
 
-POSE, RADIAL, ASPECT, ALL, SKEW = 6, 8, 9, 11, 12  # degrees of freedom
-# standard deviations of the logarithm of the focal length, the distortion, the logarithm of the
-# aspect ratio, the principal point in focal lengths, and the skew as a tangent: all others are
-# possible, but what few matches do not tell is not made up
+# Standard deviations of the logarithm of the focal length, the distortion, the logarithm of the
+# aspect ratio, the principal point in focal lengths, and the skew as a tangent. They are wide, and
+# only keep parameters that few matches do not determine near their start.
 PRIOR = np.array([0.5, 0.25, 0.25, 0.25, 0.25, 0.25])
-ROUNDS = 10  # of refinement, from the inliers of the one before
+ROUNDS = 10  # of refinement, each from the inliers of the one before
 NOISE = 2.0  # pixels, scale of the Cauchy loss
-EVALUATIONS = 100  # of the residuals, a round
-DAMPING, TINY = 1e-3, 1e-9  # of the first step; what is damped at least
+EVALUATIONS = 100  # of the residuals in each round
+DAMPING = 1e-3  # of the first step
+TINY = 1e-9  # least diagonal of the damping
 ENOUGH = 1e-6  # relative gain of the last step
 FAR = 1e6  # pixels
-# where all parameters are searched for: in a sample of the matches with errors of a few times the
-# threshold, with the principal point in the middle of the photo and near its corners
-SAMPLE, NEAR = 400, 5
-CORNER = 0.4  # of width and height from the middle
+# The search for all parameters: in a sample of SAMPLE matches with errors up to NEAR thresholds, it
+# starts with principal points in the middle and CORNER of width and height away from it.
+SAMPLE, NEAR, CORNER = 400, 5, 0.4
 
 
 class Resection(NamedTuple):
-    """A pose and intrinsics.
+    """A pose and intrinsics that were estimated together.
 
     Args:
         cam_from_world: the pose.
         camera: OPENCV intrinsics, with one coefficient of distortion.
-        inliers: (M,) bool, which matches agree.
+        inliers: (M,) bool, whether a match agrees.
         points2D: (M, 2) the image points without skew.
     """
 
@@ -48,7 +45,7 @@ class Resection(NamedTuple):
 
 
 def is_distorted(camera: pycolmap.Camera) -> bool:
-    """Tell whether intrinsics have a distortion."""
+    """Return whether intrinsics have a distortion."""
     return bool(np.any(camera.params[list(camera.extra_params_idxs())]))
 
 
@@ -60,14 +57,17 @@ def undistort(points2D: np.ndarray, camera: pycolmap.Camera) -> tuple[np.ndarray
         camera: intrinsics.
 
     Returns:
-        The points (M, 2) as a camera without distortion would have them, at most FAR pixels away,
-        and this camera, PINHOLE.
+        The points (M, 2) in a camera without distortion, clipped to FAR pixels, and that camera,
+        PINHOLE.
     """
     (fx, _, cx), (_, fy, cy), _ = camera.calibration_matrix()
-    pinhole = pycolmap.Camera(
-        model="PINHOLE", width=camera.width, height=camera.height, params=[fx, fy, cx, cy]
-    )
-    return np.clip(cam_from_img(camera, points2D) * [fx, fy] + [cx, cy], -FAR, FAR), pinhole
+    image = cam_from_img(camera, points2D) * [fx, fy] + [cx, cy]
+    return np.clip(image, -FAR, FAR), _camera(camera, "PINHOLE", fx, fy, cx, cy)
+
+
+def _camera(photo: pycolmap.Camera, model: str, *params: float) -> pycolmap.Camera:
+    """Return intrinsics for photos of the same size."""
+    return pycolmap.Camera(model=model, width=photo.width, height=photo.height, params=params)
 
 
 def resect(
@@ -79,41 +79,81 @@ def resect(
     degrees_of_freedom: int,
     chosen: np.ndarray | None = None,
 ) -> Resection | None:
-    """Refine a pose and intrinsics to the matches that agree, as long as more and more do.
+    """Refine a pose and intrinsics from their inliers, as long as the number of inliers grows.
 
     Args:
         points2D: (M, 2) image points of all matches, COLMAP's pixels.
         points3D: (M, 3) their world points.
-        cam_from_world: the pose to begin with.
-        camera: the intrinsics to begin with, PINHOLE or of a `resect` before.
+        cam_from_world: the initial pose.
+        camera: the initial intrinsics, PINHOLE or those of a `Resection`.
         max_error: inlier threshold in pixels.
         degrees_of_freedom: 7 to 12.
-        chosen: (M,) bool, the matches to begin with; default: those that agree.
+        chosen: (M,) bool, the matches of the first round; default: the initial inliers.
 
     Returns:
-        What was found; None where fewer matches agree than there are degrees of freedom.
+        None if there are fewer inliers than degrees of freedom.
     """
     if chosen is None:
         chosen = reprojection_errors(points2D, points3D, cam_from_world, camera)[0] <= max_error
-    inliers, found = chosen, None  # those of each round, and what the last one found
     start = view = _View.of(cam_from_world, camera)
-    noise = NOISE * photo_scale(camera)
+    noise, found = NOISE * photo_scale(camera), None
     for _ in range(ROUNDS):
-        if inliers.sum() < degrees_of_freedom:
+        if chosen.sum() < degrees_of_freedom:
             break
-        chosen = points2D[inliers], points3D[inliers]
-        view = _fit(*chosen, view, start, degrees_of_freedom, noise)
-        pose, lens, image = view.pose, view.camera(camera), view.unskewed(points2D)
-        errors, _ = reprojection_errors(image, points3D, pose, lens)
-        if found is not None and (errors <= max_error).sum() <= found.inliers.sum():
+        view = _fit(points2D[chosen], points3D[chosen], view, start, degrees_of_freedom, noise)
+        pose, lens, image = view.cam_from_world, view.camera(camera), view.unskewed(points2D)
+        inliers = reprojection_errors(image, points3D, pose, lens)[0] <= max_error
+        if found is not None and inliers.sum() <= found.inliers.sum():
             break
-        inliers = errors <= max_error
-        found = Resection(pose, lens, inliers, image)
+        found, chosen = Resection(pose, lens, inliers, image), inliers
     return found
 
 
+def resect_anew(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    cam_from_world: pycolmap.Rigid3d,
+    camera: pycolmap.Camera,
+    max_error: float,
+) -> Resection | None:
+    """Estimate all parameters but the skew as `resect` does, even if the initial ones are far off.
+
+    Many parameters have local optima. So this tries several starts: the initial PINHOLE intrinsics,
+    another aspect ratio, and principal points near the corners, with the camera turned accordingly.
+    """
+    errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
+    near = np.flatnonzero(errors <= NEAR * max_error)
+    near = near[:: -(-len(near) // SAMPLE) or 1]
+    sample, everything = (points2D[near], points3D[near]), np.ones(len(near), bool)
+    starts = [(cam_from_world, camera)]
+    starts += [_turned(*starts[0], x, y) for x in (-CORNER, CORNER) for y in (-CORNER, CORNER)]
+    if stretched := resect(*sample, *starts[0], max_error, ASPECT):
+        starts.append((stretched.cam_from_world, stretched.camera))
+
+    def loss(found: Resection) -> float:
+        errors, _ = reprojection_errors(*sample, found.cam_from_world, found.camera)
+        return float(np.log1p((errors / (NOISE * photo_scale(camera))) ** 2).sum())
+
+    tried = [resect(*sample, *start, max_error, ALL, everything) for start in starts]
+    best = min((found for found in tried if found is not None), key=loss, default=None)
+    return best and resect(points2D, points3D, *best[:2], max_error, ALL)
+
+
+def _turned(
+    cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera, x: float, y: float
+) -> tuple[pycolmap.Rigid3d, pycolmap.Camera]:
+    """Move the principal point by shares of width and height, and turn the camera there."""
+    fx, fy, cx, cy = camera.params
+    x, y = x * camera.width, y * camera.height
+    ray = np.array([x / fx, y / fy, 1])
+    axis = np.cross(ray, [0, 0, 1]) / np.hypot(*ray[:2])
+    rotation = pycolmap.Rotation3d(np.arctan(np.hypot(*ray[:2])) * axis)
+    turn = pycolmap.Rigid3d(rotation, np.zeros(3))
+    return turn * cam_from_world, _camera(camera, "PINHOLE", fx, fy, cx + x, cy + y)
+
+
 class _View(NamedTuple):
-    """A pose and the intrinsics that are free, of shapes (3, 3), (3,) and (6,).
+    """The parameters that are optimized: rotation (3, 3), translation (3,), intrinsics (6,).
 
     The intrinsics are the logarithm of the focal length, a radial distortion, the logarithm of the
     aspect ratio, the principal point in pixels, and the skew as a tangent.
@@ -130,7 +170,7 @@ class _View(NamedTuple):
         return cls(cam_from_world.rotation.matrix(), cam_from_world.translation, intrinsics)
 
     @property
-    def pose(self) -> pycolmap.Rigid3d:
+    def cam_from_world(self) -> pycolmap.Rigid3d:
         return pycolmap.Rigid3d(pycolmap.Rotation3d(self.rotation), self.translation)
 
     @property
@@ -144,17 +184,12 @@ class _View(NamedTuple):
         return np.array([1, 1, 1, *self.focal_lengths, 1])
 
     def change(self, start: "_View") -> np.ndarray:
-        """Return how much the intrinsics (6,) differ from others, in units of PRIOR."""
+        """Return the difference (6,) from initial intrinsics, in units of PRIOR."""
         return (self.intrinsics - start.intrinsics) / (PRIOR * start._units)
 
     def camera(self, photo: pycolmap.Camera) -> pycolmap.Camera:
         _, distortion, _, cx, cy, _ = self.intrinsics
-        return pycolmap.Camera(
-            model="OPENCV",
-            width=photo.width,
-            height=photo.height,
-            params=[*self.focal_lengths, cx, cy, distortion, 0, 0, 0],
-        )
+        return _camera(photo, "OPENCV", *self.focal_lengths, cx, cy, distortion, 0, 0, 0)
 
     def unskewed(self, points2D: np.ndarray) -> np.ndarray:
         skew = self.intrinsics[5]
@@ -165,7 +200,7 @@ class _View(NamedTuple):
         return points2D - np.stack([skew * fx / fy * below, np.zeros(len(below))], axis=1)
 
     def moved(self, step: np.ndarray) -> "_View":
-        """Return the view after a step (7 to 12,), in the order of the degrees of freedom."""
+        """Return the view after a step (7 to 12,) of the free parameters."""
         turn = pycolmap.Rotation3d(step[:3]).matrix()
         step = np.pad(step, (0, SKEW - len(step)))
         return _View(
@@ -177,7 +212,7 @@ class _View(NamedTuple):
     def residuals(
         self, points2D: np.ndarray, points3D: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return residuals (2, M), their derivatives (2, 12, M), and who is in front (M,)."""
+        """Return residuals (2, M), derivatives (2, 12, M), and which points are in front (M,)."""
         local = points3D @ self.rotation.T + self.translation
         front = local[:, 2] > 0
         local[~front] = 0, 0, 1
@@ -185,13 +220,12 @@ class _View(NamedTuple):
         ray, derivatives = project(local, distortion)
         ray[0] += skew * ray[1]
         derivatives[0, :RADIAL] += skew * derivatives[1, :RADIAL]
-        fx, fy = self.focal_lengths
-        scale = np.array([[fx], [fy]])
+        scale = self.focal_lengths[:, None]
         residuals = scale * ray + np.array(center)[:, None] - points2D.T
         return residuals, scale[:, None] * derivatives, front
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of a step that is too long, and refused
+@np.errstate(over="ignore", invalid="ignore")  # steps that are too long are refused
 def _fit(
     points2D: np.ndarray,
     points3D: np.ndarray,
@@ -200,9 +234,9 @@ def _fit(
     degrees_of_freedom: int,
     noise: float,
 ) -> _View:
-    """Minimize the Cauchy loss of the residuals by the method of Levenberg and Marquardt.
+    """Minimize the Cauchy loss of the residuals by the Levenberg-Marquardt method.
 
-    What the residuals do not fix stays as it is at the start.
+    Parameters that the residuals do not determine stay as they are in `start`.
     """
     least, damping, trial = np.inf, DAMPING, view
     free = slice(degrees_of_freedom - POSE)
@@ -225,62 +259,3 @@ def _fit(
         damped = normal + damping * np.diag(np.maximum(np.diag(normal), TINY))
         trial = view.moved(-np.linalg.solve(damped, gradient))
     return view
-
-
-def resect_anew(
-    points2D: np.ndarray,
-    points3D: np.ndarray,
-    cam_from_world: pycolmap.Rigid3d,
-    camera: pycolmap.Camera,
-    max_error: float,
-) -> Resection | None:
-    """Find all intrinsics, and the pose, though those to begin with are far off.
-
-    That many parameters have local optima. So the principal point is looked for in the middle and
-    near the corners, where the camera is turned there.
-
-    Args:
-        points2D: (M, 2) image points of all matches, COLMAP's pixels.
-        points3D: (M, 3) their world points.
-        cam_from_world: the pose to begin with.
-        camera: PINHOLE intrinsics to begin with.
-        max_error: inlier threshold in pixels.
-
-    Returns:
-        As `resect`.
-    """
-    errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
-    near = np.flatnonzero(errors <= NEAR * max_error)
-    near = near[:: -(-len(near) // SAMPLE) or 1]
-    matches, all_of_them = (points2D[near], points3D[near]), np.ones(len(near), bool)
-    starts = [(cam_from_world, camera)]
-    starts += [_turned(*starts[0], x, y) for x in (-CORNER, CORNER) for y in (-CORNER, CORNER)]
-    if stretched := resect(*matches, *starts[0], max_error, ASPECT):
-        starts.append(stretched[:2])
-    found = [resect(*matches, *start, max_error, ALL, all_of_them) for start in starts]
-    found = [pose_and_camera[:2] for pose_and_camera in found if pose_and_camera is not None]
-
-    def loss(start: tuple[pycolmap.Rigid3d, pycolmap.Camera]) -> float:
-        errors, _ = reprojection_errors(*matches, *start)
-        return float(np.log1p((errors / (NOISE * photo_scale(camera))) ** 2).sum())
-
-    return resect(points2D, points3D, *min(found, key=loss), max_error, ALL) if found else None
-
-
-def _turned(
-    cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera, x: float, y: float
-) -> tuple[pycolmap.Rigid3d, pycolmap.Camera]:
-    """Move the principal point by shares of width and height, and turn the camera there."""
-    fx, fy, cx, cy = camera.params
-    x, y = x * camera.width, y * camera.height
-    ray = np.array([x / fx, y / fy, 1])
-    axis = np.cross(ray, [0, 0, 1]) / np.hypot(*ray[:2])
-    turn = pycolmap.Rotation3d(np.arctan(np.hypot(*ray[:2])) * axis)
-    turn = pycolmap.Rigid3d(turn, np.zeros(3))
-    moved = pycolmap.Camera(
-        model="PINHOLE",
-        width=camera.width,
-        height=camera.height,
-        params=[fx, fy, cx + x, cy + y],
-    )
-    return turn * cam_from_world, moved

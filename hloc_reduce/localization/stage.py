@@ -1,6 +1,7 @@
 """Localize the queries of feature and match files in any map, and record each."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from argparse import ArgumentParser
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from functools import partial
@@ -19,20 +20,20 @@ from ..utils.cli import InputError
 from ..utils.feature_files import dimension, get_colmap_keypoints, get_image_size
 from ..utils.h5 import open_h5
 from ..utils.match_files import find_pair, get_matcher, get_matches
-from ..utils.parsers import write_poses
+from ..utils.parsers import parse_query_lists, write_poses
 from ..utils.progress import progress
-from .confidence import DEFAULT_GATE, Gate
+from .confidence import DEFAULT_GATE, Gate, add_gate_options
 from .query import localize
-from .records import RECORDS, Log, log_file, pose_of, to_record
+from .records import RECORDS, Log, log_file, pose_of, refused, to_record
 from .references import Reference
 
 CHUNK = 8  # queries
-SHOWN = 3  # queries that a message gives the reason of
+SHOWN = 3  # queries whose reasons a message gives
 
 
 def main(
     load_reference: Callable[[], Reference],
-    queries: list[tuple[str, pycolmap.Camera | None]],
+    queries: Sequence[tuple[str, pycolmap.Camera | None]],
     retrieved: Mapping[str, list[str]],
     features: Path,
     matches: Path,
@@ -40,7 +41,7 @@ def main(
     config: Callable[[str, pycolmap.Camera], dict],
     made_from: dict,
     overwrite: bool = False,
-    skip_matches: int | None = None,
+    skip_matches: int = 0,
     name_parts: int | None = 1,
     executor: Executor = SERIAL,
     gate: Gate = DEFAULT_GATE,
@@ -51,56 +52,63 @@ def main(
     localized.
 
     Args:
-        load_reference: gives the map, in each process where there is something to do.
-        queries: names and intrinsics, None where these are not known.
+        load_reference: returns the map; called in each process that localizes queries.
+        queries: names and intrinsics, None if these are not known.
         retrieved: the map images of each query, best first.
         features: feature file of the queries.
         matches: match file of the pairs.
         results: text file of poses, camera from world, one line for every query that has one.
-        config: from the name and the intrinsics of a query to the options of `localize`.
-        made_from: stamp of all that determines the poses; the records of `<results>_logs.jsonl`
-            are used again when it is the same.
-        overwrite: localize anew what is there.
+        config: returns the options for `localize` from the name and the intrinsics of a query.
+        made_from: provenance of the poses; the run resumes from `<results>_logs.jsonl` unless its
+            records are stale.
+        overwrite: localize all queries again.
         skip_matches: leave out retrieved images with fewer matches.
-        name_parts: as of `parsers.write_poses`.
-        executor: does the work; unless in this process, `load_reference` and `config` are pickled.
+        name_parts: as in `parsers.write_poses`.
+        executor: does the work; `load_reference` and `config` are pickled for other processes.
         gate: what a pose must have for the query to be called localized; its agreement, if not
-            given, is that for the matcher and the dimension that the files tell.
+            given, is that for the matcher and the dimension in the files.
 
     Returns:
-        A record for each query: `localized`; `reason`, why it is not localized, None where it is;
-        `confidence` and `agreement`; the pose that is written as `qvec` (w, x, y, z) and `tvec`,
-        the fallback where the query is not localized, None where there is none; `camera`, the
-        model, width, height and parameters in a list, None where not known; `max_error`, the pixels
-        within which inliers reproject, None for pycolmap's default; and the numbers and `db` of
-        `localize`.
+        A record for each query: `localized`; `reason`, why it is not localized, None if it is;
+        `confidence` and `agreement`; the written pose as `qvec` (w, x, y, z) and `tvec`, the
+        fallback if the query is not localized, None if there is none; `camera`, the model, width,
+        height and parameters in a list, None if not known; `max_error`, RANSAC's inlier threshold
+        in pixels, None for pycolmap's default; and the numbers and `db` of `localize`.
     """
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
-    log = Log(log_file(results), header, overwrite)
-    todo = [query for query in queries if query[0] not in log.records]
-    if todo:
-        with open_h5(features) as feature_file:
-            refused = _refused(feature_file, todo)
-        with log:
-            for name, record in _refuse(load_reference, todo, refused, retrieved):
-                log.add(name, record)
-        todo = [query for query in todo if query[0] not in refused]
-    if todo:
-        with open_h5(matches) as match_file:
-            _check_some_matched(match_file, queries, retrieved)
-            gate = gate.of_matches(get_matcher(match_file), dimension(features))
-        work = partial(_localize_all, load_reference, features, matches, config, skip_matches, gate)
-        tasks = ((name, camera, retrieved.get(name, [])) for name, camera in todo)
-        with log, closing(executor.map(work, tasks, CHUNK)) as found:
-            for name, record in progress(found, "Localizing", "query", len(todo)):
-                log.add(name, record)
+    with Log(log_file(results), header, overwrite) as log:
+        todo = [(name, camera) for name, camera in queries if name not in log.records]
+        for name, record in _refuse(load_reference, features, todo, retrieved):
+            log.add(name, record)
+        tasks = [
+            (name, camera, retrieved.get(name, []))
+            for name, camera in todo
+            if name not in log.records
+        ]
+        if tasks:
+            with open_h5(matches) as match_file:
+                _check_some_matched(match_file, [name for name, _ in queries], retrieved)
+                gate = gate.of_matches(get_matcher(match_file), dimension(features))
+            work = partial(
+                _localize_all, load_reference, features, matches, config, skip_matches, gate
+            )
+            with closing(executor.map(work, tasks, CHUNK)) as found:
+                for name, record in progress(found, "Localizing", "query", len(tasks)):
+                    log.add(name, record)
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose_of(record) for name, record in records.items()}
     submitted = {name: known for name, known in poses.items() if known is not None}
     write_poses(submitted, results, name_parts)
-    if failed := [name for name in poses if name not in submitted]:
+    _report(records, failures(features), log.path)
+    localized = sum(record["localized"] for record in records.values())
+    logger.info("Localized %d of %d queries: %s", localized, len(records), results)
+    return records
+
+
+def _report(records: dict[str, dict], unreadable: Mapping[str, str], log_path: Path) -> None:
+    """Warn of queries that are not localized, except unreadable ones: the extraction did."""
+    if failed := [name for name, record in records.items() if record["qvec"] is None]:
         logger.warning("%d queries have no pose: %s.", len(failed), cli.some(failed))
-    unreadable = failures(features)  # the extraction has named them
     reasons = [
         f"{name} ({record['reason']})"
         for name, record in records.items()
@@ -109,10 +117,52 @@ def main(
     if reasons:
         logger.warning("Not localized: %s.", cli.some(reasons, SHOWN))
     if len(reasons) > SHOWN:
-        logger.warning("The reasons of all %d are in %s.", len(reasons), log.path)
-    localized = sum(record["localized"] for record in records.values())
-    logger.info("Localized %d of %d queries: %s", localized, len(records), results)
-    return records
+        logger.warning("The reasons of all %d are in %s.", len(reasons), log_path)
+
+
+def _refuse(
+    load_reference: Callable[[], Reference],
+    features: Path,
+    queries: list[tuple[str, pycolmap.Camera | None]],
+    retrieved: Mapping[str, list[str]],
+) -> Iterator[tuple[str, dict]]:
+    """Yield the names and the records of the queries that are not to be localized."""
+    with open_h5(features) as file:
+        reasons = [_reason(file, name, camera) for name, camera in queries]
+    reference = load_reference() if any(reasons) else None
+    for (name, camera), reason in zip(queries, reasons, strict=True):
+        if reference is not None and reason:
+            names = [other for other in retrieved.get(name, []) if other in reference]
+            yield name, refused(reference, names, camera, reason)
+
+
+def _reason(feature_file: h5py.File, name: str, camera: pycolmap.Camera | None) -> str | None:
+    """Return why a query is not to be localized, None if it is."""
+    if failure := failure_of(feature_file, name):
+        return failure
+    if camera is None:
+        return "its intrinsics are not known"
+    if f"{name}/image_size" not in feature_file:
+        return None
+    width, height = get_image_size(feature_file, name)
+    if (width, height) == (camera.width, camera.height):
+        return None
+    return (
+        f"the intrinsics are for {camera.width}x{camera.height} pixels, the photo has "
+        f"{width}x{height}"
+    )
+
+
+def _check_some_matched(
+    match_file: h5py.File, names: list[str], retrieved: Mapping[str, list[str]]
+) -> None:
+    """Refuse a match file that has not a single pair."""
+    pairs = [(name, other) for name in names for other in retrieved.get(name, [])]
+    if pairs and not any(find_pair(match_file, *pair)[0] for pair in pairs):
+        raise InputError(
+            f"The pair {pairs[0][0]}, {pairs[0][1]} is not in the match file "
+            f"{match_file.filename}, and no other of the queries is."
+        )
 
 
 def _localize_all(
@@ -120,16 +170,16 @@ def _localize_all(
     features: Path,
     matches: Path,
     config: Callable[[str, pycolmap.Camera], dict],
-    skip_matches: int | None,
+    skip_matches: int,
     gate: Gate,
     queries: Iterable[tuple[str, pycolmap.Camera, list[str]]],
-) -> Iterator[tuple[str, dict]]:
+) -> Generator[tuple[str, dict], None, None]:
     """Yield the names and the records of queries with their intrinsics and retrieved images."""
     reference = load_reference()
 
     def solve(task: tuple) -> tuple[str, dict]:
         name, camera, keypoints, found = task
-        used = {n: m for n, m in found.items() if len(m) >= (skip_matches or 0)}
+        used = {other: pairs for other, pairs in found.items() if len(pairs) >= skip_matches}
         options = config(name, camera)
         cam_from_world, info = localize(reference, keypoints, camera, used, options, gate)
         info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
@@ -144,57 +194,6 @@ def _localize_all(
             yield from solved
 
 
-def _check_some_matched(
-    match_file: h5py.File,
-    queries: list[tuple[str, pycolmap.Camera]],
-    retrieved: Mapping[str, list[str]],
-) -> None:
-    """Refuse a match file that has not a single pair."""
-    pairs = [(name, other) for name, _ in queries for other in retrieved.get(name, [])]
-    if pairs and not any(find_pair(match_file, *pair)[0] for pair in pairs):
-        raise InputError(
-            f"The pair {pairs[0][0]}, {pairs[0][1]} is not in the match file "
-            f"{match_file.filename}, and no other of the queries is."
-        )
-
-
-def _refused(
-    feature_file: h5py.File, queries: list[tuple[str, pycolmap.Camera | None]]
-) -> dict[str, str]:
-    """Return the queries that are not to be localized, and why."""
-    refused = {}
-    for name, camera in queries:
-        if failure := failure_of(feature_file, name):
-            refused[name] = failure
-        elif camera is None:
-            refused[name] = "its intrinsics are not known"
-        elif f"{name}/image_size" in feature_file:
-            width, height = get_image_size(feature_file, name)
-            if (width, height) != (camera.width, camera.height):
-                refused[name] = (
-                    f"the intrinsics are for {camera.width}x{camera.height} pixels, the photo has "
-                    f"{width}x{height}"
-                )
-    return refused
-
-
-def _refuse(
-    load_reference: Callable[[], Reference],
-    queries: list[tuple[str, pycolmap.Camera | None]],
-    refused: Mapping[str, str],
-    retrieved: Mapping[str, list[str]],
-) -> Iterator[tuple[str, dict]]:
-    """Yield the names and the records of the queries that are refused."""
-    reference = load_reference() if refused else None
-    for name, camera in queries:
-        if name in refused:
-            _, info = localize(reference, np.zeros((0, 2)), camera or pycolmap.Camera(), {}, {})
-            info |= {"max_error": None, "reason": refused[name]}
-            names = [other for other in retrieved.get(name, []) if other in reference]
-            record = to_record(reference, names, None, info)
-            yield name, record | ({} if camera else {"camera": None})
-
-
 def _read(
     feature_file: h5py.File,
     match_file: h5py.File,
@@ -202,7 +201,7 @@ def _read(
     names: list[str],
     reference: Reference,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Read the keypoints of a query, and its matches with the images that were retrieved for it."""
+    """Read the keypoints of a query, and its matches with retrieved images."""
     keypoints, _ = get_colmap_keypoints(feature_file, name)
     present = [other for other in names if other in reference]
     if len(present) < len(names):
@@ -215,3 +214,28 @@ def _read(
     return keypoints, {
         other: get_matches(match_file, name, other, both)[0] for other, both in sizes.items()
     }
+
+
+def read_queries(queries: Path) -> list[tuple[str, pycolmap.Camera]]:
+    """Read the queries of all lists that match a glob."""
+    return [query for part in parse_query_lists(queries).values() for query in part]
+
+
+def add_options(parser: ArgumentParser, ransac_thresh: float, pixels: str) -> None:
+    """Add the options of `run`, with the default and the unit of --ransac_thresh."""
+    pairs = "pairs of queries and map images"
+    parser.add_argument("--retrieval", type=Path, required=True, help=pairs)
+    parser.add_argument("--features", type=Path, required=True, help="feature file")
+    parser.add_argument("--matches", type=Path, required=True, help="match file")
+    parser.add_argument("--results", type=Path, required=True, help="text file of poses")
+    text = f"RANSAC inlier threshold in {pixels}"
+    parser.add_argument("--ransac_thresh", type=float, default=ransac_thresh, help=text)
+    add_gate_options(parser)
+    parser.add_argument("--overwrite", action="store_true", help="localize all queries again")
+
+
+def run(parser: ArgumentParser, main: Callable[..., object]) -> None:
+    """Call the `main` of a localization stage with the options of the command line."""
+    args = vars(parser.parse_args())
+    gate = Gate(args.pop("min_confidence"), args.pop("min_inliers"))
+    main(**args, gate=gate)

@@ -36,8 +36,8 @@ from ..utils.images import list_images
 from ..utils.paths import strings_as_paths
 from .map import FINGERPRINTS, FINISHED, FURTHER, MORE, PLACE, RETRIEVAL, SFM, Map, with_projection
 
-MAX_EXHAUSTIVE = 100  # photos without covisibility of which all pairs are matched
-ROUNDS = 3  # in which larger sets get more pairs, where these leave photos unconnected
+MAX_EXHAUSTIVE = 100  # photos without covisibility that are all paired with each other
+ROUNDS = 3  # of additional pairs, in which larger sets of photos get connected
 
 
 @strings_as_paths
@@ -55,76 +55,63 @@ def main(
     accept_partial: bool = False,
     camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
 ) -> Map:
-    """Build a map, or open one that was made from the same.
+    """Build a map, or open the one that was made from the same.
 
     Args:
         map_dir: the folder of the map.
         image_dir: folder of the images.
-        model: COLMAP model with their poses; None to reconstruct them, in a frame and scale of
-            their own.
-        feature: as in `confs.features.get`.
-        projection: likewise.
+        model: COLMAP model with their poses; None to reconstruct them, in an arbitrary frame and
+            scale.
+        feature: as in `confs.features.get`, like `projection`, `storage` and `keypoints`.
+        projection: see `feature`.
         matcher: a key of `confs.matchers`.
-        num_covis: pairs of each image with the most covisible ones of the model. If the model has
-            no points, or there is none, up to `MAX_EXHAUSTIVE` images are all paired, and of more
-            each is paired with the most similar ones; without a model, pairs are added where
-            these leave images unconnected.
-        overwrite: build anew.
-        storage: as in `confs.features.get`.
-        keypoints: as in `confs.features.get`.
-        accept_partial: do without images of the model that are missing, and without images that
-            cannot be read; without a model, build a map even if fewer than half of the images
-            are in it.
+        num_covis: each image is paired with this number of the most covisible ones in the model.
+            Without points in the model, or without a model, up to `MAX_EXHAUSTIVE` images are all
+            paired with each other, and of more each with the most similar ones; without a model,
+            pairs are added where these leave images unconnected.
+        overwrite: rebuild the map.
+        storage: see `feature`.
+        keypoints: see `feature`.
+        accept_partial: do without images that are missing or unreadable; without a model, build a
+            map even if fewer than half of the images are in it.
         camera_mode: which images share a camera, without a model.
 
     Returns:
         The map.
 
     Raises:
-        InputError: when the folder has a map that was made from something else, something is
-            missing or wrong, or fewer than half of the images can be reconstructed; what is
-            finished is kept, for a run with `accept_partial`.
+        InputError: if the folder has a map that was made from something else, something is missing
+            or wrong, or fewer than half of the images can be reconstructed; what is finished is
+            kept, for a run with `accept_partial`.
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
-    matcher_conf = matchers_confs.confs[matcher]
-    model_files = {}
-    names, num_points3D = None, 0
-    if model is not None:
-        reference = colmap.read_model(model)
-        names = sorted(image.name for image in reference.images.values())
-        if not names:
-            raise InputError(f"The model {model} has no images.")
-        num_points3D = reference.num_points3D()
-        model_files = {
-            path.name: path
-            for path in sorted(model.iterdir())
-            if path.stem in triangulation.PARTS and path.is_file()
-        }
-        names = keep_present(image_dir, names, accept_partial)
-    names = list_images(image_dir, names)
-    if model is None and len(names) == 1:
-        raise InputError(f"A map of photos alone needs two or more: {image_dir} has one.")
+    reference = None if model is None else colmap.read_model(model)
+    if reference is not None and not reference.images:
+        raise InputError(f"The model {model} has no images.")
+    names = _list(image_dir, reference, accept_partial)
+    has_points = reference is not None and reference.num_points3D() > 0
+    exhaustive = not has_points and len(names) <= MAX_EXHAUSTIVE
     made_by = extract_features.provenance(conf)
     if overwrite or not (map_dir / "conf.json").exists():
         extract_features.check_model(conf)
     files = {f"images/{name}": image_dir / name for name in names}
-    files |= {f"model/{name}": path for name, path in model_files.items()}
+    files |= {f"model/{path.name}": path for path in _files_of(model)}
     fingerprints = provenance.fingerprints(files, provenance.read(map_dir / FINGERPRINTS))
+    digests = {name: digest for name, (_, _, digest) in fingerprints.items()}
     made_from = {
         "feature": made_by,
-        "matcher": matcher_conf["model"],
+        "matcher": matchers_confs.confs[matcher]["model"],
         "num_covis": num_covis,
-        "images": {name: fingerprints[f"images/{name}"][2] for name in names},
-        "model": {name: fingerprints[f"model/{name}"][2] for name in model_files},
+        "images": {name: digests[f"images/{name}"] for name in names},
+        "model": {path.name: digests[f"model/{path.name}"] for path in _files_of(model)},
     }
-    exhaustive = not num_points3D and len(names) <= MAX_EXHAUSTIVE
     if exhaustive:
         made_from |= {"num_covis": None, "pairs": "exhaustive"}
     elif model is None:
         made_from |= {"pairs": f"retrieval, {ROUNDS} rounds of verification"}
     before = provenance.read(map_dir / "conf.json")
     if before and before != made_from and not (map_dir / FINISHED).exists():
-        logger.info("The map %s, which was not finished, is begun anew.", map_dir)
+        logger.info("Rebuilding the unfinished map %s.", map_dir)
         overwrite = True
     with RunFolder(
         map_dir,
@@ -133,90 +120,106 @@ def main(
         inputs=[path for path in (image_dir, model, projection) if path is not None],
         kept=(PLACE, FINGERPRINTS),
     ) as folder:
-        if (map_dir / FINISHED).exists():
-            built = Map(map_dir)
-            if built.camera_mode not in (None, camera_mode.name.lower()):
-                raise InputError(
-                    f"The map {map_dir} was made with --camera_mode {built.camera_mode}: give it "
-                    "again, choose other --outputs, or --overwrite."
-                )
-            _drop_others(folder, built)  # which a killed run left
-            return built
-        if not (map_dir / PLACE).exists():
-            with replacing(map_dir / PLACE) as temporary:
-                temporary.write_text(uuid.uuid4().hex)
-
-        logger.info("Building the map %s of %d images.", map_dir, len(names))
-        provenance.write(map_dir / FINGERPRINTS, fingerprints)
-        conf = _keep_projection(conf, map_dir)
-        building = _Building(
-            *(folder, map_dir, image_dir, names, matcher_conf),
-            *(num_covis, exhaustive, accept_partial, camera_mode),
-        )
-        if model is not None:
-            name, sfm = SFM, building.of_model(conf, model, reference)
-        else:
-            name, conf, sfm = building.of_photos_alone(conf)
-        cameras = intrinsics.of_map(sfm, image_dir)
-        summary = {
-            "id": uuid.uuid4().hex,
-            "feature": feature,
-            "matcher": matcher,
-            "image_dir": str(image_dir.resolve()),
-            "model": str(model.resolve()) if model is not None else None,
-            "camera_mode": camera_mode.name.lower() if model is None else None,
-            "conf": with_projection(conf, lambda path: Path(path).name),
-            "keypoints": keypoints,
-            "sfm": name,
-            "images": len(building.names),
-            "images_with_pose": sfm.num_reg_images(),
-            "points3D": sfm.num_points3D(),
-            "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
-            "sizes": sorted(cameras.sizes),
-            "seconds": folder.seconds(),
-        }
-        provenance.write(map_dir / FINISHED, summary)
+        if not (map_dir / FINISHED).exists():
+            if not (map_dir / PLACE).exists():
+                with replacing(map_dir / PLACE) as temporary:
+                    temporary.write_text(uuid.uuid4().hex)
+            provenance.write(map_dir / FINGERPRINTS, fingerprints)
+            building = _Building(
+                *(folder, image_dir, names, matcher, num_covis, exhaustive),
+                *(accept_partial, camera_mode),
+            )
+            return building.build(feature, conf, keypoints, model, reference)
         built = Map(map_dir)
-        _drop_others(folder, built)
-        provenance.write(map_dir / FINISHED, {**summary, "bytes": folder.bytes()})
+        if built.camera_mode not in (None, camera_mode.name.lower()):
+            raise InputError(
+                f"The map {map_dir} was made with --camera_mode {built.camera_mode}: give it "
+                "again, choose other --outputs, or --overwrite."
+            )
+        _drop_others(folder, built)  # a killed run may have left some
         return built
+
+
+def _list(
+    image_dir: Path, reference: pycolmap.Reconstruction | None, accept_partial: bool
+) -> list[str]:
+    """List the images of a map: those of the model, or without it all images in a folder."""
+    if reference is None:
+        names = list_images(image_dir)
+        if len(names) == 1:
+            raise InputError(f"A map of photos alone needs two or more: {image_dir} has one.")
+        return names
+    names = sorted(image.name for image in reference.images.values())
+    return list_images(image_dir, keep_present(image_dir, names, accept_partial))
+
+
+def _files_of(model: Path | None) -> list[Path]:
+    """Return the files of a COLMAP model, if any."""
+    paths = sorted(model.iterdir()) if model else []
+    return [path for path in paths if path.stem in triangulation.PARTS and path.is_file()]
 
 
 @dataclass
 class _Building:
-    """A map that is being built.
-
-    Args:
-        folder: its run.
-        map_dir: its folder.
-        image_dir: folder of the images.
-        names: its images; those that cannot be read are dropped.
-        matcher_conf: configuration of the matcher.
-        num_covis: as in `main`.
-        exhaustive: pair all images, unless by covisibility.
-        accept_partial: do without images that are missing, unreadable or not reconstructed.
-        camera_mode: which images share a camera, without a model.
-    """
+    """A map that is being built; `names` loses images that cannot be read."""
 
     folder: RunFolder
-    map_dir: Path
     image_dir: Path
     names: list[str]
-    matcher_conf: dict
+    matcher: str
     num_covis: int
     exhaustive: bool
     accept_partial: bool
     camera_mode: pycolmap.CameraMode
 
-    def of_model(
+    def build(
+        self,
+        feature: str,
+        conf: dict,
+        keypoints: str,
+        model: Path | None,
+        reference: pycolmap.Reconstruction | None,
+    ) -> Map:
+        """Build the map with the name and the configuration of a feature, and a model, if any."""
+        logger.info("Building the map %s of %d images.", self.folder.path, len(self.names))
+        conf = _keep_projection(conf, self.folder.path)
+        if model is not None and reference is not None:
+            folder, sfm = SFM, self._of_model(conf, model, reference)
+        else:
+            folder, conf, sfm = self._of_photos_alone(conf)
+        cameras = intrinsics.of_map(sfm, self.image_dir)
+        summary = {
+            "id": uuid.uuid4().hex,
+            "feature": feature,
+            "matcher": self.matcher,
+            "image_dir": str(self.image_dir.resolve()),
+            "model": str(model.resolve()) if model is not None else None,
+            "camera_mode": self.camera_mode.name.lower() if model is None else None,
+            "conf": with_projection(conf, lambda path: Path(path).name),
+            "keypoints": keypoints,
+            "sfm": folder,
+            "images": len(self.names),
+            "images_with_pose": sfm.num_reg_images(),
+            "points3D": sfm.num_points3D(),
+            "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
+            "sizes": sorted(cameras.sizes),
+            "seconds": self.folder.seconds(),
+        }
+        provenance.write(self.folder.path / FINISHED, summary)
+        built = Map(self.folder.path)
+        _drop_others(self.folder, built)
+        provenance.write(self.folder.path / FINISHED, {**summary, "bytes": self.folder.bytes()})
+        return built
+
+    def _of_model(
         self, conf: dict, model: Path, reference: pycolmap.Reconstruction
     ) -> pycolmap.Reconstruction:
-        """Triangulate a map with the poses of a model, which is read already."""
+        """Triangulate the map with the poses of a model."""
         features, descriptors = self._describe(conf)
         if len(self.names) < len(reference.images):
-            model = colmap.write_part(model, set(self.names), self.map_dir / "sfm_reference")
+            model = colmap.write_part(model, set(self.names), self.folder.path / "sfm_reference")
         if reference.num_points3D():
-            pairs = self.map_dir / f"pairs-db-{self.num_covis}.txt"
+            pairs = self.folder.path / f"pairs-db-{self.num_covis}.txt"
             with self.folder.stage("pairs"):
                 pairs_from_covisibility.main(model, pairs, self.num_covis)
         else:
@@ -224,73 +227,73 @@ class _Building:
         matches = self._match(pairs, features)
         with self.folder.stage("triangulation"):
             sfm = triangulation.main(
-                self.map_dir / SFM, model, self.image_dir, pairs, features, matches
+                self.folder.path / SFM, model, self.image_dir, pairs, features, matches
             )
-        shutil.rmtree(self.map_dir / "sfm_reference", ignore_errors=True)
+        shutil.rmtree(self.folder.path / "sfm_reference", ignore_errors=True)
         return sfm
 
-    def of_photos_alone(self, conf: dict) -> tuple[str, dict, pycolmap.Reconstruction]:
-        """Reconstruct poses and points; again with more keypoints where photos are missing.
+    def _of_photos_alone(self, conf: dict) -> tuple[str, dict, pycolmap.Reconstruction]:
+        """Reconstruct poses and points; if photos are missing, again with more keypoints.
 
         Returns:
-            The name of the folder of the map with the most images, the configuration of its
-            features, and the map.
+            The folder of the model with the most images, the configuration of its features, and
+            the model.
         """
         adaptive = features_confs.keypoints_of(conf["model"]) == "adaptive"
         if not adaptive or len(self.names) > reconstruction.VERY_FEW:
             sfm = self._reconstruct(conf, SFM)
-            reconstruction.check(self.map_dir / SFM, self.accept_partial)
+            reconstruction.check(self.folder.path / SFM, self.accept_partial)
             return SFM, conf, sfm
         model = features_confs.with_keypoints(conf["model"], "colmap")
         more = {**conf, "output": f"{conf['output']}{MORE}", "model": model}
-        found: list[tuple[pycolmap.Reconstruction, str, dict]] = []
+        found: list[tuple[str, dict, pycolmap.Reconstruction]] = []
 
-        def attempt(sfm: str, conf: dict, once: bool = False) -> bool:
-            """Return whether all photos are in the best map so far."""
+        def attempt(folder: str, conf: dict, once: bool = False) -> bool:
+            """Return whether all photos are in the best model so far."""
             with suppress(reconstruction.NoModelError):
-                found.append((self._reconstruct(conf, sfm, once), sfm, conf))
-            found.sort(key=lambda one: reconstruction.size(one[0]), reverse=True)
-            registered = found[0][0].num_reg_images() if found else 0
+                found.append((folder, conf, self._reconstruct(conf, folder, once)))
+            found.sort(key=lambda one: reconstruction.size(one[2]), reverse=True)
+            registered = found[0][2].num_reg_images() if found else 0
             logger.info("%d of %d photos are in the map.", registered, len(self.names))
             return registered == len(self.names)
 
         if not attempt(SFM, conf, once=True):
             logger.info("Trying again with more keypoints.")
             attempt(f"{SFM}{MORE}", more)
-            if not found or found[0][1] == SFM:
+            if not found or found[0][0] == SFM:
                 attempt(f"{SFM}{FURTHER}", conf)
         if not found:
             raise reconstruction.NoModelError(reconstruction.nothing(self.image_dir))
-        best, sfm, conf = found[0]
-        reconstruction.check(self.map_dir / sfm, self.accept_partial)
-        return sfm, conf, best
+        reconstruction.check(self.folder.path / found[0][0], self.accept_partial)
+        return found[0]
 
     def _reconstruct(self, conf: dict, sfm: str, once: bool = False) -> pycolmap.Reconstruction:
         features, descriptors = self._describe(conf)
         pairs = self._pairs(descriptors)
         matches = self._match(pairs, features)
         for number in () if self.exhaustive else range(1, ROUNDS + 1):
-            before, pairs = pairs, self.map_dir / f"pairs-db-{self.num_covis}-{number}.txt"
+            before, pairs = pairs, self.folder.path / f"pairs-db-{self.num_covis}-{number}.txt"
             with self.folder.stage("verification"):
                 pairs_from_verification.main(
                     *(pairs, self.image_dir, before, features, matches, descriptors),
                     *(self.num_covis, self.num_covis if number == 1 else 0),
                     *(self.camera_mode, self.names),
                 )
-            with self.folder.stage("match_map"):
-                match_features.main(self.matcher_conf, pairs, features, matches=matches)
+            self._match(pairs, features, matches)
         with self.folder.stage("reconstruction"):
-            return reconstruction.reconstruct(
-                *(self.map_dir / sfm, self.image_dir, pairs, features, matches, self.camera_mode),
+            return reconstruction.main(
+                *(self.folder.path / sfm, self.image_dir, pairs, features, matches),
+                camera_mode=self.camera_mode,
                 image_list=self.names,
                 once=once,
+                checked=False,
             )
 
     def _describe(self, conf: dict) -> tuple[Path, Path]:
         """Return the files of the features and of the global descriptors."""
         with self.folder.stage("extract_features"):
             features = extract_features.main(
-                *(conf, self.image_dir, self.map_dir),
+                *(conf, self.image_dir, self.folder.path),
                 image_list=self.names,
                 strict=not self.accept_partial,
             )
@@ -302,20 +305,23 @@ class _Building:
         """Pair all images, or of many each with the most similar ones."""
         with self.folder.stage("pairs"):
             if self.exhaustive:
-                pairs = self.map_dir / "pairs-db-exhaustive.txt"
+                pairs = self.folder.path / "pairs-db-exhaustive.txt"
                 pairs_from_exhaustive.main(pairs, self.names)
             else:
-                pairs = self.map_dir / f"pairs-db-{self.num_covis}.txt"
+                pairs = self.folder.path / f"pairs-db-{self.num_covis}.txt"
                 pairs_from_retrieval.main(descriptors, pairs, self.num_covis)
         return pairs
 
-    def _match(self, pairs: Path, features: Path) -> Path:
+    def _match(self, pairs: Path, features: Path, matches: Path | None = None) -> Path:
+        conf = matchers_confs.confs[self.matcher]
         with self.folder.stage("match_map"):
-            return match_features.main(self.matcher_conf, pairs, features.stem, self.map_dir)
+            if matches is not None:
+                return match_features.main(conf, pairs, features, matches=matches)
+            return match_features.main(conf, pairs, features.stem, self.folder.path)
 
 
 def _drop_others(folder: RunFolder, built: Map) -> None:
-    """Delete what other attempts to build a map wrote."""
+    """Delete the files of other attempts to build a map."""
     kept = built.features.stem
     plain = kept.removesuffix(MORE)
     for name in {plain, f"{plain}{MORE}"} - {kept}:
@@ -325,7 +331,7 @@ def _drop_others(folder: RunFolder, built: Map) -> None:
 
 
 def _keep_projection(conf: dict, folder: Path) -> dict:
-    """Copy the projection of a feature into a folder and return the configuration with it."""
+    """Copy the projection of a feature to a folder and return the configuration with the copy."""
 
     def copy(projection: str) -> str:
         source, prefix = projections.find(projection), projections.split_prefix(projection)[1]

@@ -26,19 +26,18 @@ from .map import RETRIEVAL, Map
 
 
 class Localizer:
-    """Localizes photos in a map.
+    """Localizes photos in a map, with the poses of `pipelines.localize`.
 
-    The poses are those of `pipelines.localize`. Of a map image only the keypoints that show a
-    point are matched: the others cannot help.
+    Photos are matched only with keypoints of map images that show a point: the others cannot help.
 
     Args:
-        map_dir: the folder of a map, as `maps.main` or `pipelines.localize` makes it.
-        num_loc: how many of the most similar map images a photo is matched with.
-        ransac_thresh: RANSAC's inlier threshold in pixels.
+        map_dir: the folder of a map from `maps.main` or `pipelines.localize`.
+        num_loc: the number of most similar map images that a photo is matched with.
+        ransac_thresh: RANSAC inlier threshold in pixels.
         gate: what a pose must have to be trusted.
 
     Raises:
-        InputError: when the folder is not a map.
+        InputError: if the folder is not a map.
 
     Example:
         >>> localizer = Localizer("outputs/map")  # doctest: +SKIP
@@ -52,11 +51,11 @@ class Localizer:
         ransac_thresh: float = RANSAC_THRESH,
         gate: Gate = DEFAULT_GATE,
     ):
-        built = Map(map_dir)
+        built = Map(Path(map_dir))
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.preprocessing = built.conf["preprocessing"]
         self.storage, self.cameras = built.storage, built.cameras
-        matcher = matchers_confs.confs[built.matcher]["model"]
+        matcher: dict = matchers_confs.confs[built.matcher]["model"]
         self.ratio_threshold = matcher.get("ratio_threshold")
         self.gate = gate.of_matches(matcher, dimension(built.features))
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -81,20 +80,21 @@ class Localizer:
 
         Args:
             image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-            camera: its intrinsics; default: those of the map's camera if the file's EXIF data tell
-                that it took the photo, else EXIF's or guessed, and estimated with the pose.
+            camera: its intrinsics; default: those of the map's camera if it took the photo, by its
+                EXIF data, else from EXIF data or guessed, and estimated with the pose.
 
         Returns:
             The pose, camera from world, in the units of the map, or None if the photo cannot be
-            localized, for the `reason` in info; and info, as of `localization.localize`, with
-            `points2D` (M, 2) in COLMAP's pixels, `retrieved`, names of map images, best first,
-            `intrinsics` ("given", or as `intrinsics.infer`), and `seconds` by stage.
+            localized, for the `reason` in info; and info as from `localization.query.localize`,
+            with `points2D` (M, 2) in COLMAP's pixels, `retrieved`, names of map images, best first,
+            `intrinsics`, "given" or their source (`intrinsics.infer`), and `seconds` by stage.
 
         Raises:
-            InputError: when the image cannot be read, or the camera is of another size.
+            InputError: if the image cannot be read, or the camera has another size.
         """
         image = image if isinstance(image, np.ndarray) else Path(image)
-        seconds, start = {}, time.perf_counter()
+        seconds: dict[str, float] = {}
+        start = time.perf_counter()
 
         def lap(stage: str) -> None:
             seconds[stage] = time.perf_counter() - start - sum(seconds.values())
@@ -107,10 +107,10 @@ class Localizer:
         width, height = map(int, features["image_size"])
         if (camera.width, camera.height) != (width, height):
             raise InputError(
-                f"The camera is of {camera.width}x{camera.height} pixels, the photo has "
+                f"The camera has {camera.width}x{camera.height} pixels, the photo has "
                 f"{width}x{height}."
             )
-        # as they are in the map
+        # rounded as in the map
         descriptors = torch.from_numpy(restore(*store(features, self.storage)))
         lap("extraction")
         retrieved = self._retrieve(descriptors)
@@ -134,7 +134,7 @@ class Localizer:
     def _retrieve(self, descriptors: torch.Tensor) -> list[str]:
         """Return the names of the map images most similar to local descriptors (N, D)."""
         query = self.vlad({"descriptors": descriptors.T[None]})["global_descriptor"]
-        query = query.half().float().numpy()  # as they are in the map
+        query = query.half().float().numpy()  # rounded as in the map
         return [self.names[j] for j in rank(query, self.global_descriptors, self.num_loc)[0]]
 
     def _match(self, descriptors: torch.Tensor, names: list[str]) -> dict[str, np.ndarray]:

@@ -4,11 +4,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from .. import (
-    aggregate_features,
-    extract_features,
-    projections,
-)
+from .. import aggregate_features, extract_features, projections
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
@@ -19,59 +15,49 @@ from ..utils.feature_files import STORAGES
 from ..utils.h5 import file_provenance, open_h5
 from ..utils.paths import strings_as_paths
 
-FINISHED = "map.json"  # is written when all else is there
+FINISHED = "map.json"  # is written last
 FINGERPRINTS = "fingerprints.json"
 SFM = "sfm"  # the folder of the COLMAP model
-# what is added to the names of what later attempts make: with more keypoints, or without these
+# suffixes of the files of later attempts: with more keypoints, and without
 MORE, FURTHER = "-keypoints_colmap", "-further"
-PLACE = "place.txt"  # stays when the map is built anew
+PLACE = "place.txt"  # stays when the map is rebuilt
 RETRIEVAL = aggregate_features.confs["vlad"]
 
 
 class Map:
-    """A map that `main` made; what it needs is in its folder, which may be moved.
+    """A finished map. All that it needs is in its folder, which may be moved.
 
     Args:
         folder: of the map.
 
+    Attributes:
+        place: an id that stays the same when the map is rebuilt.
+        id: an id of this build.
+        feature: name of the feature.
+        storage: how descriptors are stored, as in `confs.features.get`.
+        keypoints: settings of the DoG detector that were asked for, as in `confs.features.get`;
+            `conf` may have others, which found more keypoints.
+        conf: configuration of the features, for more images.
+        matcher: key of `confs.matchers`.
+        images: folder of the photos.
+        num_images: images with a pose.
+        num_points3D: 3D points.
+        camera_mode: which images share a camera, None for the cameras of a given model.
+        cameras: what the map tells about the intrinsics of other photos.
+        sfm: folder of the COLMAP model.
+        features: feature file of the map images.
+        descriptors: h5 file of their global descriptors.
+        vocabulary: file of the vocabulary of the global descriptors.
+
     Raises:
-        InputError: when the folder is not there, is no map or not a finished one.
+        InputError: if the folder is missing, or is not a finished map.
     """
 
     @strings_as_paths
     def __init__(self, folder: Path):
         self.folder = folder
         try:
-            self.place = (folder / PLACE).read_text()
-            content = json.loads((folder / FINISHED).read_text())
-            self.id = str(content["id"])
-            self.feature = _file_name(content["feature"])
-            self.matcher = choose("matcher", content["matcher"], matchers_confs.confs)
-            self.images = Path(content["image_dir"])
-            self.num_images = int(content["images_with_pose"])
-            self.num_points3D = int(content["points3D"])
-            self.camera_mode = content.get("camera_mode")  # None for the cameras of a model
-            known = content.get("cameras", {}).items()
-            self.cameras = intrinsics.MapCameras(
-                {name: intrinsics.from_list(values) for name, values in known},
-                {(int(width), int(height)) for width, height in content.get("sizes", [])},
-            )
-            conf = content["conf"]
-            self._conf = {
-                "output": _file_name(conf["output"]),
-                "model": dict(conf["model"]),
-                "preprocessing": dict(conf["preprocessing"]),
-            }
-            base = features_confs.base_of(conf["model"])
-            if base["name"] == "dog" and "keypoints" not in base:  # made before these could adapt
-                self._conf["model"] = features_confs.with_keypoints(conf["model"], "hloc")
-            model = self._conf["model"]
-            found = features_confs.base_of(model).get("keypoints", KEYPOINTS[0])
-            self._keypoints = choose("keypoints", content.get("keypoints", found), KEYPOINTS)
-            self._sfm = _file_name(content.get("sfm", SFM))
-            if "storage" in conf:
-                self._conf["storage"] = choose("storage", conf["storage"], STORAGES)
-            with_projection(self._conf, _file_name)
+            self._read(json.loads((folder / FINISHED).read_text()))
         except (OSError, ValueError, KeyError, TypeError):
             if not folder.is_dir():
                 raise no_folder(folder) from None
@@ -79,6 +65,34 @@ class Map:
                 f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}."
             ) from None
         self._check()
+
+    def _read(self, content: dict) -> None:
+        self.place = (self.folder / PLACE).read_text()
+        self.id = str(content["id"])
+        self.feature = _file_name(content["feature"])
+        self.matcher = choose("matcher", content["matcher"], matchers_confs.confs)
+        self.images = Path(content["image_dir"])
+        self.num_images = int(content["images_with_pose"])
+        self.num_points3D = int(content["points3D"])
+        self.camera_mode = content.get("camera_mode")
+        known = content.get("cameras", {}).items()
+        self.cameras = intrinsics.MapCameras(
+            {name: intrinsics.from_list(values) for name, values in known},
+            {(int(width), int(height)) for width, height in content.get("sizes", [])},
+        )
+        conf = dict(content["conf"])
+        conf |= {key: dict(conf[key]) for key in ("model", "preprocessing")}
+        self.storage = choose("storage", conf.get("storage", STORAGES[0]), STORAGES)
+        base = features_confs.base_of(conf["model"])
+        if base["name"] == "dog" and "keypoints" not in base:  # of a version without this setting
+            conf["model"] = features_confs.with_keypoints(conf["model"], "hloc")
+        found = features_confs.base_of(conf["model"]).get("keypoints", KEYPOINTS[0])
+        self.keypoints = choose("keypoints", content.get("keypoints", found), KEYPOINTS)
+        self.conf = with_projection(conf, lambda name: str(self.folder / _file_name(name)))
+        self.sfm = self.folder / _file_name(content.get("sfm", SFM))
+        self.features = self.folder / f"{_file_name(conf['output'])}.h5"
+        self.descriptors = self.folder / f"{RETRIEVAL['output']}_{self.features.stem}.h5"
+        self.vocabulary = aggregate_features.vocabulary_of(self.descriptors)
 
     def _check(self) -> None:
         """Refuse a map that lacks a file, or has a broken one, before any work is done in it."""
@@ -104,23 +118,18 @@ class Map:
         except InputError as error:
             raise InputError(
                 f"The map {self.folder} is broken: {str(error).rstrip('.')}. Copy it again, or "
-                "build it anew with --overwrite."
+                "build it again with --overwrite."
             ) from None
-
-    @property
-    def conf(self) -> dict:
-        """The configuration of the map's features, for more images."""
-        return with_projection(self._conf, lambda name: str(self.folder / name))
 
     def check_feature(self, feature: str, projection: Path | None = None) -> None:
         """Refuse a feature that is not the map's.
 
         Args:
             feature: as in `confs.features.get`.
-            projection: likewise.
+            projection: as in `confs.features.get`.
 
         Raises:
-            InputError: if it is another, or has the same name but another projection.
+            InputError: if it is another one, or has the same name but another projection.
         """
         name, conf = features_confs.get(feature, projection, self.storage, self.keypoints)
         made_by = extract_features.provenance(conf)
@@ -131,53 +140,20 @@ class Map:
                 "Leave it out to localize in this map."
             )
 
-    @property
-    def storage(self) -> str:
-        """How descriptors are kept, as in `confs.features.get`."""
-        return self._conf.get("storage", STORAGES[0])
-
-    @property
-    def keypoints(self) -> str:
-        """The settings of the DoG detector that were asked for, as in `confs.features.get`.
-
-        `conf` may have others, which found more keypoints.
-        """
-        return self._keypoints
-
-    @property
-    def sfm(self) -> Path:
-        """The folder of the COLMAP model."""
-        return self.folder / self._sfm
-
-    @property
-    def features(self) -> Path:
-        """The feature file of the map images."""
-        return self.folder / f"{self._conf['output']}.h5"
-
-    @property
-    def descriptors(self) -> Path:
-        """The h5 file of the global descriptors of the map images."""
-        return self.folder / f"{RETRIEVAL['output']}_{self.features.stem}.h5"
-
-    @property
-    def vocabulary(self) -> Path:
-        """The file of the vocabulary of the global descriptors."""
-        return aggregate_features.vocabulary_of(self.descriptors)
-
     def names(self) -> list[str]:
         """List the images that have a pose."""
         return sorted(image.name for image in colmap.read_model(self.sfm).images.values())
 
 
 def _file_name(name: str) -> str:
-    """Return a name that leads out of no folder, or raise a ValueError."""
+    """Return a name, or raise a ValueError if it is a path that leads out of a folder."""
     if Path(name).name != name:
         raise ValueError(f"{name!r} is not the name of a file")
     return name
 
 
 def with_projection(conf: dict, change: Callable[[str], str]) -> dict:
-    """Return the configuration of a feature with another path of its projection, if it has one."""
+    """Return the configuration of a feature with a changed path of its projection, if any."""
     model = dict(conf["model"])
     if model.get("projection") is not None:
         model["projection"] = change(model["projection"])
@@ -185,5 +161,5 @@ def with_projection(conf: dict, change: Callable[[str], str]) -> dict:
 
 
 def is_map(folder: Path) -> bool:
-    """Return whether a folder is a map of `main`'s, finished or not, rather than a COLMAP model."""
+    """Return whether a folder is a map, finished or not, rather than a COLMAP model."""
     return any((folder / name).exists() for name in (FINISHED, FINGERPRINTS))
