@@ -1,4 +1,4 @@
-"""Global descriptors made of local features."""
+"""Global descriptors aggregated from local features."""
 
 from hloc_reduce.confs.retrieval import confs
 

@@ -29,7 +29,7 @@ interrupts.while_importing()
 
 
 def __getattr__(name: str) -> "type[Localizer]":
-    """Import `Localizer` when it is asked for: it takes seconds."""
+    """Import `Localizer` on first use: it takes seconds."""
     if name == "Localizer":
         from .maps.localizer import Localizer
 
@@ -42,7 +42,7 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
 
     Args:
         patches: (N, 1, 32, 32) float in [0, 1], on any device.
-        feature: a base descriptor, for example "sift", or one with a projection that ships.
+        feature: a base descriptor such as "sift", or one with a shipped projection.
 
     Returns:
         (N, D) float32 of unit norm, on the same device.
@@ -64,7 +64,7 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
 
     if not isinstance(patches, torch.Tensor):
         raise ValueError(f"Patches are a torch.Tensor, not {type(patches).__name__}.")
-    if patches.ndim != 4 or patches.shape[1:] != (1, 32, 32) or not patches.is_floating_point():
+    if patches.shape[1:] != (1, 32, 32) or not patches.is_floating_point():
         raise ValueError(
             f"Patches are (N, 1, 32, 32) float in [0, 1], not {tuple(patches.shape)} "
             f"{patches.dtype}."
@@ -79,18 +79,19 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
 def register(features: "Iterable[Path] | Path" = ()) -> list[str]:
     """Add this project's extractors, features and matchers to the installed hloc.
 
-    After it hloc's `dynamic_load` finds the extractors `reduced` and `vlad`, and the confs of
-    `hloc.extract_features` and `hloc.match_features` have the entries of `confs`. What hloc has
-    already stays as it is, its `sift`, too; a second call changes nothing.
+    Afterwards hloc's `dynamic_load` finds the extractors `reduced` and `vlad`, and the confs of
+    `hloc.extract_features` and `hloc.match_features` have the entries of `confs`. hloc's own
+    entries, such as `sift`, do not change. A second call changes nothing.
 
     Args:
-        features: YAML files of more features, each called as its file.
+        features: YAML files of more features, named after their files.
 
     Returns:
-        The names of the confs that were added.
+        The names of the added confs.
 
     Raises:
-        InputError: when hloc is missing, too old or cannot be imported, or a file is no feature's.
+        InputError: when hloc is missing, too old or cannot be imported, or a file is not the
+            configuration of a feature.
     """
     from . import hloc
 

@@ -1,4 +1,4 @@
-"""Aggregate local features into global descriptors, for retrieval without any weights."""
+"""Aggregate local features into global descriptors, for retrieval without trained weights."""
 
 import argparse
 from pathlib import Path
@@ -34,17 +34,17 @@ def main(
     Args:
         conf: an entry of `confs`.
         features: feature file.
-        vocabulary_images: the images whose features a vocabulary is learned from: the map's.
-        export_dir: where `<conf["output"]>_<features>.h5` and the vocabulary go; default: beside
+        vocabulary_images: the images to learn a vocabulary from: those of the map.
+        export_dir: folder of `<conf["output"]>_<features>.h5` and the vocabulary; default: that of
             the features.
-        overwrite: learn and compute anew what is there.
-        vocabulary: file of a vocabulary to use instead, such as the map's for queries.
+        overwrite: learn the vocabulary and compute all descriptors again.
+        vocabulary: file of an existing vocabulary, such as the map's for queries.
 
     Returns:
         The h5 file of global descriptors, `global_descriptor` (G,) float16 of unit norm.
 
     Raises:
-        InputError: when the images have no features to learn a vocabulary from.
+        InputError: when there are no features to learn a vocabulary from.
     """
     import torch
     from safetensors.torch import save
@@ -52,27 +52,29 @@ def main(
     from . import aggregators
     from .aggregators.vlad import read_vocabulary
 
-    output = Path(export_dir or features.parent) / f"{conf['output']}_{features.stem}.h5"
+    output = (export_dir or features.parent) / f"{conf['output']}_{features.stem}.h5"
     model = aggregators.load(conf["model"]).eval()
+    failed = failures(features)
+    names = [name for name in list_h5_names(features) if name not in failed]
+    made_by = {"model": conf["model"]}
+    if vocabulary is not None:
+        made_by["vocabulary"] = file_sha256(vocabulary)
     with open_h5(features) as file:
-        made_by = {"model": conf["model"], "features": file_provenance(file)}
-        learn = vocabulary is None
-        if learn:
-            vocabulary = vocabulary_of(output)
-        else:
-            made_by["vocabulary"] = file_sha256(vocabulary)
+        made_by["features"] = file_provenance(file)
         with GroupWriter(output, made_by, overwrite) as writer:
-            failed = failures(features)
-            names = [name for name in list_h5_names(features) if name not in failed]
             todo = [name for name in names if name not in writer]
             if not todo:
                 return output
-            if learn and (overwrite or not vocabulary.exists()):
-                if len(todo) < len(names):
-                    raise InputError(f"The vocabulary {vocabulary} of {output} is gone: overwrite.")
-                model.fit(_sample(file, vocabulary_images, conf["model"]["max_samples"]))
-                with replacing(vocabulary) as temporary:
-                    temporary.write_bytes(save({"vocabulary": model.vocabulary}))
+            if vocabulary is None:
+                vocabulary = vocabulary_of(output)
+                if overwrite or not vocabulary.exists():
+                    if len(todo) < len(names):
+                        raise InputError(
+                            f"The vocabulary {vocabulary} of {output} is gone: overwrite."
+                        )
+                    model.fit(_sample(file, vocabulary_images or [], conf["model"]["max_samples"]))
+                    with replacing(vocabulary) as temporary:
+                        temporary.write_bytes(save({"vocabulary": model.vocabulary}))
             model.vocabulary = read_vocabulary(vocabulary)
             for name in progress(todo, "Aggregating", "image"):
                 local = torch.from_numpy(get_descriptors(file, name).T)
@@ -86,21 +88,21 @@ def main(
 
 
 def files_of(features: Path) -> list[Path]:
-    """Return the files and folders that `main` may write beside a feature file."""
+    """Return the files and folders that `main` may write next to a feature file."""
     descriptors = features.with_name(f"{confs['vlad']['output']}_{features.stem}.h5")
     pieces = descriptors.with_name(f"{descriptors.name}.pieces")
     return [descriptors, pieces, vocabulary_of(descriptors)]
 
 
 def vocabulary_of(descriptors: Path) -> Path:
-    """Return the file of the vocabulary that was learned for a file of global descriptors."""
+    """Return the file of the vocabulary learned for a file of global descriptors."""
     return descriptors.with_suffix(".vocabulary.safetensors")
 
 
 def _sample(file: h5py.File, names: list[str], max_samples: int) -> np.ndarray:
     """Read an even share of each image's descriptors: (N, D), about `max_samples` at most."""
     share = -(-max_samples // max(len(names), 1))
-    samples = []
+    samples: list[np.ndarray] = []
     for name in names:
         descriptors = get_descriptors(file, name)
         if samples and descriptors.shape[1] != samples[0].shape[1]:
@@ -125,7 +127,7 @@ def _main() -> None:
     parser.add_argument("--model", type=Path, required=True, help="COLMAP model of the map images")
     parser.add_argument("--conf", default="vlad", help=f"one of {', '.join(confs)}")
     parser.add_argument("--export_dir", type=Path, help="folder for the output")
-    parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
+    parser.add_argument("--overwrite", action="store_true", help="compute all descriptors again")
     args = parser.parse_args()
     images = [image.name for image in colmap.read_model(args.model).images.values()]
     conf = confs[cli.choose("aggregation", args.conf, confs)]

@@ -1,11 +1,12 @@
 """Extract local features from images into an h5 file."""
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import BrokenExecutor, Future
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from . import logger, projections
 from .confs import features as features_confs
 from .descriptors import DESCRIPTORS, check_weights
 from .runtime import parallel, processes
-from .runtime.executors import SERIAL, Executor
+from .runtime.executors import SERIAL, Executor, Results
 from .runtime.group_writer import FAILURE, Group, GroupWriter, failures, fill
 from .runtime.trace import span
 from .utils import cli
@@ -24,9 +25,12 @@ from .utils.parsers import image_names
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
+if TYPE_CHECKING:
+    from .extractors import Detect, Extractor
+
 confs = features_confs.confs
 CHUNK = 8  # images
-BLACK = 32  # pixels, the sides of what stands for an image that cannot be read
+BLACK = np.zeros((32, 32), np.uint8)  # extracted instead of an image that cannot be read
 
 
 @strings_as_paths
@@ -45,24 +49,25 @@ def main(
 
     Args:
         conf: an entry of `confs`.
-        image_dir: the folder that the image names are relative to.
-        export_dir: where `<conf["output"]>.h5` goes.
-        as_half: store everything but keypoints as float16, unless `conf` says how.
+        image_dir: the folder that image names are relative to.
+        export_dir: folder of the feature file, `<conf["output"]>.h5`.
+        as_half: store everything but keypoints as float16, unless `conf` has a `storage`.
         image_list: names, or a text file of them; default: every image of the folder.
-        feature_path: the h5 file itself, instead of `export_dir`.
-        overwrite: extract anew what is there.
-        executor: does the work.
+        feature_path: the feature file itself, instead of `export_dir`.
+        overwrite: extract all features again.
+        executor: runs the extraction.
         strict: stop at an image that cannot be read, instead of recording the failure.
 
     Returns:
-        The feature file; images it holds already are skipped.
+        The feature file. Images that it has already are skipped.
 
     Raises:
-        InputError: for an unknown storage, or if `strict` for an image that is not there or cannot
-            be read.
+        InputError: for an unknown storage or, if `strict`, a missing or unreadable image.
     """
     if feature_path is None:
-        feature_path = Path(export_dir) / f"{conf['output']}.h5"
+        if export_dir is None:
+            raise InputError("Give --export_dir or --feature_path.")
+        feature_path = export_dir / f"{conf['output']}.h5"
     stored = {"storage": "float16" if as_half else "float32", **conf}
     cli.choose("storage", stored["storage"], STORAGES)
     if strict or image_list is None:
@@ -88,29 +93,26 @@ def extract_several(
     Keypoints are detected once, and each base descriptor is computed once for all its projections.
 
     Args:
-        features: from feature file to the configuration, with `storage`, and the writer; all with
-            the same keypoints (`extractors.Extractor.detection`) and preprocessing.
+        features: from feature file to its configuration, with `storage`, and its writer. All have
+            the same preprocessing and the same keypoints (`extractors.Extractor.detection`).
         image_dir: the folder that names are relative to.
-        names: the images; a file's own are skipped.
-        executor: does the work.
-        strict: stop at an image that cannot be read. Else it has the features of a black one, and
-            a `group_writer.FAILURE`; a later run tries to read it again.
+        names: the images; those that a file has already are skipped.
+        executor: runs the extraction.
+        strict: stop at an image that cannot be read. Otherwise it gets the features of a black
+            image and a `group_writer.FAILURE`, and a later run tries to read it again.
 
     Raises:
-        UnreadableImage: as said.
+        UnreadableImage: if `strict`.
     """
     confs = {path: conf for path, (conf, _) in features.items()}
     writers = {path: writer for path, (_, writer) in features.items()}
-    wanted = (
-        (name, [path for path, writer in writers.items() if name not in writer]) for name in names
-    )
-    todo = [(name, paths) for name, paths in wanted if paths]
+    missing = [(name, [path for path in writers if name not in writers[path]]) for name in names]
+    todo = [(name, paths) for name, paths in missing if paths]
     if todo:
-        work = partial(_extract, confs, image_dir, strict)
-        # counts files: an image is as many as are wanted of it
-        number = sum(len(paths) for _, paths in todo)
-        with closing(fill(writers, work, todo, executor, CHUNK, gpu=True)) as done:
-            for _ in progress(done, "Extracting features", "image", number):
+        extract = partial(_extract, confs, image_dir, strict)
+        groups = sum(len(paths) for _, paths in todo)
+        with closing(fill(writers, extract, todo, executor, CHUNK, gpu=True)) as written:
+            for _ in progress(written, "Extracting features", "image", groups):
                 pass
     for path in writers:
         logger.info("Features of %d images are in %s.", len(names), path)
@@ -121,11 +123,11 @@ def _extract(
     image_dir: Path,
     strict: bool,
     items: Iterable[tuple[str, list[Path]]],
-) -> Iterator[tuple[Path, Group]]:
-    """Yield the features of images, for each the wanted ones, as files keep them.
+) -> Results[tuple[Path, Group]]:
+    """Yield the groups of images for those feature files that lack them.
 
-    COLMAP's detector lets no other thread of its process run, so what an extractor detects apart
-    is detected in processes.
+    COLMAP's detector blocks the other threads of its process, so several images are detected in
+    processes and described in threads.
     """
     import torch
 
@@ -133,93 +135,95 @@ def _extract(
 
     items, preprocessing = list(items), next(iter(confs.values()))["preprocessing"]
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    models = {path: extractors.load(conf["model"]).eval() for path, conf in confs.items()}
-    models = {path: model.to(device) for path, model in models.items()}
-
-    def work(item: tuple[str, list[Path]], detect: Callable | None = None) -> list:
-        name, paths = item
-        wanted = [models[path] for path in paths]
-        extract = partial(extractors.extract_several, wanted, device=device, detect=detect)
-        failure = None
-        try:
-            found = extract(image_dir / name, preprocessing)
-        except UnreadableImage as error:
-            if strict:
-                raise
-            failure = str(error)
-            found = extract(np.zeros((BLACK, BLACK), np.uint8), preprocessing)
-        groups = [
-            _to_group(name, features, confs[path]["storage"], failure)
-            for path, features in zip(paths, found, strict=True)
-        ]
-        return list(zip(paths, groups, strict=True))
-
-    workers, detect = min(parallel.cores(), len(items)), next(iter(models.values())).detect
-    if workers == 1 or detect is None:
-        for item in items:
-            with span("extract"):
-                groups = work(item)
+    models = {path: extractors.load(confs[path]["model"]).eval().to(device) for path in confs}
+    storages = {path: confs[path]["storage"] for path in confs}
+    detect = next(iter(models.values())).detect
+    workers = min(parallel.cores(), len(items)) if detect else 1
+    with ExitStack() as stack:
+        if detect and workers > 1:
+            submit = stack.enter_context(processes.pool(workers)).submit
+            detect = partial(_detect_elsewhere, submit, detect)
+        extract = partial(
+            extractors.extract_several, preprocessing=preprocessing, device=device, detect=detect
+        )
+        work = partial(_extract_image, extract, models, storages, image_dir, strict)
+        extracted: Iterable[list[tuple[Path, Group]]]
+        if workers == 1:
+            extracted = map(span("extract")(work), items)
+        else:
+            results = parallel.ordered("extract", work, items, workers)
+            extracted = stack.enter_context(closing(results))
+        for groups in extracted:
             yield from groups
-        return
-    with _in_processes(detect, workers) as detect:
-        results = parallel.ordered("extract", partial(work, detect=detect), items, workers)
-        with closing(results):  # at once if writing fails: it has processes
-            for groups in results:
-                yield from groups
 
 
-@contextmanager
-def _in_processes(detect: Callable, workers: int) -> Iterator[Callable]:
-    """Give a function that does in processes what another does here."""
-    with processes.pool(workers) as pool:
-
-        def detect_there(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            try:
-                with span("detect"):
-                    return pool.submit(detect, image).result()
-            except BrokenExecutor:
-                raise InputError(
-                    "A process that detects keypoints was killed, perhaps for want of memory: "
-                    "try fewer cores, for example OMP_NUM_THREADS=1. What is written is kept."
-                ) from None
-
-        yield detect_there
+def _detect_elsewhere(
+    submit: Callable[..., Future], detect: "Detect", image: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Detect keypoints in the process that a function is submitted to."""
+    try:
+        with span("detect"):
+            return submit(detect, image).result()
+    except BrokenExecutor:
+        raise InputError(
+            "A process that detects keypoints was killed, perhaps for lack of memory: use fewer "
+            "cores, for example with OMP_NUM_THREADS=1. Finished work is kept."
+        ) from None
 
 
-def _to_group(
-    name: str, features: dict[str, np.ndarray], storage: str, failure: str | None
-) -> Group:
-    """Return the features of an image as a file keeps them."""
-    if failure:
+def _extract_image(
+    extract: Callable[..., list[dict[str, np.ndarray]]],
+    models: Mapping[Path, "Extractor"],
+    storages: Mapping[Path, str],
+    image_dir: Path,
+    strict: bool,
+    item: tuple[str, list[Path]],
+) -> list[tuple[Path, Group]]:
+    """Extract the features of one image for some feature files, and return their groups."""
+    name, paths = item
+    wanted, failure = [models[path] for path in paths], None
+    try:
+        extracted = extract(wanted, image_dir / name)
+    except UnreadableImage as error:
+        if strict:
+            raise
+        failure = str(error)
+        extracted = extract(wanted, BLACK)
         logger.warning(failure)
-    elif len(features["keypoints"]) == 0:
+    if failure is None and len(extracted[0]["keypoints"]) == 0:
         logger.warning("Image %s has no keypoints.", name)
-    arrays, attrs = store({k: v for k, v in features.items() if k != "uncertainty"}, storage)
-    attrs["keypoints"] = {"uncertainty": features["uncertainty"]}
-    return name, arrays, attrs | ({"": {FAILURE: failure}} if failure else {})
+    groups = []
+    for path, features in zip(paths, extracted, strict=True):
+        uncertainty = features.pop("uncertainty")
+        arrays, attrs = store(features, storages[path])
+        attrs["keypoints"] = {"uncertainty": uncertainty}
+        if failure is not None:
+            attrs[""] = {FAILURE: failure}
+        groups.append((path, (name, arrays, attrs)))
+    return groups
 
 
 def provenance(conf: dict, as_half: bool = True) -> dict:
     """Return what determines the features: the configuration and the projection's checksum.
 
     Raises:
-        InputError: when the projection or the weights of its base descriptor are not to be had.
+        InputError: when the projection or the weights of its base descriptor cannot be found.
     """
     made_by = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
     if "storage" in conf:
         made_by["storage"] = conf["storage"]
     if (projection := conf["model"].get("projection")) is not None:
-        # a file may be moved
+        # the name only, as the file may be moved
         made_by["model"] = {**conf["model"], "projection": Path(projection).name}
         made_by["projection_sha256"] = projections.checksum(projection)
     descriptor = features_confs.descriptor_of(conf["model"])
-    if descriptor in list(DESCRIPTORS):  # a wrong one may be of any kind
+    if descriptor in list(DESCRIPTORS):  # one from a YAML file may be unhashable
         check_weights(descriptor)
     return made_by
 
 
 def check_model(conf: dict) -> None:
-    """Fail for a bad configuration of a feature before anything is deleted.
+    """Fail on a bad configuration of a feature before deleting anything.
 
     Raises:
         InputError: when its extractor cannot be made.
@@ -230,51 +234,47 @@ def check_model(conf: dict) -> None:
 
 
 def keep_present(image_dir: Path, names: list[str], accept_partial: bool) -> list[str]:
-    """Return the images of a map whose files are there.
+    """Return the images of a map whose files exist.
 
     Args:
         image_dir: the folder that names are relative to.
         names: the images of the map.
-        accept_partial: leave out those that are not there.
+        accept_partial: leave out missing images.
 
     Raises:
-        InputError: when one is missing that may not be left out, or all are.
+        InputError: when an image is missing and `accept_partial` is not set, or all are missing.
     """
     absent = [name for name in names if not (image_dir / name).is_file()]
-    if absent and (not accept_partial or len(absent) == len(names)):
-        raise InputError(
-            f"{len(absent)} of {len(names)} images of the map are not in {image_dir}: "
-            f"{cli.some(absent)}."
-            + (" Give --accept_partial to do without them." if len(absent) < len(names) else "")
-        )
-    return _without(names, absent)
+    return _without(absent, names, accept_partial, f"are not in {image_dir}: {cli.some(absent)}")
 
 
 def keep_readable(features: Path, names: list[str], accept_partial: bool) -> list[str]:
-    """Return the images of a map that could be read, as its feature file tells.
+    """Return the images of a map that could be read, according to its feature file.
 
     Args:
         features: feature file, made without `strict`.
         names: the images of the map.
-        accept_partial: leave out those that could not be read.
+        accept_partial: leave out unreadable images.
 
     Raises:
-        InputError: when one could not be read that may not be left out, or all could not.
+        InputError: when an image is unreadable and `accept_partial` is not set, or all are
+            unreadable.
     """
     failed = failures(features)
-    broken = [name for name in names if name in failed]
-    if broken and (not accept_partial or len(broken) == len(names)):
+    broken = {name: failed[name] for name in names if name in failed}
+    return _without(list(broken), names, accept_partial, f"cannot be read: {with_reasons(broken)}")
+
+
+def _without(left_out: list[str], names: list[str], accept_partial: bool, reason: str) -> list[str]:
+    """Return the other images of a map, if it may do without some."""
+    if not left_out:
+        return names
+    if not accept_partial or len(left_out) == len(names):
         raise InputError(
-            f"{len(broken)} of {len(names)} images of the map cannot be read: "
-            f"{with_reasons({name: failed[name] for name in broken})}."
-            + (" Give --accept_partial to do without them." if len(broken) < len(names) else "")
+            f"{len(left_out)} of {len(names)} images of the map {reason}."
+            + (" Give --accept_partial to do without them." if len(left_out) < len(names) else "")
         )
-    return _without(names, broken)
-
-
-def _without(names: list[str], left_out: list[str]) -> list[str]:
-    if left_out:
-        logger.warning("The map is without %d images: %s.", len(left_out), cli.some(left_out))
+    logger.warning("The map is without %d images: %s.", len(left_out), cli.some(left_out))
     dropped = set(left_out)
     return [name for name in names if name not in dropped]
 
@@ -301,13 +301,11 @@ def _main() -> None:
         default=features_confs.RECOMMENDED,
         help="feature, see pipelines.aachen --list_features, or a YAML file of one",
     )
-    parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
+    parser.add_argument("--image_list", type=Path, help="text file of names, one per line")
     features_confs.add_storage_option(parser)
     features_confs.add_keypoints_option(parser)
-    parser.add_argument("--overwrite", action="store_true", help="extract anew what is there")
+    parser.add_argument("--overwrite", action="store_true", help="extract all features again")
     args = parser.parse_args()
-    if args.export_dir is None and args.feature_path is None:
-        raise InputError("Give --export_dir or --feature_path.")
     _, conf = features_confs.get(args.conf, storage=args.storage, keypoints=args.keypoints)
     main(
         conf,

@@ -3,10 +3,11 @@
 import argparse
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -15,8 +16,8 @@ from . import logger
 from .confs import features as features_confs
 from .confs import matchers as matchers_confs
 from .runtime import parallel
-from .runtime.executors import SERIAL, Executor
-from .runtime.group_writer import Group, GroupWriter, fill
+from .runtime.executors import SERIAL, Executor, Results
+from .runtime.group_writer import Arrays, Group, GroupWriter, fill
 from .utils import cli
 from .utils.cli import InputError
 from .utils.feature_files import get_descriptors
@@ -26,10 +27,15 @@ from .utils.parsers import parse_pairs
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
+if TYPE_CHECKING:
+    from .matchers import Matcher
+
 confs = matchers_confs.confs
-CACHE_BYTES = 2**30  # descriptors that stay in memory: of 500 images at 8,000 x 64
+CACHE_BYTES = 2**30  # descriptors in memory: 500 images of 8,000 x 64
 CHUNK = 64  # pairs
-PAIRS_ON_GPU = 16  # handed to a GPU at once, which matches as many together as its memory allows
+PAIRS_ON_GPU = 16  # given to a matcher at once, which batches as many as its memory allows
+
+DescribedPair = tuple[str, np.ndarray, np.ndarray]  # name of its group, descriptors (N, D), (M, D)
 
 
 @strings_as_paths
@@ -46,21 +52,21 @@ def main(
 ) -> Path:
     """Match all pairs of a list, each unordered pair once.
 
-    With another file of the second images, whose names may be those of the first, each pair once.
+    With `features_ref`, whose images may have the same names, match each ordered pair once.
 
     Args:
         conf: an entry of `confs`.
         pairs: text file of pairs.
         features: feature file, or its name in `export_dir` without suffix.
         export_dir: folder of the features and of `<features>_<conf["output"]>_<pairs>.h5`.
-        matches: the match file itself; needed where `features` is a path.
+        matches: the match file itself; needed if `features` is a path.
         features_ref: feature file of the second images; default: `features`.
-        overwrite: match anew what is there.
-        gpu_bytes: what a matcher may take of the memory of a GPU at once; default: 1 GiB.
-        executor: does the work.
+        overwrite: match all pairs again.
+        gpu_bytes: GPU memory that a matcher may use at once; default: 1 GiB.
+        executor: runs the matching.
 
     Returns:
-        The match file; pairs it holds already are skipped.
+        The match file. Pairs that it has already are skipped.
 
     Raises:
         InputError: for an image without features, or no path for the matches.
@@ -70,32 +76,36 @@ def main(
     number = sum(1 for _ in parse_pairs(pairs))
     if not number:
         raise InputError(f"{pairs} has no pair.")
-    if isinstance(features, Path) or Path(features).exists():
-        feature_path = Path(features)
-        if matches is None:
-            raise InputError("Give the path of the matches, --matches, as the features have one.")
-    elif export_dir is None:
-        raise InputError(f"There is no feature file {features}, and no export_dir to look in.")
-    else:
-        name = str(features).removesuffix(".h5")
-        feature_path = Path(export_dir, f"{name}.h5")
-        matches = matches or Path(export_dir, f"{name}_{conf['output']}_{pairs.stem}.h5")
+    feature_path, matches = _paths(conf, pairs, features, export_dir, matches)
     if matches.resolve() in {path.resolve() for path in (feature_path, features_ref or pairs)}:
-        raise InputError(f"{matches} is what the matches are made of: choose other --matches.")
+        raise InputError(f"{matches} is an input of the matching: choose other --matches.")
     feature_paths = feature_path, features_ref or feature_path
-    with ExitStack() as stack:
-        files = [stack.enter_context(open_h5(path)) for path in feature_paths]
-        made_by = provenance(conf, *files)
+    with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
+        made_by = provenance(conf, file0, file1)
     with GroupWriter(matches, made_by, overwrite, compression="gzip") as writer:
         listed = progress(parse_pairs(pairs), "Matching", "pair", number)
         todo = unmatched_pairs(listed, writer, ordered=features_ref not in (None, feature_path))
-        work = partial(_match, conf, feature_paths, gpu_bytes)
-        done = fill({None: writer}, work, todo, executor, CHUNK, gpu=True)
-        with listed, closing(done):
+        match = partial(_match, conf, feature_paths, gpu_bytes)
+        with listed, closing(fill({None: writer}, match, todo, executor, CHUNK, gpu=True)) as done:
             for _ in done:
                 pass
     logger.info("Matches of the pairs %s are in %s.", pairs.name, matches)
     return matches
+
+
+def _paths(
+    conf: dict, pairs: Path, features: Path | str, export_dir: Path | None, matches: Path | None
+) -> tuple[Path, Path]:
+    """Return the paths of the features and the matches."""
+    if isinstance(features, Path) or Path(features).exists():
+        if matches is None:
+            raise InputError("Give the path of the matches, --matches, as the features have one.")
+        return Path(features), matches
+    if export_dir is None:
+        raise InputError(f"There is no feature file {features}, and no export_dir to look in.")
+    name = features.removesuffix(".h5")
+    matches = matches or export_dir / f"{name}_{conf['output']}_{pairs.stem}.h5"
+    return export_dir / f"{name}.h5", matches
 
 
 def provenance(conf: dict, *feature_files: h5py.File) -> dict:
@@ -115,7 +125,7 @@ def unmatched_pairs(
     """
     for name0, name1 in pairs:
         same = [(name0, name1)] if ordered else [(name0, name1), (name1, name0)]
-        # the second separator is of hloc's old format
+        # the second separator is that of hloc's old format
         if any(names_to_pair(*names, mark) in matched for names in same for mark in "/_"):
             continue
         matched.begin(names_to_pair(name0, name1))
@@ -127,62 +137,61 @@ def _match(
     feature_paths: tuple[Path, Path],
     gpu_bytes: int | None,
     pairs: Iterable[tuple[str, str]],
-) -> Iterator[tuple[None, Group]]:
-    """Match pairs while others are read and written, which this thread does."""
+) -> Results[tuple[None, Group]]:
+    """Yield the groups of pairs: this thread reads and yields while others match."""
     import torch
 
     from . import matchers
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    matcher = matchers.load(conf["model"]).eval().to(device)
-    read = DescriptorCache(CACHE_BYTES)
-    drawn = iter(pairs)
     size, workers = (1, parallel.cores()) if device == "cpu" else (PAIRS_ON_GPU, 1)
-
-    def match(
-        batch: tuple[list[str], list[tuple[np.ndarray, np.ndarray]]],
-    ) -> list[tuple[str, dict[str, np.ndarray]]]:
-        groups, descriptors = batch
-        moved = {
-            id(part): torch.from_numpy(part).to(device) for pair in descriptors for part in pair
-        }
-        on_device = [(moved[id(part0)], moved[id(part1)]) for part0, part1 in descriptors]
-        matched = [
-            {
-                "matches0": matches.cpu().numpy().astype(np.int32),
-                "matching_scores0": scores.cpu().numpy().astype(np.float16),
-            }
-            for matches, scores in matcher.match(on_device, gpu_bytes or matchers.GPU_BYTES)
-        ]
-        return list(zip(groups, matched, strict=True))
-
+    matcher = matchers.load(conf["model"]).eval().to(device)
+    match = partial(_match_batch, matcher, device, gpu_bytes or matchers.GPU_BYTES)
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
+        described = map(partial(_describe, DescriptorCache(CACHE_BYTES), file0, file1), pairs)
+        batches = iter(lambda: list(islice(described, size)), [])
+        with closing(parallel.ordered("match", match, batches, workers)) as matched:
+            for groups in matched:
+                yield from groups
 
-        def read_pair(name0: str, name1: str) -> tuple[np.ndarray, np.ndarray]:
-            pair = read(file0, name0), read(file1, name1)
-            if pair[0].shape[1] != pair[1].shape[1]:
-                raise InputError(
-                    f"{file1.filename}: the descriptors of {name1} are {pair[1].shape[1]}-D, those "
-                    f"of {name0} {pair[0].shape[1]}-D."
-                )
-            return pair
 
-        def draw() -> Iterator[tuple[list[str], list[tuple[np.ndarray, np.ndarray]]]]:
-            while batch := list(islice(drawn, size)):
-                groups = [names_to_pair(*names) for names in batch]
-                yield groups, [read_pair(*names) for names in batch]
+def _describe(
+    read: "DescriptorCache", file0: h5py.File, file1: h5py.File, pair: tuple[str, str]
+) -> DescribedPair:
+    """Read the descriptors of a pair."""
+    descriptors0, descriptors1 = read(file0, pair[0]), read(file1, pair[1])
+    if descriptors0.shape[1] != descriptors1.shape[1]:
+        raise InputError(
+            f"{file1.filename}: the descriptors of {pair[1]} are {descriptors1.shape[1]}-D, those "
+            f"of {pair[0]} are {descriptors0.shape[1]}-D."
+        )
+    return names_to_pair(*pair), descriptors0, descriptors1
 
-        with closing(parallel.ordered("match", match, draw(), workers)) as results:
-            for batch in results:
-                for group, arrays in batch:
-                    yield None, (group, arrays, {})
+
+def _match_batch(
+    matcher: "Matcher", device: str, gpu_bytes: int, batch: list[DescribedPair]
+) -> list[tuple[None, Group]]:
+    """Match pairs and return their groups."""
+    import torch
+
+    arrays = {id(array): array for _, *pair in batch for array in pair}  # pairs share images
+    moved = {key: torch.from_numpy(array).to(device) for key, array in arrays.items()}
+    found = matcher.match([(moved[id(a)], moved[id(b)]) for _, a, b in batch], gpu_bytes)
+    groups: list[tuple[None, Group]] = []
+    for (name, _, _), (matches, scores) in zip(batch, found, strict=True):
+        matched: Arrays = {
+            "matches0": matches.cpu().numpy().astype(np.int32),
+            "matching_scores0": scores.cpu().numpy().astype(np.float16),
+        }
+        groups.append((None, (name, matched, {})))
+    return groups
 
 
 class DescriptorCache:
-    """Reads descriptors and keeps those used last in memory.
+    """Reads descriptors and keeps the last used ones in memory.
 
     Args:
-        max_bytes: how much memory they may take.
+        max_bytes: maximum size of the descriptors in memory.
     """
 
     def __init__(self, max_bytes: int):
@@ -219,12 +228,12 @@ def _main() -> None:
     parser.add_argument("--export_dir", type=Path, required=True, help="folder of the features")
     parser.add_argument("--matches", type=Path, help="the match file itself")
     parser.add_argument("--conf", default="NN-ratio", help=f"one of {', '.join(confs)}")
-    parser.add_argument("--overwrite", action="store_true", help="match anew what is there")
+    parser.add_argument("--overwrite", action="store_true", help="match all pairs again")
     parser.add_argument(
         "--gpu_bytes",
         type=int,
-        help="bytes of a GPU's memory that a matcher may take at once (default: 1 GiB); without a "
-        "GPU it means nothing",
+        help="GPU memory in bytes that a matcher may use at once (default: 1 GiB); ignored without "
+        "a GPU",
     )
     args = parser.parse_args()
     args.conf = confs[cli.choose("matcher", args.conf, confs)]

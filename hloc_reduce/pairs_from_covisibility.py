@@ -1,4 +1,4 @@
-"""Pair each image of a COLMAP model with those that see most of the same points."""
+"""Pair each image of a COLMAP model with the images that share most points with it."""
 
 import argparse
 from collections.abc import Iterable, Iterator
@@ -12,7 +12,7 @@ from .utils import cli, colmap
 from .utils.parsers import write_pairs
 from .utils.paths import strings_as_paths
 
-BLOCK = 256  # images whose counts with all others are in memory at once
+BLOCK = 256  # images whose covisibility with all others is computed at once
 
 
 @strings_as_paths
@@ -22,13 +22,13 @@ def main(model: Path, output: Path, num_matched: int) -> Path:
     Args:
         model: COLMAP model folder.
         output: text file of pairs.
-        num_matched: pairs an image, at most.
+        num_matched: maximum number of pairs per image.
 
     Returns:
         `output`.
 
     Raises:
-        InputError: when there is no model or it has no covisible images.
+        InputError: when there is no model, or no images of it are covisible.
     """
     if num_matched < 1:
         raise cli.InputError(f"num_matched is {num_matched}: at least 1.")
@@ -54,13 +54,11 @@ def main(model: Path, output: Path, num_matched: int) -> Path:
 
 
 def most_covisible(point3D_ids: Iterable[np.ndarray], number: int) -> Iterator[np.ndarray]:
-    """Yield for each image those that share most points with it, best first, at most `number`.
-
-    Of images that share equally many the first come first.
+    """Yield for each image the rows of those that share most points with it, best first.
 
     Args:
-        point3D_ids: for each image the point of each keypoint, -1 where it has none.
-        number: how many to find.
+        point3D_ids: for each image the points of its keypoints (N,), -1 for none.
+        number: maximum number of rows for each image; ties keep the order of the images.
     """
     from scipy.sparse import coo_array
 
@@ -87,7 +85,9 @@ def _main() -> None:
     )
     parser.add_argument("--model", type=Path, required=True, help="COLMAP model folder")
     parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
-    parser.add_argument("--num_matched", type=int, default=20, help="pairs an image, at most")
+    parser.add_argument(
+        "--num_matched", type=int, default=20, help="maximum number of pairs per image"
+    )
     main(**vars(parser.parse_args()))
 
 

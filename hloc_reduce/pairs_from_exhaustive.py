@@ -1,4 +1,4 @@
-"""Pair all images of a list or a feature file, with each other or with those of another."""
+"""Pair all images of a list or a feature file with each other, or with reference images."""
 
 import argparse
 from collections.abc import Iterable
@@ -21,29 +21,29 @@ def main(
     ref_list: Path | str | Iterable[str] | None = None,
     ref_features: Path | None = None,
 ) -> Path:
-    """Write all pairs of images, or of queries and reference images.
+    """Write all pairs of images, each unordered pair once, or of images and reference images.
 
-    Takes what hloc's `pairs_from_exhaustive.main` takes.
+    Takes the arguments of hloc's `pairs_from_exhaustive.main`.
 
     Args:
         output: text file of pairs.
-        image_list: names, or a text file of them ...
-        features: ... or the feature file with the images.
-        ref_list: names of the reference images, or a text file of them; default: the images, each
-            unordered pair is written once.
-        ref_features: feature file with the reference images, instead of `ref_list`.
+        image_list: names of the images, or a text file of them.
+        features: feature file of the images, instead of `image_list`.
+        ref_list: names of the reference images, or a text file of them; default: the images.
+        ref_features: feature file of the reference images, instead of `ref_list`.
 
     Returns:
         `output`.
 
     Raises:
-        InputError: when neither a list nor a feature file is given, one has no image, or there
-            is only one image to pair.
+        InputError: when neither a list nor a feature file is given, one of them is empty, or there
+            is only one image.
     """
     names = _names(image_list, features)
     if names is None:
         raise InputError("There is nothing to pair: give a list of images or a feature file.")
     references = _names(ref_list, ref_features)
+    pairs: Iterable[tuple[str, str]]
     if references is None or set(references) == set(names):
         if len(names) == 1:
             raise InputError(f"{names[0]} is the only image: there is no other to pair it with.")
@@ -56,7 +56,7 @@ def main(
 
 
 def _names(images: Path | str | Iterable[str] | None, features: Path | None) -> list[str] | None:
-    """Return the different names of a list, or else of a feature file; None without either."""
+    """Return the unique names of a list, or else of a feature file; None without either."""
     if images is not None:
         return list(dict.fromkeys(image_names(images)))
     if features is None:

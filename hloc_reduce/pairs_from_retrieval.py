@@ -14,9 +14,10 @@ from .utils.parsers import check_names, image_names, parse_retrieval, write_pair
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
-# queries, and images of the database, whose descriptors are in memory at once
+# global descriptors of queries, and of database images, in memory at once: at most this many rows
+# and bytes
 BLOCK, BLOCK_BYTES = 2**14, 2**28
-QUERIES = 1024  # of them so many rows of the similarity matrix
+QUERIES = 1024  # rows of the similarity matrix in memory at once
 
 
 @strings_as_paths
@@ -36,29 +37,29 @@ def main(
     Args:
         descriptors: h5 file with a `global_descriptor` (G,) of every image.
         output: text file of pairs.
-        num_matched: pairs a query, at most.
-        query_prefix: queries are the names that begin so ...
-        query_list: ... or those of this list; default: all names.
-        db_prefix: likewise for the database.
-        db_list: likewise for the database.
-        db_model: the database is the images of this COLMAP model.
+        num_matched: maximum number of pairs per query.
+        query_prefix: the queries are the names with this prefix, or one of these.
+        query_list: names of the queries, or a text file of them; default: all names.
+        db_prefix: as `query_prefix`, for the database.
+        db_list: as `query_list`, for the database.
+        db_model: COLMAP model whose images are the database.
         db_descriptors: h5 file of the database; default: `descriptors`.
 
     Returns:
         `output`.
 
     Raises:
-        InputError: for an image without a global descriptor, or no image at all.
+        InputError: for an image without a global descriptor, or no images.
     """
     if num_matched < 1:
         raise InputError(f"num_matched is {num_matched}: at least 1.")
-    same_file = db_descriptors in (None, descriptors)  # else equal names are other images
+    # in two files equal names are different images
+    same_file = db_descriptors in (None, descriptors)
     db_descriptors = db_descriptors or descriptors
     if db_model is not None:
         db_list = [image.name for image in colmap.read_model(db_model).images.values()]
     query_names = _select(descriptors, query_prefix, query_list)
     db_names = _select(db_descriptors, db_prefix, db_list)
-
     size = max(1, min(BLOCK, BLOCK_BYTES // read_global(descriptors, query_names[:1]).nbytes))
 
     def retrieve() -> Iterator[tuple[str, str]]:
@@ -83,7 +84,7 @@ def rank(queries: np.ndarray, database: np.ndarray, num_matched: int) -> np.ndar
     Args:
         queries: (Q, G) global descriptors of unit norm.
         database: (N, G) global descriptors of unit norm, or zero for images without features.
-        num_matched: how many to find, at most.
+        num_matched: maximum number of images to find.
 
     Returns:
         (Q, num_matched) rows of the database, best first.
@@ -94,38 +95,26 @@ def rank(queries: np.ndarray, database: np.ndarray, num_matched: int) -> np.ndar
 def _rank_file(
     queries: np.ndarray, path: Path, names: list[str], num_matched: int, size: int
 ) -> np.ndarray:
-    """Rank as `rank` does, with a database that is read from a file, `size` images at once."""
+    """Rank as `rank` does, but read the database from a file, `size` images at once."""
     rows = np.empty((len(queries), 0), np.int64)
     similarity = np.empty((len(queries), 0), np.float32)
     for start in range(0, len(names), size):
         database = read_global(path, names[start : start + size])
         if queries.shape[1] != database.shape[1]:
             raise InputError(
-                f"Global descriptors of {queries.shape[1]} numbers and, in {path}, of "
-                f"{database.shape[1]} cannot be compared."
+                f"Global descriptors of {queries.shape[1]} numbers cannot be compared with "
+                f"{database.shape[1]} numbers in {path}."
             )
-        parts = [
-            _better(rows[part], similarity[part], start, queries[part], database, num_matched)
-            for part in (slice(i, i + QUERIES) for i in range(0, len(queries), QUERIES))
-        ]
-        rows, similarity = (np.concatenate(part) for part in zip(*parts, strict=True))
+        new = np.arange(start, start + len(database))
+        best = []
+        for i in range(0, len(queries), QUERIES):
+            part = slice(i, i + QUERIES)
+            values = np.hstack([similarity[part], _similarity(queries[part], database)])
+            found = np.hstack([rows[part], np.broadcast_to(new, (len(values), len(new)))])
+            order = _best(values, num_matched)
+            best.append([np.take_along_axis(array, order, 1) for array in (found, values)])
+        rows, similarity = (np.concatenate(parts) for parts in zip(*best, strict=True))
     return rows
-
-
-def _better(
-    rows: np.ndarray,
-    similarity: np.ndarray,
-    start: int,
-    queries: np.ndarray,
-    database: np.ndarray,
-    number: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best rows of those found and of the database from `start` on."""
-    more = np.broadcast_to(np.arange(len(database)) + start, (len(queries), len(database)))
-    rows = np.concatenate([rows, more], axis=1)
-    similarity = np.concatenate([similarity, _similarity(queries, database)], axis=1)
-    best = _best(similarity, number)
-    return np.take_along_axis(rows, best, 1), np.take_along_axis(similarity, best, 1)
 
 
 def _similarity(queries: np.ndarray, database: np.ndarray) -> np.ndarray:
@@ -135,7 +124,7 @@ def _similarity(queries: np.ndarray, database: np.ndarray) -> np.ndarray:
 
 
 def _best(similarity: np.ndarray, number: int) -> np.ndarray:
-    """Return the columns of the largest numbers of each row, of equal ones the first."""
+    """Return the columns of the largest numbers of each row; ties keep their order."""
     return np.argsort(-similarity, axis=1, kind="stable")[:, :number]
 
 
@@ -147,14 +136,14 @@ def select(
     query_list: Iterable[str],
     db_list: Iterable[str],
 ) -> Path:
-    """Take the first `num_matched` pairs of every query from a list made elsewhere.
+    """Take the first `num_matched` pairs of every query from an existing list.
 
     Args:
         pairs: text file of pairs, best first.
-        output: text file of those selected.
-        num_matched: pairs a query, at most.
+        output: text file of the selected pairs.
+        num_matched: maximum number of pairs per query.
         query_list: the queries.
-        db_list: the database images; pairs with others are left out.
+        db_list: the database images; pairs with other images are dropped.
 
     Returns:
         `output`.
@@ -163,13 +152,15 @@ def select(
         InputError: when no pair is left.
     """
     retrieved, database = parse_retrieval(pairs), set(db_list)
-    selected, absent, without = [], 0, []
+    selected: list[tuple[str, str]] = []
+    without, absent = [], 0
     for query in query_list:
-        names = [name for name in retrieved.get(query, []) if name in database]
-        absent += len(retrieved.get(query, [])) - len(names)
+        listed = retrieved.get(query, [])
+        names = [name for name in listed if name in database]
+        selected += [(query, name) for name in names[:num_matched]]
+        absent += len(listed) - len(names)
         if not names:
             without.append(query)
-        selected += [(query, name) for name in names[:num_matched]]
     if absent:
         logger.warning("%d pairs of %s are with images that are not in the map.", absent, pairs)
     if without:
@@ -219,10 +210,12 @@ def _main() -> None:
     )
     parser.add_argument("--descriptors", type=Path, required=True, help="global descriptors")
     parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
-    parser.add_argument("--num_matched", type=int, default=50, help="pairs a query, at most")
-    parser.add_argument("--query_prefix", nargs="+", help="beginning of the queries' names")
+    parser.add_argument(
+        "--num_matched", type=int, default=50, help="maximum number of pairs per query"
+    )
+    parser.add_argument("--query_prefix", nargs="+", help="prefixes of the queries' names")
     parser.add_argument("--query_list", type=Path, help="text file of the queries' names")
-    parser.add_argument("--db_prefix", nargs="+", help="beginning of the database's names")
+    parser.add_argument("--db_prefix", nargs="+", help="prefixes of the database's names")
     parser.add_argument("--db_list", type=Path, help="text file of the database's names")
     parser.add_argument("--db_model", type=Path, help="COLMAP model of the database")
     parser.add_argument("--db_descriptors", type=Path, help="global descriptors of the database")

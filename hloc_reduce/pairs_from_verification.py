@@ -1,4 +1,4 @@
-"""Add pairs where the verified matches of a list of pairs connect its images poorly."""
+"""Add pairs of images that the verified matches of a list of pairs connect poorly."""
 
 import argparse
 from collections import Counter, defaultdict
@@ -13,7 +13,7 @@ import pycolmap
 from . import logger
 from .pairs_from_retrieval import rank, read_global
 from .runtime import provenance
-from .triangulation import read_matches
+from .triangulation import Pair, Verified, read_matches
 from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.h5 import file_provenance, list_h5_names, open_h5
@@ -22,11 +22,9 @@ from .utils.overlays import drop_overlays
 from .utils.parsers import parse_pairs, write_pairs
 from .utils.paths import strings_as_paths
 
-MIN_INLIERS = 15  # verified matches of a pair that connects its images, COLMAP's min_num_matches
-MIN_PAIRS = 3  # verified pairs of an image that is connected well
+MIN_INLIERS = 15  # verified matches of a connected pair, COLMAP's min_num_matches
+MIN_PAIRS = 3  # connected pairs of a well connected image
 BLOCK = 256  # images whose similarity to all others is in memory at once
-
-Pair = tuple[str, str]
 
 
 @strings_as_paths
@@ -42,13 +40,13 @@ def main(
     camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
     image_list: Path | str | Iterable[str] | None = None,
 ) -> Path:
-    """Write a list of pairs and more of them where it leaves images unconnected.
+    """Write a list of pairs, and more pairs of poorly connected images.
 
     COLMAP verifies the matches by two-view geometry. Images outside the largest connected component
     are paired with the most similar images of other components, and images with few verified pairs
-    with any similar ones. Images that have verified neighbours in common are likely to see the same
-    points, so they are paired too.
-    `<matches>_verified.json` keeps the results, so that a second call verifies only other pairs.
+    with any similar ones. Images with common verified neighbours probably see the same points, so
+    they are paired too.
+    `<matches>_verified.json` keeps the results, so that a second call verifies only new pairs.
 
     Args:
         output: text file of pairs: those of `pairs`, then the new ones.
@@ -59,7 +57,7 @@ def main(
         descriptors: h5 file of global descriptors.
         num_matched: maximum number of new pairs of a poorly connected image with similar images,
             and again with neighbours of its neighbours.
-        num_covis: new pairs of any other image with neighbours of its neighbours, at most.
+        num_covis: maximum number of new pairs of any other image with neighbours of its neighbours.
         camera_mode: which images share a camera.
         image_list: the images, names or a text file of them; default: those of `features`.
 
@@ -77,7 +75,7 @@ def main(
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
     names = list_images(image_dir, list_h5_names(features) if image_list is None else image_list)
-    listed = list(dict.fromkeys(tuple(sorted(pair)) for pair in parse_pairs(pairs)))
+    listed = list(dict.fromkeys(_unordered(*pair) for pair in parse_pairs(pairs)))
     if unknown := {name for pair in listed for name in pair}.difference(names):
         raise InputError(f"{pairs}: {min(unknown)} is not in the list of images.")
     verified = _verify(image_dir, names, listed, features, matches, camera_mode)
@@ -101,11 +99,11 @@ def more_pairs(
 
     Args:
         names: the images.
-        listed: pairs that are known, each sorted.
-        connected: numbers of verified matches of those that connect two images.
+        listed: known pairs, each sorted.
+        connected: from connected pair to its number of verified matches.
         descriptors: (N, G) global descriptors of the images.
-        num_matched: new pairs of an image that is connected poorly, at most, of each kind.
-        num_covis: new pairs of any other image with neighbours of its neighbours, at most.
+        num_matched: see `main`.
+        num_covis: see `main`.
 
     Returns:
         New pairs, each sorted.
@@ -133,7 +131,7 @@ def more_pairs(
         ranking = rank(descriptors[block], descriptors, len(names))
         for i, row in zip(block, ranking, strict=True):
             others = (
-                tuple(sorted((names[i], names[j])))
+                _unordered(names[i], names[j])
                 for j in row
                 if i != j and not (apart[i] and component[i] == component[j])
             )
@@ -145,21 +143,26 @@ def more_pairs(
 def _by_neighbours(
     limits: dict[str, int], listed: set[Pair], connected: dict[Pair, int]
 ) -> list[Pair]:
-    """Pair images with neighbours of their neighbours, those of most verified matches first."""
-    neighbours = defaultdict(dict)
+    """Pair images with neighbours of their neighbours, most verified matches first."""
+    neighbours: dict[str, dict[str, int]] = defaultdict(dict)
     for (a, b), number in connected.items():
         neighbours[a][b] = neighbours[b][a] = number
-    found = []
+    found: list[Pair] = []
     for name, limit in limits.items():
-        scores = Counter()
+        scores: Counter[Pair] = Counter()
         for between, number in neighbours[name].items():
             for other, other_number in neighbours[between].items():
-                pair = tuple(sorted((name, other)))
+                pair = _unordered(name, other)
                 if other != name and pair not in listed:
                     scores[pair] += min(number, other_number)
         best = sorted(scores, key=lambda pair: (-scores[pair], pair))
         found += best[:limit]
     return found
+
+
+def _unordered(name0: str, name1: str) -> Pair:
+    """Return a pair in the order of the names."""
+    return (name0, name1) if name0 < name1 else (name1, name0)
 
 
 def _verify(
@@ -170,7 +173,7 @@ def _verify(
     matches: Path,
     camera_mode: pycolmap.CameraMode,
 ) -> dict[Pair, int]:
-    """Count the verified matches of pairs; those that were verified before are read."""
+    """Return the number of verified matches of each pair, of known pairs from the file."""
     path = matches.with_name(f"{matches.stem}_verified.json")
     with open_h5(features) as feature_file, open_h5(matches) as match_file:
         made_from = {
@@ -190,12 +193,12 @@ def _verify(
             colmap.import_images(database, image_dir, images, camera_mode, {})
             keypoints, _, found = read_matches(images, listed, features, matches, None)
             found = drop_overlays(keypoints, found)
-            unverified = {pair: (indices, None) for pair, indices in found.items()}
+            unverified: Verified = {pair: (indices, None) for pair, indices in found.items()}
             colmap.write_matches(database, keypoints, unverified)
             colmap.verify_matches(database, listed, False)
             counts = colmap.count_verified(database)
-        counts = {tuple(sorted(pair)): number for pair, number in counts.items()}
-        known = known | {"\t".join(pair): counts.get(pair, 0) for pair in todo}
+        counts = {_unordered(*pair): number for pair, number in counts.items()}
+        known |= {"\t".join(pair): counts.get(pair, 0) for pair in todo}
         provenance.write(path, {"made_from": made_from, "pairs": known})
     return {pair: known["\t".join(pair)] for pair in pairs}
 
@@ -214,12 +217,17 @@ def _main() -> None:
     parser.add_argument("--features", type=Path, required=True, help="feature file")
     parser.add_argument("--matches", type=Path, required=True, help="match file")
     parser.add_argument("--descriptors", type=Path, required=True, help="global descriptors")
-    parser.add_argument("--num_matched", type=int, default=20, help="new pairs an image, at most")
     parser.add_argument(
-        "--num_covis", type=int, default=0, help="new pairs of images that are connected well"
+        "--num_matched", type=int, default=20, help="maximum number of new pairs per image"
+    )
+    parser.add_argument(
+        "--num_covis",
+        type=int,
+        default=0,
+        help="maximum number of new pairs per well connected image",
     )
     parser.add_argument("--camera_mode", default="auto", help="which photos share a camera")
-    parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
+    parser.add_argument("--image_list", type=Path, help="text file of names, one per line")
     args = parser.parse_args()
     main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})
 

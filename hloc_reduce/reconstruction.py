@@ -1,9 +1,10 @@
-"""Reconstruct a map from matches of images of which nothing else is known."""
+"""Reconstruct a map from matches of images without known poses or intrinsics."""
 
 import argparse
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,23 +22,23 @@ from .utils.overlays import drop_overlays
 from .utils.paths import strings_as_paths
 
 REGISTRATION = "registration.json"  # which images are in the model, and in other parts
-# shares of the images that are in the model, below which it is reported in detail, or refused
+# shares of registered images: a model with fewer is reported in detail, or refused
 ENOUGH, LEAST = 0.8, 0.5
 NAMED = 10  # images that a message names
-# COLMAP would drop parts of fewer than 10 images, or than 8 of 10
+# COLMAP would drop parts of fewer than 10 images
 MAPPER_OPTIONS = {"random_seed": 0, "num_threads": 1, "min_model_size": 3}
-# half of COLMAP's thresholds, where images are missing; a quarter of them gave wrong poses
+# half of COLMAP's thresholds, for missing images; a quarter of them gave wrong poses
 RELAXED = {
     "init_min_num_inliers": 50,
     "init_min_tri_angle": 8.0,
     "abs_pose_min_num_inliers": 15,
 }
-FEW = 100  # images of which a second attempt takes little time
-VERY_FEW = 30  # images of which some more take little; what comes of them is a matter of luck
+FEW = 100  # images: further attempts take little time, even for one missing image
+VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
 SEEDS = (1, 2, 3)
-MORE = 1.5  # times as many images tell that one camera took all
-MAX_DISTORTION = 1.0  # as COLMAP has it for images that it registers
-MANY = 3  # images of a camera from which on EXIF data do not bound its focal length
+MORE = 1.5  # times as many images show that one camera took all
+MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
+MANY = 3  # images of one camera estimate its focal length better than EXIF data do
 
 
 class NoModelError(InputError):
@@ -60,71 +61,44 @@ def main(
     mapper_options: dict | None = None,
     overwrite: bool = False,
     accept_partial: bool = False,
+    once: bool = False,
+    checked: bool = True,
 ) -> pycolmap.Reconstruction:
-    """Reconstruct poses, intrinsics and points by COLMAP's incremental mapper, and check the model.
+    """Reconstruct poses, intrinsics and points with COLMAP's incremental mapper.
 
-    Takes what hloc's `reconstruction.main` takes. The frame and the scale are arbitrary. Images
-    whose focal length or distortion no lens has, or whose focal length is far from that of EXIF
-    data, are dropped from the model.
-    Where images are missing, and of more than 100 images more than a fifth, further attempts
-    follow, and the model with the most images is kept: with lower thresholds, and with up to 30
-    images with other pairs to begin with. With `camera_mode` AUTO, if at most two thirds are in the
-    model and one camera may have taken all images, the mapper is run with one shared camera; that
-    model is kept if it has at least 1.5 times as many images.
+    Takes the arguments of hloc's `reconstruction.main`. The frame and the scale of the model are
+    arbitrary. Images with an implausible focal length or distortion, or a focal length far from
+    their EXIF data, are dropped from the model.
+    If images are missing (of more than 100 images, more than a fifth), further attempts follow, and
+    the model with the most images is kept: an attempt with lower thresholds and, for up to 30
+    images, some with other initial pairs. With `camera_mode` AUTO, if at most two thirds of the
+    images are in the model and one camera may have taken all of them, the mapper runs with one
+    shared camera; its model is kept if it has at least 1.5 times as many images.
 
     Args:
-        sfm_dir: the folder of the new COLMAP model; one made from the same inputs is read back.
-        image_dir: folder of the images, whose EXIF data give the first guess of the intrinsics.
+        sfm_dir: folder of the new COLMAP model; a model made from the same inputs is read instead.
+        image_dir: folder of the images, whose EXIF data give the initial intrinsics.
         pairs: text file of pairs.
         features: feature file.
         matches: match file.
         camera_mode: which images share a camera.
         verbose: show COLMAP's log.
-        skip_geometric_verification: take all matches, without two-view geometry.
-        min_match_score: take matches of a higher score only.
+        skip_geometric_verification: use all matches, without two-view geometry.
+        min_match_score: use only matches with a higher score.
         image_list: the images, names or a text file of them; default: those of `features`.
         image_options: of pycolmap's ImageReaderOptions.
-        mapper_options: of pycolmap's IncrementalPipelineOptions; with any there is one attempt.
-        overwrite: reconstruct anew.
-        accept_partial: return a model of fewer than half of the images, too.
+        mapper_options: of pycolmap's IncrementalPipelineOptions; if given, there is one attempt.
+        overwrite: reconstruct again.
+        accept_partial: also return a model of fewer than half of the images.
+        once: make one attempt only.
+        checked: call `check` on the model.
 
     Returns:
-        The model with the most images. Its keypoints are those of the feature file, in the same
-        order.
+        The model with the most images. It has the keypoints of the feature file, in the same order.
 
     Raises:
-        InputError: when an input is missing, nothing can be reconstructed, or fewer than half of
-            the images are in the model, which is kept for a run with `accept_partial`.
-    """
-    sfm = reconstruct(
-        *(sfm_dir, image_dir, pairs, features, matches, camera_mode, verbose),
-        *(skip_geometric_verification, min_match_score, image_list, image_options),
-        *(mapper_options, overwrite),
-    )
-    check(sfm_dir, accept_partial)
-    return sfm
-
-
-def reconstruct(
-    sfm_dir: Path,
-    image_dir: Path,
-    pairs: Path,
-    features: Path,
-    matches: Path,
-    camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
-    verbose: bool = False,
-    skip_geometric_verification: bool = False,
-    min_match_score: float | None = None,
-    image_list: Path | str | Iterable[str] | None = None,
-    image_options: dict | None = None,
-    mapper_options: dict | None = None,
-    overwrite: bool = False,
-    once: bool = False,
-) -> pycolmap.Reconstruction:
-    """Reconstruct as `main` does, however few images the model has; if `once`, in one attempt.
-
-    Raises:
-        InputError: when an input is missing.
+        InputError: when an input is missing, or fewer than half of the images are in the model,
+            which is kept for a run with `accept_partial`.
         NoModelError: when nothing can be reconstructed.
     """
     options = {**MAPPER_OPTIONS, **(mapper_options or {})}
@@ -132,10 +106,8 @@ def reconstruct(
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
-    if image_list is None:
-        image_list = list_h5_names(features)
-    names = list_images(image_dir, image_list)
-    attempts = [] if once or mapper_options else list(_attempts(len(names)))
+    names = list_images(image_dir, list_h5_names(features) if image_list is None else image_list)
+    attempts = [{}] if once or mapper_options else _attempts(len(names))
     chosen = {
         "camera_mode": camera_mode.name,
         "image_options": image_options or {},
@@ -143,91 +115,123 @@ def reconstruct(
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
         "overlays": "dropped",
-        "attempts": [{}, *attempts],
+        "attempts": attempts,
         "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
         "once": once,
     }
-    made_from = provenance.stamp({**options, **chosen}, [pairs, features, matches])
+    made_from = provenance.of_inputs({**options, **chosen}, [pairs, features, matches])
     is_whole = bool(provenance.read(sfm_dir / REGISTRATION))
     if not overwrite and is_whole and provenance.is_current(sfm_dir / STAMP, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
-        return colmap.read_model(sfm_dir)
-
-    with replacing_map(sfm_dir, made_from) as building:
-        keypoints, _, found = read_matches(names, pairs, features, matches, min_match_score)
-        found = drop_overlays(keypoints, found)
-        verified = {
-            pair: (indices, indices if skip_geometric_verification else None)
-            for pair, indices in found.items()
-        }
-
-        def write_database(mode: pycolmap.CameraMode) -> Path:
-            database = building / f"database-{mode.name}.db"
-            colmap.import_images(database, image_dir, names, mode, image_options or {})
-            colmap.write_matches(database, keypoints, verified)
-            if not skip_geometric_verification:
-                colmap.verify_matches(database, pairs, verbose)
-            return database
-
-        database = write_database(camera_mode)
-        enough = len(names) if len(names) <= FEW else ENOUGH * len(names)
-
-        def reconstruct_from(database: Path) -> tuple[list[pycolmap.Reconstruction], dict]:
-            """Return the largest models of all attempts, and what was dropped from them."""
-            given, best = colmap.read_cameras(database), ([], {})
-            # no attempt brings in an image that matches no other
-            possible = min(enough, len(_matched(database)))
-            for number, changed in enumerate([{}, *attempts], start=1):
-                own, models_dir = colmap.mapper_options({**options, **changed}), building / "models"
-                found = colmap.incremental_mapping(database, image_dir, models_dir, own, verbose)
-                shutil.rmtree(models_dir, ignore_errors=True)
-                best = max(best, _plausible(found, given), key=lambda both: _size(both[0]))
-                logger.info(
-                    "Attempt %d of up to %d: %d of %d images reconstructed.",
-                    *(number, 1 + len(attempts), _size(best[0])[0], len(names)),
-                )
-                if _size(best[0])[0] >= possible:
-                    break
-            return best
-
-        models, dropped = reconstruct_from(database)
-        registered, cameras = _size(models)[0], colmap.read_cameras(database)
-        alike = camera_mode == pycolmap.CameraMode.AUTO and _are_alike(cameras)
-        if alike and attempts and MORE * registered <= len(_matched(database)):
-            logger.info("Trying again with one camera for all images.")
-            shared = write_database(pycolmap.CameraMode.SINGLE)
-            one, one_dropped = reconstruct_from(shared)
-            if one and _size(one)[0] >= MORE * registered:
-                models, dropped, database, alike = one, one_dropped, shared, False
-        if not models:
-            raise NoModelError(nothing(image_dir, dropped))
-        models[0].write(building)
-        parts = _parts(models)
-        missing = sorted(set(names) - set(parts[0]))
-        state = {
-            "images": len(names),
-            "parts": parts,
-            "missing": missing,
-            "unmatched": sorted(set(names) - _matched(database)),
-            "implausible": {name: lens for name, lens in dropped.items() if name in missing},
-            "alike": alike,
-        }
-        provenance.write(building / REGISTRATION, state)
-        database.rename(building / "database.db")
-        for other in building.glob("database-*"):
-            other.unlink()
-    sfm = colmap.read_model(sfm_dir)
-    logger.info("The map %s:\n%s", sfm_dir, sfm.summary())
+        sfm = colmap.read_model(sfm_dir)
+    else:
+        with replacing_map(sfm_dir, made_from) as building:
+            keypoints, _, found = read_matches(names, pairs, features, matches, min_match_score)
+            found = drop_overlays(keypoints, found)
+            _Mapper(
+                *(building, image_dir, names, image_options or {}, keypoints, found),
+                unverified=None if skip_geometric_verification else pairs,
+                attempts=[{**options, **changed} for changed in attempts],
+                verbose=verbose,
+            ).reconstruct(camera_mode)
+        sfm = colmap.read_model(sfm_dir)
+        logger.info("The map %s:\n%s", sfm_dir, sfm.summary())
+    if checked:
+        check(sfm_dir, accept_partial)
     return sfm
 
 
-def _attempts(number: int) -> Iterator[dict]:
-    """Yield the options of further attempts at a number of images."""
-    yield {"mapper": RELAXED}
-    if number <= VERY_FEW:
-        for seed in SEEDS:
-            yield {"random_seed": seed}
-            yield {"random_seed": seed, "mapper": RELAXED}
+def _attempts(number: int) -> list[dict]:
+    """Return the changed mapper options of each attempt to reconstruct a number of images."""
+    attempts: list[dict] = [{}, {"mapper": RELAXED}]
+    for seed in SEEDS if number <= VERY_FEW else ():
+        attempts += [{"random_seed": seed}, {"random_seed": seed, "mapper": RELAXED}]
+    return attempts
+
+
+Models = tuple[list[pycolmap.Reconstruction], dict[str, str]]  # see `_plausible`
+
+
+@dataclass
+class _Mapper:
+    """COLMAP's incremental mapper, with several attempts."""
+
+    folder: Path  # of the new model
+    image_dir: Path
+    names: list[str]
+    image_options: dict  # of pycolmap's ImageReaderOptions
+    keypoints: dict[str, np.ndarray]  # from image to (N, 2), COLMAP's pixels
+    matches: dict[tuple[str, str], np.ndarray]  # from pair to (M, 2)
+    unverified: Path | None  # text file of pairs to verify by two-view geometry
+    attempts: list[dict]  # of pycolmap's IncrementalPipelineOptions
+    verbose: bool
+
+    def reconstruct(self, camera_mode: pycolmap.CameraMode) -> None:
+        """Write the best model, its database and its registration."""
+        database = self.write_database(camera_mode)
+        models, dropped = self.run(database)
+        registered = _size(models)[0]
+        alike = camera_mode == pycolmap.CameraMode.AUTO and _are_alike(database)
+        several = len(self.attempts) > 1
+        if alike and several and MORE * registered <= len(_matched(database)):
+            logger.info("Trying again with one camera for all images.")
+            shared = self.write_database(pycolmap.CameraMode.SINGLE)
+            found, implausible = self.run(shared)
+            if found and _size(found)[0] >= MORE * registered:
+                models, dropped, database, alike = found, implausible, shared, False
+        if not models:
+            raise NoModelError(nothing(self.image_dir, dropped))
+        models[0].write(self.folder)
+        parts = _parts(models)
+        missing = sorted(set(self.names) - set(parts[0]))
+        state = {
+            "images": len(self.names),
+            "parts": parts,
+            "missing": missing,
+            "unmatched": sorted(set(self.names) - _matched(database)),
+            "implausible": {name: lens for name, lens in dropped.items() if name in missing},
+            "alike": alike,
+        }
+        provenance.write(self.folder / REGISTRATION, state)
+        database.rename(self.folder / "database.db")
+        for other in self.folder.glob("database-*"):
+            other.unlink()
+
+    def write_database(self, mode: pycolmap.CameraMode) -> Path:
+        """Write a database of the images and their verified matches."""
+        database = self.folder / f"database-{mode.name}.db"
+        colmap.import_images(database, self.image_dir, self.names, mode, self.image_options)
+        verified = {
+            pair: (indices, None if self.unverified else indices)
+            for pair, indices in self.matches.items()
+        }
+        colmap.write_matches(database, self.keypoints, verified)
+        if self.unverified:
+            colmap.verify_matches(database, self.unverified, self.verbose)
+        return database
+
+    def run(self, database: Path) -> Models:
+        """Return the plausible models of the best attempt; stop when enough images are in one."""
+        cameras, folder = colmap.read_cameras(database), self.folder / "models"
+        number = len(self.names)
+        enough = number if number <= FEW else ENOUGH * number
+        enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
+        best: Models = [], {}
+        for attempt, changed in enumerate(self.attempts, start=1):
+            options = colmap.mapper_options(changed)
+            found = colmap.incremental_mapping(
+                database, self.image_dir, folder, options, self.verbose
+            )
+            shutil.rmtree(folder, ignore_errors=True)
+            best = max(best, _plausible(found, cameras), key=lambda both: _size(both[0]))
+            registered = _size(best[0])[0]
+            logger.info(
+                "Attempt %d of up to %d: %d of %d images reconstructed.",
+                *(attempt, len(self.attempts), registered, number),
+            )
+            if registered >= enough:
+                break
+        return best
 
 
 def _matched(database: Path) -> set[str]:
@@ -235,45 +239,36 @@ def _matched(database: Path) -> set[str]:
     return {name for pair in colmap.count_verified(database) for name in pair}
 
 
-def _are_alike(cameras: dict[int, pycolmap.Camera]) -> bool:
-    """Tell whether one camera may have taken all images, though each was given its own."""
-    alike = {(camera.width, camera.height, *camera.params) for camera in cameras.values()}
-    return len(cameras) > len(alike) == 1
+def _are_alike(database: Path) -> bool:
+    """Tell whether one camera may have taken all images, although each has its own."""
+    cameras = colmap.read_cameras(database).values()
+    return len(cameras) > len({(c.width, c.height, *c.params) for c in cameras}) == 1
 
 
 def _plausible(
     models: list[pycolmap.Reconstruction], cameras: dict[int, pycolmap.Camera]
-) -> tuple[list[pycolmap.Reconstruction], dict[str, str]]:
-    """Drop images of implausible lenses from models, and what only these connect.
+) -> Models:
+    """Drop images with implausible lenses from models, and images that only these connect.
 
     Args:
         models: of COLMAP's mapper.
-        cameras: from their ids to those that the mapper began with.
+        cameras: from id to the initial camera.
 
     Returns:
-        The models that have points, by size; and from the names of images to what is implausible.
+        The models that have points, the largest first; and from the name of each dropped image to
+        what is implausible.
     """
-    dropped = {}
+    dropped: dict[str, str] = {}
     for model in models:
         images = [model.images[i] for i in model.reg_image_ids()]
         shared = Counter(image.camera_id for image in images)
         implausible = {}
         for image in images:
-            given = cameras[image.camera_id]
-            # many images tell the focal length of their camera better than EXIF data do
-            unknown = not given.has_prior_focal_length or shared[image.camera_id] >= MANY
-            low, high = focal_lengths(given, unknown)
-            focal_length = image.camera.mean_focal_length()
-            distortion = image.camera.params[list(image.camera.extra_params_idxs())]
-            if not low <= focal_length <= high:
-                implausible[image.name] = f"focal length {focal_length:.0f}"
-            elif np.abs(distortion).max(initial=0) > MAX_DISTORTION:
-                implausible[image.name] = (
-                    f"distortion {distortion[np.abs(distortion).argmax()]:.1f}"
-                )
-            else:
-                continue
-            model.deregister_frame(image.frame_id)
+            camera_id = image.camera_id
+            lens = _implausible(model.cameras[camera_id], cameras[camera_id], shared[camera_id])
+            if lens is not None:
+                implausible[image.name] = lens
+                model.deregister_frame(image.frame_id)
         if implausible:
             _keep_connected(model)
         dropped |= implausible
@@ -281,8 +276,18 @@ def _plausible(
     return sorted(whole, key=size, reverse=True), dropped
 
 
+def _implausible(camera: pycolmap.Camera, initial: pycolmap.Camera, number: int) -> str | None:
+    """Say what is implausible about the refined camera of a number of images, if anything."""
+    low, high = focal_lengths(initial, not initial.has_prior_focal_length or number >= MANY)
+    focal_length = camera.mean_focal_length()
+    if not low <= focal_length <= high:
+        return f"focal length {focal_length:.0f}"
+    distortion = max(camera.params[list(camera.extra_params_idxs())], key=abs, default=0.0)
+    return f"distortion {distortion:.1f}" if abs(distortion) > MAX_DISTORTION else None
+
+
 def _keep_connected(model: pycolmap.Reconstruction) -> None:
-    """Drop all images but those of the largest part that is connected by common points."""
+    """Keep only the largest set of images that common points connect."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -296,8 +301,7 @@ def _keep_connected(model: pycolmap.Reconstruction) -> None:
     if not seen:
         return
     image, point = np.array(seen).T
-    sees = coo_array((np.ones(len(image)), (image, point)), shape=(len(ids), point.max() + 1))
-    sees = sees.tocsr()
+    sees = coo_array((np.ones(len(image)), (image, point)), (len(ids), point.max() + 1)).tocsr()
     _, label = connected_components(sees @ sees.T, directed=False)
     largest = np.bincount(label).argmax()
     for image_id, part in zip(ids, label, strict=True):
@@ -307,15 +311,15 @@ def _keep_connected(model: pycolmap.Reconstruction) -> None:
 
 def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
     """Say that no image could be reconstructed, and what to try."""
-    if dropped:
-        return f"COLMAP could not reconstruct the images of {image_dir}. {_said(dropped)}"
-    return (
-        f"COLMAP could not reconstruct the images of {image_dir}. Do enough of them overlap? Take "
-        "photos from several places, each overlapping the one before by about two thirds."
+    advice = (
+        "Do enough of them overlap? Take photos from several places, each overlapping the one "
+        "before by about two thirds."
     )
+    hint = _lenses(dropped) if dropped else advice
+    return f"COLMAP could not reconstruct the images of {image_dir}. {hint}"
 
 
-def _said(dropped: dict[str, str]) -> str:
+def _lenses(dropped: dict[str, str]) -> str:
     """Say which images have implausible lenses."""
     lenses = [f"{name} ({lens})" for name, lens in dropped.items()]
     return (
@@ -325,30 +329,30 @@ def _said(dropped: dict[str, str]) -> str:
 
 
 def size(model: pycolmap.Reconstruction) -> tuple[int, int]:
-    """Return how many images and points a model has; the larger of two models is the better."""
+    """Return the numbers of images and points of a model, by which models are compared."""
     return model.num_reg_images(), model.num_points3D()
 
 
 def _size(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
-    """Return the size of the first of some models."""
+    """Return the size of the first model."""
     return size(models[0]) if models else (0, 0)
 
 
 def _parts(models: list[pycolmap.Reconstruction]) -> list[list[str]]:
-    """Return the images of each model that no larger one has; COLMAP's models may overlap."""
-    parts, seen = [], set()
+    """Return the images of each model that no larger one has: COLMAP's models may overlap."""
+    parts: list[list[str]] = []
     for model in models:
-        if new := sorted({model.images[i].name for i in model.reg_image_ids()} - seen):
+        names = {model.images[i].name for i in model.reg_image_ids()}
+        if new := sorted(names.difference(*parts)):
             parts.append(new)
-            seen.update(new)
     return parts
 
 
 def check(sfm_dir: Path, accept_partial: bool) -> None:
-    """Report which images are missing in a model.
+    """Report which images are missing from a model.
 
     Raises:
-        InputError: if it has fewer than half of them, unless `accept_partial`.
+        InputError: if it has fewer than half of the images, unless `accept_partial`.
     """
     state = provenance.read(sfm_dir / REGISTRATION)
     missing, number = state["missing"], state["images"]
@@ -364,7 +368,7 @@ def check(sfm_dir: Path, accept_partial: bool) -> None:
             logger.warning(
                 "%d of %d images are not in the map: %s.%s",
                 *(len(missing), number, cli.some(missing, NAMED)),
-                f" {_said(implausible)}" if implausible else "",
+                f" {_lenses(implausible)}" if implausible else "",
             )
         return
     message = shortfall(sfm_dir / REGISTRATION, **state)
@@ -389,9 +393,9 @@ def shortfall(
         images: number of images.
         parts: the images of each part that COLMAP reconstructed, the model first.
         missing: the images that are not in the model.
-        unmatched: those that match no other image.
-        implausible: from images that were dropped to what is implausible of their lenses.
-        alike: each image has a camera of its own, but one may have taken all.
+        unmatched: the images without verified matches.
+        implausible: from each dropped image to what is implausible about its lens.
+        alike: each image has its own camera, but one camera may have taken all.
     """
     registered = images - len(missing)
     only = "Only " if registered < ENOUGH * images else ""
@@ -414,7 +418,7 @@ def shortfall(
         said.append(f"No other photo matches {cli.some(unmatched)}.")
         tries.append("leave out photos of other places, and retake blurred or dark ones")
     if implausible:
-        said.append(_said(implausible))
+        said.append(_lenses(implausible))
     if alike:
         tries.append("--camera_mode single, if one camera with a fixed zoom took all photos")
     return f"{' '.join(said)} What to try: {'; '.join(tries)}."
@@ -451,12 +455,14 @@ def _main() -> None:
         help="accept a map that has fewer than half of the photos",
     )
     parser.add_argument(
-        "--skip_geometric_verification", action="store_true", help="take all matches"
+        "--skip_geometric_verification", action="store_true", help="use all matches"
     )
-    parser.add_argument("--min_match_score", type=float, help="take matches of a higher score only")
-    parser.add_argument("--image_list", type=Path, help="text file of names, one a line")
+    parser.add_argument(
+        "--min_match_score", type=float, help="use only matches with a higher score"
+    )
+    parser.add_argument("--image_list", type=Path, help="text file of names, one per line")
     parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
-    parser.add_argument("--overwrite", action="store_true", help="reconstruct anew")
+    parser.add_argument("--overwrite", action="store_true", help="reconstruct again")
     args = parser.parse_args()
     main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})
 

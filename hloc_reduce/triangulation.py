@@ -26,6 +26,10 @@ STAMP = "made_from.json"
 PARTS = ("cameras", "frames", "images", "points3D", "rigs")
 MADE_BY_HLOC = {"database.db", *(f"{part}.bin" for part in PARTS)}
 
+Pair = tuple[str, str]
+# from pair to all matches and the verified ones, both (M, 2); None for COLMAP to verify
+Verified = dict[Pair, tuple[np.ndarray, np.ndarray | None]]
+
 
 @strings_as_paths
 def main(
@@ -44,25 +48,25 @@ def main(
 ) -> pycolmap.Reconstruction:
     """Triangulate the matches that agree with the epipolar geometry of the known poses.
 
-    Takes what hloc's `triangulation.main` takes.
+    Takes the arguments of hloc's `triangulation.main`.
 
     Args:
-        sfm_dir: the folder of the new COLMAP model; one made from the same inputs is read back.
+        sfm_dir: folder of the new COLMAP model; a model made from the same inputs is read instead.
         reference_model: COLMAP model with the cameras and poses of all images of the pairs.
-        image_dir: folder of the images; their colours go to the points.
+        image_dir: folder of the images, which give the points their colours.
         pairs: text file of pairs.
         features: feature file.
         matches: match file.
         skip_geometric_verification: triangulate all matches.
-        estimate_two_view_geometries: triangulate those that agree with a geometry that COLMAP
-            estimates from them, not with the known poses.
-        min_match_score: take matches of a higher score only.
+        estimate_two_view_geometries: triangulate the matches that agree with two-view geometries
+            that COLMAP estimates from them, instead of the known poses.
+        min_match_score: use only matches with a higher score.
         verbose: show COLMAP's log.
         mapper_options: of pycolmap's IncrementalPipelineOptions.
-        overwrite: triangulate anew.
+        overwrite: triangulate again.
 
     Returns:
-        The map. Its keypoints are those of the feature file, in the same order.
+        The map. It has the keypoints of the feature file, in the same order.
 
     Raises:
         InputError: when an input is missing or no point can be triangulated.
@@ -80,7 +84,9 @@ def main(
         "min_match_score": min_match_score,
     }
     chosen = {key: value for key, value in verification.items() if value}
-    made_from = provenance.stamp({**options, **chosen}, [*model_files, pairs, features, matches])
+    made_from = provenance.of_inputs(
+        {**options, **chosen}, [*model_files, pairs, features, matches]
+    )
     if not overwrite and provenance.is_current(sfm_dir / STAMP, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
         return colmap.read_model(sfm_dir)
@@ -93,6 +99,7 @@ def main(
         keypoints, uncertainty, found = read_matches(
             names, pairs, features, matches, min_match_score
         )
+        verified: Verified
         if skip_geometric_verification:
             verified = {pair: (indices, indices) for pair, indices in found.items()}
         elif estimate_two_view_geometries:
@@ -115,7 +122,7 @@ def main(
     images = reconstruction.images.values()
     if alone := sorted(image.name for image in images if image.num_points3D == 0):
         logger.warning(
-            "%d of %d photos have no point in the map, so that no query is localized by them: %s.",
+            "%d of %d photos have no point in the map, so no query is localized with them: %s.",
             *(len(alone), len(images), cli.some(alone)),
         )
     return reconstruction
@@ -125,10 +132,10 @@ def main(
 def replacing_map(
     sfm_dir: Path, made_from: dict, reference_model: Path | None = None
 ) -> Iterator[Path]:
-    """Give a new folder for a COLMAP model, and put it in the place of `sfm_dir` when it is whole.
+    """Give a folder for a new COLMAP model; it replaces `sfm_dir` when the block succeeds.
 
     Raises:
-        InputError: when `sfm_dir` is `reference_model` or holds something else than such a map.
+        InputError: when `sfm_dir` is `reference_model` or holds anything but a triangulated map.
     """
     sfm_dir = sfm_dir.resolve()
     inside = {path.name for path in sfm_dir.iterdir()} if sfm_dir.is_dir() else set()
@@ -159,7 +166,7 @@ def replacing_map(
 
 def read_matches(
     names: list[str], pairs: Path, features: Path, matches: Path, min_match_score: float | None
-) -> tuple[dict[str, np.ndarray], dict[str, float], dict[tuple[str, str], np.ndarray]]:
+) -> tuple[dict[str, np.ndarray], dict[str, float], dict[Pair, np.ndarray]]:
     """Read the keypoints of images and the matches of pairs of them, each unordered pair once.
 
     Args:
@@ -167,25 +174,27 @@ def read_matches(
         pairs: text file of pairs.
         features: feature file.
         matches: match file.
-        min_match_score: take matches of a higher score only.
+        min_match_score: use only matches with a higher score.
 
     Returns:
-        From image to keypoints (N, 2), COLMAP's pixels; from image to their uncertainty in
-        pixels; from pair to matches (M, 2).
+        From image to keypoints (N, 2), COLMAP's pixels; from image to their uncertainty in pixels;
+        and from pair to matches (M, 2).
 
     Raises:
         InputError: when something is missing, or a pair names another image.
     """
-    keypoints, uncertainty, found = {}, {}, {}
+    keypoints: dict[str, np.ndarray] = {}
+    uncertainty: dict[str, float] = {}
+    found: dict[Pair, np.ndarray] = {}
     with open_h5(features) as file:
         for name in progress(names, "Reading keypoints", "image"):
             keypoints[name], uncertainty[name] = get_colmap_keypoints(file, name)
     with open_h5(matches) as file:
         for name0, names1 in parse_retrieval(pairs).items():
             for name1 in names1:
-                if name0 not in keypoints or name1 not in keypoints:
-                    absent = name1 if name0 in keypoints else name0
-                    raise InputError(f"{pairs}: image {absent} is not in the reference model.")
+                for name in (name0, name1):
+                    if name not in keypoints:
+                        raise InputError(f"{pairs}: image {name} is not in the reference model.")
                 if name0 == name1 or (name0, name1) in found or (name1, name0) in found:
                     continue
                 sizes = len(keypoints[name0]), len(keypoints[name1])
@@ -199,22 +208,22 @@ def read_matches(
 
 
 def _check_sizes(reference: pycolmap.Reconstruction, features: Path) -> None:
-    """Warn of photos of other sizes than their cameras in a model: these see nothing right."""
+    """Warn of photos whose sizes differ from those of their cameras: their geometry is wrong."""
     wrong = []
     with open_h5(features) as file:
         for image in reference.images.values():
             camera = reference.cameras[image.camera_id]
             try:
                 width, height = get_image_size(file, image.name)
-            except InputError:  # of other programs, whose features have none
+            except InputError:  # features of other programs may have none
                 continue
             if (width, height) != (camera.width, camera.height):
                 size = f"{camera.width}x{camera.height}"
                 wrong.append(f"{image.name} ({width}x{height}, its camera {size})")
     if wrong:
         logger.warning(
-            "%d of %d photos are of other sizes than their cameras in the model: %s. Take the "
-            "photos that the model was made of, or resize its cameras.",
+            "%d of %d photos differ in size from their cameras in the model: %s. Use the photos "
+            "that the model was made from, or resize its cameras.",
             *(len(wrong), len(reference.images), cli.some(wrong, 3)),
         )
 
@@ -223,20 +232,17 @@ def _verify_by_poses(
     reference: pycolmap.Reconstruction,
     keypoints: dict[str, np.ndarray],
     uncertainty: dict[str, float],
-    matches: dict[tuple[str, str], np.ndarray],
-) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]:
-    """Find the matches that lie on the epipolar lines of the known poses.
-
-    Returns:
-        From pair to all matches and to those (M, 2).
-    """
+    matches: dict[Pair, np.ndarray],
+) -> Verified:
+    """Return for each pair all matches, and those close to the epipolar lines of known poses."""
     poses, rays, thresholds = {}, {}, {}
     for image in reference.images.values():
         camera, name = reference.cameras[image.camera_id], image.name
         poses[name] = image.cam_from_world()
         rays[name] = colmap.cam_from_img(camera, keypoints[name])
         thresholds[name] = camera.cam_from_img_threshold(MAX_EPIPOLAR_ERROR * uncertainty[name])
-    verified, ratios = {}, []
+    verified: Verified = {}
+    ratios = []
     for (name0, name1), indices in matches.items():
         errors0, errors1 = epipolar_errors(
             poses[name1] * poses[name0].inverse(),
@@ -263,11 +269,11 @@ def epipolar_errors(
     Args:
         cam1_from_cam0: the relative pose.
         points0: (M, 2) points on the normalized image plane of camera 0.
-        points1: (M, 2) their matches on that of camera 1.
+        points1: (M, 2) their matches on the normalized image plane of camera 1.
 
     Returns:
-        Distances (M,) of points0 and of points1 to their lines, in units of focal lengths;
-        infinite where a line is not defined.
+        Distances (M,) of points0 and of points1 to their epipolar lines, on these planes; infinite
+        where a line is undefined.
     """
     tx, ty, tz = cam1_from_cam0.translation
     cross = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]])
@@ -308,11 +314,13 @@ def _main() -> None:
     parser.add_argument(
         "--estimate_two_view_geometries",
         action="store_true",
-        help="verify by geometries estimated from the matches, not by the known poses",
+        help="verify with geometries estimated from the matches, not with the known poses",
     )
-    parser.add_argument("--min_match_score", type=float, help="take matches of a higher score only")
+    parser.add_argument(
+        "--min_match_score", type=float, help="use only matches with a higher score"
+    )
     parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
-    parser.add_argument("--overwrite", action="store_true", help="triangulate anew")
+    parser.add_argument("--overwrite", action="store_true", help="triangulate again")
     main(**vars(parser.parse_args()))
 
 

@@ -1,7 +1,7 @@
-"""Local features: base descriptors, 128-D, their projections, and those of a user's own file.
+"""Local features: 128-D base descriptors, their projections, and features of users' YAML files.
 
 `<descriptor>_<scheme><dim>` are the paper's; `<descriptor>_nested` is 64-D, and
-`<descriptor>_nested@<dim>` its first numbers. `colmap_sift` is COLMAP's own SIFT.
+`<descriptor>_nested@<dim>` its first numbers. `colmap_sift` is COLMAP's SIFT.
 """
 
 import re
@@ -89,15 +89,15 @@ def get(
     """Return the name and the configuration of a feature.
 
     Args:
-        name: a key of `confs`, or the path of a YAML file with a `model` and perhaps
-            `preprocessing`; that feature is called as the file.
-        projection: file of another projection of the same base; the feature is called after it.
-        storage: how descriptors are kept, one of `storage.STORAGES`.
-        keypoints: settings of DoG, one of `detection.KEYPOINTS`; "adaptive" leaves those of a YAML
-            file as they are.
+        name: a key of `confs`, or a YAML file with a `model` and perhaps `preprocessing`, which
+            names the feature.
+        projection: file of another projection of the same base, which names the feature.
+        storage: of the descriptors, one of `feature_files.STORAGES`.
+        keypoints: settings of DoG, one of `detectors.dog.KEYPOINTS`; "adaptive" keeps those of a
+            YAML file.
 
     Raises:
-        InputError: for an unknown name or a file that is none.
+        InputError: for an unknown name or a file that is not a feature's configuration.
     """
     choose("storage", storage, STORAGES)
     choose("keypoints", keypoints, KEYPOINTS)
@@ -111,25 +111,22 @@ def get(
         conf = {**conf, "model": with_keypoints(conf["model"], keypoints)}
     if projection is None:
         return name, conf
-    model = {
-        "name": "reduced",
-        "base": base_of(conf["model"]),
-        "projection": str(projection),
-    }
+    base = base_of(conf["model"])
+    model = {"name": "reduced", "base": base, "projection": str(projection)}
     file, prefix = projections.split_prefix(projection)
     name = Path(file).stem + (prefix and f"@{prefix}")
     return name, {**conf, "output": feature(name, model)["output"], "model": model}
 
 
 def with_keypoints(model: dict, keypoints: str) -> dict:
-    """Return the configuration of a model with other settings of DoG, if it has that detector."""
+    """Return the configuration of a model with other settings of DoG, if it uses DoG."""
     if "base" in model:
         return {**model, "base": with_keypoints(model["base"], keypoints)}
     return {**model, "keypoints": keypoints} if model["name"] == "dog" else model
 
 
 def base_of(model: dict) -> dict:
-    """Return the configuration of the extractor below a projection, or of the model itself."""
+    """Return the configuration of the extractor whose descriptors a model projects, or its own."""
     return model.get("base", model)
 
 
@@ -140,19 +137,19 @@ def descriptor_of(model: dict) -> str | None:
 
 
 def keypoints_of(model: dict) -> str | None:
-    """Return the name of the settings of DoG of a model, None if it has options of its own."""
+    """Return the name of a model's DoG settings; None for its own options."""
     found = base_of(model)
     return found.get("keypoints") if found.get("options", HLOC) == HLOC else None
 
 
 def of_patches(name: str) -> tuple[str, str | None]:
-    """Return the base descriptor and the projection, if any, of a feature that describes patches.
+    """Return the base descriptor and the projection, if any, of a feature of patches.
 
     Args:
-        name: as of `get`.
+        name: see `get`.
 
     Raises:
-        InputError: for an unknown one, or one that describes photos only.
+        InputError: for an unknown feature, or one that cannot describe patches.
     """
     name, conf = get(name)
     descriptor = descriptor_of(conf["model"])
@@ -166,7 +163,7 @@ def add_storage_option(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--storage",
         default=STORAGES[0],
-        help=f"how descriptors are kept, one of {', '.join(STORAGES)}; hloc reads no uint8",
+        help=f"storage of descriptors, one of {', '.join(STORAGES)}; hloc cannot read uint8",
     )
 
 
@@ -185,25 +182,27 @@ def read(path: Path) -> dict:
     """Read the configuration of a feature from a YAML file.
 
     Raises:
-        InputError: when it is none.
+        InputError: when the file is not a feature's configuration.
     """
     content = read_yaml(path)
-    model = content.get("model") if isinstance(content, dict) else None
-    for part in (model, model.get("base", model) if isinstance(model, dict) else None):
-        if not isinstance(part, dict) or "name" not in part:
-            raise InputError(f"{path} has no model with a name, such as: model: {{name: dog}}.")
+    content = content if isinstance(content, dict) else {}
+    model = content.get("model")
+    base = model.get("base", model) if isinstance(model, dict) else None
+    if not (
+        isinstance(model, dict) and isinstance(base, dict) and "name" in model and "name" in base
+    ):
+        raise InputError(f"{path} has no model with a name, such as: model: {{name: dog}}.")
     projection = model.get("projection", "" if model["name"] == "reduced" else None)
     if projection is not None and not (isinstance(projection, str) and projection):
-        raise InputError(f"{path}: the {model['name']} model names no projection.")
-    base = model.get("base", model)
+        raise InputError(f"{path}: the model {model['name']} needs a projection.")
     if base["name"] == "dog" and "keypoints" not in base:
         model = with_keypoints(model, KEYPOINTS[0])
     if projection and Path(projections.split_prefix(projection)[0]).suffix:
-        model = {**model, "projection": str(Path(projection).absolute())}  # other machines read it
+        model = {**model, "projection": str(Path(projection).absolute())}  # for other machines
     given = content.get("preprocessing") or {}
     if not isinstance(given, dict):
         raise InputError(f"{path}: preprocessing cannot be {given!r}.")
-    # what the confs of hloc have besides, `output`, is not needed
+    # hloc's confs also have an `output`, which is ignored
     unknown = content.keys() - {"model", "preprocessing", "output"}
     unknown |= given.keys() - {*PREPROCESSING, "resize_force"}
     if unknown:

@@ -1,6 +1,6 @@
 """Matchers, by hloc's names."""
 
-confs = {
+confs: dict[str, dict] = {
     "NN-ratio": {
         "output": "matches-NN-mutual-ratio.8",
         "model": {"name": "nearest_neighbor", "ratio_threshold": 0.8},

@@ -1,4 +1,4 @@
-"""Base descriptors: 32x32 patches to 128 numbers."""
+"""Base descriptors: 32x32 patches to 128-D descriptors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 PATCH_SIZE = 32
 DIM = 128
-COLMAP = "colmap_sift"  # COLMAP's own SIFT, a base descriptor that takes no patches
+COLMAP = "colmap_sift"  # COLMAP's SIFT, a base descriptor that takes no patches
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,10 @@ class Base:
 
     Args:
         make: returns the module that maps (N, 1, 32, 32) in [0, 1] to (N, 128).
-        urls: of the weights, which kornia looks for in torch's cache; none for a descriptor
-            without.
+        urls: of the weights, if any, which kornia looks for in torch's cache.
         sha256: of the weights.
-        hidden: the sizes of the hidden layers of its projections: two for hand-crafted descriptors,
-            one for learned ones (Sec. III-D).
+        hidden: sizes of the hidden layers of its projections: two for hand-crafted descriptors, one
+            for learned ones (Sec. III-D).
     """
 
     make: "Callable[[], nn.Module]"
@@ -73,14 +72,14 @@ DESCRIPTORS = {
         hidden=(96,),
     ),
 }
-BASES = (*DESCRIPTORS, COLMAP)  # of features of photos
+BASES = (*DESCRIPTORS, COLMAP)  # base descriptors of photos
 
 
 def check_weights(name: str) -> None:
-    """Make sure that torch's cache has the weights of a descriptor, the right ones.
+    """Download the weights of a descriptor to torch's cache unless it has them.
 
     Raises:
-        InputError: when they are broken, or not there and not to be downloaded.
+        InputError: when they are broken or cannot be downloaded.
     """
     path, base = weights(name), DESCRIPTORS[name]
     if path is not None:
@@ -89,6 +88,6 @@ def check_weights(name: str) -> None:
 
 
 def weights(name: str) -> Path | None:
-    """Return where torch's cache has the weights of a descriptor; None for one without."""
+    """Return the path of a descriptor's weights in torch's cache; None if it has none."""
     urls = DESCRIPTORS[name].urls
     return downloads.cache() / urls[0].rpartition("/")[2] if urls else None

@@ -8,16 +8,16 @@ from . import DESCRIPTORS, DIM, check_weights
 
 
 class Descriptor(nn.Module):
-    """A base descriptor by name; computes in small batches, which stay in the cache.
+    """A base descriptor, computed in batches.
 
     Args:
         name: a key of `DESCRIPTORS`.
 
     Raises:
-        InputError: for an unknown name, or when its weights are broken or not to be had.
+        InputError: for an unknown name, or when its weights are broken or cannot be downloaded.
     """
 
-    batch_size = 128  # whose intermediate results stay in the cache of a CPU
+    batch_size = 128  # intermediate results stay in the cache of a CPU
 
     def __init__(self, name: str):
         super().__init__()

@@ -1,4 +1,4 @@
-"""SIFT of patches: kornia's, computed in a third of the time on a CPU."""
+"""SIFT of patches: equal to kornia's, in a third of the time on a CPU."""
 
 import math
 
@@ -12,8 +12,8 @@ EPSILON = 1e-10  # kornia's: keeps the orientation of a zero gradient defined
 class SIFT(nn.Module):
     """The descriptors of kornia's `SIFTDescriptor(patch_size, 8, 4, rootsift=False)`.
 
-    Where kornia convolves each angular bin with the pooling kernel, here all are pooled by one
-    matrix product, the Gaussian window included. Equal to kornia's but for rounding.
+    kornia convolves each angular bin with the pooling kernel. Here one matrix product, with the
+    Gaussian window, pools all bins. The results differ by rounding only.
 
     Args:
         patch_size: side of the patches in pixels.
@@ -21,13 +21,15 @@ class SIFT(nn.Module):
 
     angles = 8
     clip = 0.2
+    pooling: torch.Tensor
 
     def __init__(self, patch_size: int):
         super().__init__()
         sift = SIFTDescriptor(patch_size, self.angles, 4, rootsift=False)
         pixels = torch.eye(patch_size**2).unflatten(1, (1, patch_size, patch_size))
         with torch.no_grad():
-            pooling = sift.pk(pixels).flatten(1) * sift.gk.reshape(-1, 1)
+            window = sift.get_buffer("gk").reshape(-1, 1)
+            pooling = sift.get_submodule("pk")(pixels).flatten(1) * window
         self.register_buffer("pooling", pooling, persistent=False)
 
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
@@ -37,7 +39,7 @@ class SIFT(nn.Module):
         gy = (padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]).flatten(1) / 2
         squared = gx * gx + gy * gy
         magnitude = (squared + EPSILON).sqrt_() * (squared > 0)
-        # in bins, above 0 so that rounding down is rounding towards zero
+        # in bins, positive, so that truncation rounds down
         orientation = torch.atan2(gy, gx + EPSILON) * (self.angles / (2 * math.pi)) + self.angles
         lower = orientation.long()
         upper_share = (orientation - lower) * magnitude

@@ -1,8 +1,8 @@
 """DoG keypoints whose settings follow the photo.
 
-hloc's settings are meant for well-lit photos of about 1600 pixels. In a photo that is small, dark,
-hazy or smooth they find too few keypoints to match, so finer and weaker ones are added until there
-are enough.
+hloc's settings suit well-lit photos of about 1600 pixels. In small, dark, hazy or smooth photos
+they find too few keypoints to match, so settings that find finer and weaker ones are tried until
+there are enough.
 """
 
 import cv2
@@ -12,39 +12,37 @@ from ..utils import colmap
 
 HLOC = {"first_octave": 0, "peak_threshold": 0.01}
 COLMAP = {"first_octave": -1, "peak_threshold": 0.0067}
-# name -> the settings that are tried first, and whether finer ones are where these find too few
+# name -> the settings to try first, and whether to try others if these find too few keypoints
 SETTINGS = {"adaptive": (HLOC, True), "colmap": (COLMAP, True), "hloc": (HLOC, False)}
 KEYPOINTS = tuple(SETTINGS)
 
-ENOUGH = 2500  # keypoints of a photo, and in small ones
-PIXELS = 200  # for each of them
-SMALL = 1200  # pixels on the longer side: twice as large it is still fast to search
-# (first_octave, peak_threshold), tried one after the other while there are not enough keypoints.
-# Octave -1 is that of the photo at twice its size; 0.0067 is COLMAP's own threshold.
+ENOUGH = 2500  # keypoints of a photo
+PIXELS = 200  # per keypoint: fewer keypoints are enough in small photos
+SMALL = 1200  # pixels on the longer side: detection is fast even at twice the size
+# (first_octave, peak_threshold), tried in turn until there are enough keypoints. Octave -1 is the
+# photo at twice its size; 0.0067 is COLMAP's threshold.
 LADDERS = {
     "small": ((-1, 0.0067), (-1, 0.0033), (-1, 0.001)),
     "large": ((0, 0.005), (0, 0.0025), (0, 0.001), (-1, 0.0033)),
 }
 
 BLUR = 4.0  # pixels, standard deviation of the blur that suppresses noise
-LEAST_SIGNAL = 5.0  # times what noise alone leaves after such a blur
+LEAST_SIGNAL = 5.0  # minimum contrast after the blur, relative to that of pure noise
 
 
 def detect(
     image: np.ndarray, options: dict, adaptive: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Detect and describe keypoints, with other settings where those given find too few.
-
-    Where they find enough, the keypoints are exactly theirs. A photo that shows nothing but noise
-    is left as it is.
+    """Detect and describe keypoints.
 
     Args:
         image: (H, W) float32 in [0, 1].
         options: of pycolmap's SiftExtractionOptions.
-        adaptive: try other settings.
+        adaptive: try other settings if `options` find too few keypoints, unless the image shows
+            nothing but noise.
 
     Returns:
-        As `colmap.detect_dog`.
+        Keypoints and descriptors, see `colmap.detect_dog`.
     """
     found = colmap.detect_dog(image, options)
     enough = min(ENOUGH, image.size / PIXELS)
@@ -63,14 +61,14 @@ def detect(
 
 
 def is_noise(image: np.ndarray) -> bool:
-    """Tell whether a photo (H, W) has no contrast beyond that of its noise, as of a covered lens.
+    """Tell whether a photo (H, W) has no contrast beyond its noise, as with a covered lens.
 
-    The noise is estimated from second differences (Immerkaer, 1996), by their median.
+    The noise is estimated from the median of second differences (Immerkaer, 1996).
     """
     kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
     noise = np.median(np.abs(cv2.filter2D(image, -1, kernel))) / 0.6745 / 6
     smooth = cv2.GaussianBlur(image, (0, 0), BLUR)
-    left = noise / (2 * np.sqrt(np.pi) * BLUR)  # standard deviation of white noise that was blurred
-    # 98 % of it lie within 2.33 deviations; never less than an 8-bit step, which dithers
+    left = noise / (2 * np.sqrt(np.pi) * BLUR)  # standard deviation of blurred white noise
+    # 98 % of it is within 2.33 deviations; at least an 8-bit step, because of dithering
     low, high = np.percentile(smooth, [1, 99])
     return bool(high - low <= max(LEAST_SIGNAL * 2 * 2.33 * left, 1 / 255))

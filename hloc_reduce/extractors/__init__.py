@@ -15,7 +15,7 @@ from ..utils.base_model import BaseModel, dynamic_load
 from ..utils.hloc import is_installed
 from ..utils.images import convert, read_image
 
-# finds the keypoints of an image (H, W) float32 in [0, 1], as `utils.colmap.detect_dog`
+# from an image (H, W) float32 in [0, 1] to what `utils.colmap.detect_dog` returns
 Detect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -28,9 +28,9 @@ class Extractor(BaseModel):
 
     Attributes:
         detection_noise: standard deviation of the keypoints in pixels.
-        detect: finds the keypoints, where that can be done apart from describing them, in another
-            process: pickled. What it returns is then `_forward`'s `detected`.
-        dim: number of dimensions of the descriptors, as far as it is known beforehand.
+        detect: detects the keypoints, if that can be done in another process (pickled), separately
+            from describing them; `_forward` gets the result as `detected`.
+        dim: dimension of the descriptors, as far as it is known.
     """
 
     required_inputs = ("image",)
@@ -40,29 +40,29 @@ class Extractor(BaseModel):
 
     @property
     def descriptor(self) -> str:
-        """The name that projections of these descriptors are kept under."""
+        """The name of these descriptors in the metadata of projections."""
         return type(self).__module__.rpartition(".")[2]
 
     @property
     def base(self) -> "Extractor":
-        """The extractor whose features `reduce` makes these of; several may share it."""
+        """The extractor whose features `reduce` takes; several extractors may share it."""
         return self
 
     @property
     def detection(self) -> dict:
-        """What determines the keypoints; extractors that agree in it share them."""
+        """What determines the keypoints, equal for extractors that share them."""
         return {**self.conf, "name": type(self).__module__}
 
     def reduce(self, features: dict) -> dict:
-        """Return these features, made of those of `base`."""
+        """Return the features of this extractor, computed from those of `base`."""
         return features
 
 
 def load(conf: dict) -> Extractor:
     """Make the extractor of a model configuration.
 
-    Its `name` is that of a module of this package, else of one of an installed hloc's
-    extractors. `hloc.dog` is hloc's where both have a `dog`.
+    Its `name` is a module of this package, or else an extractor of an installed hloc. `hloc.dog`
+    is hloc's `dog`, although this package has one too.
 
     Raises:
         InputError: when there is no such extractor, or its configuration is wrong.
@@ -71,13 +71,16 @@ def load(conf: dict) -> Extractor:
     ours = [module.name for module in pkgutil.iter_modules(__path__)]
     if name not in ours and (is_installed() or name.startswith("hloc.")):
         return load({"name": "hloc", "conf": conf})
-    return dynamic_load(sys.modules[__name__], name)(conf)
+    extractor = dynamic_load(sys.modules[__name__], name)(conf)
+    if not isinstance(extractor, Extractor):
+        raise TypeError(f"{type(extractor).__name__} is not an Extractor.")
+    return extractor
 
 
 def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:
-    """Read an image and resize it to at most `resize_max` pixels on its longer side.
+    """Read an image and resize its longer side to at most `resize_max` pixels.
 
-    With `resize_force` smaller ones get so many, too.
+    With `resize_force` smaller images are enlarged to `resize_max` pixels.
 
     Args:
         image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
@@ -90,20 +93,20 @@ def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Ten
         InputError: when it cannot be read.
     """
     grayscale = preprocessing.get("grayscale", False)
-    image = (
+    pixels = (
         convert(image, grayscale) if isinstance(image, np.ndarray) else read_image(image, grayscale)
     )
-    image = image.astype(np.float32)
-    size = np.array(image.shape[1::-1])
+    pixels = pixels.astype(np.float32)
+    size = np.array(pixels.shape[1::-1])
     resize_max = preprocessing.get("resize_max")
     if resize_max and (size.max() > resize_max or preprocessing.get("resize_force")):
-        # one pixel at least: a panorama may be a thousand times wider than high
+        # at least one pixel: a panorama may be a thousand times wider than high
         new_size = np.maximum(1, np.round(size * (resize_max / size.max())).astype(int))
         smaller = (new_size <= size).all()
         interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR  # as hloc
-        image = cv2.resize(image, new_size.tolist(), interpolation=interpolation)
-    image = np.atleast_3d(image).transpose(2, 0, 1) / 255
-    return torch.from_numpy(np.ascontiguousarray(image))[None], size
+        pixels = cv2.resize(pixels, new_size.tolist(), interpolation=interpolation)
+    pixels = np.atleast_3d(pixels).transpose(2, 0, 1) / 255
+    return torch.from_numpy(np.ascontiguousarray(pixels))[None], size
 
 
 def extract(
@@ -113,14 +116,14 @@ def extract(
 
     Args:
         model: an extractor.
-        image: as of `load_image`.
-        preprocessing: as of `load_image`.
+        image: see `load_image`.
+        preprocessing: see `load_image`.
         device: of the model.
 
     Returns:
         keypoints (N, 2) float32 (x, y) in pixels of the original image, centres at integers;
-        descriptors (D, N); scores, scales (pixels), oris (degrees) (N,), as far as the model has
-        them; image_size (2,) width, height; and the uncertainty of the keypoints in pixels.
+        descriptors (D, N); scores, scales (pixels), oris (degrees) (N,), if the model has them;
+        image_size (2,) width, height; and the uncertainty of the keypoints in pixels.
     """
     return extract_several([model], image, preprocessing, device)[0]
 
@@ -136,27 +139,28 @@ def extract_several(
     """Extract several features of one image; what they have in common is computed once.
 
     Args:
-        models: extractors that agree in `detection`.
-        image: as of `load_image`.
-        preprocessing: as of `load_image`.
+        models: extractors with equal `detection`.
+        image: see `load_image`.
+        preprocessing: see `load_image`.
         device: of the models.
-        detect: does what theirs does, elsewhere.
+        detect: replaces `detect` of the models, for example by a call in another process.
 
     Returns:
-        Of each model what `extract` returns.
+        What `extract` returns, for each model.
     """
-    image, size = load_image(image, preprocessing)
-    data = {"image": image.to(device)}
-    detect = detect or (models[0].detect if len(models) > 1 else None)
+    pixels, size = load_image(image, preprocessing)
+    data: dict = {"image": pixels.to(device)}
+    detect = detect or models[0].detect
     if detect is not None:
-        data["detected"] = detect(image[0, 0].numpy())
-    ratio = (size / np.array(image.shape[:1:-1])).astype(np.float32)
-    described, extracted = {}, []
+        data["detected"] = detect(pixels[0, 0].numpy())
+    ratio = (size / np.array(pixels.shape[:1:-1])).astype(np.float32)
+    described: dict[str, dict] = {}
+    extracted = []
     for model in models:
-        key = json.dumps(model.base.conf, sort_keys=True, default=str)
-        if key not in described:
-            described[key] = model.base(data)
-        found = model.reduce(described[key])
+        base = json.dumps(model.base.conf, sort_keys=True, default=str)
+        if base not in described:
+            described[base] = model.base(data)
+        found = model.reduce(described[base])
         features = {key: value[0].cpu().numpy() for key, value in found.items()}
         features["keypoints"] = (features["keypoints"] + 0.5) * ratio - 0.5
         if "scales" in features:

@@ -1,4 +1,4 @@
-"""DoG keypoints by COLMAP's SIFT and a base descriptor of the patches around them."""
+"""DoG keypoints of COLMAP's SIFT, with a base descriptor of the patches around them."""
 
 from functools import partial
 
@@ -12,21 +12,21 @@ from ..descriptors.model import Descriptor
 from ..detectors import dog
 from ..utils import colmap
 from ..utils.cli import InputError, choose
-from . import Extractor
+from . import Detect, Extractor
 
 
 def extract_patches(
     image: torch.Tensor, keypoints: np.ndarray, mr_size: float = 12.0
 ) -> torch.Tensor:
-    """Cut the oriented patches around keypoints out of an image pyramid.
+    """Sample oriented patches around keypoints from an image pyramid.
 
-    The same as kornia's `extract_patches_from_pyramid`, several times faster on a CPU.
+    Equal to kornia's `extract_patches_from_pyramid`, and several times faster on a CPU.
 
     Args:
         image: (1, 1, H, W) float in [0, 1].
         keypoints: (N, 4) x, y (pixels, centres at integers), scale (pixels), orientation
             (degrees, from x towards y).
-        mr_size: the side of a patch in units of the keypoint's scale.
+        mr_size: side of a patch in units of the keypoint's scale.
 
     Returns:
         (N, 1, 32, 32) float32 in [0, 1].
@@ -35,7 +35,7 @@ def extract_patches(
     x_y, scale, orientation = np.split(keypoints.astype(np.float32), [2, 3], axis=1)
     half_width, angle = scale * mr_size / 2, np.deg2rad(orientation)
     level = np.log2(2 * half_width[:, 0] / PATCH_SIZE).clip(0, len(levels) - 1).astype(int)
-    # the sides of a patch, in pixels of the image
+    # vectors from the centre of a patch to its right and lower sides, in pixels of the image
     right = half_width * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
     down = right[:, ::-1] * [-1, 1]
     steps = ((torch.arange(PATCH_SIZE) + 0.5) * (2 / PATCH_SIZE) - 1).to(image.device)
@@ -43,7 +43,7 @@ def extract_patches(
     size = np.array(image.shape[:1:-1])
     for number, pixels in enumerate(levels):
         rows = np.flatnonzero(level == number)
-        # grid_sample's coordinates: -1 and 1 are the borders of the image, whatever its level
+        # grid_sample's coordinates: -1 and 1 are the borders of the image at every level
         centre, across, along = (
             torch.from_numpy((2 * part[rows] / size).astype(np.float32)).to(image.device)
             for part in (x_y + 0.5, right, down)
@@ -63,7 +63,7 @@ def extract_patches(
 
 
 def pyramid(image: np.ndarray) -> list[np.ndarray]:
-    """Halve an image (H, W) float32 again and again, while a patch fits into it."""
+    """Halve an image (H, W) float32 repeatedly, while a patch fits into it."""
     levels = [image]
     kernel = np.array([1, 4, 6, 4, 1], np.float32) / 16
     while min(levels[-1].shape) // 2 >= PATCH_SIZE:
@@ -76,14 +76,14 @@ def pyramid(image: np.ndarray) -> list[np.ndarray]:
 class DoG(Extractor):
     """hloc's `dog`: DoG keypoints of COLMAP and descriptors of 32x32 patches.
 
-    With the descriptor `colmap_sift` these are COLMAP's own, which need no patches. Unlike hloc's
-    it stores keypoints with pixel centres at integers whatever pycolmap says, gives each keypoint a
-    score, its scale (COLMAP's own ranking), and honours `max_keypoints`.
+    The descriptor `colmap_sift` is COLMAP's SIFT, which needs no patches. Unlike hloc's `dog` this
+    one stores keypoints with pixel centres at integers for every version of pycolmap, scores each
+    keypoint by its scale, as COLMAP ranks them, and honours `max_keypoints`.
 
-    `keypoints` names the settings of DoG: "adaptive" are hloc's, and others in photos where these
-    find too few (`detection.detect`); "colmap" are COLMAP's, which find several times as many,
-    with the same fallback; "hloc" are hloc's for every photo. Other `options` than hloc's are used
-    for every photo, whatever `keypoints` says.
+    `keypoints` names the settings of DoG: "adaptive" uses hloc's, and others in photos where these
+    find too few (`detectors.dog.detect`); "colmap" uses COLMAP's, which find several times as many,
+    with the same fallback; "hloc" uses hloc's for every photo. `options` that differ from hloc's
+    override `keypoints`.
     """
 
     default_conf = {
@@ -93,6 +93,7 @@ class DoG(Extractor):
         "max_keypoints": -1,
         "mr_size": 12,
     }
+    detect: Detect
 
     def _init(self, conf: dict) -> None:
         name = choose("keypoints", conf["keypoints"], dog.KEYPOINTS)
@@ -105,7 +106,7 @@ class DoG(Extractor):
 
     @property
     def descriptor(self) -> str:
-        """The name that projections of these descriptors are kept under."""
+        """The name of these descriptors in the metadata of projections."""
         return self.conf["descriptor"]
 
     @property
@@ -114,10 +115,7 @@ class DoG(Extractor):
         return {key: value for key, value in super().detection.items() if key != "descriptor"}
 
     def _forward(self, data: dict) -> dict:
-        """Extract from an image (1, 1, H, W), or describe what was `detected` in it.
-
-        `data["detected"]` is what `detect` returns.
-        """
+        """Describe the `detected` keypoints of an image (1, 1, H, W), by default detect them."""
         image = data["image"]
         if image.shape[1] != 1:
             raise InputError("DoG needs grey images: preprocessing: {grayscale: true}.")

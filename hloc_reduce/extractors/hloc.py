@@ -1,4 +1,4 @@
-"""An extractor of hloc's as one of this project's."""
+"""An extractor of an installed hloc as an extractor of this project."""
 
 import pkgutil
 
@@ -9,7 +9,7 @@ from ..utils.cli import InputError, choose
 from ..utils.hloc import extractors_package
 from . import Extractor
 
-# keys of hloc's configurations that say which descriptors there will be
+# keys of hloc's configurations that determine the descriptors
 DETERMINING = ("descriptor", "model_name", "weights")
 
 
@@ -18,9 +18,9 @@ def _reason(error: Exception) -> str:
 
 
 class HlocExtractor(Extractor):
-    """The features of an extractor of an installed hloc, as this project's extractors give them.
+    """The features of an extractor of an installed hloc.
 
-    `conf` is hloc's configuration: `name` and what that extractor takes.
+    `conf` is hloc's configuration: `name` and the options of that extractor.
     """
 
     default_conf = {"conf": {}}
@@ -29,7 +29,9 @@ class HlocExtractor(Extractor):
         package, load = extractors_package()
         conf = dict(conf["conf"])
         if "name" not in conf:
-            raise InputError("The extractor hloc names none of hloc's: conf: {name: ...}.")
+            raise InputError(
+                "The extractor hloc needs the name of one of hloc's: conf: {name: ...}."
+            )
         name = conf["name"] = str(conf["name"]).removeprefix("hloc.")
         self.name = choose(
             "extractor", name, [module.name for module in pkgutil.iter_modules(package.__path__)]
@@ -44,13 +46,12 @@ class HlocExtractor(Extractor):
 
     @property
     def descriptor(self) -> str:
-        """The name that a projection of these descriptors is kept under: hloc.disk.depth."""
+        """The name of these descriptors in the metadata of projections, such as hloc.disk.depth."""
         chosen = [str(self.model.conf[key]) for key in DETERMINING if self.model.conf.get(key)]
         return ".".join(["hloc", self.name, *chosen])
 
     @torch.no_grad()
     def _forward(self, data: dict) -> dict:
-        """Extract keypoints (1, N, 2), descriptors (1, D, N) of unit norm and whatever else."""
         try:
             features = {key: value[0] for key, value in self.model(data).items()}
         except (torch.cuda.OutOfMemoryError, MemoryError):
@@ -58,11 +59,11 @@ class HlocExtractor(Extractor):
         except Exception as error:
             raise InputError(
                 f"hloc's extractor {self.name} fails ({_reason(error)}). "
-                "Is preprocessing as it needs it, grayscale above all?"
+                "Does it need other preprocessing, such as grayscale?"
             ) from error
         if "descriptors" not in features:
             raise InputError(f"hloc's extractor {self.name} gives no local descriptors.")
-        # some describe on the CPU, wherever they are
+        # some extractors return descriptors on the CPU
         descriptors = features["descriptors"].to(data["image"].device).float()
         features["descriptors"] = normalize(descriptors, dim=0)
         if "keypoint_scores" in features:

@@ -8,8 +8,8 @@ from . import Extractor, load
 class Reduced(Extractor):
     """The features of `base` with descriptors projected to fewer dimensions.
 
-    `base` is the configuration of an extractor, of this project or of an installed hloc;
-    `projection` the name of a projection that ships or the path of one, None for none.
+    `base` is the configuration of an extractor of this project or of an installed hloc.
+    `projection` is the name of a shipped projection, the path of another one, or None.
     """
 
     default_conf = {"base": {"name": "dog"}, "projection": None}
@@ -17,6 +17,7 @@ class Reduced(Extractor):
     def _init(self, conf: dict) -> None:
         self.extractor = load(conf["base"])
         self.detect, self.dim = self.base.detect, self.base.dim
+        self.detection_noise = self.base.detection_noise
         self.project = None
         if conf["projection"] is None:
             return
@@ -35,11 +36,6 @@ class Reduced(Extractor):
         return self.extractor
 
     @property
-    def detection_noise(self) -> float:
-        """The standard deviation of the keypoints in pixels, as the base extractor has it."""
-        return self.base.detection_noise
-
-    @property
     def detection(self) -> dict:
         """What determines the keypoints."""
         return self.base.detection
@@ -48,7 +44,7 @@ class Reduced(Extractor):
         return self.reduce(self.base(data))
 
     def reduce(self, features: dict) -> dict:
-        """Project the descriptors of features that `base` extracted."""
+        """Project the descriptors of features of `base`."""
         if self.project is None:
             return features
         descriptors = features["descriptors"][0].T

@@ -13,7 +13,7 @@ from ..confs import matchers as matchers_confs
 from ..utils.cli import InputError
 from ..utils.hloc import MIN_PYCOLMAP, extractors_package, import_module, parse_version
 
-# from this pycolmap on geometries whose configuration is undefined are skipped: hloc's all are
+# this pycolmap and later ones skip geometries of undefined configuration, which all of hloc's have
 NO_POINTS = Version("4.2.1")
 EXTRACTORS = Path(__file__).parent / "extractors"
 VLAD = {
@@ -24,7 +24,7 @@ VLAD = {
 
 
 def register(features: Iterable[Path] | Path = ()) -> list[str]:
-    """Do what `hloc_reduce.register` says."""
+    """Register this project with hloc, see `hloc_reduce.register`."""
     if isinstance(features, str | Path):
         features = [features]
     package, _ = extractors_package()
@@ -45,15 +45,15 @@ def register(features: Iterable[Path] | Path = ()) -> list[str]:
 
 
 def _add(offered: dict[str, dict], registered: dict[str, dict]) -> list[str]:
-    """Add the confs whose names are new, and return these."""
+    """Add the confs with new names, and return these names."""
     added = [name for name in offered if name not in registered]
-    # copies, as hloc's users change their confs
+    # copies, because users of hloc change its confs
     registered.update({name: copy.deepcopy(offered[name]) for name in added})
     return added
 
 
 def for_hloc(conf: dict) -> dict:
-    """Return the configuration of a feature with the extractor that hloc knows it by."""
+    """Return the configuration of a feature with the extractor's name in hloc."""
     model = conf["model"]
     if model["name"] == "reduced":
         return conf
@@ -61,10 +61,10 @@ def for_hloc(conf: dict) -> dict:
 
 
 def warn() -> None:
-    """Warn of a pycolmap with which hloc triangulates no point and does not say so."""
+    """Warn about a pycolmap with which hloc silently triangulates no points."""
     if parse_version(pycolmap.__version__) >= NO_POINTS:
         logger.warning(
-            "With pycolmap %s hloc's triangulation gives no points, and says nothing: use "
+            "With pycolmap %s hloc's triangulation silently gives no points: use "
             "hloc_reduce.triangulation and hloc_reduce.localize_sfm, or pip install pycolmap==%s.",
             pycolmap.__version__,
             MIN_PYCOLMAP,

@@ -1,6 +1,6 @@
 """Run a module of the installed hloc with this project's features and extractors registered.
 
-What follows the name of the module is the module's own.
+The module gets the arguments after its name.
 """
 
 import argparse
@@ -15,22 +15,22 @@ from . import register
 
 
 def main(name: str, args: list[str]) -> None:
-    """Run `python -m hloc.<name>` in this process, on the module's confs as they are now.
+    """Run the command line of `hloc.<name>` in this process, with the registered confs.
 
     Raises:
         InputError: when hloc has no such module, or it has no command line.
     """
     module = import_module(name)
-    source = Path(module.__file__).read_text() if module.__file__ else ""
-    # run as a module it would be executed anew, and with it its confs
-    blocks = [
+    path = module.__file__ or ""
+    # runpy would execute the whole module again, and drop the registered confs
+    blocks: list[ast.stmt] = [
         node
-        for node in ast.parse(source).body
+        for node in ast.parse(Path(path).read_text() if path else "").body
         if isinstance(node, ast.If) and "__main__" in ast.unparse(node.test)
     ]
     if not blocks:
         raise InputError(f"hloc.{name} has no command line.")
-    code = compile(ast.Module(blocks, type_ignores=[]), module.__file__, "exec")
+    code = compile(ast.Module(blocks, type_ignores=[]), path, "exec")
     sys.argv = [f"python -m hloc_reduce.hloc {name}", *args]
     exec(code, {**vars(module), "__name__": "__main__"})
 
@@ -48,10 +48,10 @@ def _main() -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="YAML file of a feature to register too, under the name of the file",
+        help="YAML file of another feature to register, named after the file",
     )
     parser.add_argument("module", help="such as extract_features or match_features")
-    parser.add_argument("args", nargs=argparse.REMAINDER, help="of the module")
+    parser.add_argument("args", nargs=argparse.REMAINDER, help="arguments of the module")
     args = parser.parse_args()
     register(args.feature)
     main(args.module, args.args)

@@ -6,7 +6,9 @@ import torch
 
 from ..utils.base_model import BaseModel, dynamic_load
 
-GPU_BYTES = 2**30  # of the memory of a GPU for what is computed at once
+GPU_BYTES = 2**30  # of GPU memory that a matcher may use at once
+
+Tensors = tuple[torch.Tensor, torch.Tensor]
 
 
 class Matcher(BaseModel):
@@ -19,26 +21,27 @@ class Matcher(BaseModel):
     required_inputs = ("descriptors0", "descriptors1")
 
     @torch.no_grad()
-    def match(
-        self, pairs: list[tuple[torch.Tensor, torch.Tensor]], gpu_bytes: int = GPU_BYTES
-    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Match several pairs; a subclass may do so at once.
+    def match(self, pairs: list[Tensors], gpu_bytes: int = GPU_BYTES) -> list[Tensors]:
+        """Match several pairs; a subclass may match them at once.
 
         Args:
-            pairs: of descriptors (N, D) and (M, D), all on one device.
-            gpu_bytes: what may be taken of the memory of a GPU at once.
+            pairs: descriptors (N, D) and (M, D) of unit norm, all on one device.
+            gpu_bytes: GPU memory to use at once.
 
         Returns:
-            Of each pair matches0 (N,) and matching_scores0 (N,).
+            matches0 (N,) and matching_scores0 (N,) of each pair.
         """
         found = [self({"descriptors0": a.T[None], "descriptors1": b.T[None]}) for a, b in pairs]
         return [(one["matches0"][0], one["matching_scores0"][0]) for one in found]
 
 
 def load(conf: dict) -> Matcher:
-    """Make the matcher of a model configuration, whose `name` is that of a module of this package.
+    """Make the matcher of a model configuration, whose `name` is a module of this package.
 
     Raises:
         InputError: when there is no such matcher, or its configuration is wrong.
     """
-    return dynamic_load(sys.modules[__name__], str(conf.get("name")))(conf)
+    matcher = dynamic_load(sys.modules[__name__], str(conf.get("name")))(conf)
+    if not isinstance(matcher, Matcher):
+        raise TypeError(f"{type(matcher).__name__} is not a Matcher.")
+    return matcher

@@ -1,13 +1,13 @@
 """Nearest neighbours: mutual, with a ratio test and a distance threshold, as in hloc."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch.nn.utils.rnn import pad_sequence
 
-from . import GPU_BYTES, Matcher
+from . import GPU_BYTES, Matcher, Tensors
 
-PART_BYTES = 2**19  # of descriptors1 at once, which stay in the cache of a core
+PART_BYTES = 2**19  # of descriptors1 at once: they stay in the cache of a core
 TILE = 2**20  # similarities at once
 
 
@@ -17,16 +17,16 @@ def nearest(
     ratio_threshold: float | None,
     gpu_bytes: int = GPU_BYTES,
     distance_threshold: float | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
+) -> Tensors:
     """Find the nearest descriptor1 of every descriptor0 that passes the tests.
 
     Args:
         descriptors0: (N, D) of unit norm.
         descriptors1: (M, D) of unit norm, M > 0, and M > 1 for a ratio test.
-        ratio_threshold: accept if the distance to the nearest is at most this times the distance
-            to the second nearest; None accepts all.
-        gpu_bytes: what similarities may take of the memory of a GPU at once.
-        distance_threshold: accept if the distance to the nearest is at most this.
+        ratio_threshold: maximum ratio of the distances to the nearest and the second nearest; None
+            for no ratio test.
+        gpu_bytes: GPU memory for similarities at once.
+        distance_threshold: maximum distance to the nearest; None for any.
 
     Returns:
         Its index (N,) int64, -1 where it does not pass, and its cosine (N,).
@@ -54,35 +54,33 @@ def nearest(
                 torch.amax(tile, 1, out=second[i, chosen])
         index[i] += i * len(parts[0])
     cosine, winner = best.max(dim=0, keepdim=True)
-    found = index.gather(0, winner)[0]
-    runner_up = None
+    accepted = _is_near(cosine[0], distance_threshold)
     if ratio_threshold is not None:
         runner_up = torch.maximum(
             second.gather(0, winner), best.scatter(0, winner, -torch.inf).amax(0, keepdim=True)
-        )[0]
-    accepted = _accepted(cosine[0], runner_up, ratio_threshold, distance_threshold)
-    return torch.where(accepted, found, -1), cosine[0]
+        )
+        accepted &= _is_distinct(cosine[0], runner_up[0], ratio_threshold)
+    return torch.where(accepted, index.gather(0, winner)[0], -1), cosine[0]
 
 
-def _accepted(
-    cosine: torch.Tensor,
-    runner_up: torch.Tensor | None,
-    ratio_threshold: float | None,
-    distance_threshold: float | None,
-) -> torch.Tensor:
-    """Tell which nearest neighbours pass the tests, by their cosines and those of the second."""
+def _is_near(cosine: torch.Tensor, distance_threshold: float | None) -> torch.Tensor:
+    """Apply the distance threshold, if any, to the cosines of nearest neighbours."""
+    if distance_threshold is None:
+        return torch.ones_like(cosine, dtype=torch.bool)
     # squared distances of unit vectors are 2 - 2 * cosine
-    accepted = torch.ones_like(cosine, dtype=torch.bool)
-    if ratio_threshold is not None:
-        accepted &= 1 - cosine <= ratio_threshold**2 * (1 - runner_up)
-    if distance_threshold is not None:
-        accepted &= 2 * (1 - cosine) <= distance_threshold**2
-    return accepted
+    return 2 * (1 - cosine) <= distance_threshold**2
+
+
+def _is_distinct(
+    cosine: torch.Tensor, runner_up: torch.Tensor, ratio_threshold: float
+) -> torch.Tensor:
+    """Apply the ratio test to the cosines of the nearest and second nearest neighbours."""
+    return 1 - cosine <= ratio_threshold**2 * (1 - runner_up)
 
 
 def _argmax(similarity: torch.Tensor) -> torch.Tensor:
-    """Return the column of the largest number of each row; of equal ones the first."""
-    if similarity.is_cpu:  # NumPy's is twice as fast there
+    """Return the column of the largest number of each row, the first of equal ones."""
+    if similarity.is_cpu:  # NumPy is twice as fast there
         return torch.from_numpy(similarity.numpy().argmax(axis=1))
     return similarity.argmax(dim=1)
 
@@ -95,33 +93,33 @@ def mutual_nearest(
     gpu_bytes: int = GPU_BYTES,
     distance_threshold: float | None = None,
     mutual: bool = True,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Match descriptors that are each other's nearest, both ways through the tests.
+) -> Tensors:
+    """Match descriptors that are each other's nearest and pass the tests of `nearest` both ways.
 
     Args:
         descriptors0: (N, D) of unit norm.
         descriptors1: (M, D) of unit norm.
-        ratio_threshold: as of `nearest`.
-        rows: (K,) of descriptors0, to find the matches of these only; default: all.
-        gpu_bytes: as of `nearest`.
-        distance_threshold: as of `nearest`.
-        mutual: if not, match each row with its nearest, whatever that one's nearest is.
+        ratio_threshold: see `nearest`.
+        rows: (K,) rows of descriptors0 to match; default: all.
+        gpu_bytes: see `nearest`.
+        distance_threshold: see `nearest`.
+        mutual: if False, match each row with its nearest only one way.
 
     Returns:
         For each of the rows the index of its match (K,) int64, or -1, and its cosine (K,).
     """
     chosen = descriptors0 if rows is None else descriptors0[rows]
     if min(len(chosen), len(descriptors1)) == 0:
-        nothing = torch.full((len(chosen),), -1, device=chosen.device)
-        return nothing, chosen.new_zeros(len(chosen))
-    # as in hloc, a lone descriptor on either side, which has no second best, skips the test
+        unmatched = torch.full((len(chosen),), -1, device=chosen.device)
+        return unmatched, chosen.new_zeros(len(chosen))
+    # as in hloc, a lone descriptor on either side has no second nearest and skips the test
     if min(len(descriptors0), len(descriptors1)) == 1:
         ratio_threshold = None
     limits = ratio_threshold, gpu_bytes, distance_threshold
     forward, cosine = nearest(chosen, descriptors1, *limits)
     if not mutual:
         return forward, cosine
-    # the way back only for those that somebody wants
+    # the way back, only for descriptors that are someone's nearest
     wanted = forward[forward >= 0].unique()
     backward = torch.full((len(descriptors1),), -1, device=forward.device)
     if len(wanted):
@@ -133,30 +131,31 @@ def mutual_nearest(
 
 
 def mutual_nearest_padded(
-    descriptors0: list[torch.Tensor],
-    descriptors1: list[torch.Tensor],
+    descriptors0: Sequence[torch.Tensor],
+    descriptors1: Sequence[torch.Tensor],
     ratio_threshold: float | None,
     distance_threshold: float | None = None,
     mutual: bool = True,
-) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Match several pairs as `mutual_nearest` does, at once, as suits a GPU.
+) -> list[Tensors]:
+    """Match several pairs as `mutual_nearest` does, at once, for a GPU.
 
     Args:
-        descriptors0: of P pairs (N, D), N > 0, of unit norm.
-        descriptors1: of these (M, D), M > 0, of unit norm.
-        ratio_threshold: as of `nearest`.
-        distance_threshold: as of `nearest`.
-        mutual: as of `mutual_nearest`.
+        descriptors0: (N, D) of unit norm of each pair, N > 0.
+        descriptors1: (M, D) of unit norm of each pair, M > 0.
+        ratio_threshold: see `nearest`.
+        distance_threshold: see `nearest`.
+        mutual: see `mutual_nearest`.
 
     Returns:
-        Of each pair the index of the match of each descriptor0 (N,) int64, or -1, and its cosine
+        For each pair the index of the match of each descriptor0 (N,) int64, or -1, and its cosine
         (N,).
     """
     sizes0, sizes1 = (
         torch.tensor([len(part) for part in parts], device=parts[0].device)
         for parts in (descriptors0, descriptors1)
     )
-    similarity = _pad(descriptors0) @ _pad(descriptors1).mT
+    padded0, padded1 = (pad_sequence(list(d), True) for d in (descriptors0, descriptors1))
+    similarity = padded0 @ padded1.mT
     for dim, sizes in ((1, sizes0), (2, sizes1)):
         padding = torch.arange(similarity.shape[dim], device=sizes.device) >= sizes[:, None]
         similarity.masked_fill_(padding.unsqueeze(3 - dim), -torch.inf)
@@ -171,28 +170,26 @@ def mutual_nearest_padded(
     return [(matches[i, :n], cosine[i, :n]) for i, n in enumerate(sizes0.tolist())]
 
 
-def _pad(descriptors: list[torch.Tensor]) -> torch.Tensor:
-    return pad_sequence(descriptors, batch_first=True)
-
-
 def _nearest_padded(
     similarity: torch.Tensor,
     dim: int,
     ratio_threshold: float | None,
     lone: torch.Tensor,
     distance_threshold: float | None,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Do what `nearest` does along a dimension of cosines (P, N, M); `lone` (P,) skip the test."""
+) -> Tensors:
+    """Find nearest neighbours along a dimension of cosines (P, N, M), see `nearest`.
+
+    The pairs in `lone` (P,) skip the ratio test.
+    """
     best, index = similarity.max(dim)
     # nothing is the nearest of padding
-    accepted = (best > -torch.inf) & _accepted(best, None, None, distance_threshold)
-    if ratio_threshold is None:
-        return torch.where(accepted, index, -1), best
-    hidden = index.unsqueeze(dim)
-    similarity.scatter_(dim, hidden, -torch.inf)
-    second = similarity.amax(dim)
-    similarity.scatter_(dim, hidden, best.unsqueeze(dim))
-    accepted &= _accepted(best, second, ratio_threshold, None) | lone[:, None]
+    accepted = (best > -torch.inf) & _is_near(best, distance_threshold)
+    if ratio_threshold is not None:
+        hidden = index.unsqueeze(dim)
+        similarity.scatter_(dim, hidden, -torch.inf)
+        distinct = _is_distinct(best, similarity.amax(dim), ratio_threshold)
+        similarity.scatter_(dim, hidden, best.unsqueeze(dim))
+        accepted &= distinct | lone[:, None]
     return torch.where(accepted, index, -1), best
 
 
@@ -206,61 +203,41 @@ class NearestNeighbor(Matcher):
     }
 
     @torch.no_grad()
-    def match(
-        self, pairs: list[tuple[torch.Tensor, torch.Tensor]], gpu_bytes: int = GPU_BYTES
-    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Match descriptors of unit norm, on a GPU several pairs at once.
-
-        Args:
-            pairs: of descriptors (N, D) and (M, D).
-            gpu_bytes: what similarities may take of the memory of a GPU at once. A pair that needs
-                more is matched in blocks.
-
-        Returns:
-            Of each pair matches0 (N,) int64, the index in 1 or -1, and matching_scores0 (N,) in
-            [0, 1].
-        """
-        ratio_threshold = self.conf["ratio_threshold"]
+    def match(self, pairs: list[Tensors], gpu_bytes: int = GPU_BYTES) -> list[Tensors]:
+        """Match pairs, see `Matcher.match`; on a GPU several small ones at once."""
         options = {
+            "ratio_threshold": self.conf["ratio_threshold"],
             "distance_threshold": self.conf["distance_threshold"],
             "mutual": self.conf["do_mutual_check"],
         }
-        found = {}
-        if all(descriptors.is_cpu for pair in pairs for descriptors in pair):
-            batches = [[i] for i in range(len(pairs))]
-        else:
-            batches = _batches([(len(first), len(second)) for first, second in pairs], gpu_bytes)
-        for batch in batches:
-            parts = [pairs[i] for i in batch]
+        on_cpu = all(descriptors.is_cpu for pair in pairs for descriptors in pair)
+        max_bytes = 0 if on_cpu else gpu_bytes
+        found: dict[int, Tensors] = {}
+        for batch in _batches([(len(a), len(b)) for a, b in pairs], max_bytes):
             if len(batch) == 1:
-                matched = [mutual_nearest(*parts[0], ratio_threshold, None, gpu_bytes, **options)]
+                matched = [mutual_nearest(*pairs[batch[0]], gpu_bytes=gpu_bytes, **options)]
             else:
-                matched = mutual_nearest_padded(
-                    *zip(*parts, strict=True), ratio_threshold, **options
-                )
+                descriptors0, descriptors1 = zip(*(pairs[i] for i in batch), strict=True)
+                matched = mutual_nearest_padded(descriptors0, descriptors1, **options)
             found.update(zip(batch, matched, strict=True))
-        results = [found[i] for i in range(len(pairs))]
+        results = (found[i] for i in range(len(pairs)))
         return [(m, torch.where(m >= 0, (cosine + 1) / 2, 0)) for m, cosine in results]
 
     def _forward(self, data: dict) -> dict:
-        """Match descriptors (1, D, N) of unit norm with descriptors (1, D, M).
-
-        Returns:
-            matches0 (1, N) and matching_scores0 (1, N), as of `match`.
-        """
         pair = (data["descriptors0"][0].T.contiguous(), data["descriptors1"][0].T.contiguous())
         ((matches, scores),) = self.match([pair])
         return {"matches0": matches[None], "matching_scores0": scores[None]}
 
 
 def _batches(sizes: list[tuple[int, int]], max_bytes: int) -> Iterator[list[int]]:
-    """Split pairs of (N, M) descriptors into batches whose similarities, padded, take so much.
+    """Split pairs of (N, M) descriptors into batches whose padded similarities fit into memory.
 
-    Pairs of similar sizes come together. One that is too large, or empty, is alone.
+    Pairs of similar sizes share a batch. A pair that is too large, or empty, is alone.
     """
     empty = [i for i, size in enumerate(sizes) if 0 in size]
     yield from ([i] for i in empty)
-    batch, height, width = [], 0, 0
+    batch: list[int] = []
+    height = width = 0
     for i in sorted(set(range(len(sizes))).difference(empty), key=sizes.__getitem__):
         n, m = sizes[i]
         height, width = max(height, n), max(width, m)

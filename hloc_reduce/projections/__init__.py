@@ -13,13 +13,13 @@ __all__ = ["checksum", "find", "load", "names", "split_prefix"]
 
 
 def load(projection: "str | Path") -> "Projection":
-    """Load a projection that ships, by name, or any other, by the path of its file.
+    """Load a shipped projection by its name, or another one by the path of its file.
 
     Returns:
         The projection, frozen and folded, float32, on the CPU.
 
     Raises:
-        InputError: when it is not there or is not a projection.
+        InputError: when the file is missing or is not a projection.
     """
     from . import network
 

@@ -1,4 +1,4 @@
-"""The files of projections: those that ship, those of the paper's authors, and those of users."""
+"""The files of projections: shipped, released by the paper's authors, and trained by users."""
 
 import re
 from pathlib import Path
@@ -9,29 +9,27 @@ from ..utils.files import file_sha256
 from . import released
 
 WEIGHTS = Path(__file__).parent / "weights"
-# how to make one that does not ship
+# trains a projection that does not ship
 COMMAND = (
     "python -m hloc_reduce.training --descriptor {descriptor} --scheme {scheme}{dim} "
     "--map IMAGES:MODEL --output weights"
 )
-# sift_nested@24: the first 24 numbers of sift_nested; an @ in the path of a file is its own
+# sift_nested@24: the first 24 numbers of sift_nested; an @ in a folder or a suffix is no prefix
 PREFIX = re.compile(r"(.+)@([^@/\\.]+)")
 
 
 def names() -> list[str]:
-    """List the projections that ship."""
+    """List the shipped projections."""
     return sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
 
 
 def find(projection: str | Path) -> Path:
-    """Return the file of a projection, given by the name of one that ships or by its path.
+    """Return the file of a projection, given by its name or path, with or without a prefix.
 
-    `@` and a prefix may follow.
-
-    Those of hardnet that the paper's authors released are downloaded once.
+    The projections of hardnet that the paper's authors released are downloaded once.
 
     Raises:
-        InputError: when it is not there, does not ship or cannot be had.
+        InputError: when it is missing, does not ship or cannot be downloaded.
     """
     name, prefix = split_prefix(projection)
     path = Path(name)
@@ -58,11 +56,11 @@ def find(projection: str | Path) -> Path:
 
 
 def split_prefix(projection: str | Path) -> tuple[str, str]:
-    """Split `name@24` into the name and the prefix, "" where there is none."""
+    """Split `name@24` into the name and the prefix, "" without one."""
     match = PREFIX.fullmatch(str(projection))
-    return match.groups() if match else (str(projection), "")
+    return (match[1], match[2]) if match else (str(projection), "")
 
 
 def checksum(projection: str | Path) -> str:
-    """Return the sha256 of a projection's file, to tell which one made a feature file."""
+    """Return the sha256 of a projection's file, the provenance of feature files."""
     return file_sha256(find(projection))

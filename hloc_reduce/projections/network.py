@@ -17,7 +17,7 @@ from .files import find, split_prefix
 
 
 class MLP(nn.Module):
-    """Linear layers, each but the last followed by ReLU, then batch normalization (Sec. III-D).
+    """Linear layers; ReLU and batch normalization follow each but the last (Sec. III-D).
 
     Args:
         sizes: of the input, the hidden layers and the output, for example (128, 512, 512, 64).
@@ -40,8 +40,8 @@ class Projection(nn.Module):
     """A frozen MLP: two or three matrix products, with the batch normalizations folded in.
 
     Args:
-        mlp: the trained network; only its running statistics are used.
-        metadata: what is known of its training: descriptor, scheme, dim, ...
+        mlp: the trained network; its running statistics are used.
+        metadata: of its training: descriptor, scheme, dim, ...
     """
 
     def __init__(self, mlp: MLP, metadata: dict | None = None):
@@ -51,24 +51,24 @@ class Projection(nn.Module):
         self.linears = nn.ModuleList(map(nn.Linear, mlp.sizes[:-1], mlp.sizes[1:]))
         scale, shift = torch.ones(mlp.sizes[0]), torch.zeros(mlp.sizes[0])
         for folded, linear, norm in zip(self.linears, mlp.linears, [*mlp.norms, None], strict=True):
-            # the normalization before a layer, x * scale + shift, goes into its weight and bias
-            folded.weight.data = linear.weight.detach() * scale
-            folded.bias.data = linear.bias.detach() + linear.weight.detach() @ shift
+            # fold the normalization before the layer, x * scale + shift, into weight and bias
+            weight, bias = (part.detach() for part in linear.parameters())
+            folded.weight.data, folded.bias.data = weight * scale, bias + weight @ shift
             if norm is not None:
                 scale = norm.weight.detach() / (norm.running_var + norm.eps).sqrt()
                 shift = norm.bias.detach() - norm.running_mean * scale
         self.requires_grad_(False).eval()
 
     def cut(self, dim: int) -> "Projection":
-        """Keep the first numbers only, as nested projections are made for.
+        """Keep only the first numbers of a nested projection's output.
 
         Raises:
-            InputError: when there are not so many.
+            InputError: when there are fewer.
         """
         if not 0 < dim <= self.dim:
             raise InputError(f"A projection to {self.dim} numbers has no first {dim}.")
-        last = self.linears[-1]
-        last.weight.data, last.bias.data = last.weight.data[:dim], last.bias.data[:dim]
+        for parameter in self.linears[-1].parameters():
+            parameter.data = parameter.data[:dim]
         self.sizes = (*self.sizes[:-1], dim)
         return self
 
@@ -102,13 +102,13 @@ def save(mlp: MLP, metadata: dict, path: Path) -> None:
 
 
 def load(projection: str | Path) -> Projection:
-    """Load a projection as `projections.load` does."""
+    """Load a projection, see `projections.load`."""
     loaded, (name, prefix) = Projection(*read(projection)), split_prefix(projection)
     if not prefix:
         return loaded
     if loaded.metadata.get("scheme") != "nested" or not prefix.isdigit():
         stem = Path(name).stem
-        raise InputError(f"{stem} is not nested: it has no first {prefix} numbers of use.")
+        raise InputError(f"{stem} is not nested: its first {prefix} numbers are of no use.")
     return loaded.cut(int(prefix))
 
 
@@ -116,27 +116,29 @@ def read(projection: str | Path) -> tuple[MLP, dict]:
     """Read the network of a projection as it was trained, and its metadata.
 
     Raises:
-        InputError: when it is not there or is not a projection.
+        InputError: when the file is missing or is not a projection.
     """
     path = find(projection)
     try:
-        mlp, metadata = READERS.get(path.suffix, read_safetensors)(path)
+        mlp, metadata = (read_released if path.suffix == ".pth" else read_safetensors)(path)
         if not all(part.isfinite().all() for part in Projection(mlp).parameters()):
             raise ValueError("its weights are not finite")
-    except Exception as error:  # torch raises whatever a broken file leads it to
+    except Exception as error:  # torch may raise anything for a broken file
         reason = next(iter(str(error).split("\n")))
         raise InputError(f"{path} is not a projection ({reason}).") from None
     return mlp, metadata
 
 
 def read_safetensors(path: Path) -> tuple[MLP, dict]:
-    """Read a network and its metadata; a broken file raises any of what `load` handles."""
+    """Read a network and its metadata; a broken file raises any error."""
     with safe_open(path, "pt") as file:
         metadata = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
         state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
     layers = metadata["layers"]
     sizes = [len(state[f"linears.{i}.bias"]) for i in range(len(layers) - 1)]
-    if layers[1:] != sizes or layers[0] != state["linears.0.weight"].shape[1]:  # may be too many
+    if (
+        layers[1:] != sizes or layers[0] != state["linears.0.weight"].shape[1]
+    ):  # before MLP allocates them
         raise ValueError(f"its layers are not {layers}")
     mlp = MLP(layers)
     missing, unexpected = mlp.load_state_dict(state, strict=False)
@@ -147,7 +149,7 @@ def read_safetensors(path: Path) -> tuple[MLP, dict]:
 
 
 def read_released(path: Path) -> tuple[MLP, dict]:
-    """Read a network in the form in which the paper's authors released theirs."""
+    """Read a network in the format of the paper's authors."""
     state = torch.load(path, weights_only=True, map_location="cpu")
     state = {key.replace("module.", ""): value for key, value in state.items()}
     linears = [key.removesuffix("weight") for key, value in state.items() if value.ndim == 2]
@@ -159,6 +161,3 @@ def read_released(path: Path) -> tuple[MLP, dict]:
     metadata = {"training_data": f"{path.name}, in the form of {released.SOURCE}"}
     descriptor = path.name.lower().partition("_")[0]  # SIFT_sv_dim64.pth
     return mlp, metadata | ({"descriptor": descriptor} if descriptor in DESCRIPTORS else {})
-
-
-READERS = {".pth": read_released}

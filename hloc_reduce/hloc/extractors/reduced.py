@@ -20,5 +20,5 @@ class Reduced(BaseModel):
 
     def _forward(self, data: dict) -> dict:
         features = self.model(data)
-        # hloc would store float32 as float16, in which pixels from 1024 on have no fraction
+        # hloc would store float32 as float16, which has no fractions of pixels above 1024
         return {**features, "keypoints": features["keypoints"].double()}

@@ -1,4 +1,4 @@
-"""hloc's extractor `vlad`: global descriptors made of reduced local ones, for retrieval."""
+"""hloc's extractor `vlad`: global descriptors aggregated from local ones, for retrieval."""
 
 from hloc.utils.base_model import BaseModel
 
@@ -10,8 +10,8 @@ from hloc_reduce.extractors import load
 class VLAD(BaseModel):
     """Local features of an image, aggregated with the words of a vocabulary.
 
-    `features` is the model configuration of an extractor; `vocabulary` the file that
-    hloc_reduce.aggregate_features wrote of such features, by default one that ships.
+    `features` is the model configuration of an extractor, `vocabulary` a file that
+    hloc_reduce.aggregate_features wrote for such features; default: the shipped one.
     """
 
     default_conf = {
