@@ -1,8 +1,8 @@
-"""Compare features on a data set: run what is missing, print a table of recall, and report.
+"""Compare features on a data set: run missing ones, print a table of recall, write a report.
 
 A data set is in the layout of Aachen Day-Night or of InLoc. On Aachen Day-Night v1.1 and InLoc
-themselves the paper's recall is shown below that of each feature. Each feature has its own outputs
-folder, like those of pipelines.aachen and pipelines.inloc, where an interrupted run resumes.
+themselves the paper's recall is shown below each feature. Each feature has its own outputs folder,
+like those of pipelines.aachen and pipelines.inloc, so an interrupted comparison resumes.
 """
 
 import argparse
@@ -33,22 +33,23 @@ def main(
     ground_truth: Path | None = None,
     gate: Gate = DEFAULT_GATE,
 ) -> dict[str, str]:
-    """Localize the queries of a data set with several features, print their table and report.
+    """Localize the queries of a data set with several features, print a table, write a report.
 
     Args:
-        dataset: its folder.
-        features: names, or YAML files, as of the pipelines.
-        outputs: folder of the outputs folders, and of compare.csv.
+        dataset: data set folder.
+        features: names of features, or their YAML files.
+        outputs: folder for compare.csv and the outputs folder of each feature.
         page: the report; default: `<outputs>/report.html`.
-        retrieval: as of the pipelines.
-        ground_truth: as of the pipelines; default: what a folder was made with, or theirs.
-        gate: what a pose must have for a query to be called localized.
+        retrieval: "vlad", or a file of pairs or of global descriptors.
+        ground_truth: true poses of the queries; default: those that a finished run had, else
+            those of the data set.
+        gate: what a pose must have for the query to be called localized.
 
     Returns:
-        From each feature that failed to what was wrong.
+        The error message of each feature that failed.
 
     Raises:
-        InputError: for another layout, an unknown feature, or when all failed.
+        InputError: for an unknown layout or feature, or if all features failed.
     """
     pipeline = pipeline_of(dataset).main
     report.check()
@@ -79,10 +80,10 @@ def main(
 
 
 def rows(tables: list[dict]) -> list[dict]:
-    """Return a row for each run, list and threshold: recall, and the paper's if it has any.
+    """Return a row for each run, query list and threshold, with the recall and the paper's.
 
     Args:
-        tables: as of `runs.recall_tables`.
+        tables: from `runs.recall_tables`.
     """
     return [
         {
@@ -108,7 +109,7 @@ def rows(tables: list[dict]) -> list[dict]:
 
 
 def table(tables: list[dict]) -> str:
-    """Format recall, a row for each feature, and below it the paper's if it has any."""
+    """Format recall, one row per feature, followed by the paper's if it has any."""
     lines = [["", "bytes", *(found["list"] for found in tables)]]
     for unit, place in (("distance [m]", 0), ("orient. [deg]", 1)):
         limits = [[limit[place] for limit in found["thresholds"]] for found in tables]
@@ -151,12 +152,15 @@ def _main() -> None:
         "-o", "--output", type=Path, help="the report (default: <outputs>/report.html)"
     )
     parser.add_argument(
-        "--retrieval", default="vlad", metavar="vlad|FILE", help="as of the pipelines"
+        "--retrieval",
+        default="vlad",
+        metavar="vlad|FILE",
+        help="vlad, or hloc's text file of pairs or h5 file of global descriptors",
     )
     parser.add_argument(
         "--ground_truth",
         type=Path,
-        help="true poses of the queries (default: what was given before, or that of the data set)",
+        help="true poses of the queries (default: as in finished runs, else those of the data set)",
     )
     add_gate_options(parser)
     args = parser.parse_args()
@@ -171,7 +175,9 @@ def _main() -> None:
         Gate(args.min_confidence, args.min_inliers),
     )
     if failed:
-        raise InputError(f"These failed, see above: {', '.join(failed)}. The others are reported.")
+        raise InputError(
+            f"These failed, see above: {', '.join(failed)}. The others are in the report."
+        )
 
 
 if __name__ == "__main__":

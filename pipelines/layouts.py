@@ -1,4 +1,4 @@
-"""The pipeline for the layout of a data set."""
+"""The pipeline for each data set layout."""
 
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +14,7 @@ def pipeline_of(dataset: Path) -> ModuleType:
     """Return the pipeline for a data set.
 
     Raises:
-        InputError: when it has no layout that is known.
+        InputError: when its layout is unknown.
     """
     if not dataset.is_dir():
         raise no_folder(dataset)

@@ -1,8 +1,8 @@
-"""Localize photos in a map of one's own.
+"""Localize photos in a map of your own.
 
-Builds the map from photos and a COLMAP model of them, or from photos alone, once; later runs
-localize other photos in it. Without --query_images only the map is built. A new map is of the
-feature colmap_sift_sv64 and the matcher NN-ratio if no others are given.
+Builds the map once, from photos and a COLMAP model of them or from photos alone; later runs
+localize other photos in it. Without --query_images only the map is built. A new map has the feature
+colmap_sift_sv64 and the matcher NN-ratio unless you choose others.
 """
 
 import argparse
@@ -10,6 +10,7 @@ import hashlib
 import os
 import re
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 import pycolmap
@@ -20,12 +21,10 @@ from hloc_reduce import (
     localize_sfm,
     logger,
     maps,
-    match_features,
     pairs_from_retrieval,
     reconstruction,
 )
 from hloc_reduce.confs import features as features_confs
-from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS
 from hloc_reduce.localization import intrinsics
@@ -41,18 +40,18 @@ from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.parsers import parse_query_lists, write_pairs
 from hloc_reduce.utils.paths import strings_as_paths
 
-from . import common
+from . import options
+from .run import Run, check_queries, readable
 
-FEATURE, MATCHER = features_confs.RECOMMENDED, "NN-ratio"
-MADE_FROM = "made_from.json"  # the map and the photos of queries
-LISTED = "queries_with_intrinsics.txt"  # those of a folder
+MADE_FROM = "made_from.json"  # the map and the photos of the queries
+LISTED = "queries_with_intrinsics.txt"  # written for a folder of queries
 SOURCES = {
-    "map": "those of the map's camera, which took them by EXIF data",
+    "map": "those of the map's camera, according to their EXIF data",
     "EXIF": "from EXIF data and refined with the pose",
     "guess": "guessed and refined with the pose",
-    "unknown": "guessed and refined with the pose, but sizes not of map photos: perhaps cropped",
+    "unknown": "guessed and refined with the pose, of sizes that no map photo has: perhaps cropped",
 }
-NOT_IN_NAMES = r"[^\w.-]+"  # of a glob
+NOT_IN_NAMES = r"[^\w.-]+"  # characters of a glob
 
 
 @strings_as_paths
@@ -70,65 +69,65 @@ def open_map(
     accept_partial: bool = False,
     camera_mode: str | None = None,
 ) -> Map:
-    """Build a map in `outputs`, or open one that was built before.
+    """Build a map, or open one that was built before.
+
+    None stands for the default of a new map, and for whatever an old map was built with.
 
     Args:
-        outputs: its folder map is that of a new map.
-        map_images: folder of the photos of the map; None to open a map that was built.
-        model_or_map: COLMAP model of the photos, or that map.
-        feature: default: colmap_sift_sv64 for a new map; any other than that of an old one is
-            refused.
-        projection: of one's own.
-        matcher: likewise, NN-ratio.
-        num_covis: pairs of each map image.
-        overwrite: build anew.
-        storage: of descriptors; likewise, float16.
-        keypoints: settings of the DoG detector; likewise, adaptive.
-        accept_partial: as of `maps.main`.
+        outputs: a new map goes into its folder `map`.
+        map_images: folder of the map's photos; None to open an old map.
+        model_or_map: COLMAP model of the photos, or an old map.
+        feature: name of a feature, or its YAML file; default: colmap_sift_sv64.
+        projection: projection file to use with the base descriptor of `feature`.
+        matcher: default: NN-ratio.
+        num_covis: other images that each map image is matched with.
+        overwrite: rebuild the map.
+        storage: how descriptors are stored; default: float16.
+        keypoints: settings of the DoG detector; default: adaptive.
+        accept_partial: build the map without photos that are missing, unreadable or not
+            reconstructed.
         camera_mode: which photos share a camera, as in COLMAP; default: auto.
+
+    Raises:
+        InputError: when an old map was built with other options, or something is missing or wrong.
     """
-    if camera_mode is not None:
-        mode = colmap.camera_mode(camera_mode)
-        if map_images is None or model_or_map is not None:
-            raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
-    else:
-        mode = colmap.camera_mode("auto")
-    if map_images is None:
-        if model_or_map is None:
-            raise InputError("Give --map_images, the folder of the photos to build a map of.")
-        if any(model_or_map.glob("cameras.*")):
+    if camera_mode is not None and (map_images is None or model_or_map is not None):
+        raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
+    mode = colmap.camera_mode(camera_mode or "auto")
+    if map_images is not None:
+        if model_or_map is not None and maps.is_map(model_or_map):
             raise InputError(
-                f"{model_or_map} is a COLMAP model: give its photos, --map_images, too."
+                f"--map {model_or_map} is a map that was built: leave out --map_images to localize "
+                "in it, or give the COLMAP model that it was built from."
             )
-        built = Map(model_or_map)
-        if feature or projection:
-            built.check_feature(feature or FEATURE, projection)
-        if storage not in (None, built.storage):
-            raise InputError(f"The map {model_or_map} is of --storage {built.storage}.")
-        if keypoints not in (None, built.keypoints):
-            raise InputError(f"The map {model_or_map} is of --keypoints {built.keypoints}.")
-        if matcher not in (None, built.matcher):
-            raise InputError(f"The map {model_or_map} is of --matcher {built.matcher}.")
-        return built
-    if model_or_map is not None and maps.is_map(model_or_map):
-        raise InputError(
-            f"--map {model_or_map} is a map that was built: leave out --map_images to localize in "
-            "it, or give the COLMAP model that it was built from."
+        return maps.main(
+            outputs / "map",
+            map_images,
+            model_or_map,
+            feature or features_confs.RECOMMENDED,
+            projection,
+            matcher or "NN-ratio",
+            num_covis,
+            overwrite,
+            storage or STORAGES[0],
+            keypoints or KEYPOINTS[0],
+            accept_partial,
+            mode,
         )
-    return maps.main(
-        outputs / "map",
-        map_images,
-        model_or_map,
-        feature or FEATURE,
-        projection,
-        matcher or MATCHER,
-        num_covis,
-        overwrite,
-        storage or STORAGES[0],
-        keypoints or KEYPOINTS[0],
-        accept_partial,
-        mode,
-    )
+    if model_or_map is None:
+        raise InputError("Give --map_images, the folder of the photos to build a map of.")
+    if any(model_or_map.glob("cameras.*")):
+        raise InputError(f"{model_or_map} is a COLMAP model: give its photos, --map_images, too.")
+    built = Map(model_or_map)
+    if feature or projection:
+        built.check_feature(feature or features_confs.RECOMMENDED, projection)
+    given = {"storage": storage, "keypoints": keypoints, "matcher": matcher}
+    for option, value in given.items():
+        if value not in (None, getattr(built, option)):
+            raise InputError(
+                f"The map {model_or_map} was built with --{option} {getattr(built, option)}."
+            )
+    return built
 
 
 @strings_as_paths
@@ -143,95 +142,71 @@ def main(
     strict: bool = False,
     gate: Gate = DEFAULT_GATE,
 ) -> dict:
-    """Localize queries in a map and return the summary, as in summary.json."""
-    matcher_conf = matchers_confs.confs[built.matcher]
-    given, cameras = queries, {}
+    """Localize queries in a map and return the summary, as in summary.json.
+
+    Args:
+        built: the map.
+        query_images: folder of the photos.
+        outputs: folder for the results.
+        queries: query list with intrinsics, or a glob of several; default: all photos of the
+            folder, with inferred intrinsics.
+        num_loc: retrieved map images per query.
+        ground_truth: true poses of the queries.
+        overwrite: recompute existing results.
+        strict: stop at an unreadable query photo instead of recording it as not localized.
+        gate: what a pose must have for the query to be called localized.
+
+    Raises:
+        InputError: when something is missing or wrong.
+    """
+    given = parse_query_lists(queries) if queries else None
     if given is None:
         names = list_images(query_images)
         lists = {query_images.resolve().name: names}
-        cameras = _infer(query_images, names, built.cameras, strict)
-        queries = outputs / LISTED
+        inferred = _infer(query_images, names, built.cameras, strict)
+        sources = {name: source for name, (_, source) in inferred.items()}
     else:
-        parts = parse_query_lists(queries)
-        lists = {stem: [name for name, _ in part] for stem, part in parts.items()}
-    names = [name for part in lists.values() for name in part]
-    common.check_queries(query_images, names, strict)
-    map_names = built.names()  # a broken model is to be found before photos are read
+        lists = {stem: [name for name, _ in part] for stem, part in given.items()}
+        names = [name for part in lists.values() for name in part]
+        sources = dict.fromkeys(names, "list")
+    check_queries(query_images, names, strict)
+    map_names = built.names()  # a broken model is found before photos are read
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
-    made_from = outputs / MADE_FROM
-    before = provenance.read(made_from)
-    files = {name: query_images / name for name in names}
-    files = {
-        name: file for name, file in files.items() if file.is_file() and os.access(file, os.R_OK)
+    photos = _Photos(outputs / MADE_FROM, built, query_images, names)
+    conf = {
+        "map": built.place,
+        "query_images": str(query_images.resolve()),
+        "queries": str((queries or outputs / LISTED).resolve()),
+        "num_loc": num_loc,
     }
-    now = {"map": built.id, "queries": provenance.fingerprints(files, before.get("queries", {}))}
-    changed = provenance.changed(before.get("queries", {}), now["queries"])
-    if before and before.get("map") != now["map"]:
-        changed.append(f"the map {built.folder}")
-    if changed:
-        logger.info("Localizing anew, because of changes: %s.", ", ".join(changed))
-    with RunFolder(
-        outputs,
-        {
-            "map": built.place,
-            "query_images": str(query_images.resolve()),
-            "queries": str(queries.resolve()),
-            "num_loc": num_loc,
-        },
-        overwrite,
-        inputs=[query_images, *([given] if given else [])],
-        stale=bool(changed),
-    ) as folder:
-        if not changed:  # photos that are not in this list may be in the next
-            now["queries"] = {**before.get("queries", {}), **now["queries"]}
-        provenance.write(made_from, now)
-        sources = dict.fromkeys(names, "list") if given else {}
-        sources |= {name: source for name, (_, source) in cameras.items()}
-        if given is None:
-            intrinsics.write_queries(cameras, queries)
+    inputs = [query_images, *([queries] if queries else [])]
+    folder = RunFolder(outputs, conf, overwrite, inputs, stale=bool(photos.changed))
+    with Run(folder, built.feature, built.matcher) as run:
+        photos.write()
+        listed: Path | list[tuple[str, pycolmap.Camera | None]]
+        if queries:
+            listed = queries
+        else:
+            intrinsics.write_queries(inferred, outputs / LISTED)
+            listed = [(name, inferred[name][0] if name in inferred else None) for name in names]
         for source, said in SOURCES.items():
             if some := [name for name in names if sources.get(name) == source]:
                 logger.info("Intrinsics of %d queries are %s: %s", len(some), said, cli.some(some))
-        loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
-        poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
 
-        with folder.stage("extract_features"):
+        with run.stage("extract_features"):
             features = extract_features.main(
                 built.conf, query_images, outputs, image_list=names, strict=strict
             )
-            readable = common.readable(features, names)
-        # when another one has been read, what is finished of these stays
-        failed = failures(features)
-        now["queries"] = {name: made for name, made in now["queries"].items() if name not in failed}
-        provenance.write(made_from, now)
-        with folder.stage("retrieval"):
-            descriptors = aggregate_features.main(RETRIEVAL, features, vocabulary=built.vocabulary)
-            if readable:
-                pairs_from_retrieval.main(
-                    descriptors,
-                    loc_pairs,
-                    num_loc,
-                    query_list=readable,
-                    db_list=map_names,
-                    db_descriptors=built.descriptors,
-                )
-            else:
-                write_pairs([], loc_pairs)
-        with folder.stage("match_queries"):
-            matches = outputs / f"{features.stem}_{matcher_conf['output']}_{loc_pairs.stem}.h5"
-            if readable:
-                match_features.main(
-                    matcher_conf, loc_pairs, features, matches=matches, features_ref=built.features
-                )
-        with folder.stage("localization"):
+        photos.forget(failures(features))
+        loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
+        with run.stage("retrieval"):
+            _retrieve(built, features, loc_pairs, num_loc, readable(features, names), map_names)
+        matches = run.match("match_queries", loc_pairs, features, built.features)
+        poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
+        with run.stage("localization"):
             records = localize_sfm.main(
-                built.sfm,
-                given or [(name, cameras[name][0] if name in cameras else None) for name in names],
-                loc_pairs,
-                features,
-                matches,
-                poses,
+                *(built.sfm, listed, loc_pairs, features, matches, poses),
                 refinements={
                     name: intrinsics.REFINEMENTS[source]
                     for name, source in sources.items()
@@ -241,8 +216,6 @@ def main(
                 gate=gate,
             )
         summary = {
-            "feature": built.feature,
-            "matcher": built.matcher,
             "retrieval": "vlad",
             "map": str(built.folder),
             "num_loc": num_loc,
@@ -260,13 +233,48 @@ def main(
             "matches": matches,
             "ground_truth": ground_truth,
         }
-        return common.finish(folder, summary, lists, records, truth, limits, features, poses, files)
+        return run.finish(summary, lists, records, truth, limits, features, poses, files)
+
+
+class _Photos:
+    """The provenance of results: the map and the photos of the queries.
+
+    Results are stale if a photo that they were made from has changed, or the map was rebuilt.
+    """
+
+    def __init__(self, path: Path, built: Map, query_images: Path, names: list[str]):
+        self._path = path
+        before = provenance.read(path)
+        known = before.get("queries", {})
+        files = {name: query_images / name for name in names}
+        found = {
+            name: file
+            for name, file in files.items()
+            if file.is_file() and os.access(file, os.R_OK)
+        }
+        self._map, self._photos = built.id, provenance.fingerprints(found, known)
+        self.changed = provenance.changed(known, self._photos)
+        if before and before.get("map") != built.id:
+            self.changed.append(f"the map {built.folder}")
+        if self.changed:
+            logger.info("Results are stale, as these changed: %s.", ", ".join(self.changed))
+        else:  # photos that are not in this list may be in the next
+            self._photos = {**known, **self._photos}
+
+    def write(self) -> None:
+        provenance.write(self._path, {"map": self._map, "queries": self._photos})
+
+    def forget(self, unreadable: Iterable[str]) -> None:
+        """Leave out unreadable photos: once readable, they do not make the other results stale."""
+        for name in unreadable:
+            self._photos.pop(name, None)
+        self.write()
 
 
 def _infer(
     query_images: Path, names: list[str], of_map: intrinsics.MapCameras, strict: bool
 ) -> dict[str, tuple[pycolmap.Camera, str]]:
-    """Infer the intrinsics of photos, unless `strict` without those that cannot be read."""
+    """Infer the intrinsics of photos; skip unreadable ones unless `strict`."""
     cameras = {}
     for name in names:
         try:
@@ -277,18 +285,33 @@ def _infer(
     return cameras
 
 
-def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> Path:
-    """Return the folder for the results of queries, which is called by their list or folder.
+def _retrieve(
+    built: Map, features: Path, output: Path, num_loc: int, queries: list[str], map_names: list[str]
+) -> None:
+    """Retrieve map images by VLAD with the map's vocabulary."""
+    descriptors = aggregate_features.main(RETRIEVAL, features, vocabulary=built.vocabulary)
+    if not queries:
+        write_pairs([], output)
+        return
+    pairs_from_retrieval.main(
+        *(descriptors, output, num_loc),
+        query_list=queries,
+        db_list=map_names,
+        db_descriptors=built.descriptors,
+    )
 
-    Where that is of other queries of the same name, a digest of their path follows the name.
+
+def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> Path:
+    """Return the folder for the results of queries, named after their list or folder.
+
+    If that folder holds results of other queries, a digest of the path is appended to the name.
 
     Args:
-        outputs: the folder for it.
+        outputs: the parent folder.
         query_images: folder of the photos.
         queries: their list, if there is one.
     """
-    name = (queries or query_images.resolve()).stem
-    name = re.sub(NOT_IN_NAMES, "_", name).strip("._-")
+    name = re.sub(NOT_IN_NAMES, "_", (queries or query_images.resolve()).stem).strip("._-")
     folder = outputs / f"queries-{name or 'all'}"
     before = provenance.read(folder / "conf.json")
     own = {"query_images": str(query_images.resolve())}
@@ -320,67 +343,48 @@ def _main() -> None:
         "--queries",
         type=Path,
         help="query list with intrinsics, or a glob of several (default: all photos of "
-        "--query_images, with intrinsics of EXIF data or guessed)",
+        "--query_images, with intrinsics from EXIF data or guessed)",
     )
     parser.add_argument(
         "--outputs",
         type=Path,
         help="folder for the map, in map, and for the results, in queries-<name of --queries or "
-        "--query_images>, and some letters where the queries of another folder have that name",
+        "--query_images>, followed by a digest if other queries have that name",
     )
     parser.add_argument(
         "--num_covis", type=int, default=20, help="other images that each map image is matched with"
     )
     reconstruction.add_camera_mode(parser)
-    common.add_feature_options(parser)
-    common.add_localization_options(parser, "none", 50)
-    # None: those of a map that was built
+    options.add_feature_options(parser)
+    options.add_localization_options(parser, "none", 50)
+    # None: what an old map was built with
     parser.set_defaults(feature=None, matcher=None, storage=None, keypoints=None, camera_mode=None)
-    args = parser.parse_args()
-    common.check_options(args)
-    if args.storage is not None:
-        cli.choose("storage", args.storage, STORAGES)
-    if args.keypoints is not None:
-        cli.choose("keypoints", args.keypoints, KEYPOINTS)
-    if args.outputs is None:
+    given = options.parse(parser)
+    for name, names in (("storage", STORAGES), ("keypoints", KEYPOINTS)):
+        if given[name] is not None:
+            cli.choose(name, given[name], names)
+    if given["outputs"] is None:
         raise InputError("Give --outputs, a folder.")
-    if args.queries is not None and args.query_images is None:
+    if given["queries"] is not None and given["query_images"] is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
-    with trace.recording(args.outputs / "trace.json" if args.profile else None):
-        _run(args)
+    trace_file = given["outputs"] / "trace.json" if given.pop("profile") else None
+    with trace.recording(trace_file):
+        _run(given)
 
 
-def _run(args: argparse.Namespace) -> None:
-    built = open_map(
-        args.outputs,
-        args.map_images,
-        args.map,
-        args.feature,
-        args.projection,
-        args.matcher,
-        args.num_covis,
-        args.overwrite,
-        args.storage,
-        args.keypoints,
-        args.accept_partial,
-        args.camera_mode,
-    )
-    if args.query_images is None:
-        print(f"The map {built.folder} is there. Localize photos in it with --query_images.")
+def _run(given: dict) -> None:
+    """Build or open the map, and localize the queries in it."""
+    outputs, query_images, queries = (given.pop(k) for k in ("outputs", "query_images", "queries"))
+    of_queries = {name: given.pop(name) for name in ("num_loc", "ground_truth", "strict", "gate")}
+    built = open_map(outputs, model_or_map=given.pop("map"), **given)
+    if query_images is None:
+        print(f"The map {built.folder} is ready. Localize photos in it with --query_images.")
         return
-    outputs = results_folder(args.outputs, args.query_images, args.queries)
+    results = results_folder(outputs, query_images, queries)
     summary = main(
-        built,
-        args.query_images,
-        outputs,
-        args.queries,
-        args.num_loc,
-        args.ground_truth,
-        args.overwrite,
-        args.strict,
-        Gate(args.min_confidence, args.min_inliers),
+        built, query_images, results, queries, overwrite=given["overwrite"], **of_queries
     )
-    common.print_result(summary, outputs, "The poses, camera from world, are in {}.")
+    options.print_result(summary, results, "The poses, camera from world, are in {}.")
 
 
 if __name__ == "__main__":

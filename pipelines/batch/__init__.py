@@ -1,8 +1,8 @@
-"""Run the jobs of a file: data sets, features, matchers and options of the pipelines, in grids.
+"""Run the jobs of a file: grids of data sets, features, matchers and options of the pipelines.
 
-What the jobs of a data set have in common is done once: keypoints are detected once, each base
-descriptor is computed once for all its projections, and retrieval is done once. A job that fails
-does not stop the others; a batch that was stopped goes on where it was.
+The jobs of a data set share their work: keypoints are detected once, each base descriptor is
+computed once for all its projections, and retrieval is done once. A job that fails does not stop
+the others. An interrupted batch resumes.
 """
 
 from collections.abc import Iterator
@@ -23,9 +23,10 @@ from . import jobs, tables
 from .jobs import Job
 from .shared import Shared
 
-# what --dry_run takes for granted, of keypoints as DoG finds them at 1600 pixels
-KEYPOINTS = 5000  # of an image
-FEATURE_BYTES, MATCH_BYTES, MAP_BYTES = 14, 0.75, 67  # of a keypoint but for its descriptor, ...
+# what --dry_run assumes: keypoints of an image of 1600 pixels, and bytes of a keypoint without its
+# descriptor in a feature file, in a pair of a match file, and in a map
+KEYPOINTS = 5000
+FEATURE_BYTES, MATCH_BYTES, MAP_BYTES = 14, 0.75, 67
 
 
 @strings_as_paths
@@ -36,24 +37,24 @@ def main(
     strict: bool = False,
     executor: Executor = SERIAL,
 ) -> list[dict]:
-    """Run jobs, and print and write their tables.
+    """Run jobs; print and write their tables.
 
     Args:
-        job_file: as of `jobs.read`.
-        outputs: the folder for the results: jobs.csv, jobs.txt, failures.csv, and for each data
-            set a folder with one for each job; default: that of the file.
-        overwrite: begin anew.
-        strict: stop the jobs of a data set at an image that cannot be read. Else it is left out
-            of the map, or as a query not localized; it is listed in failures.csv, and read again
-            by a later run.
-        executor: does the work.
+        job_file: YAML file of jobs, see `jobs`.
+        outputs: folder for jobs.csv, jobs.txt, failures.csv and a folder for each data set, with
+            one for each job; default: the one that the file names.
+        overwrite: recompute existing results.
+        strict: fail the jobs of a data set at an unreadable image. Otherwise it is left out of the
+            map, or is a query that is not localized; failures.csv lists it, and a later run
+            retries it.
+        executor: where the work is done.
 
     Returns:
-        The rows of jobs.csv, of `tables.COLUMNS`: for each job one for each list and threshold of
-        recall, or one with the `error`.
+        The rows of jobs.csv, with the keys `tables.COLUMNS`: one for each job, query list and
+        recall threshold, or one with the `error`.
 
     Raises:
-        InputError: when the file is none of jobs, or another run is at work in `outputs`.
+        InputError: when the job file is wrong, or another run is at work in `outputs`.
     """
     named, all_jobs = jobs.read(job_file)
     outputs = (outputs or named).resolve()
@@ -72,8 +73,8 @@ def main(
                         shared.dataset,
                         folder_of(shared, job),
                         job.feature,
-                        job.matcher,
-                        shared.retrieval(job),
+                        matcher=job.matcher,
+                        retrieval=shared.retrieval(job),
                         ground_truth=job.ground_truth,
                         overwrite=overwrite,
                         storage=job.storage,
@@ -107,12 +108,12 @@ def folder_of(shared: Shared, job: Job) -> Path:
 
 @strings_as_paths
 def dry_run(job_file: Path, outputs: Path | None = None, overwrite: bool = False) -> list[str]:
-    """Print what `main` would do: the steps, with about how many bytes they write.
+    """Print the steps that `main` would do, with the approximate number of bytes they write.
 
     Args:
-        job_file: as of `jobs.read`.
-        outputs: as of `main`.
-        overwrite: as of `main`.
+        job_file: as in `main`.
+        outputs: as in `main`.
+        overwrite: as in `main`.
 
     Returns:
         The jobs that cannot be run.
@@ -132,13 +133,13 @@ def dry_run(job_file: Path, outputs: Path | None = None, overwrite: bool = False
         print(aligned(lines, left=3))
     print(
         f"About {total / 1e3:,.2f} GB in {outputs}, for {KEYPOINTS:,} keypoints an image. Numbers "
-        "of pairs are upper limits. What is done is left out."
+        "of pairs are upper limits. Finished steps are not counted."
     )
     return failed
 
 
 def steps(shared: Shared, overwrite: bool) -> Iterator[tuple[str, str, int, str, float]]:
-    """Yield the steps of the jobs of a data set: name, of what, how many of what items, bytes."""
+    """Yield the steps for a data set: name, feature or job, number and kind of items, bytes."""
     running = shared.running()
     if not running:
         return

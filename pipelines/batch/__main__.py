@@ -1,4 +1,4 @@
-"""Run the jobs of a file: data sets, features, matchers and options of the pipelines, in grids."""
+"""Run the jobs of a file: grids of data sets, features, matchers and options of the pipelines."""
 
 import argparse
 from pathlib import Path
@@ -16,31 +16,31 @@ def _main() -> None:
         epilog="example: python -m pipelines.batch confs/jobs/aachen_table1.yaml --dry_run",
         formatter_class=cli.HelpFormatter,
     )
-    parser.add_argument("job_file", type=Path, help="YAML file of jobs (docs/operations.md)")
+    parser.add_argument("job_file", type=Path, help="YAML file of jobs, see docs/operations.md")
     parser.add_argument(
-        "--outputs", type=Path, help="folder for all results (default: that of the file)"
+        "--outputs", type=Path, help="folder for all results (default: the one that the file names)"
     )
-    parser.add_argument("--dry_run", action="store_true", help="show what would be done, and exit")
+    parser.add_argument("--dry_run", action="store_true", help="show the steps and exit")
     parser.add_argument(
         "--strict",
         action="store_true",
-        help="fail at an image that cannot be read, instead of listing it in failures.csv",
+        help="fail at an unreadable image instead of listing it in failures.csv",
     )
     parser.add_argument(
         "--executor",
         default="processes",
-        help=f"what does the work, one of {', '.join(executors.EXECUTORS)}",
+        help=f"where the work is done, one of {', '.join(executors.EXECUTORS)}",
     )
     parser.add_argument(
         "--address",
-        help="of a Ray cluster, for --executor ray (default: RAY_ADDRESS, or a new one here)",
+        help="Ray cluster for --executor ray (default: RAY_ADDRESS, or a new one on this machine)",
     )
-    parser.add_argument("--overwrite", action="store_true", help="compute anew what is there")
+    parser.add_argument("--overwrite", action="store_true", help="recompute existing results")
     args = parser.parse_args()
     cli.choose("executor", args.executor, executors.EXECUTORS)
     if args.address and args.executor != "ray":
-        raise InputError("--address is of --executor ray.")
-    jobs.read(args.job_file)  # is wrong before processes are started
+        raise InputError("--address needs --executor ray.")
+    jobs.read(args.job_file)  # a wrong file fails before processes start
     if args.dry_run:
         failed = dry_run(args.job_file, args.outputs, args.overwrite)
     else:
@@ -48,7 +48,7 @@ def _main() -> None:
             rows = main(args.job_file, args.outputs, args.overwrite, args.strict, executor)
         failed = [f"{row['dataset']}/{row['job']}" for row in rows if row["error"]]
     if failed:
-        raise InputError(f"Failed, as said above: {cli.some(failed)} ({len(failed)} in all).")
+        raise InputError(f"{len(failed)} jobs failed, see above: {cli.some(failed)}.")
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
 """Job files: grids of runs of the pipelines of data sets, in YAML.
 
     outputs: outputs/example           # default: outputs/<name of the file>
-    jobs:                              # grids: each option a value, or a list of values
+    jobs:                              # grids: each option has a value or a list of values
       - dataset: [datasets/aachen_v1.1, datasets/demo_town]
         feature: [sift, {descriptor: [sift, mkd], scheme: sv, dim: [64, 16]}]
         matcher: NN-ratio
-    exclude:                           # jobs that agree with all that is named, * is anything
+    exclude:                           # jobs that match all given options; * matches anything
       - {dataset: "*demo_town", feature: "*16"}
 
-Options are those of `pipelines.aachen` and `pipelines.inloc`.
+The options are those of `pipelines.aachen` and `pipelines.inloc`.
 """
 
 import os
@@ -21,7 +21,7 @@ from pathlib import Path
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.detectors.dog import KEYPOINTS
-from hloc_reduce.localization.confidence import Gate
+from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.runtime.outputs import SHARED
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
@@ -29,14 +29,14 @@ from hloc_reduce.utils.feature_files import STORAGES
 from hloc_reduce.utils.parsers import read_yaml
 
 SHIPPED = Path(__file__).parents[2] / "confs/jobs"
-# from options that are numbers to their types, and what a message calls these
-NUMBERS = {
+# numeric options: their types, and how a message calls these
+NUMBERS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "num_covis": (int, "an integer"),
     "num_loc": (int, "an integer"),
     "min_confidence": ((int, float), "a number"),
     "min_inliers": (int, "an integer"),
 }
-NAME_PARTS = ("descriptor", "scheme", "dim")  # of the name of a feature
+NAME_PARTS = ("descriptor", "scheme", "dim")  # of a feature's name
 
 
 @dataclass(frozen=True)
@@ -44,16 +44,17 @@ class Job:
     """A run of a pipeline.
 
     Args:
-        dataset: the folder of a data set.
-        feature: name of a feature or YAML file, as of `confs.features.get`.
+        dataset: data set folder.
+        feature: name of a feature, or its YAML file.
         matcher: name of a matcher.
-        storage: how descriptors are kept.
+        storage: how descriptors are stored.
         keypoints: settings of the DoG detector.
-        retrieval: vlad, of the first feature of the data set, or a file.
+        retrieval: "vlad", with the first feature of the data set, or a file.
         ground_truth: true poses of the queries; default: those of the data set.
-        num_covis: pairs of each map image; default: that of the pipeline.
-        num_loc: map images of each query; default: that of the pipeline.
-        min_confidence, min_inliers: what makes a query localized; default: those of the gate.
+        num_covis: other images that each map image is matched with; default: the pipeline's.
+        num_loc: retrieved map images per query; default: the pipeline's.
+        min_confidence: what a pose must have for the query to be called localized.
+        min_inliers: likewise.
     """
 
     dataset: Path
@@ -65,12 +66,12 @@ class Job:
     ground_truth: Path | None = None
     num_covis: int | None = None
     num_loc: int | None = None
-    min_confidence: float | None = None
-    min_inliers: int | None = None
+    min_confidence: float = DEFAULT_GATE.min_confidence
+    min_inliers: int = DEFAULT_GATE.min_inliers
 
     @property
     def name(self) -> str:
-        """What its folder is called: the feature, and whatever is not by default."""
+        """The name of its folder: the feature, and all options that are not the default."""
         parts = [Path(self.feature).stem]
         for field in fields(self)[2:]:
             value = getattr(self, field.name)
@@ -83,28 +84,27 @@ class Job:
 
     @property
     def numbers(self) -> dict[str, int]:
-        """The numbers that are given."""
+        """The --num_... options that are given."""
         given = {"num_covis": self.num_covis, "num_loc": self.num_loc}
         return {name: number for name, number in given.items() if number is not None}
 
     @property
     def gate(self) -> Gate:
         """What a pose must have for a query to be called localized."""
-        given = {"min_confidence": self.min_confidence, "min_inliers": self.min_inliers}
-        return Gate(**{name: least for name, least in given.items() if least is not None})
+        return Gate(self.min_confidence, self.min_inliers)
 
 
 OPTIONS = tuple(field.name for field in fields(Job))
 
 
 def read(path: Path) -> tuple[Path, list[Job]]:
-    """Read a job file, or one that ships and is called as `path`.
+    """Read a job file; if `path` does not exist, the one of that name that ships.
 
     Returns:
         The folder for the results, and the jobs in the order of the file, each once.
 
     Raises:
-        InputError: when it is none.
+        InputError: when the file is missing or wrong.
     """
     shipped = SHIPPED / path.name
     if not path.exists() and shipped.exists() and path.parent in (Path(), Path("confs/jobs")):
@@ -114,15 +114,15 @@ def read(path: Path) -> tuple[Path, list[Job]]:
         content = _mapping("a job file", content, ("outputs", "jobs", "exclude"))
         found = [job for grid in _list(content.get("jobs")) for job in _expand(grid)]
         excluded = [
-            _mapping("what is excluded", item, OPTIONS) for item in _list(content.get("exclude"))
+            _mapping("an entry of exclude", item, OPTIONS) for item in _list(content.get("exclude"))
         ]
         outputs = content.get("outputs", f"outputs/{path.stem}")
         if not isinstance(outputs, str):
             raise InputError(f"outputs is a folder, not {outputs!r}.")
         for item in excluded:
-            if not any(_agrees(job, item) for job in found):
+            if not any(_matches(job, item) for job in found):
                 raise InputError(f"no job is excluded by {item}.")
-        jobs = [job for job in dict.fromkeys(found) if not any(_agrees(job, e) for e in excluded)]
+        jobs = [job for job in dict.fromkeys(found) if not any(_matches(job, e) for e in excluded)]
         if found and not jobs:
             raise InputError(f"all {len(found)} jobs are excluded.")
         _check(jobs)
@@ -154,8 +154,8 @@ def _expand(grid: object) -> Iterator[Job]:
         yield _job(dict(zip(axes, values, strict=True)))
 
 
-def _features(item: object) -> list[str]:
-    """Return the names of a feature, or of a grid of descriptors, schemes and dimensions."""
+def _features(item: str | dict) -> list[str]:
+    """Return the name of a feature, or those of a grid of descriptors, schemes and dimensions."""
     if not isinstance(item, dict):
         return [item]
     item = _mapping("a grid of features", item, NAME_PARTS)
@@ -166,10 +166,11 @@ def _features(item: object) -> list[str]:
 
 
 def _job(options: dict) -> Job:
-    """Make a job of options of the right types."""
+    """Make a job; raise an InputError for an option of the wrong type."""
     for name, value in options.items():
         kind, called = NUMBERS.get(name, (str, "a name"))
-        if not isinstance(value, kind) or isinstance(value, bool):
+        is_right = isinstance(value, kind) and not isinstance(value, bool)
+        if not is_right:
             raise InputError(f"{name} is {value!r}: {called} is needed.")
         if name.startswith("num_") and value < 1:
             raise InputError(f"{name} is {value}: at least 1.")
@@ -185,8 +186,8 @@ def _job(options: dict) -> Job:
     return job
 
 
-def _agrees(job: Job, excluded: dict) -> bool:
-    """Return whether a job has one of the named values of each named option."""
+def _matches(job: Job, excluded: dict) -> bool:
+    """Tell whether a job has one of the given values of each given option."""
     return all(
         any(fnmatchcase(_text(getattr(job, name)), _text(value)) for value in _list(values))
         for name, values in excluded.items()
@@ -198,7 +199,7 @@ def _text(value: object) -> str:
 
 
 def _check(jobs: list[Job]) -> None:
-    """Refuse that there is no job, or that two would have the same folder."""
+    """Raise an InputError if there is no job, or two would have the same folder."""
     if not jobs:
         raise InputError("there is no job.")
     datasets: dict[str, Path] = {}

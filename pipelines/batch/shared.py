@@ -1,4 +1,4 @@
-"""What the jobs of a batch have in common on a data set: features, and retrieval."""
+"""What the jobs of a batch share on a data set: features and retrieval."""
 
 import errno
 import json
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from hloc_reduce import aggregate_features, extract_features, logger
+from hloc_reduce import extract_features, logger
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS
@@ -17,14 +17,12 @@ from hloc_reduce.runtime.outputs import STAGES, RunFolder
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.feature_files import STORAGES
-from hloc_reduce.utils.files import delete
-from hloc_reduce.utils.h5 import get_text, open_h5
 
-from .. import common
 from ..layouts import pipeline_of
+from ..run import check_retrieval, readable, retrieve
 from .jobs import Job
 
-RECORD = "shared.json"  # the ids of feature files, and the feature by which VLAD is
+RECORD = "shared.json"  # the feature file that VLAD uses, in later runs too
 
 
 class Shared:
@@ -33,13 +31,13 @@ class Shared:
     Args:
         dataset: the folder of the data set.
         jobs: its jobs.
-        folder: for what they have in common.
+        folder: for the shared files.
 
     Attributes:
-        failed: from each job that cannot be run to the reason.
-        features: from each other job to its feature file.
-        confs: from each feature file to the configuration.
-        dims: from each feature file to the number of dimensions.
+        failed: the reason why a job cannot be run, by job.
+        features: the feature file of each other job.
+        confs: the configuration of each feature file.
+        dims: the number of dimensions in each feature file.
         pipeline: the module of the pipeline.
     """
 
@@ -49,10 +47,9 @@ class Shared:
         self.features: dict[Job, Path] = {}
         self.confs: dict[Path, dict] = {}
         self.dims: dict[Path, int] = {}
-        self._detections: dict[Path, str] = {}  # what determines the keypoints of feature files
+        self._detections: dict[Path, str] = {}  # provenance of the keypoints, by feature file
         self._used: set[str] = set()  # map images
-        self._truths: set[Path | None] = set()  # of which options ground_truth is checked
-        self._record = provenance.read(folder / RECORD)
+        self._truths: set[Path | None] = set()  # checked values of ground_truth
         with self.failing(jobs):
             self.pipeline = pipeline_of(dataset)
             self._place = self.pipeline.Place(dataset)
@@ -63,15 +60,15 @@ class Shared:
                     self._check(job)
 
     def _check(self, job: Job) -> None:
-        """Refuse a job that cannot be run, or note what it needs."""
+        """Note what a job needs, or raise an error if it cannot be run."""
         from hloc_reduce import extractors
 
         for name in job.numbers:
             cli.choose(f"option for {self.dataset.name}", name, self.pipeline.NUMBERS)
         if job.retrieval != "vlad" and not Path(job.retrieval).is_file():
-            raise InputError(f"retrieval {job.retrieval}: neither vlad nor a file that is there.")
+            raise InputError(f"retrieval {job.retrieval}: neither vlad nor an existing file.")
         num_loc, names = self.numbers(job)["num_loc"], (self.query_names, self.map_names)
-        used = common.check_retrieval(job.retrieval, self.folder, num_loc, *names)
+        used = check_retrieval(job.retrieval, self.folder, num_loc, *names)
         self._place.check(used)
         if job.ground_truth not in self._truths:
             truth = job.ground_truth or self._place.ground_truth
@@ -84,7 +81,7 @@ class Shared:
         found = "" if job.keypoints == KEYPOINTS[0] else f"-keypoints_{job.keypoints}"
         path = self.folder / f"{conf['output']}{stored}{found}.h5"
         if self.confs.setdefault(path, conf) != conf:
-            raise InputError(f"{path.name} is that of another feature, too: rename its YAML file.")
+            raise InputError(f"{path.name} is the file of two features: rename a YAML file.")
         self.features[job] = path
         self.dims[path] = model.dim
         self._detections[path] = json.dumps([model.detection, conf["preprocessing"]], default=str)
@@ -92,11 +89,11 @@ class Shared:
 
     @contextmanager
     def failing(self, jobs: list[Job]) -> Iterator[None]:
-        """Have an error of a block be that of jobs, and go no further."""
+        """Record an error in a block as the failure of jobs."""
         try:
             yield
         except Exception as error:
-            if getattr(error, "errno", None) == errno.ENOSPC:  # which is no job's own
+            if getattr(error, "errno", None) == errno.ENOSPC:  # a full disk concerns all jobs
                 raise
             logger.error(
                 "%s, %s: %s",
@@ -108,11 +105,11 @@ class Shared:
             self.failed = dict.fromkeys(jobs, error) | self.failed
 
     def running(self) -> list[Job]:
-        """Return the jobs that did not fail so far."""
+        """Return the jobs that have not failed."""
         return [job for job in self.jobs if job not in self.failed]
 
     def numbers(self, job: Job) -> dict[str, int]:
-        """Return the numbers of a job, those of its pipeline where it does not say."""
+        """Return the --num_... options of a job, with the defaults of its pipeline."""
         return {**self.pipeline.NUMBERS, **job.numbers}
 
     def images(self) -> list[str]:
@@ -134,12 +131,12 @@ class Shared:
         return str(self.folder / f"vlad_{self._vlad_features().stem}" / name)
 
     def _vlad_features(self) -> Path:
-        """Return the feature file of which VLAD is made: the first one, or that of before."""
-        before = self.folder / self._record.get("vlad", "")
+        """Return the feature file that VLAD uses: the first one, or that of an earlier run."""
+        before = self.folder / provenance.read(self.folder / RECORD).get("vlad", "")
         return before if before in self.confs else self.features[next(iter(self.features))]
 
     def seconds(self) -> dict[str, float]:
-        """Return how long each stage of `main` took, all runs together."""
+        """Return the seconds of each stage of `main`, summed over all runs."""
         kept = provenance.read(self.folder / STAGES)
         return {name: stage["seconds"] for name, stage in kept.items()}
 
@@ -147,9 +144,9 @@ class Shared:
         """Extract the features and retrieve.
 
         Args:
-            executor: does the work.
-            strict: as of `extract_features.extract_several`.
-            overwrite: begin anew.
+            executor: where the work is done.
+            strict: as in `extract_features.extract_several`.
+            overwrite: recompute existing results.
         """
         if not self.running():
             return
@@ -162,27 +159,12 @@ class Shared:
                 for group in self.groups():
                     with self.failing([j for j in self.running() if self.features[j] in group]):
                         self._extract(group, executor, strict)
-            self._drop_stale()
             by_vlad = [job for job in self.running() if job.retrieval == "vlad"]
             with folder.stage("retrieval"), self.failing(by_vlad):
                 self._retrieve(by_vlad, not strict)
 
-    def _retrieve(self, jobs: list[Job], accept_partial: bool) -> None:
-        """Retrieve by VLAD for jobs."""
-        if not jobs:
-            return
-        features = self._vlad_features()
-        if features not in {self.features[job] for job in self.running()}:
-            raise InputError(f"Retrieval is by VLAD of {features.stem}, which failed.")
-        names = (
-            common.readable(features, self.query_names),
-            extract_features.keep_readable(features, self.map_names, accept_partial),
-        )
-        for pairs, num_loc in {(self.retrieval(j), self.numbers(j)["num_loc"]) for j in jobs}:
-            common.retrieve("vlad", features, Path(pairs), num_loc, *names)
-
     def _extract(self, paths: list[Path], executor: Executor, strict: bool) -> None:
-        """Extract features whose keypoints are the same."""
+        """Extract features that have the same keypoints."""
         with ExitStack() as stack:
             features = {}
             for path in paths:
@@ -193,16 +175,17 @@ class Shared:
                 features, self._place.images, self.images(), executor, strict
             )
 
-    def _drop_stale(self) -> None:
-        """Delete what was made of features that were begun anew."""
-        ids = {}
-        for path in {self.features[job] for job in self.running()}:
-            with open_h5(path) as file:
-                ids[path.name] = get_text(file, "id")
-        before = self._record.get("ids", {})
-        if any(before.get(name, made) != made for name, made in ids.items()):
-            for path in self.confs:
-                for derived in aggregate_features.files_of(path):
-                    delete(derived)
-        self._record = {"vlad": self._vlad_features().name, "ids": before | ids}
-        provenance.write(self.folder / RECORD, self._record)
+    def _retrieve(self, jobs: list[Job], accept_partial: bool) -> None:
+        """Retrieve by VLAD for jobs."""
+        if not jobs:
+            return
+        features = self._vlad_features()
+        if features not in {self.features[job] for job in self.running()}:
+            raise InputError(f"Retrieval needs VLAD of {features.stem}, which failed.")
+        provenance.write(self.folder / RECORD, {"vlad": features.name})
+        names = (
+            readable(features, self.query_names),
+            extract_features.keep_readable(features, self.map_names, accept_partial),
+        )
+        for pairs, num_loc in {(self.retrieval(j), self.numbers(j)["num_loc"]) for j in jobs}:
+            retrieve("vlad", features, Path(pairs), num_loc, *names)

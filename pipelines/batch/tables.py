@@ -1,4 +1,4 @@
-"""The tables of a batch: recall, bytes and seconds of its jobs, or why they failed."""
+"""The tables of a batch: recall, bytes and seconds of its jobs, or their errors."""
 
 import csv
 from collections.abc import Iterator, Mapping
@@ -32,9 +32,9 @@ COLUMNS = (
 
 
 def write(done: list[tuple[Shared, dict[Job, dict]]], outputs: Path) -> tuple[list[dict], str]:
-    """Write jobs.csv, jobs.txt and failures.csv, and return what is in the first two.
+    """Write jobs.csv, jobs.txt and failures.csv; return the rows and the text of the first two.
 
-    jobs.csv keeps the rows of other jobs.
+    jobs.csv keeps the rows of jobs that are not in this batch.
     """
     rows = [row for shared, summaries in done for row in job_rows(shared, summaries)]
     over = {(row["dataset"], row["job"]) for row in rows}
@@ -56,7 +56,7 @@ def write(done: list[tuple[Shared, dict[Job, dict]]], outputs: Path) -> tuple[li
 
 
 def read_rows(path: Path) -> list[dict]:
-    """Read the rows of an earlier jobs.csv, none if it is of another version."""
+    """Read the rows of an earlier jobs.csv; none if it has other columns."""
     if not path.exists():
         return []
     with path.open(newline="", encoding="utf-8") as file:
@@ -66,7 +66,7 @@ def read_rows(path: Path) -> list[dict]:
 
 def unreadable_images(shared: Shared) -> list[dict]:
     """Return the rows of failures.csv."""
-    found = {}
+    found: dict[str, str] = {}
     for path in shared.confs:
         if path.exists():
             found |= failures(path)
@@ -77,7 +77,7 @@ def unreadable_images(shared: Shared) -> list[dict]:
 
 
 def job_rows(shared: Shared, summaries: Mapping[Job, dict]) -> Iterator[dict]:
-    """Yield the rows of jobs.csv of the jobs that are over."""
+    """Yield the rows of jobs.csv for the jobs that are finished or failed."""
     for job in shared.jobs:
         row = {
             **dict.fromkeys(COLUMNS),
@@ -98,7 +98,7 @@ def job_rows(shared: Shared, summaries: Mapping[Job, dict]) -> Iterator[dict]:
 
 
 def _recall_rows(row: dict, summary: dict, shared_seconds: float) -> Iterator[dict]:
-    """Yield the rows of a job, one for each list and threshold."""
+    """Yield the rows of a job, one for each query list and threshold."""
     row = row | {
         "descriptor_bytes": summary["bytes_per_keypoint"]["descriptor"],
         "bytes_per_keypoint": summary["bytes_per_keypoint"]["feature_file"],
@@ -113,7 +113,7 @@ def _recall_rows(row: dict, summary: dict, shared_seconds: float) -> Iterator[di
 
 
 def table(shared: Shared, summaries: Mapping[Job, dict]) -> str:
-    """Format what came out of the jobs of a data set, with a line for each."""
+    """Format the results of the jobs of a data set, one line each."""
     lists = {name: found for s in summaries.values() for name, found in s["lists"].items()}
     lines = [[shared.dataset.name, *HEADINGS, *lists]]
     for label, place in (("distance [m]", 0), ("orient. [deg]", 1)):
@@ -134,12 +134,12 @@ def table(shared: Shared, summaries: Mapping[Job, dict]) -> str:
         )
     said = [aligned(lines)] if summaries else [f"{shared.dataset.name}:"]
     if seconds := shared.seconds():
-        said.append("in common: " + ", ".join(f"{name} {s:.1f} s" for name, s in seconds.items()))
+        said.append("shared: " + ", ".join(f"{name} {s:.1f} s" for name, s in seconds.items()))
     failed = [job for job in shared.jobs if job in shared.failed]
     said += [f"{job.name} failed: {one_line(shared.failed[job])}" for job in failed]
     return "\n".join(said)
 
 
 def one_line(error: Exception) -> str:
-    """Return what an error says, in one line."""
+    """Return the message of an error in one line."""
     return " ".join(str(error).split()) or type(error).__name__
