@@ -1,11 +1,10 @@
-"""How groups of arrays are added to h5 files, so that a run that is stopped loses little."""
+"""Add groups of arrays to h5 files such that a killed run loses little work."""
 
 import json
 import shutil
-import sqlite3
 import time
 import uuid
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -19,39 +18,37 @@ from ..utils.cli import InputError
 from ..utils.files import announce, replacing
 from ..utils.h5 import get_text, iterate_h5_names, open_h5, reading, set_text, write_h5
 from . import trace
-from .executors import Executor, Item
+from .executors import Executor, Item, Results
 
-PIECE_SECONDS = 5.0  # of work that a killed run may lose
+PIECE_SECONDS = 5.0  # work that a killed run may lose
 PIECE_BYTES = 64 * 2**20
-SYNC_SECONDS = 120.0  # until what another machine wrote is to be seen on this one
-FAILURE = "failure"  # attribute of a group that stands for what could not be computed, and why
-FAILURES = "failures"  # attribute of a file: the names of its groups that have a FAILURE
-QUOTED = 200  # characters of a configuration in a message
+SYNC_SECONDS = 120.0  # until files written by other machines must be visible here
+FAILURE = "failure"  # group attribute: why its input could not be processed
+FAILURES = "failures"  # file attribute: names of the groups that have a FAILURE
+QUOTED = 200  # characters of a configuration that a message shows
 
 Arrays = dict[str, np.ndarray]
-# the name of a group, its arrays, and from the name of an array, "" for the group itself, whose
-# attributes are texts, to its attributes
-Group = tuple[str, Arrays, dict[str, dict]]
+Attributes = dict[str, dict]  # by the name of an array, or "" for the group itself (texts only)
+Group = tuple[str, Arrays, Attributes]  # name, arrays, attributes
 Key = TypeVar("Key", bound=Hashable)
 
 
 class GroupWriter:
-    """Adds groups of arrays to an h5 file; a killed run loses its last seconds of work only.
+    """Adds groups of arrays to an h5 file; a killed run loses only its last seconds of work.
 
-    Groups go into pieces beside the file, each moved into place when it is whole. Leaving the
-    context merges the pieces into the file. What a piece holds is never computed again, and the
-    file itself is whole at any instant. A file keeps the `id` that it got when it was begun, so
-    that what is derived from it can tell it from one made anew. The names of its groups, which may
-    be more than memory can hold, are in a temporary data base on disk.
+    Groups are first written to pieces beside the file, each moved into place when it is complete;
+    leaving the context merges them into the file. Groups of earlier pieces are not computed again,
+    and the file itself is complete at any instant. Its header holds the provenance: `conf` and an
+    `id` that a file keeps when it is extended, but not when it is recomputed.
 
     Args:
         path: the h5 file, new or to be extended.
-        conf: what makes the arrays; kept in the file and refused when it differs.
-        overwrite: start anew instead of extending.
+        conf: what determines the arrays.
+        overwrite: start anew instead of extending the file.
         compression: h5py's name of a compression filter for all arrays.
 
     Raises:
-        InputError: when the file is broken or was made with another conf.
+        InputError: when the file is broken or has another `conf`.
     """
 
     def __init__(
@@ -65,17 +62,14 @@ class GroupWriter:
         if overwrite:
             self._drop_pieces()
             path.unlink(missing_ok=True)
-        self.names = _Names()
-        self.expected: dict[str, str] = {}  # pieces of other processes, and a group of each
+        self.names: set[str] = set()
+        self.expected: dict[str, str] = {}  # pieces of other processes, with one group of each
         header = {"conf": json.dumps(conf, sort_keys=True)}
         for part in [path] * path.exists() + self._pieces():
             with open_h5(part) as file:
                 _check(file, part, header["conf"])
                 header.setdefault("id", get_text(file, "id", uuid.uuid4().hex))
-                failed = _failed(file)
-                for name in iterate_h5_names(file.id):
-                    if name not in failed:
-                        self.names.add(name)
+                self.names.update(set(iterate_h5_names(file.id)) - _failed(file))
         header.setdefault("id", uuid.uuid4().hex)
         self.header = header
         self.new_pieces = partial(Pieces, self.folder, header, compression)
@@ -85,7 +79,7 @@ class GroupWriter:
         return name in self.names
 
     def begin(self, name: str, piece: str | None = None) -> None:
-        """Have a group count as one that is there: it will be added, or is in a piece."""
+        """Mark a group as present: it will be added, or another process has put it in a piece."""
         self.names.add(name)
         if piece is not None:
             self.expected[piece] = name
@@ -94,7 +88,6 @@ class GroupWriter:
         return self
 
     def __exit__(self, error: type | None, *_: object) -> None:
-        self.names.database.close()
         self.added.flush()
         if error is None:
             with trace.span("merge"):
@@ -109,7 +102,7 @@ class GroupWriter:
         return sorted(self.folder.glob("*.h5"))
 
     def _drop_pieces(self) -> None:
-        """Delete all pieces or, if killed meanwhile, leave none that counts."""
+        """Delete all pieces at once: none is left half deleted, even by a kill."""
         if self.folder.exists():
             dropped = self.folder.with_name(f".{self.folder.name}.{uuid.uuid4().hex}.tmp")
             self.folder.rename(dropped)
@@ -132,24 +125,24 @@ class GroupWriter:
         self._drop_pieces()
 
     def _await_pieces(self) -> list[Path]:
-        """Return all pieces, when those that other machines wrote are here, too."""
+        """Return all pieces; wait for those that other machines have written."""
         end = time.monotonic() + SYNC_SECONDS
         while missing := self.expected.keys() - {piece.name for piece in self._pieces()}:
             if self.path.exists():
-                with open_h5(self.path) as file:  # into which another writer may have merged them
+                with open_h5(self.path) as file:  # another writer may have merged them
                     missing = {piece for piece in missing if self.expected[piece] not in file}
             if not missing:
                 break
             if time.monotonic() > end:
                 raise InputError(
-                    f"{len(missing)} pieces that other machines wrote are not in {self.folder}: is "
-                    "it shared with them, or synced? The same command goes on from here."
+                    f"{len(missing)} pieces written by other machines are not in {self.folder}. "
+                    "Is it a shared or synced folder? Run the same command again to resume."
                 )
             time.sleep(SYNC_SECONDS / 100)
         return self._pieces()
 
     def _has_news(self, piece: Path) -> bool:
-        """Return whether a piece has what the file has not, or has as another failure."""
+        """Tell whether a piece has a group, or another failure, that the file lacks."""
         with open_h5(piece) as new, open_h5(self.path) as old:
             known = _failed(old)
             return any(
@@ -159,10 +152,10 @@ class GroupWriter:
 
 
 def resume_or_replace(path: Path, made_from: dict) -> GroupWriter:
-    """Return a writer that resumes an intermediate file, or starts it anew if it is stale."""
+    """Return a writer that resumes an intermediate file, or replaces it if it is stale."""
     try:
         return GroupWriter(path, made_from)
-    except InputError:  # made from something else, or broken
+    except InputError:  # stale, or broken
         return GroupWriter(path, made_from, overwrite=True)
 
 
@@ -171,9 +164,9 @@ class Pieces:
     """Gathers groups in memory and writes them into pieces of an h5 file.
 
     Args:
-        folder: of the pieces.
-        header: attributes of each.
-        compression: as of GroupWriter.
+        folder: where the pieces go.
+        header: file attributes of each piece.
+        compression: as in GroupWriter.
     """
 
     folder: Path
@@ -184,7 +177,7 @@ class Pieces:
         self._clear()
 
     def add(self, name: str, arrays: Arrays, attrs: dict[str, dict]) -> str:
-        """Add a group, write a piece if it is time to, and return the name of the group's piece."""
+        """Add a group, write a piece if it is due, and return the name of the group's piece."""
         piece = self.piece
         self.groups[name] = arrays, attrs
         self.bytes += sum(array.nbytes for array in arrays.values())
@@ -193,7 +186,7 @@ class Pieces:
         return piece
 
     def flush(self) -> None:
-        """Write what was gathered into a piece."""
+        """Write the gathered groups into a piece."""
         if self.groups:
             with trace.span("write"), replacing(self.folder / self.piece) as temporary:
                 self._write(temporary)
@@ -202,7 +195,7 @@ class Pieces:
     def _clear(self) -> None:
         self.groups: dict[str, tuple[Arrays, dict]] = {}
         self.bytes, self.since = 0, time.monotonic()
-        # in the order of time, and of one writer only
+        # sorted by time, and unique to this writer
         self.piece = f"{time.time_ns():020d}-{uuid.uuid4().hex[:8]}.h5"
 
     def _write(self, path: Path) -> None:
@@ -223,24 +216,24 @@ class Pieces:
 
 def fill(
     writers: Mapping[Key, GroupWriter],
-    work: Callable[[Iterable[Item]], Iterator[tuple[Key, Group]]],
+    work: Callable[[Iterable[Item]], Results[tuple[Key, Group]]],
     items: Iterable[Item],
     executor: Executor,
     size: int,
     gpu: bool = False,
-) -> Iterator[tuple[Key, str]]:
-    """Add the groups that work makes of items to files, wherever an executor does it.
+) -> Results[tuple[Key, str]]:
+    """Run `work` on items and add the groups it yields to files.
 
     Args:
-        writers: of the files.
-        work: as of `executors`, yields groups, each with the key of its writer.
-        items: as of `Executor.map`.
-        executor: does the work.
-        size: as of `Executor.map`.
-        gpu: as of `Executor.map`.
+        writers: by key, the writers of the files.
+        work: see `executors`; yields groups, each with the key of its writer.
+        items: see `Executor.map`.
+        executor: where the work is done.
+        size: see `Executor.map`.
+        gpu: see `Executor.map`.
 
     Yields:
-        For each group the key of its writer and its name.
+        The key of the writer and the name of each group.
     """
     new_pieces = {key: writer.new_pieces for key, writer in writers.items()}
     write = partial(_write_pieces, new_pieces, work)
@@ -252,10 +245,10 @@ def fill(
 
 def _write_pieces(
     new_pieces: Mapping[Key, Callable[[], Pieces]],
-    work: Callable[[Iterable[Item]], Iterator[tuple[Key, Group]]],
+    work: Callable[[Iterable[Item]], Results[tuple[Key, Group]]],
     items: Iterable[Item],
-) -> Iterator[tuple[Key, str, str]]:
-    """Write the groups that work makes of items, and yield their keys, names and pieces."""
+) -> Results[tuple[Key, str, str]]:
+    """Write the groups that work yields into pieces; yield their keys, names and pieces."""
     pieces = {key: new() for key, new in new_pieces.items()}
     try:
         with closing(work(items)) as groups:
@@ -266,33 +259,9 @@ def _write_pieces(
             part.flush()
 
 
-class _Names:
-    """A set of names on disk, in a file without a name in the system's temporary folder."""
-
-    def __init__(self):
-        self.database = sqlite3.connect("", isolation_level=None)
-        self.database.execute("PRAGMA journal_mode = OFF")
-        self.database.execute("CREATE TABLE names (name TEXT PRIMARY KEY) WITHOUT ROWID")
-
-    def add(self, name: str) -> None:
-        self._run("INSERT OR IGNORE INTO names VALUES (?)", name)
-
-    def __contains__(self, name: str) -> bool:
-        return self._run("SELECT 1 FROM names WHERE name = ?", name) is not None
-
-    def _run(self, command: str, name: str) -> tuple | None:
-        try:
-            return self.database.execute(command, (name,)).fetchone()
-        except sqlite3.OperationalError as error:
-            raise InputError(
-                f"The names of what is done cannot be kept in the temporary folder ({error}): set "
-                "SQLITE_TMPDIR to another one."
-            ) from None
-
-
 def _check(file: h5py.File, path: Path, conf: str) -> None:
     """Raise an InputError if an h5 file was made with another configuration."""
-    before = get_text(file, "conf", conf)  # hloc's own files say nothing
+    before = get_text(file, "conf", conf)  # hloc's own files have none
     if before != conf:
         try:
             old, new = dict(json.loads(before)), json.loads(conf)
@@ -316,14 +285,14 @@ def _quoted(conf: dict, key: str) -> str:
 
 
 def failures(path: Path) -> dict[str, str]:
-    """Return the groups of an h5 file that stand for what could not be computed, and why."""
+    """Return the names of the groups of an h5 file whose input was unreadable, with the reasons."""
     with open_h5(path) as file:
         reasons = {name: failure_of(file, name) for name in sorted(_failed(file))}
     return {name: str(reason) for name, reason in reasons.items() if reason is not None}
 
 
 def failure_of(file: h5py.File, name: str) -> str | None:
-    """Return why a group of an open h5 file could not be computed; None where it was."""
+    """Return why the input of a group was unreadable; None if it was not."""
     with reading(file.filename):
         group = file.get(name)
     return None if group is None else get_text(group, FAILURE)
@@ -336,7 +305,7 @@ def _set_header(file: h5py.File, header: dict[str, str]) -> None:
 
 def _failed(file: h5py.File) -> set[str]:
     try:
-        return set(map(str, json.loads(get_text(file, FAILURES) or "[]")))
+        return set(map(str, json.loads(get_text(file, FAILURES, "[]"))))
     except (ValueError, TypeError) as error:
         raise InputError(f"Cannot read {file.filename}: it is corrupted ({error}).") from error
 
@@ -347,7 +316,7 @@ def _set_failed(file: h5py.File, names: set[str]) -> None:
 
 
 def _merge_piece(piece: h5py.File, merged: h5py.File) -> None:
-    """Add what a piece has and a file has not, or has as a failure."""
+    """Add the groups of a piece that a file lacks or has as failures."""
     failed, again = _failed(merged), _failed(piece)
     for name in {name for name in failed if name in piece}:
         del merged[name]
@@ -359,7 +328,7 @@ def _merge_piece(piece: h5py.File, merged: h5py.File) -> None:
 
 
 def _copy_missing(source: h5py.Group, target: h5py.Group) -> None:
-    """Copy what a group has and another has not, whole groups at once."""
+    """Copy the members of a group that another lacks, whole groups at once."""
     for name in source:
         if name not in target:
             source.copy(name, target)

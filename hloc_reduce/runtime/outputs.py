@@ -1,4 +1,4 @@
-"""Outputs folders, each of one configuration."""
+"""Outputs folders, each for one configuration."""
 
 import fcntl
 import glob
@@ -12,29 +12,37 @@ from pathlib import Path
 
 from .. import logger
 from ..utils.cli import InputError
-from ..utils.files import delete, observing, replacing
+from ..utils.files import delete, observing
 from . import provenance, trace
 
 LOCK = ".lock"  # in an outputs folder
-SHARED = "shared"  # folder of what the jobs of a batch have in common on a data set
+SHARED = "shared"  # folder of the files that the jobs of a batch share on a data set
+CONF = "conf.json"
+STAGES = "stages.json"
+FILES = "files.json"  # names of the files and folders that runs wrote, noted before they write
+WHOLE = ("map.json", "queries.csv", "summary.json")  # mark a finished run, so deleted first
+BOOKKEEPING = {CONF, STAGES, FILES, "summary.json", "queries.csv", "trace.json"}
+DELETING = {"is": "being deleted"}  # configuration of a folder whose deletion was interrupted
+NAMED = 3  # differences that a message names
+SHORT = 40  # characters of values that it shows
 
 
 class Lock:
     """A folder that no other run may write to.
 
-    The lock is the system's, which ends with the process however that ends.
+    The operating system releases the lock when the process ends, however it ends.
 
     Args:
-        folder: made if need be.
+        folder: created if missing.
 
     Raises:
-        InputError: when another run has it.
+        InputError: when another run has locked it.
     """
 
     def __init__(self, folder: Path):
         folder.mkdir(parents=True, exist_ok=True)
         self.file = None
-        if not os.access(folder, os.W_OK):  # then nobody writes to it
+        if not os.access(folder, os.W_OK):  # nobody writes to it
             return
         self.file = (folder / LOCK).open("a+")
         try:
@@ -46,47 +54,38 @@ class Lock:
             raise InputError(f"Another run is at work in {folder} ({who}).") from None
         except OSError as error:
             logger.warning("%s cannot be locked (%s): start no second run in it.", folder, error)
-        with suppress(OSError):  # of a full disk: it is locked all the same
+        with suppress(OSError):  # of a full disk; the folder is locked all the same
             self.file.truncate(0)
             self.file.write(f"process {os.getpid()} on {platform.node()}")
             self.file.flush()
 
     def release(self) -> None:
-        """Let others have it."""
+        """Release the lock."""
         if self.file is not None:
             self.file.close()
 
 
-STAGES = "stages.json"
-FILES = "files.json"  # names of what runs wrote in their folder, noted before it is written
-WHOLE = ("map.json", "queries.csv", "summary.json")  # say that a run is whole, so deleted first
-BOOKKEEPING = {"conf.json", STAGES, FILES, "summary.json", "queries.csv", "trace.json"}
-DELETING = {"is": "being deleted"}
-NAMED = 3  # differences that a message names
-SHORT = 40  # characters of values that it quotes
-
-
 class RunFolder:
-    """An output folder that belongs to one configuration and knows how long its stages took.
+    """An outputs folder that belongs to one configuration and records what its stages did.
 
-    In a `with` block no other run can write to it, and what is written in it is noted.
+    In a `with` block no other run can write to it, and the names of all files that are written in
+    it are recorded.
 
     Args:
-        path: the folder; made if need be.
+        path: the folder; created if missing.
         conf: what determines the results.
-        overwrite: begin anew, with this configuration; what runs wrote in the folder, by its
-            record, is deleted first, so that a run that is stopped can go on without `overwrite`.
-        inputs: files and folders that the run reads, which are not to be deleted.
-        stale: where the configuration is the same, begin anew all the same: what the results
-            were made from has changed.
-        kept: names of files that stay all the same.
+        overwrite: delete everything that earlier runs wrote, according to the folder's record, and
+            take this configuration. An interrupted run resumes without `overwrite`.
+        inputs: files and folders that the run reads; they must not be deleted.
+        stale: delete earlier results even if they have the same configuration.
+        kept: names of files that are never deleted.
 
     Attributes:
-        written: names of the files and folders that runs wrote in it.
+        written: names of the files and folders that runs wrote.
 
     Raises:
-        InputError: when the folder holds results of another configuration, or an input that would
-            be deleted, or another run is at work in it.
+        InputError: when the folder has results of another configuration, an input would be
+            deleted, or another run is at work in it.
     """
 
     def __init__(
@@ -98,7 +97,7 @@ class RunFolder:
         stale: bool = False,
         kept: Iterable[str] = (),
     ):
-        self.path, self._stages_file, self.kept = path, path / STAGES, {*kept}
+        self.path, self.kept = path, {*kept}
         self._lock = Lock(path)
         try:
             self.written = self._read_written()
@@ -117,91 +116,84 @@ class RunFolder:
         self._observing.__exit__(None, None, None)
         self._lock.release()
 
+    def _stages(self) -> dict:
+        return provenance.read(self.path / STAGES)
+
     def _read_written(self) -> set[str]:
-        """Return the names of what runs wrote in the folder."""
+        """Return the names of the files and folders that runs wrote."""
         noted = provenance.read(self.path / FILES).get("written")
-        if noted is None:  # of a run before there was this record
-            stages = provenance.read(self._stages_file).values()
-            noted = [name for stage in stages for name in stage["wrote"]]
+        if noted is None:  # of a version without this record
+            noted = [name for stage in self._stages().values() for name in stage["wrote"]]
             noted += WHOLE if noted else ()
         names = {str(name) for name in noted}
         return {name for name in names if Path(name).name == name and name not in self.kept}
 
     def _note(self, path: Path) -> None:
-        """Note, before it is written, the file or folder in this one that a path leads to."""
+        """Record the file or folder of this folder that contains `path`, before it is written."""
         if not path.resolve().is_relative_to(self.path.resolve()):
             return
         name = path.resolve().relative_to(self.path.resolve()).parts[0]
-        if (
-            name not in self.written
-            and name not in self.kept
-            and name not in BOOKKEEPING - {*WHOLE}
-        ):
+        if name not in self.written | self.kept | (BOOKKEEPING - {*WHOLE}):
             self.written.add(name)
             provenance.write(self.path / FILES, {"written": sorted(self.written)})
 
     def delete(self, names: Iterable[str]) -> None:
-        """Delete files and folders that runs wrote; those of other names are left alone."""
+        """Delete files and folders that runs wrote; others are left alone."""
         for name in [name for name in names if name in self.written]:
             delete(self.path / name)
             self.written.discard(name)
 
     def _drop_temporaries(self) -> None:
-        """Delete what a killed run left: only who has the lock makes these."""
+        """Delete the temporary files of a killed run."""
         for name in (*self.written, *BOOKKEEPING):
             for left in self.path.glob(f".{glob.escape(name)}.*tmp"):
                 delete(left)
 
     def _claim(self, conf: dict, overwrite: bool, inputs: Iterable[Path], stale: bool) -> None:
-        """Check that the folder is of a configuration, or make it so."""
-        path, conf_file = self.path, self.path / "conf.json"
+        """Check the configuration of the folder, or delete earlier results and set it."""
+        path, conf_file = self.path, self.path / CONF
         conf = json.loads(json.dumps(conf))
-        before = None
-        if conf_file.exists() and not overwrite:
+        is_new = not conf_file.exists()
+        if not is_new and not overwrite:
             try:
                 before = dict(json.loads(conf_file.read_text()))
             except (ValueError, TypeError):
                 raise InputError(f"{conf_file} is broken: use --overwrite.") from None
             changes = _changes(before, conf)
-            if before == DELETING or not changes and stale:
-                overwrite = True
-            elif changes:
+            overwrite = before == DELETING or stale and not changes
+            if changes and not overwrite:
                 named = " and ".join(f"{key}{which}" for key, which in changes.items())
                 raise InputError(
                     f"What {path} was made from differs: {named}. "
                     "Choose other --outputs, one folder for each configuration, or --overwrite."
                 )
-        if overwrite and conf_file.exists():
+        if not is_new and overwrite:
             for file in inputs:
                 if path.resolve() in file.resolve().parents:
-                    raise InputError(f"{file} is in {path}, which is to be made anew: move it.")
-            # whoever finds this, because the deletion was cut short, deletes again
-            with replacing(conf_file) as temporary:
-                temporary.write_text(json.dumps(DELETING))
+                    raise InputError(f"{file} is in {path}, which --overwrite deletes: move it.")
+            # if the deletion is interrupted, the next run completes it
+            provenance.write(conf_file, DELETING)
             self.delete(sorted(self.written, key=lambda name: name not in WHOLE))
             for name in (STAGES, FILES):
                 delete(path / name)
-        if overwrite or before is None:
-            with replacing(conf_file) as temporary:
-                temporary.write_text(json.dumps(conf, indent=1))
+        if is_new or overwrite:
+            provenance.write(conf_file, conf)
 
     def seconds(self) -> dict[str, float]:
-        """Return how long each stage took, all runs together."""
-        return {
-            name: stage["seconds"] for name, stage in provenance.read(self._stages_file).items()
-        }
+        """Return the seconds of each stage, summed over all runs."""
+        return {name: stage["seconds"] for name, stage in self._stages().items()}
 
     def bytes(self) -> dict[str, int]:
-        """Return how large the files and folders are that each stage wrote."""
+        """Return the size of the files and folders that each stage wrote."""
         sizes = {name: size for name, (size, _) in self._contents().items()}
         return {
             name: sum(sizes.get(written, 0) for written in stage["wrote"])
-            for name, stage in provenance.read(self._stages_file).items()
+            for name, stage in self._stages().items()
         }
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Measure a stage; what a run that failed spent counts too."""
+        """Time a stage, a failed one too, and record what it wrote."""
         contents, start = self._contents(), time.perf_counter()
         try:
             with trace.span(name):
@@ -213,20 +205,20 @@ class RunFolder:
         self._measure(name, contents, start)
 
     def _measure(self, name: str, contents: dict, start: float) -> None:
-        """Write down what a stage spent and wrote since a time when there were other contents."""
-        stages = provenance.read(self._stages_file)
+        """Record the seconds of a stage and the files that changed during it."""
+        stages = self._stages()
         changed = {
             written for written, state in self._contents().items() if contents.get(written) != state
         }
-        if changed or name not in stages:  # a look at what is there does not count
+        if changed or name not in stages:  # a run that finds everything done does not count
             before = stages.get(name, {"seconds": 0.0, "wrote": []})
             spent = before["seconds"] + time.perf_counter() - start
             wrote = sorted(changed.union(before["wrote"]))
             stages[name] = {"seconds": round(spent, 3), "wrote": wrote}
-            provenance.write(self._stages_file, stages)
+            provenance.write(self.path / STAGES, stages)
 
     def _contents(self) -> dict[str, tuple[int, int]]:
-        """Return the size and the time of the last change of all that stages wrote, by name."""
+        """Return the size and the last change of each file and folder, by name."""
         contents = {}
         for path in self.path.iterdir():
             if path.name in BOOKKEEPING or path.name.startswith("."):
@@ -241,7 +233,7 @@ class RunFolder:
 
 
 def _changes(before: dict, after: dict) -> dict[str, str]:
-    """Return the keys whose values differ, each with the entries that differ where it has some."""
+    """Return the keys whose values differ, with the differing entries of those that are dicts."""
     changes = {}
     for key in {**before, **after}:
         old, new = before.get(key), after.get(key)

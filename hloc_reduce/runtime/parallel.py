@@ -1,23 +1,25 @@
-"""The cores of a machine: each works on an item of its own, in one thread."""
+"""The cores of a machine: each processes an item of its own, in one thread."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from threading import Lock
+from typing import TypeVar
 
 from .trace import span
 
-BACKLOG = 4  # results for each worker that may wait to be taken
-
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+BACKLOG = 4  # results per worker that may wait to be taken
 
 _lock = Lock()
-_running = 0  # blocks of `_one_thread_each`, of whatever threads
-_threads = 1  # of torch before the first of them
+_running = 0  # active blocks of `_one_thread_each`, in all threads
+_threads = 1  # torch's threads before the first of them
 
 
 def cores() -> int:
-    """Return how many cores to use: OMP_NUM_THREADS if it is set, else all."""
+    """Return the number of cores to use: OMP_NUM_THREADS if it is set, else all."""
     import torch
 
     with _lock:
@@ -26,7 +28,7 @@ def cores() -> int:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Have torch compute in the thread that asks it to; several such blocks may overlap."""
+    """Let torch compute in the calling thread only; such blocks may overlap."""
     global _running, _threads
     import torch
 
@@ -43,53 +45,49 @@ def _one_thread_each() -> Iterator[None]:
             torch.set_num_threads(1 if _running else _threads)
 
 
-def ordered(name: str, function: Callable, items: Iterable, workers: int | None = None) -> Iterator:
+def ordered(
+    name: str,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    workers: int | None = None,
+) -> Generator[Result, None, None]:
     """Apply a function to items in threads and yield the results in the order of the items.
 
-    While one worker is at work the others and the caller go on: the caller draws the items, so that
-    what reads them runs here too. Few items and results are held at once. Torch computes in one
-    thread of each worker, so that results do not depend on their number. If drawing an item fails,
-    the results of those before it are yielded first.
+    The calling thread draws the items, so whatever reads them runs in it, while the workers go on.
+    Few items and results are held at once. Torch computes in one thread of each worker, so that
+    results do not depend on the number of workers. If drawing an item fails, the results of the
+    items before it are yielded first.
 
     Args:
         name: of the work, in a trace.
-        function: what is done with an item; it spends its time outside of Python.
-        items: drawn as workers get free.
-        workers: how many; default: `cores()`.
+        function: should spend its time outside of Python.
+        items: drawn as workers become free.
+        workers: number of threads; default: `cores()`.
     """
     workers = workers or cores()
-    pending = deque()
+    pending: deque[Future[Result]] = deque()
 
-    def work(item: object) -> object:
+    def work(item: Item) -> Result:
         with span(name):
             return function(item)
 
-    def draw() -> Iterator:
-        iterator = iter(items)
-        while True:
-            with span(f"read to {name}"):
-                item = next(iterator, pending)
-            if item is pending:  # which is no item
-                return
-            yield item
-
     with _one_thread_each():
         pool = ThreadPoolExecutor(workers)
+        iterator, failure, is_over = iter(items), None, False
         try:
-            drawn, failure = draw(), None
-            while failure is None:
+            while not is_over:
                 try:
-                    item = next(drawn)
+                    with span(f"read to {name}"):
+                        item = next(iterator)
+                    pending.append(pool.submit(work, item))
                 except StopIteration:
-                    break
+                    is_over = True
                 except Exception as error:
-                    failure = error
-                    break
-                pending.append(pool.submit(work, item))
-                while pending and (pending[0].done() or len(pending) > BACKLOG * workers):
+                    is_over, failure = True, error
+                while pending and (
+                    is_over or pending[0].done() or len(pending) > BACKLOG * workers
+                ):
                     yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
             if failure is not None:
                 raise failure
         finally:

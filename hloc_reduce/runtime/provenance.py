@@ -1,4 +1,10 @@
-"""Tell whether a derived file is still up to date, as make does, by what it was made from."""
+"""Provenance: what determines the content of a file. A file is stale when it has changed.
+
+There are two mechanisms. Each derived file has a header with its provenance: the attributes of an
+h5 file (`group_writer`), the first line of a JSON lines file, a JSON file in or beside a COLMAP
+model. Each outputs folder has a configuration, conf.json (`outputs`). A third, the fingerprints of
+photos, serves users who copy or touch their photos: their content counts, not their time.
+"""
 
 import json
 from collections.abc import Mapping
@@ -8,8 +14,8 @@ from ..utils.files import file_sha256, replacing
 from ..utils.progress import progress
 
 
-def stamp(options: dict, inputs: list[Path]) -> dict:
-    """Describe what a file is made from: options, and the size and time of each input file."""
+def of_inputs(options: dict, inputs: list[Path]) -> dict:
+    """Return the provenance of a file: options, and the size and time of each input file."""
     files = {}
     for path in inputs:
         status = path.stat()
@@ -19,36 +25,36 @@ def stamp(options: dict, inputs: list[Path]) -> dict:
 
 
 def is_current(path: Path, expected: dict) -> bool:
-    """Return whether the stamp file `path` is there and says what is expected."""
+    """Tell whether the JSON file `path` exists and has the expected content."""
     return bool(expected) and read(path) == json.loads(json.dumps(expected))
 
 
 def read(path: Path) -> dict:
-    """Read a stamp file; one that is not there or broken is empty."""
+    """Read a JSON file; a missing or broken one is empty."""
     try:
         return dict(json.loads(path.read_text()))
     except (OSError, ValueError, TypeError):
         return {}
 
 
-def write(path: Path, made_from: dict) -> None:
-    """Write a stamp file."""
+def write(path: Path, content: dict) -> None:
+    """Write a JSON file."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(made_from, indent=1))
+        temporary.write_text(json.dumps(content, indent=1))
 
 
 def fingerprints(files: Mapping[str, Path], before: Mapping[str, list]) -> dict[str, list]:
-    """Compute the size, the time and the sha256 of files.
+    """Compute the size, time and sha256 of files.
 
     Args:
-        files: from name to path.
-        before: earlier ones. A file that still has its size and time is not read.
+        files: paths by name.
+        before: earlier fingerprints. A file that still has its size and time is not read.
 
     Returns:
-        From name to [size, time, digest].
+        [size, time, digest] by name.
     """
     statuses = {name: path.stat() for name, path in files.items()}
-    now = {name: [status.st_size, status.st_mtime_ns] for name, status in statuses.items()}
+    now: dict[str, list] = {name: [s.st_size, s.st_mtime_ns] for name, s in statuses.items()}
     changed = [name for name in now if before.get(name, [])[:2] != now[name]]
     for name in progress(changed, "Reading files", "file"):
         now[name].append(file_sha256(files[name]))
@@ -56,5 +62,5 @@ def fingerprints(files: Mapping[str, Path], before: Mapping[str, list]) -> dict[
 
 
 def changed(before: Mapping[str, list], now: Mapping[str, list]) -> list[str]:
-    """Return the names whose fingerprints are in both, but of other contents."""
+    """Return the names that have fingerprints in both, with different digests."""
     return [name for name in now if name in before and before[name][2] != now[name][2]]

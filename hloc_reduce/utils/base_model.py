@@ -1,4 +1,4 @@
-"""What extractors and matchers have in common; the same contract as hloc's BaseModel."""
+"""The base class of extractors, aggregators and matchers; the same contract as hloc's."""
 
 import importlib
 import inspect
@@ -18,8 +18,7 @@ class BaseModel(nn.Module):
         conf: overrides of `default_conf`, and optionally the key `name`.
 
     Raises:
-        InputError: for a configuration key that the model does not have, or a value of another
-            kind than its default.
+        InputError: for an unknown configuration key, or a value of another type than its default.
     """
 
     default_conf: dict = {}
@@ -42,7 +41,7 @@ class BaseModel(nn.Module):
         self._init(self.conf)
 
     def forward(self, data: dict) -> dict:
-        """Check that the required inputs are there and compute the predictions."""
+        """Check that no required input is missing and compute the predictions."""
         missing = [key for key in self.required_inputs if key not in data]
         if missing:
             raise InputError(f"{type(self).__name__} needs {', '.join(missing)}.")
@@ -50,6 +49,9 @@ class BaseModel(nn.Module):
 
     def _init(self, conf: dict) -> None:
         pass
+
+    def _forward(self, data: dict) -> dict:
+        raise NotImplementedError
 
 
 def dynamic_load(root: ModuleType, name: str) -> type[BaseModel]:

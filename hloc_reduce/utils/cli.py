@@ -1,4 +1,4 @@
-"""What all command lines share: how a user's mistake ends a program."""
+"""What all command lines share: how errors that a user can mend end a program."""
 
 import argparse
 import difflib
@@ -13,23 +13,23 @@ NEAREST = 8  # names shown in place of an unknown one
 
 
 class InputError(ValueError):
-    """Something the user gave is wrong; the message says what and how to mend it."""
+    """A user's input is wrong; the message says what is wrong and how to mend it."""
 
 
 def run(main: Callable[[], None]) -> None:
     """Run a command line: an error that a user can mend is one logged line and exit code 2.
 
-    Ctrl-C, and a SIGTERM as of Slurm, end it as an error would, so that what is done is written.
+    Ctrl-C and SIGTERM (as from Slurm) end it like an error, so that finished work is written.
     """
     try:
         interrupts.hear()
-        # argparse would call a module by its file
+        # argparse would name a module by its file
         if spec := sys.modules["__main__"].__spec__:
             sys.argv[0] = f"python -m {spec.name.removesuffix('.__main__')}"
         main()
         if spec and spec.name.startswith(interrupts.COMMANDS):
             interrupts.ignore()
-    except BrokenPipeError:  # of a pager or head that has read enough
+    except BrokenPipeError:  # a pager or `head` has read enough
         sys.stdout = None
         sys.exit(1)
     except (InputError, OSError) as error:
@@ -59,34 +59,34 @@ def check_positive(args: argparse.Namespace, *names: str) -> None:
 
 
 def no_folder(path: Path) -> InputError:
-    """Return the error that a folder is not there."""
+    """Return the error for a missing folder."""
     return InputError(
         f"{path} is a file, not a folder." if path.exists() else f"There is no folder {path}."
     )
 
 
 def check_folder(path: Path) -> None:
-    """Raise an InputError if a folder for results cannot be made, as a file has its name."""
+    """Raise an InputError if a file prevents a folder for results from being created."""
     for part in (path, *path.parents):
         if part.exists() and not part.is_dir():
             raise InputError(f"{part} is a file: choose a folder for the results.")
 
 
 def check_file(path: Path, what: str) -> None:
-    """Raise an InputError if a file cannot be written, as a folder has its name."""
+    """Raise an InputError if a folder prevents a file from being written."""
     if path.is_dir():
         raise InputError(f"{path} is a folder: name {what} in it.")
     check_folder(path.parent)
 
 
 def some(names: Iterable[str], number: int = 5) -> str:
-    """Name the first few of many."""
+    """Join the first few of many names."""
     names = list(names)
     return ", ".join(names[:number]) + (", ..." if len(names) > number else "")
 
 
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
-    """Shows defaults, except of options that have none, and keeps an example on its line."""
+    """Shows the defaults of options that have one, and keeps an example on one line."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         if text.startswith("example: "):

@@ -1,17 +1,18 @@
-"""The parts of pycolmap whose interface or behaviour differs between versions."""
+"""pycolmap: what differs between its versions, and its databases."""
 
 import errno
 import json
 import os
 import shutil
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from struct import error as struct_error
 from struct import unpack_from
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -22,22 +23,22 @@ from .interrupts import interruptible
 from .parsers import CAMERA_MODELS, check_names, parse_pairs, write_pairs
 
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
-FULL = 2**16  # bytes: in less COLMAP cannot even open a database
+FULL = 2**16  # free bytes, below which COLMAP cannot even open a database
 
 
 def detect_dog(image: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray]:
-    """Detect and describe keypoints by COLMAP's SIFT on the CPU, in one thread.
+    """Detect and describe keypoints with COLMAP's SIFT on the CPU, in one thread.
 
     Args:
         image: (H, W) float32 in [0, 1].
-        options: of pycolmap's SiftExtractionOptions.
+        options: pycolmap's SiftExtractionOptions.
 
     Returns:
         Keypoints (N, 4) float32: x, y with pixel centres at integers, scale in pixels, orientation
-        in degrees from x towards y; and COLMAP's descriptors (N, 128) float32 of unit norm.
+        in degrees from x towards y; and COLMAP's descriptors (N, 128) float32, unit norm.
     """
-    extractor = _sift_extractor(json.dumps(options, sort_keys=True))
-    if hasattr(extractor, "extract_from_float32_array"):  # from 4.0 on
+    extractor: Any = _sift_extractor(json.dumps(options, sort_keys=True))
+    if hasattr(extractor, "extract_from_float32_array"):  # pycolmap 4
         found, described = extractor.extract_from_float32_array(image)
         keypoints = np.array(
             [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found], np.float32
@@ -48,7 +49,7 @@ def detect_dog(image: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray
     x_y, scale, orientation = np.split(keypoints.reshape(-1, 4), [2, 3], axis=1)
     descriptors = descriptors.reshape(-1, 128)
     norm = np.linalg.norm(descriptors, axis=1, keepdims=True)
-    # the origin of both is COLMAP's, the corner
+    # COLMAP's origin is the corner
     return (
         np.concatenate([x_y - 0.5, scale, np.rad2deg(orientation)], axis=1),
         np.divide(descriptors, norm, out=np.zeros_like(descriptors), where=norm > 0),
@@ -59,21 +60,21 @@ _thread = threading.local()
 
 
 def _sift_extractor(options: str) -> "pycolmap.FeatureExtractor":
-    """Return an extractor of this thread's own; COLMAP's has state, and keeps its pyramid.
+    """Return an extractor for this thread: COLMAP's have state.
 
-    Only the last one is kept, as that of an image at twice its size takes half a gigabyte.
+    Only the last one is kept: its pyramid of an image at twice its size takes half a gigabyte.
     """
     if getattr(_thread, "options", None) != options:
-        _thread.extractor = _thread.options = None  # free it before another is made
+        _thread.extractor = _thread.options = None  # free it before another is created
         extraction = _extraction_options(json.loads(options))
-        new = hasattr(pycolmap, "FeatureExtractor")  # from 4.0 on
+        new = hasattr(pycolmap, "FeatureExtractor")  # pycolmap 4
         make = pycolmap.FeatureExtractor.create if new else pycolmap.Sift
         _thread.extractor, _thread.options = make(extraction, pycolmap.Device.cpu), options
     return _thread.extractor
 
 
 def check_dog_options(options: dict) -> None:
-    """Raise an InputError for an option of `detect_dog` that there is not."""
+    """Raise an InputError for an unknown option of `detect_dog`."""
     _extraction_options(options)
 
 
@@ -90,7 +91,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model, binary or text, with or without rigs and frames.
 
     Raises:
-        InputError: when it is not there or broken, or an image has a name that no list can have.
+        InputError: when it is missing or broken, or has an invalid image name.
     """
     if not path.is_dir():
         raise InputError(f"There is no COLMAP model folder {path}.")
@@ -106,10 +107,10 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
 
 
 def check_whole(path: Path) -> None:
-    """Refuse a binary COLMAP model one of whose files is cut off: COLMAP may read it for ever.
+    """Check that no file of a binary COLMAP model is truncated: COLMAP may never finish reading it.
 
     Raises:
-        InputError: naming the file.
+        InputError: naming a truncated file.
     """
     for name, skip in RECORDS.items():
         file = path / f"{name}.bin"
@@ -123,7 +124,7 @@ def check_whole(path: Path) -> None:
                 if end > len(data):
                     raise ValueError
         except (ValueError, struct_error, OverflowError):  # of an empty file, or at its end
-            raise InputError(f"{path} is not a COLMAP model ({file.name} is cut off).") from None
+            raise InputError(f"{path} is not a COLMAP model ({file.name} is truncated).") from None
 
 
 def _skip_camera(data: mmap, start: int) -> int:
@@ -150,14 +151,14 @@ def _skip_frame(data: mmap, start: int) -> int:
 
 @lru_cache
 def _num_params() -> dict[int, int]:
-    """Return how many parameters a camera has, by the number of its model."""
+    """Return the number of parameters of each camera model, by its id."""
     models = [pycolmap.CameraModelId.__members__[name] for name in CAMERA_MODELS]
-    new = hasattr(pycolmap.Camera, "create_from_model_id")  # from 4.0 on
+    new = hasattr(pycolmap.Camera, "create_from_model_id")  # pycolmap 4
     make = pycolmap.Camera.create_from_model_id if new else pycolmap.Camera.create
     return {int(model): len(make(1, model, 1.0, 1, 1).params) for model in models}
 
 
-# from a file of a binary COLMAP model to what finds the end of a record in it
+# files of a binary COLMAP model -> functions that return the end of the record at an offset
 RECORDS = {
     "cameras": _skip_camera,
     "images": _skip_image,
@@ -167,12 +168,12 @@ RECORDS = {
 
 
 def write_part(path: Path, names: Collection[str], output: Path) -> Path:
-    """Write the part of a COLMAP model that some of its images see.
+    """Write a COLMAP model with only some of its images.
 
     Args:
-        path: the model.
+        path: folder of the model.
         names: the images.
-        output: the folder of the part; files that stay the same keep their times.
+        output: folder of the new model; unchanged files keep their times.
 
     Returns:
         `output`.
@@ -200,9 +201,9 @@ def add_image(
     image: pycolmap.Image,
     cam_from_world: pycolmap.Rigid3d,
 ) -> None:
-    """Add an image with a pose, and its camera if it is new, as a rig and a frame of its own.
+    """Add an image with a pose, and its camera if it is new, with its own rig and frame.
 
-    The same as pycolmap's `add_image_with_trivial_frame`, which 3.13 does not have.
+    Same as pycolmap's `add_image_with_trivial_frame`, which 3.13 lacks.
     """
     if not model.exists_camera(camera.camera_id):
         model.add_camera(camera)
@@ -219,14 +220,14 @@ def add_image(
 
 
 def point3D_ids(image: pycolmap.Image) -> np.ndarray:
-    """Return the ids of the 3D points of an image's keypoints (N,) int64, -1 where none."""
+    """Return the 3D point ids of an image's keypoints (N,) int64, -1 for none."""
     return np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
 
 
 def cam_from_img(camera: pycolmap.Camera, points2D: np.ndarray) -> np.ndarray:
-    """Undistort image points (N, 2), COLMAP's pixels, onto the normalized image plane.
+    """Undistort image points (N, 2) in COLMAP's pixels onto the normalized image plane.
 
-    A point that the camera model cannot undistort is infinite.
+    Points that the camera model cannot undistort become infinite.
     """
     if len(points2D) == 0:
         return np.zeros((0, 2))
@@ -235,7 +236,7 @@ def cam_from_img(camera: pycolmap.Camera, points2D: np.ndarray) -> np.ndarray:
 
 
 def write_reference(database: Path, reference: pycolmap.Reconstruction) -> None:
-    """Begin a COLMAP database with the cameras and images of a model, and their ids."""
+    """Create a COLMAP database with the cameras and images of a model, with their ids."""
     with _open(database) as opened:
         for camera in reference.cameras.values():
             opened.write_camera(camera, use_camera_id=True)
@@ -249,18 +250,14 @@ def write_reference(database: Path, reference: pycolmap.Reconstruction) -> None:
 
 @contextmanager
 def _open(database: Path) -> Iterator[pycolmap.Database]:
-    """Open a COLMAP database; in no transaction, whose end aborts the process on a full disk."""
+    """Open a COLMAP database, without a transaction: on a full disk it would abort the process."""
     with _full_disk(database), pycolmap.Database.open(database) as opened:
         yield opened
 
 
 @contextmanager
 def _full_disk(path: Path) -> Iterator[None]:
-    """Raise an OSError if a disk is full in a block that writes; COLMAP says why not, or nothing.
-
-    Args:
-        path: what is written.
-    """
+    """Raise an OSError if the disk gets full in a block that writes `path`; COLMAP does not."""
 
     def check() -> None:
         if shutil.disk_usage(path.parent).free < FULL:
@@ -275,7 +272,7 @@ def _full_disk(path: Path) -> Iterator[None]:
 
 
 def camera_mode(name: str) -> pycolmap.CameraMode:
-    """Return COLMAP's camera mode of a name in lower or upper case, such as per_folder.
+    """Return COLMAP's camera mode by its name in lower or upper case, such as per_folder.
 
     Raises:
         InputError: for an unknown name.
@@ -291,10 +288,10 @@ def import_images(
     camera_mode: pycolmap.CameraMode,
     options: dict,
 ) -> None:
-    """Begin a COLMAP database with images, and cameras guessed from their EXIF data.
+    """Create a COLMAP database with images, and cameras guessed from their EXIF data.
 
     Raises:
-        InputError: for an option that there is not, or an image that COLMAP skips.
+        InputError: for an unknown option, or an image that COLMAP skips.
     """
     with _open(database):
         pass
@@ -309,7 +306,7 @@ def import_images(
     if skipped := [name for name in names if name not in imported]:
         reason = "they cannot be read"
         if camera_mode in (pycolmap.CameraMode.SINGLE, pycolmap.CameraMode.PER_FOLDER):
-            reason += " or differ in size from those that they are to share a camera with"
+            reason += " or differ in size from the images that share their camera"
         raise InputError(
             f"COLMAP skipped {len(skipped)} images in {image_dir}, because {reason}: "
             f"{some(skipped)}."
@@ -321,13 +318,13 @@ def write_matches(
     keypoints: dict[str, np.ndarray],
     matches: dict[tuple[str, str], tuple[np.ndarray, np.ndarray | None]],
 ) -> None:
-    """Write the keypoints and matches of the images of a COLMAP database.
+    """Write the keypoints and matches of images into a COLMAP database.
 
     Args:
-        database: with the images.
-        keypoints: from image name to (N, 2), COLMAP's pixels.
-        matches: from two image names to all and to the verified matches, both (M, 2); None for
-            those that `verify_matches` will verify.
+        database: has the images.
+        keypoints: (N, 2) in COLMAP's pixels, by image name.
+        matches: all and the verified matches (M, 2) of pairs of image names; None instead of the
+            verified ones if `verify_matches` will find them.
     """
     with _open(database) as opened:
         image_ids = {image.name: image.image_id for image in opened.read_all_images()}
@@ -338,7 +335,7 @@ def write_matches(
             opened.write_matches(*ids, all_matches.astype(np.uint32))
             if verified is None:
                 continue
-            # from 4.2.1 on COLMAP skips a geometry whose configuration is undefined
+            # COLMAP 4.2.1 and later skip geometries with an undefined configuration
             geometry = pycolmap.TwoViewGeometry(
                 config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
                 inlier_matches=verified.astype(np.uint32),
@@ -347,10 +344,10 @@ def write_matches(
 
 
 def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
-    """Make pycolmap's options of a dict of them.
+    """Convert a dict to pycolmap's mapper options.
 
     Raises:
-        InputError: for an option that there is not.
+        InputError: for an unknown option.
     """
     try:
         return pycolmap.IncrementalPipelineOptions(options)
@@ -368,9 +365,9 @@ def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
 
 @contextmanager
 def _named_by_ids(database: Path, pairs: Path) -> Iterator[Path]:
-    """Call the images of a database by their ids in a block, if COLMAP cannot read their pairs.
+    """In a block, name the images of a database by their ids if any name contains spaces.
 
-    Gives the file of their pairs by these names. COLMAP's own has names without spaces.
+    COLMAP cannot read a list of pairs with spaces in names. Yields a list that it can read.
     """
     with _open(database) as opened:
         images = opened.read_all_images()
@@ -397,13 +394,13 @@ def _rename(database: Path, images: list[pycolmap.Image], names: dict[int, str])
 
 
 def read_cameras(database: Path) -> dict[int, pycolmap.Camera]:
-    """Read the cameras of a COLMAP database, by their ids."""
+    """Return the cameras of a COLMAP database by their ids."""
     with _open(database) as opened:
         return {camera.camera_id: camera for camera in opened.read_all_cameras()}
 
 
 def count_verified(database: Path) -> dict[tuple[str, str], int]:
-    """Count the verified matches of each pair of images of a database that has any."""
+    """Return the number of verified matches of each pair of images that has any."""
     with _open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         counts = zip(*opened.read_two_view_geometry_num_inliers(), strict=True)
@@ -419,9 +416,9 @@ def triangulate_points(
     options: pycolmap.IncrementalPipelineOptions,
     verbose: bool,
 ) -> pycolmap.Reconstruction:
-    """Triangulate the verified matches of a database into `output`; poses stay as they are.
+    """Triangulate the verified matches of a database into `output` with fixed poses.
 
-    Without any the model is empty; COLMAP 3.13 would raise a ValueError.
+    Without any match the model is empty; COLMAP 3.13 would raise a ValueError.
     """
     with _open(database) as opened:
         if opened.num_inlier_matches() == 0:
@@ -438,9 +435,9 @@ def incremental_mapping(
     options: pycolmap.IncrementalPipelineOptions,
     verbose: bool,
 ) -> list[pycolmap.Reconstruction]:
-    """Reconstruct the images of a database of verified matches, the largest model first."""
+    """Reconstruct the images of a database with verified matches; the largest model comes first."""
     output.mkdir()
-    # the mapper repeats warnings for failed attempts
+    # the mapper warns at every failed attempt
     with _log(verbose, pycolmap.logging.Level.FATAL), _full_disk(output):
         inputs = database, image_dir, output
         models = interruptible(pycolmap.incremental_mapping, *inputs, options=options)
@@ -448,17 +445,18 @@ def incremental_mapping(
 
 
 def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
-    """Guess the intrinsics of a photo: SIMPLE_RADIAL, its focal length by EXIF.
+    """Guess the intrinsics of a photo: SIMPLE_RADIAL, with the focal length of its EXIF data.
 
     Returns:
-        The camera, and whether EXIF gave the focal length; else it is 1.2 times the longer side.
+        The camera, and whether EXIF data gave the focal length; otherwise it is 1.2 times the
+        longer side.
 
     Raises:
         InputError: when the image cannot be read.
     """
     try:
         camera = pycolmap.infer_camera_from_image(image)
-    except Exception:  # RuntimeError, ValueError, by version
+    except Exception:  # RuntimeError or ValueError, depending on the version
         broken, absent = "it is not an image, or it is truncated", "No such file or directory"
         reason = broken if Path(image).exists() else absent
         raise InputError(f"Cannot read image {image}: {reason}.") from None
@@ -466,9 +464,9 @@ def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
 
 
 def exif_camera_model(image: Path) -> str | None:
-    """Return which camera took a photo: its make, model, focal length and the size of the photo.
+    """Return the camera of a photo: its make, model, focal length and the size of the photo.
 
-    None where EXIF data do not tell, or before pycolmap 4.
+    Returns None if EXIF data do not tell, and with pycolmap 3.
     """
     if not hasattr(pycolmap.Bitmap, "exif_camera_model"):
         return None
@@ -480,7 +478,7 @@ def exif_camera_model(image: Path) -> str | None:
 def _log(
     verbose: bool, least: pycolmap.logging.Level = pycolmap.logging.Level.WARNING
 ) -> Iterator[None]:
-    """Show COLMAP's log of a block, otherwise only messages of at least the level `least`."""
+    """Show COLMAP's log of a block if `verbose`, else messages of at least the level `least`."""
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.INFO if verbose else least)
     try:
@@ -492,14 +490,14 @@ def _log(
 def estimate_pose(
     points2D: np.ndarray, points3D: np.ndarray, camera: pycolmap.Camera, config: dict, seed: int
 ) -> dict | None:
-    """Estimate an absolute pose by PnP + LO-RANSAC and refine it, the same way every time.
+    """Estimate an absolute pose by PnP + LO-RANSAC and refine it, deterministically.
 
     Args:
-        points2D: (M, 2) image points, COLMAP's pixels.
+        points2D: (M, 2) image points in COLMAP's pixels.
         points3D: (M, 3) world points.
-        camera: intrinsics.
-        config: hloc's dict, options under "estimation" and "refinement".
-        seed: of RANSAC.
+        camera: the intrinsics.
+        config: hloc's dict, with options under "estimation" and "refinement".
+        seed: the seed of RANSAC.
 
     Returns:
         cam_from_world, num_inliers and inlier_mask (M,), or None.
@@ -508,6 +506,5 @@ def estimate_pose(
     estimation["ransac"] = {"random_seed": seed, **estimation.get("ransac", {})}
     if len(points2D) == 0:
         return None
-    return pycolmap.estimate_and_refine_absolute_pose(
-        points2D, points3D, camera, estimation, config.get("refinement", {})
-    )
+    estimate: Callable[..., dict | None] = pycolmap.estimate_and_refine_absolute_pose
+    return estimate(points2D, points3D, camera, estimation, config.get("refinement", {}))

@@ -1,4 +1,4 @@
-"""Files that are downloaded once, checked by their sha256."""
+"""Files that are downloaded once and checked by their sha256."""
 
 import hashlib
 from collections.abc import Iterable
@@ -13,24 +13,24 @@ TIMEOUT = 5  # seconds to wait for a server
 
 
 def cache() -> Path:
-    """Return torch's folder of downloaded files."""
+    """Return torch's folder for downloaded files."""
     import torch
 
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 
 def fetch(path: Path, urls: Iterable[str], sha256: str, what: str, otherwise: str) -> Path:
-    """Return a file, downloaded if it is not there.
+    """Return a file; download it if it is missing.
 
     Args:
-        path: of the file.
+        path: where the file is kept.
         urls: tried one after the other.
-        sha256: of the file, which is checked in any case.
-        what: the file is, for a message, as in "The weights of tfeat".
-        otherwise: what else the user can do, likewise.
+        sha256: checked in any case.
+        what: names the file in messages, as in "The weights of tfeat".
+        otherwise: what else the user can do, for messages.
 
     Raises:
-        InputError: when it cannot be downloaded, or is another one.
+        InputError: when it cannot be downloaded, or its sha256 is another.
     """
     if path.is_file():
         if file_sha256(path) != sha256:
@@ -50,9 +50,8 @@ def fetch(path: Path, urls: Iterable[str], sha256: str, what: str, otherwise: st
             with replacing(path) as temporary:
                 temporary.write_bytes(content)
             return path
-        reasons[url] = f"what it sends has not the sha256 {sha256}"
+        reasons[url] = f"the downloaded file does not have the sha256 {sha256}"
     tried = "; ".join(f"{url}: {reason}" for url, reason in reasons.items())
     raise InputError(
-        f"{what} are not there, and cannot be downloaded ({tried}): put them to {path}, "
-        f"{otherwise}."
+        f"{what} are missing and cannot be downloaded ({tried}): put them to {path}, {otherwise}."
     )

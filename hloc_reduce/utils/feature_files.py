@@ -1,4 +1,4 @@
-"""Feature files in hloc's format, and how they keep descriptors."""
+"""Feature files in hloc's format, and how they store descriptors."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -14,10 +14,14 @@ def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
     """Read keypoints (N, 2) float64, pixel centres at integers, and their uncertainty in pixels."""
     keypoints = get_array(file, name, "keypoints", (0, 2))[:, :2].astype(np.float64)
     with reading(file.filename):
-        uncertainty = get_dataset(file, name, "keypoints").attrs.get("uncertainty", 1.0)
-    if not (np.isscalar(uncertainty) and np.isreal(uncertainty) and 0 < uncertainty < np.inf):
-        raise InputError(f"{file.filename}: the uncertainty of {name} is {uncertainty!r}.")
-    return keypoints, float(uncertainty)
+        stored = get_dataset(file, name, "keypoints").attrs.get("uncertainty", 1.0)
+    try:
+        uncertainty = float(stored)
+    except (TypeError, ValueError):
+        uncertainty = np.nan
+    if not 0 < uncertainty < np.inf:
+        raise InputError(f"{file.filename}: the uncertainty of {name} is {stored!r}.")
+    return keypoints, uncertainty
 
 
 def get_image_size(file: h5py.File, name: str) -> tuple[int, int]:
@@ -29,20 +33,20 @@ def get_image_size(file: h5py.File, name: str) -> tuple[int, int]:
 
 
 def get_colmap_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
-    """Read keypoints as `get_keypoints` does, with COLMAP's pixel origin."""
+    """Read keypoints with COLMAP's pixel origin, and their uncertainty; see `get_keypoints`."""
     keypoints, uncertainty = get_keypoints(file, name)
     return to_colmap(keypoints), uncertainty
 
 
 def to_colmap(keypoints: np.ndarray) -> np.ndarray:
-    """Move keypoints (N, 2), pixel centres at integers, to COLMAP's pixel origin, the corner.
+    """Move keypoints (N, 2) with pixel centres at integers to COLMAP's pixel origin, the corner.
 
-    The only place where the half pixel is added.
+    This is the only place where the half pixel is added.
     """
     return keypoints.astype(np.float64) + 0.5
 
 
-STORAGES = ("float16", "float32", "uint8")  # hloc's `as_half`, without it, and ours
+STORAGES = ("float16", "float32", "uint8")  # hloc has the first two, as `as_half`
 QUANTIZED = "descriptors_uint8"
 STEPS = 255
 
@@ -50,16 +54,16 @@ STEPS = 255
 def store(
     features: dict[str, np.ndarray], storage: str
 ) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
-    """Return the features of an image as a file keeps them.
+    """Convert the features of an image to what a file stores.
 
     Args:
         features: arrays of floats or integers, with `descriptors` (D, N).
-        storage: one of `STORAGES`, of all floats but the keypoints; with uint8 those that are not
-            descriptors are float16.
+        storage: one of `STORAGES`. Keypoints stay float32; with uint8, floats that are not
+            descriptors become float16.
 
     Returns:
-        The arrays, with `descriptors_uint8` in place of `descriptors` if they are quantized; and
-        from the name of an array to its attributes: `scale` and `offset` of these.
+        The arrays, with `descriptors_uint8` instead of quantized `descriptors`, and the attributes
+        of each array: `scale` and `offset` of quantized descriptors.
     """
     floats = np.float32 if storage == "float32" else np.float16
     stored = {
@@ -74,10 +78,10 @@ def store(
 
 
 def quantize(descriptors: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Round descriptors to 256 levels between the least and the greatest number.
+    """Round descriptors to 256 levels between their minimum and maximum.
 
     Returns:
-        Levels, uint8 of the same shape; scale and offset: descriptors are offset + scale * level.
+        Levels (uint8, same shape), scale and offset: descriptors are offset + scale * level.
     """
     if not descriptors.size:
         return descriptors.astype(np.uint8), 1.0, 0.0
@@ -88,9 +92,9 @@ def quantize(descriptors: np.ndarray) -> tuple[np.ndarray, float, float]:
 
 
 def restore(stored: dict[str, np.ndarray], attrs: dict[str, dict]) -> np.ndarray:
-    """Return the descriptors (N, D) float32 of what `store` returned, one row each.
+    """Return descriptors (N, D) float32 from what `store` returned.
 
-    Quantized ones have unit norm again.
+    Quantized descriptors are normalized.
     """
     if QUANTIZED not in stored:
         return np.ascontiguousarray(stored["descriptors"].T, np.float32)
@@ -101,25 +105,25 @@ def restore(stored: dict[str, np.ndarray], attrs: dict[str, dict]) -> np.ndarray
 
 
 def stored_descriptors(file: h5py.File, name: str) -> h5py.Dataset:
-    """Return the data set of the descriptors (D, N) of an image, floats or quantized.
+    """Return the data set of an image's descriptors (D, N), floats or quantized.
 
     Raises:
-        InputError: when the image is not there or has none, or not as many as keypoints.
+        InputError: when it is missing, or their number is not that of the keypoints.
     """
     with reading(file.filename):
         key = QUANTIZED if f"{name}/{QUANTIZED}" in file else "descriptors"
         dataset, keypoints = get_dataset(file, name, key), file[name].get("keypoints")
-        shapes = [getattr(part, "shape", None) for part in (dataset, keypoints)]
+        shapes = [getattr(part, "shape", None) or () for part in (dataset, keypoints)]
     if all(shapes) and shapes[0][-1] != shapes[1][0]:
         raise InputError(
             f"{file.filename}: the descriptors of {name} are {shapes[0]}, its keypoints "
-            f"{shapes[1]}: they are to be (D, N) and (N, 2)."
+            f"{shapes[1]}: (D, N) and (N, 2) are expected."
         )
     return dataset
 
 
 def dimension(features: Path) -> int:
-    """Return the dimension of the descriptors of a feature file, 0 if no image has sound ones."""
+    """Return the dimension of the descriptors in a feature file, 0 if no image has valid ones."""
     with open_h5(features) as file:
         for name in iterate_h5_names(file.id):
             with suppress(InputError):
@@ -130,10 +134,10 @@ def dimension(features: Path) -> int:
 
 
 def get_descriptors(file: h5py.File, name: str) -> np.ndarray:
-    """Read the descriptors (N, D) float32 of an image, one row each.
+    """Read the descriptors (N, D) float32 of an image.
 
     Raises:
-        InputError: when the image is not there, or has none, or broken ones.
+        InputError: when they are missing or broken.
     """
     dataset = stored_descriptors(file, name)
     key = dataset.name.rpartition("/")[2]

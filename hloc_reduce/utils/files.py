@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, and their checksums."""
+"""Files: atomic writing, checksums, deletion."""
 
 import csv
 import filecmp
@@ -14,7 +14,7 @@ _observers: list[Callable[[Path], None]] = []
 
 @contextmanager
 def observing(observe: Callable[[Path], None]) -> Iterator[None]:
-    """Call a function with the path of each file and folder that is to be written in a block."""
+    """Call a function with the path of each file and folder, before it is written in a block."""
     _observers.append(observe)
     try:
         yield
@@ -23,7 +23,7 @@ def observing(observe: Callable[[Path], None]) -> Iterator[None]:
 
 
 def announce(path: Path) -> None:
-    """Tell observers of a file or folder that is to be written."""
+    """Tell observers that a file or folder is about to be written."""
     for observe in _observers:
         observe(path)
 
@@ -32,7 +32,7 @@ def announce(path: Path) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path` and move it into place when the block succeeds.
 
-    A file that is replaced by an equal one keeps its time, so that nothing is made anew of it.
+    A file that is replaced by an equal one keeps its time, so that nothing derived gets stale.
     """
     announce(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,11 +40,11 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         with naming(path):
             yield temporary
-        filecmp.clear_cache()  # which goes by sizes and times
+        filecmp.clear_cache()  # it compares only sizes and times
         if path.exists() and filecmp.cmp(temporary, path, shallow=False):
             shutil.copystat(path, temporary)
         with temporary.open("rb") as file:
-            os.fsync(file.fileno())  # else a power cut may leave an empty file
+            os.fsync(file.fileno())  # otherwise a power cut may leave an empty file
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -52,7 +52,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Have an error of the system that names no file, as that of a full disk, name this one."""
+    """Add a path to operating system errors that name no file, such as a full disk's."""
     try:
         yield
     except OSError as error:
@@ -62,9 +62,9 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def write_csv(rows: list[dict], path: Path, columns: Iterable[str] = ()) -> None:
-    """Write rows that have the same keys, the columns; None is empty.
+    """Write rows with the same keys as CSV; None is an empty cell.
 
-    Where there may be no row, `columns` names them.
+    `columns` gives the header if there may be no row.
     """
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(columns) or list(rows[0]))
@@ -79,7 +79,7 @@ def file_sha256(path: Path) -> str:
 
 
 def delete(path: Path) -> None:
-    """Delete a file or a folder, if it is there."""
+    """Delete a file or a folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

@@ -1,11 +1,12 @@
-"""h5 files, of which a broken one is an error of its user's."""
+"""h5 files. A broken one is a user's error, with a message that names it."""
 
 import os
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
-from typing import IO
+from typing import overload
 
 import h5py
 import numpy as np
@@ -13,18 +14,18 @@ import numpy as np
 from .cli import InputError
 from .interrupts import uninterrupted
 
-MOST_COMPRESSED = 2000  # times what an h5 file holds is more than gzip can pack into it
+MOST_COMPRESSED = 2000  # times its size: more than gzip can compress into a file
 
 
 @contextmanager
 def open_h5(path: Path) -> Iterator[h5py.File]:
-    """Open an h5 file for reading; one that is absent or broken raises an InputError."""
+    """Open an h5 file for reading; raise an InputError if it is missing or broken."""
     try:
         file = h5py.File(path, "r", libver="latest")
     except Exception as error:
         if not _is_of_h5py(error):
             raise
-        reason = "it is not there" if not path.exists() else "not a whole h5 file"
+        reason = "not a whole h5 file" if path.exists() else "it does not exist"
         raise InputError(f"Cannot open {path}: {reason}.") from error
     with file, reading(path):
         yield file
@@ -32,10 +33,12 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
 
 @contextmanager
 def reading(path: Path | str) -> Iterator[None]:
-    """Have an error of h5py, which may be of any kind if the file is damaged, name the file.
+    """Turn errors of h5py in a block into one that names the file.
+
+    A damaged file can cause errors of any type.
 
     Raises:
-        InputError: in its place.
+        InputError: instead of them.
     """
     try:
         yield
@@ -46,7 +49,7 @@ def reading(path: Path | str) -> Iterator[None]:
 
 
 def _is_of_h5py(error: Exception) -> bool:
-    """Tell whether h5py raised an error, but for a name that is not in a file."""
+    """Tell whether h5py raised an error, other than for a name that is not in a file."""
     if isinstance(error, KeyError) and "doesn't exist" in str(error):
         return False
     *_, last = traceback.walk_tb(error.__traceback__)
@@ -59,27 +62,27 @@ def _first_line(error: Exception) -> str:
 
 @contextmanager
 def write_h5(path: Path) -> Iterator[h5py.File]:
-    """Open an h5 file, or a new one, to add to it; Ctrl-C waits until the block ends.
+    """Open an h5 file to add to it, or create it; Ctrl-C waits until the block ends.
 
     Raises:
-        OSError: after the block, when the disk is full; HDF5 itself would crash.
+        OSError: after the block, if the disk was full; HDF5 itself would crash.
     """
-    modes = ("r+b", "r+") if path.exists() else ("w+b", "w")
-    with uninterrupted(), path.open(modes[0], buffering=0) as file:
+    raw_mode, mode = ("r+", "r+") if path.exists() else ("w+", "w")
+    with uninterrupted(), FileIO(path, raw_mode) as file:
         disk = _Disk(file)
-        with h5py.File(disk, modes[1], libver="latest") as h5_file:
+        with h5py.File(disk, mode, libver="latest") as h5_file:
             yield h5_file
         if disk.error is not None:
             raise disk.error
 
 
 class _Disk:
-    """A file for HDF5, which must not see an error: what cannot be written is kept in memory."""
+    """A file whose writes never fail, as HDF5 would crash: it keeps unwritten data in memory."""
 
-    def __init__(self, file: IO[bytes]):
+    def __init__(self, file: FileIO):
         self.file, self.place = file, 0
         self.error: OSError | None = None
-        self.unwritten: list[tuple[int, bytes]] = []  # where, and what
+        self.unwritten: list[tuple[int, bytes]] = []  # offset and data
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         self.place = offset if whence == os.SEEK_SET else self.file.seek(offset, whence)
@@ -139,11 +142,11 @@ def list_h5_names(path: Path) -> list[str]:
 def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]:
     """Yield the groups below a group that hold data sets, in the order of their names.
 
-    Reads one group at a time: HDF5's own visit of all groups keeps all in memory. Only what the
-    file itself holds counts, not links to elsewhere.
+    Reads one group at a time; HDF5's own visitor keeps all of them in memory. Links to other files
+    are ignored.
 
     Raises:
-        InputError: when a group has several names, and so could be in itself.
+        InputError: when a group has several names, so that it could contain itself.
     """
     names = []
 
@@ -159,7 +162,7 @@ def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]
             path = f"{prefix}{name.decode()}"
             if child.rc > 1:
                 file = h5py.h5f.get_name(group).decode()
-                raise InputError(f"{file}: the group {path} has another name, too; copy the file.")
+                raise InputError(f"{file}: the group {path} has a second name; copy the file.")
             yield from iterate_h5_names(h5py.h5g.open(group, name), f"{path}/")
         elif prefix and not holds_data:
             holds_data = True
@@ -167,7 +170,7 @@ def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]
 
 
 def get_dataset(file: h5py.File, name: str, key: str) -> h5py.Dataset:
-    """Return a data set of an image or a pair in an open h5 file, or raise an InputError."""
+    """Return a data set of an image or a pair; raise an InputError if it is missing."""
     with reading(file.filename):
         group = file.get(name)
         dataset = group.get(key) if isinstance(group, h5py.Group) else None
@@ -179,16 +182,16 @@ def get_dataset(file: h5py.File, name: str, key: str) -> h5py.Dataset:
 
 
 def get_array(file: h5py.File, name: str, key: str, least: tuple[int, ...]) -> np.ndarray:
-    """Read a data set of finite numbers of an image or a pair in an open h5 file.
+    """Read a data set of finite numbers of an image or a pair.
 
     Args:
-        file: the h5 file.
-        name: of the image or pair.
-        key: of the data set.
-        least: the least size of each of its dimensions.
+        file: an open h5 file.
+        name: group name of the image or pair.
+        key: name of the data set.
+        least: minimum size of each dimension.
 
     Raises:
-        InputError: when it is not there or is none of such.
+        InputError: when it is missing or has another shape or type.
     """
     dataset = get_dataset(file, name, key)
     said = f"{file.filename}: the {key} of {name}"
@@ -215,14 +218,18 @@ def get_array(file: h5py.File, name: str, key: str, least: tuple[int, ...]) -> n
 def set_text(item: h5py.Group | h5py.Dataset, key: str, text: str) -> None:
     """Set a text attribute of an open h5 file.
 
-    It has a fixed length: HDF5 keeps others in a heap without checksums, and may hang if that is
-    damaged.
+    The text has a fixed length: HDF5 keeps others in a heap without checksums, and may hang if
+    that is damaged.
     """
     item.attrs[key] = np.bytes_(text.encode()) if text else h5py.Empty("S1")
 
 
+@overload
+def get_text(item: h5py.Group | h5py.Dataset, key: str) -> str | None: ...
+@overload
+def get_text(item: h5py.Group | h5py.Dataset, key: str, default: str) -> str: ...
 def get_text(item: h5py.Group | h5py.Dataset, key: str, default: str | None = None) -> str | None:
-    """Return a text attribute of an open h5 file, or the default where it has none.
+    """Return a text attribute of an open h5 file, or the default if it has none.
 
     Raises:
         InputError: when the file is damaged.
@@ -235,6 +242,6 @@ def get_text(item: h5py.Group | h5py.Dataset, key: str, default: str | None = No
 
 
 def file_provenance(file: h5py.File) -> str:
-    """Return what tells an open h5 file from others: what made it and when, or its name."""
+    """Return the provenance of an open h5 file: its `conf` and `id`, or else its name."""
     conf = get_text(file, "conf", Path(file.filename).name)
     return f"{conf} {get_text(file, 'id', '')}".strip()

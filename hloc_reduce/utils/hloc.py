@@ -10,15 +10,15 @@ from packaging.version import InvalidVersion, Version
 from .cli import InputError
 
 SOURCE = "git+https://github.com/cvg/Hierarchical-Localization"
-# hloc is 1.5 since 2023; the first one with the pycolmap that this project needs says so itself
+# hloc has been 1.5 since 2023; its `min_version` tells whether its pycolmap is new enough
 LAST_OLD = Version("1.5")
 MIN_PYCOLMAP = Version("3.13.0")
 
 
 def is_installed() -> bool:
-    """Tell whether there is an hloc to import."""
+    """Tell whether hloc is installed."""
     spec = find_spec("hloc")
-    return spec is not None and spec.origin is not None  # a folder of that name is none
+    return spec is not None and spec.origin is not None  # a mere folder of that name has no origin
 
 
 def extractors_package() -> tuple[ModuleType, Callable]:
@@ -41,7 +41,7 @@ def extractors_package() -> tuple[ModuleType, Callable]:
 
 
 def parse_version(version: str) -> Version:
-    """Parse a version; one of a development build, such as `dev`, is the newest."""
+    """Parse a version; a development build, such as `dev`, counts as the newest."""
     try:
         return Version(version)
     except InvalidVersion:
@@ -49,7 +49,7 @@ def parse_version(version: str) -> Version:
 
 
 def import_module(name: str) -> ModuleType:
-    """Import a module of hloc's by its name there, or hloc itself by "".
+    """Import a module of hloc by its name there, or hloc itself by "".
 
     Raises:
         InputError: when it cannot be imported.
@@ -57,5 +57,5 @@ def import_module(name: str) -> ModuleType:
     path = f"hloc.{name}".strip(".")
     try:
         return importlib.import_module(path)
-    except Exception as error:  # also of what hloc imports: torchvision raises RuntimeError
+    except Exception as error:  # torchvision, which hloc imports, raises RuntimeError
         raise InputError(f"{path} cannot be imported ({error}).") from None

@@ -1,4 +1,4 @@
-"""Images: their names, their pixels, and what models get of them."""
+"""Images: their names and their pixels."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,22 +11,22 @@ from .cli import InputError, no_folder, some
 from .parsers import check_names, image_names
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
-# of images that are not read
+# images of these types are ignored
 OTHER_SUFFIXES = {".bmp", ".gif", ".heic", ".jp2", ".ppm", ".tif", ".tiff", ".webp"}
 
 
 def list_images(
     image_dir: Path, image_list: Path | str | Iterable[str] | None = None, folder: str = ""
 ) -> list[str]:
-    """Return the names of the images of a folder, or of a list, checked to be there.
+    """Return the names of the images in a folder or in a list.
 
     Args:
         image_dir: the folder that names are relative to.
-        image_list: names, or a text file of them; default: every image of `folder`.
+        image_list: names, or a text file of them; default: every image in `folder`.
         folder: a folder in `image_dir`.
 
     Raises:
-        InputError: when there is none, or one of the list is not there.
+        InputError: when there is no image, or an image of the list is missing.
     """
     within = Path(image_dir, folder)
     if not within.is_dir():
@@ -49,17 +49,16 @@ def list_images(
     missing = [name for name in names if not (image_dir / name).is_file()]
     if missing:
         raise InputError(
-            f"{len(missing)} of {len(names)} images are not in {image_dir}: "
-            f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+            f"{len(missing)} of {len(names)} images are not in {image_dir}: {some(missing)}"
         )
     return names
 
 
 def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
-    """Return pixels (H, W) or (H, W, 3) RGB, uint8, as (H, W) if `grayscale` or else (H, W, 3).
+    """Convert pixels (H, W) or (H, W, 3) RGB, uint8, to (H, W) if `grayscale`, else (H, W, 3).
 
     Raises:
-        InputError: for other arrays.
+        InputError: for arrays of another shape or type.
     """
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.size == 0:
         raise InputError(
@@ -71,14 +70,14 @@ def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
 
 
 class UnreadableImage(InputError):
-    """A file that is not there, or no image that can be read."""
+    """An image file is missing or cannot be read."""
 
 
 def read_image(path: Path, grayscale: bool = False) -> np.ndarray:
     """Read an image as uint8, (H, W) or (H, W, 3) RGB, without applying EXIF's rotation.
 
     Raises:
-        UnreadableImage: when the file is no image that OpenCV can read.
+        UnreadableImage: when OpenCV cannot read the file.
     """
     mode = cv2.IMREAD_GRAYSCALE if grayscale else cv2.IMREAD_COLOR
     try:
@@ -86,9 +85,9 @@ def read_image(path: Path, grayscale: bool = False) -> np.ndarray:
         image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
         reason = "it is not an image, or it is truncated" if data.size else "it is empty"
     except OSError as error:
-        image, reason = None, error.strerror
+        image, reason = None, str(error.strerror)
     except cv2.error as error:
-        image, reason = None, f"OpenCV says that not {error.err}"
+        image, reason = None, f"OpenCV requires {error.err}"
     if image is None:
         raise UnreadableImage(f"Cannot read image {path}: {reason}.")
     return image if grayscale else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

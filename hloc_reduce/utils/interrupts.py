@@ -1,4 +1,4 @@
-"""How Ctrl-C and SIGTERM end a command: as an error does, so that what is done is written."""
+"""Ctrl-C and SIGTERM end a command like an error, so that finished work is written."""
 
 import logging
 import os
@@ -13,22 +13,22 @@ from threading import Thread, Timer
 from typing import NoReturn, TypeVar
 
 Result = TypeVar("Result")
-INTERRUPTED = "Interrupted. The same command, but for any --overwrite, goes on from here."
+INTERRUPTED = "Interrupted. Run the same command again, without --overwrite, to resume."
 STOPS = (signal.SIGINT, signal.SIGTERM)
-COMMANDS = ("hloc_reduce.", "pipelines.")  # how their modules' names begin
-REPEATED = 2.0  # seconds: `timeout` for one sends a signal twice
+COMMANDS = ("hloc_reduce.", "pipelines.")  # prefixes of the modules of commands
+REPEATED = 2.0  # seconds within which a second signal is ignored: `timeout` sends two
 logger = logging.getLogger("hloc_reduce")
 
 _stopped = -REPEATED  # the time of the last signal
-_calls: list[Thread] = []  # of `interruptible`
+_calls: list[Thread] = []  # running calls of `interruptible`
 
 
 def while_importing() -> None:
-    """Have Ctrl-C end `python -m` without a traceback in the seconds before `hear` is called.
+    """Let Ctrl-C end `python -m` without a traceback before `hear` is called.
 
-    A SIGTERM, which pycolmap would answer with a trace of its stack, waits for that.
+    SIGTERM, for which pycolmap would print a stack trace, waits until then.
     """
-    # so it is while python looks for the module
+    # while Python looks for the module, argv still begins with -m
     name = sys.orig_argv[-len(sys.argv)] if sys.argv[:1] == ["-m"] else ""
     if name.startswith(COMMANDS):
         signal.signal(signal.SIGINT, _quit)
@@ -37,11 +37,11 @@ def while_importing() -> None:
 
 def _quit(number: int, _: object) -> NoReturn:
     logger.error(INTERRUPTED)
-    os._exit(128 + number)  # an exception would be any import's to handle
+    os._exit(128 + number)  # an import might handle an exception
 
 
 def hear() -> None:
-    """Have both signals raise a KeyboardInterrupt with their number in the main thread."""
+    """Make both signals raise a KeyboardInterrupt with their number in the main thread."""
     for number in STOPS:
         signal.signal(number, _stop)
     sys.unraisablehook = _unraisable
@@ -49,24 +49,24 @@ def hear() -> None:
 
 
 def ignore() -> None:
-    """Have both signals do nothing any more: all is done."""
+    """Make both signals do nothing: the command is done."""
     for number in STOPS:
         signal.signal(number, signal.SIG_IGN)
 
 
 def end(interrupt: KeyboardInterrupt) -> NoReturn:
-    """Say how to go on, and end the process with the code of the signal."""
+    """Say how to resume, and end the process with the signal's exit code."""
     ignore()
     logger.error(INTERRUPTED)
     code = 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
-    if any(thread.is_alive() for thread in _calls):  # which cannot be stopped otherwise
+    if any(thread.is_alive() for thread in _calls):  # nothing else stops them
         sys.stdout.flush()
         os._exit(code)
     sys.exit(code)
 
 
 def interruptible(function: Callable[..., Result], *arguments: object, **options: object) -> Result:
-    """Call a function that takes minutes outside of Python, where no signal would be heard."""
+    """Call a function that spends minutes outside of Python, where signals would not be heard."""
     result: Future[Result] = Future()
 
     def call() -> None:
@@ -87,24 +87,25 @@ def interruptible(function: Callable[..., Result], *arguments: object, **options
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Have both signals wait for the end of a block; their handlers are then as they were."""
+    """Make both signals wait for the end of a block; then restore their handlers."""
     came: list[int] = []
-    handlers: dict[int, object] = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in STOPS:
-            if signal.getsignal(number) is not None:
-                handlers[number] = signal.signal(number, lambda number, _: came.append(number))
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    handlers = {
+        stop: signal.signal(stop, lambda number, _: came.append(number))
+        for stop in STOPS
+        if in_main_thread and signal.getsignal(stop) is not None
+    }
     try:
         yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        for stop, handler in handlers.items():
+            signal.signal(stop, handler)
         for number in came[:1]:
             signal.raise_signal(number)
 
 
 def _stop(number: int, _: object) -> None:
-    """Interrupt the main thread, but not while it writes what is done because of the same."""
+    """Interrupt the main thread, but not again while it writes finished work."""
     global _stopped
     if time.monotonic() - _stopped > REPEATED:
         _stopped = time.monotonic()
@@ -112,7 +113,7 @@ def _stop(number: int, _: object) -> None:
 
 
 def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Interrupt once more where Python has ignored it, as in a destructor."""
+    """Repeat an interrupt that Python has ignored, as in a destructor."""
     global _stopped
     if isinstance(unraisable.exc_value, KeyboardInterrupt):
         _stopped = -REPEATED

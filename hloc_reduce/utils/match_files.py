@@ -10,7 +10,7 @@ from .h5 import get_array, get_text, reading
 
 
 def get_matcher(match_file: h5py.File) -> dict:
-    """Return the configuration of the matcher's model of a match file, {} if it does not say."""
+    """Return the model configuration of the matcher of a match file, {} if the file has none."""
     try:
         model = json.loads(get_text(match_file, "conf") or "{}")["model"]
     except (ValueError, TypeError, KeyError):
@@ -24,7 +24,7 @@ def names_to_pair(name0: str, name1: str, separator: str = "/") -> str:
 
 
 def find_pair(file: h5py.File, name0: str, name1: str) -> tuple[str | None, bool]:
-    """Return the group of a pair in an open match file (None if absent) and if it is reversed."""
+    """Return the group of a pair in an open match file, or None, and whether it is reversed."""
     for separator in "/_":  # the second is hloc's old format
         for reverse in (False, True):
             names = (name1, name0) if reverse else (name0, name1)
@@ -43,16 +43,16 @@ def get_matches(
 
     Args:
         file: the match file.
-        name0: an image.
-        name1: another.
-        sizes: how many keypoints both have, if that is to be checked.
+        name0: name of an image.
+        name1: name of another.
+        sizes: their numbers of keypoints, to check the matches.
 
     Returns:
-        matches (M, 2) int64, indices of the keypoints of name0 and name1, and scores (M,), None
-        where the file has none.
+        matches (M, 2) int64, indices of the keypoints of name0 and name1, and scores (M,), or None
+        if the file has none.
 
     Raises:
-        InputError: when the pair was not matched, or its matches are of other keypoints.
+        InputError: when the pair was not matched, or was matched with other keypoints.
     """
     pair, reverse = find_pair(file, name0, name1)
     if pair is None:
@@ -77,11 +77,9 @@ def _check_matches(
     said = f"{file.filename}: the matches of {names[0]}, {names[1]}"
     if len(matches) and matches.min() < 0:
         raise InputError(
-            f"{said} are negative, as hloc's are that have more than 32,767 keypoints: match these "
-            "anew."
+            f"{said} are negative, as happens to hloc with more than 32,767 keypoints: match them "
+            "again."
         )
     for column, (name, size) in enumerate(zip(names, sizes, strict=True)):
         if len(matches) and matches[:, column].max() >= size:
-            raise InputError(
-                f"{said} were made of other features: {name} has {size} keypoints only."
-            )
+            raise InputError(f"{said} belong to other features: {name} has only {size} keypoints.")

@@ -1,7 +1,7 @@
-"""Text files: those of hloc, image lists, query lists with intrinsics, pairs, poses; and YAML.
+"""Text files in hloc's formats: image lists, query lists with intrinsics, pairs, poses; and YAML.
 
-The words of a line are separated by spaces, as in hloc. A line of a name that has spaces itself,
-which no list of hloc's can hold, has tabs after its names instead.
+The words of a line are separated by spaces, as in hloc. If a name itself contains spaces, which
+hloc's lists cannot represent, a tab follows each name of its line.
 """
 
 import re
@@ -17,40 +17,40 @@ from .cli import InputError, choose, some
 from .files import replacing
 
 CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
-_ENDS = r"\t\n\v\f\r\x1c-\x1f\x85\u2028\u2029"  # of lines, and of names in them
+_ENDS = r"\t\n\v\f\r\x1c-\x1f\x85\u2028\u2029"  # ends of lines and of names
 _LETTER = rf"[^{_ENDS}/\0\ud800-\udfff]"
-_PART = rf"(?!\.\.?(?:/|$))(?!\s){_LETTER}+(?<!\s)"  # neither . nor .., and what h5 and lists hold
+_PART = rf"(?!\.\.?(?:/|$))(?!\s){_LETTER}+(?<!\s)"  # not . or ..
 _NUMBER = re.compile(r"[-+]?\d+\.\d+(e[-+]?\d+)?")
 _NAME = re.compile(rf"(?!#){_PART}(?:/{_PART})*")
 
 
 def check_names(names: list[str], place: Path | str) -> list[str]:
-    """Return names of images, the paths of their files in a folder, if they are sound.
+    """Return image names, paths relative to a folder, if they are valid.
 
     Args:
         names: from a list, a model, a folder or an h5 file.
-        place: the one that they are from, for the message.
+        place: where they come from, for the message.
 
     Raises:
-        InputError: for a name that is absolute, or begins with a space, or the like.
+        InputError: for an invalid name, such as an absolute path.
     """
     wrong = [name for name in names if not _NAME.fullmatch(name)]
     if wrong:
         raise InputError(
-            f"{place}: {some(map(repr, wrong), 3)} cannot be names of images: these are relative "
-            "to a folder, without a # or spaces at the beginning, spaces at the end, tabs, or . or "
-            ".. as a part. Rename them."
+            f"{place}: {some(map(repr, wrong), 3)} cannot be names of images: a name is a relative "
+            "path that does not begin with # or a space, does not end with a space, and has no "
+            "tabs and no part . or .. in it. Rename them."
         )
     return names
 
 
 def _lines(path: Path, names: int = 1) -> Iterator[tuple[str, list[str]]]:
-    """Yield ("file:number", words) of every line that is neither empty nor a comment.
+    """Yield ("file:number", words) for every line that is neither empty nor a comment.
 
-    The first words, so many, are names of images.
+    The first `names` words are image names.
     """
     try:
-        with path.open(encoding="utf-8-sig") as file:  # which Windows likes to mark as such
+        with path.open(encoding="utf-8-sig") as file:  # Windows may add a byte order mark
             for number, line in enumerate(file, 1):
                 words = _words(line, names)
                 if words and not words[0].startswith("#"):
@@ -62,7 +62,7 @@ def _lines(path: Path, names: int = 1) -> Iterator[tuple[str, list[str]]]:
 
 
 def _words(line: str, names: int) -> list[str]:
-    """Split a line that begins with a number of image names."""
+    """Split a line that begins with `names` image names."""
     # lists of other programs may mix spaces and tabs
     after = line.partition("\t")[0].split()[1:]
     if "\t" not in line or any(map(_is_value, after)):
@@ -74,17 +74,12 @@ def _words(line: str, names: int) -> list[str]:
 
 
 def _is_value(word: str) -> bool:
-    """Tell whether a word is none of a name: a camera model, or a number of a pose."""
+    """Tell whether a word is a camera model or a number, so not part of a name."""
     return word in CAMERA_MODELS or _NUMBER.fullmatch(word) is not None
 
 
 def to_line(*words: object, names: int = 1) -> str:
-    """Join words to a line of a list.
-
-    Args:
-        words: the words.
-        names: how many of them, the first ones, are names of images.
-    """
+    """Join words to a line of a list; the first `names` words are image names."""
     named, rest = list(map(str, words[:names])), list(map(str, words[names:]))
     if any(name.split() != [name] for name in named):
         return "\t".join([*named, *[" ".join(rest)] * bool(rest)]) + "\n"
@@ -95,11 +90,11 @@ def read_yaml(path: Path) -> object:
     """Read a YAML file of plain values.
 
     Raises:
-        InputError: when it is none.
+        InputError: when it is missing or broken.
     """
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except Exception as error:  # yaml raises whatever a broken value leads it to
+    except Exception as error:  # yaml raises many types for broken values
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise InputError(f"{path} cannot be read ({reason}).") from None
 
@@ -110,7 +105,7 @@ def parse_image_list(path: Path) -> list[str]:
 
 
 def image_names(images: Path | str | Iterable[str]) -> list[str]:
-    """Return the names of a list file, given by its path, or of any other iterable.
+    """Return the image names in a list file, given by its path, or in any other iterable.
 
     Raises:
         InputError: when there is none.
@@ -144,7 +139,7 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
             )
             if not camera.verify_params():
                 raise ValueError(f"wrong number of parameters for {model}")
-            # of a panorama, which has none, COLMAP crashes when asked for the first
+            # COLMAP crashes when a panorama, which has none, is asked for a focal length
             focal_lengths = camera.params[camera.focal_length_idxs()]
             sizes = camera.width, camera.height, *focal_lengths
             if not (np.isfinite(camera.params).all() and min(sizes) > 0):
@@ -168,7 +163,7 @@ def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]
     """Read all query lists that match a glob, for example `queries/*_with_intrinsics.txt`.
 
     Returns:
-        From the stem of each list to its queries, in the order of the file names.
+        The queries of each list by its stem, in the order of the file names.
 
     Raises:
         InputError: when no file matches or a name is listed twice.
@@ -187,7 +182,7 @@ def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]
 
 
 def parse_pairs(path: Path) -> Iterator[tuple[str, str]]:
-    """Read pairs, one `name0 name1` a line, as they are drawn: a list may be of any length."""
+    """Yield pairs, one `name0 name1` a line, without reading the whole list."""
     for place, words in _lines(path, names=2):
         if len(words) != 2:
             raise InputError(
@@ -205,7 +200,7 @@ def parse_retrieval(path: Path) -> dict[str, list[str]]:
 
 
 def write_pairs(pairs: Iterable[tuple[str, str]], path: Path) -> int:
-    """Write pairs, one `name0 name1` a line, as they are drawn, and return how many they are."""
+    """Write pairs, one `name0 name1` a line, as they are drawn, and return their number."""
     number = 0
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for name0, name1 in pairs:
@@ -224,8 +219,8 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
     for place, (name, *values) in _lines(path):
         if name in poses:
             raise InputError(
-                f"{place}: {name} is listed twice: whole names are needed, which the "
-                "*_logs.jsonl of a pipeline has."
+                f"{place}: {name} is listed twice: full names are needed, as in the "
+                "*_logs.jsonl of a pipeline."
             )
         try:
             qw, qx, qy, qz, *translation = map(float, values)
@@ -246,9 +241,9 @@ def write_poses(
     """Write poses (camera from world) in the submission format of visuallocalization.net.
 
     Args:
-        poses: from image name to pose.
+        poses: by image name.
         path: the text file, one `name qw qx qy qz tx ty tz` a line.
-        name_parts: how much of names is written: 1 for `basename`, 2 for `folder/basename`
+        name_parts: parts of the names that are written: 1 for `basename`, 2 for `folder/basename`
             (RobotCar's format), None for all.
     """
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:

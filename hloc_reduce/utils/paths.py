@@ -1,4 +1,4 @@
-"""Strings for paths, as hloc takes them."""
+"""Strings instead of paths, as in hloc."""
 
 import inspect
 from collections.abc import Callable
@@ -13,8 +13,8 @@ Result = TypeVar("Result")
 def strings_as_paths(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Let a function take strings for paths.
 
-    A string becomes a path where the annotation has `Path` but not `str`, such as `Path | None`.
-    With `Path | str` the function itself tells them apart.
+    A string is converted if the annotation has `Path` but not `str`, such as `Path | None`. With
+    `Path | str` the function itself distinguishes them.
     """
     signature = inspect.signature(function)
     kinds = {

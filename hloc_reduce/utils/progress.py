@@ -1,4 +1,4 @@
-"""How far a loop is: a bar on a terminal, and elsewhere, as in a log file, a line a minute."""
+"""Progress of loops: a bar on a terminal, otherwise (as in a log file) one line a minute."""
 
 import sys
 import time
@@ -9,7 +9,7 @@ from tqdm import tqdm
 from .. import logger
 
 INTERVAL = 60.0  # seconds between two lines
-PLURALS = {"query": "queries"}  # of units; the others only add an s
+PLURALS = {"query": "queries"}  # other units only add an s
 
 
 def progress(
@@ -19,26 +19,26 @@ def progress(
     total: int | None = None,
     initial: int = 0,
 ) -> "tqdm | Lines":
-    """Show how far a loop is.
+    """Show the progress of a loop.
 
     Args:
-        items: what the loop goes through; None to call `update` of what is returned.
-        desc: what is done.
-        unit: what one of the items is.
-        total: how many there are, with those of `initial`; default: the length of `items`.
-        initial: how many were done before.
+        items: what the loop iterates over; None to call `update` instead.
+        desc: description of the work.
+        unit: name of one item.
+        total: number of items, including the `initial` ones; default: the length of `items`.
+        initial: number of items that are done already.
 
     Returns:
         A context manager to iterate over, with tqdm's `update` and `set_postfix`.
     """
     if not sys.stderr.isatty():
         return Lines(items, desc, unit, total, initial)
-    # results of batches come at once, so that the rate is averaged over many
+    # results of a batch come at once, so the rate is averaged over many
     return tqdm(items, desc, total, unit=unit, initial=initial, smoothing=0.1)
 
 
 class Lines:
-    """Logs at most one line every `INTERVAL` seconds, none for short work. Arguments as above."""
+    """Logs at most one line every `INTERVAL` seconds. Arguments as in `progress`."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class Lines:
 
 
 def duration(seconds: float) -> str:
-    """Format a duration in the unit that suits it."""
+    """Format a duration in seconds, minutes or hours."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"

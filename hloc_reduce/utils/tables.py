@@ -1,10 +1,10 @@
-"""Tables of text."""
+"""Text tables."""
 
 from collections.abc import Sequence
 
 
-def aligned(lines: list[Sequence[str]], left: int = 1) -> str:
-    """Format lines of cells as a table, the first `left` columns to the left, others centred."""
+def aligned(lines: Sequence[Sequence[str]], left: int = 1) -> str:
+    """Format lines of cells; the first `left` columns are left-aligned, the others centred."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
         " | ".join(
@@ -16,6 +16,6 @@ def aligned(lines: list[Sequence[str]], left: int = 1) -> str:
 
 
 def joined(values: Sequence[float | None] | None, kind: str) -> str:
-    """Format numbers, as far as they are known, in one cell of a table."""
+    """Format the known numbers of one table cell."""
     known = [value for value in values or () if value is not None]
     return " / ".join(format(value, kind) for value in known) or "-"
