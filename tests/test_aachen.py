@@ -115,7 +115,7 @@ def test_a_wrong_configuration_touches_no_results(aachen_layout, tmp_path, monke
     (tmp_path / "pairs.txt").write_text("other/a.png db/1.png\nquery/day/a.png other/1.png\n")
     for message, *wrong in (
         ("The DoG options", "--feature", tmp_path / "typo.yaml"),
-        ("names no projection", "--feature", tmp_path / "bare.yaml"),
+        ("needs a projection", "--feature", tmp_path / "bare.yaml"),
         ("not a projection", "--projection", tmp_path / "no.safetensors"),
         ("is for mkd, not for sift", "--projection", projections.find("mkd_sv16")),
         ("is for hardnet, not for sift", "--projection", tmp_path / "HardNet_sv.pth"),

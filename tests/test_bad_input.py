@@ -927,5 +927,5 @@ def test_models_that_are_cut_off_are_refused(name, aachen_layout):
     colmap.read_model(model)
     for length in (0, 7, 8, len(content) // 2, len(content) - 1):
         path.write_bytes(content[:length])
-        with pytest.raises(InputError, match=f"not a COLMAP model .{name}.bin is cut off"):
+        with pytest.raises(InputError, match=f"not a COLMAP model .{name}.bin is truncated"):
             colmap.read_model(model)

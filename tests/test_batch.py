@@ -98,7 +98,7 @@ def test_a_job_that_is_listed_twice_is_one(tmp_path):
         ("jobs: [{dataset: a, min_inliers: 8.5}]", "min_inliers is 8.5: an integer is needed"),
         ("jobs: [{dataset: a, min_confidence: -1}]", "must be finite and at least 0"),
         ("jobs: [{dataset: 3}]", "dataset is 3: a name is needed"),
-        ("jobs: [{dataset: a}]\nexclude: [{job: a}]", "Unknown key of what is excluded 'job'"),
+        ("jobs: [{dataset: a}]\nexclude: [{job: a}]", "Unknown key of an entry of exclude 'job'"),
         ("jobs: [{dataset: [x/a, y/a]}]", "y/a and .*x/a would have the same folder"),
         ("jobs: [{dataset: a, num_loc: 2, retrieval: [x/b, y/b]}]", "two jobs .* differ in retri"),
         ("jobs: [{dataset: a, feature: [], num_loc: 3}]", "feature of a grid of jobs has no value"),
@@ -187,7 +187,7 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
     assert {row["descriptor_bytes"] for row in rows if row["job"] == "sift_sv16"} == {"32"}
     assert table(outputs / "failures.csv") == []
     assert all(feature in run_batch.printed for feature in features)
-    assert "in common: extract_features" in run_batch.printed
+    assert "shared: extract_features" in run_batch.printed
 
     states = {path: path.stat().st_mtime_ns for path in folder.rglob("*.h5")}
     done.clear()

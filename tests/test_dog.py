@@ -215,7 +215,7 @@ def test_a_killed_detector_is_said(tmp_path, textured, monkeypatch):
 
     monkeypatch.setattr(extract_features.processes, "pool", lambda _: nullcontext(Broken()))
     monkeypatch.setattr(extract_features.parallel, "cores", lambda: 2)
-    with pytest.raises(InputError, match="want of memory"):
+    with pytest.raises(InputError, match="lack of memory"):
         extract_features.main(extract_features.confs["sift"], tmp_path, tmp_path / "o")
 
 

@@ -283,7 +283,8 @@ def test_hpatches_lists_are_the_benchmarks(root, few, tmp_path):
     for kind, rows in (("queries", ["i_a,3", "i_c,0"]), ("distractors", ["v_b,19"])):
         text = "\n".join(["s,idx", *rows])
         (tmp_path / f"lists/retr_{kind}_split-a.csv").write_text(text)
-    found = lists.pools(tmp_path / "lists", tmp_path / "drawn", "a", sizes, contrast)
+    task_lists = lists.TaskLists(tmp_path / "lists", tmp_path / "drawn", "a", sizes)
+    found = task_lists.pools(contrast)
     assert [part.tolist() for part in found] == [[23, 32], [19]]
 
 
@@ -490,7 +491,7 @@ def test_exact_poses_and_unknown_names(two_lists, monkeypatch, capsys, caplog, r
     files = ("--estimates", two_lists / "exact.txt", "--ground_truth", two_lists / "truth.txt")
     monkeypatch.setattr(cli.logger, "propagate", True)
     run(monkeypatch, evaluation, "poses", *files, "--outputs", two_lists / "o")
-    assert "1 estimates are of no such query: query/day/O.jpg." in caplog.text
+    assert "1 estimates are of other queries: query/day/O.jpg." in caplog.text
     assert "day: 4 queries, median errors 0.000 m, 0.000 deg" in capsys.readouterr().out
     assert not list(recwarn)
 

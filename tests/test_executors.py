@@ -53,10 +53,10 @@ def test_each_item_once(pool):
 def test_items_are_drawn_as_workers_get_free():
     drawn, handed = [], []
 
-    def submit(function, *arguments):
-        handed.append(arguments)
+    def submit(work, items):
+        handed.append(items)
         future = Future()
-        future.set_result(function(*arguments))
+        future.set_result(list(work(items)))
         return future
 
     results = Pool(submit, lambda: 2).map(squares, (drawn.append(i) or i for i in range(1000)), 5)

@@ -80,7 +80,7 @@ def test_nothing_to_pair_is_refused(tmp_path, monkeypatch, caplog):
         with pytest.raises(InputError, match="db/b.jpg is the only image"):
             pairs(output, image_list=NAMES[:1], ref_list=references)
     command = ("--output", output, "--features", tmp_path / "none.h5")
-    assert "it is not there" in refused(monkeypatch, caplog, pairs_from_exhaustive, *command)
+    assert "it does not exist" in refused(monkeypatch, caplog, pairs_from_exhaustive, *command)
     command = ("--output", output, "--image_list", tmp_path / "none.txt")
     assert "Cannot read" in refused(monkeypatch, caplog, pairs_from_exhaustive, *command)
     assert not output.exists()

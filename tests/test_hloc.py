@@ -324,7 +324,7 @@ def test_a_base_of_hlocs_is_trained_on(double, tmp_path, monkeypatch):
     assert reduced["descriptors"].shape == (1, 16, 3)
     with pytest.raises(InputError, match="for hloc.dots, not for sift"):
         extractors.load({**conf["model"], "base": features.base("sift")})
-    with pytest.raises(InputError, match="mine has 256 dimensions, which 300 do not reduce"):
+    with pytest.raises(InputError, match="mine descriptors are 256-D: --dim 300 is too large"):
         train(monkeypatch, *arguments, "--dim", 300)
     with pytest.raises(InputError, match="not the patches of PhotoTour"):
         train(monkeypatch, *arguments, "--phototour", tmp_path)

@@ -90,7 +90,7 @@ def huge_header():
         (lambda content: content[: len(content) // 2], "not an image, or it is truncated"),
         (lambda content: content[:-30], "not an image, or it is truncated"),
         (lambda content: b"a text", "not an image, or it is truncated"),
-        (lambda content: huge_header(), "OpenCV says that not"),
+        (lambda content: huge_header(), "OpenCV requires"),
         (None, "No such file"),
     ],
 )

@@ -82,7 +82,7 @@ def test_broken_h5_is_refused_and_kept(tmp_path):
     with pytest.raises(InputError, match="not a whole h5 file"):
         GroupWriter(path, {})
     assert path.exists()
-    with pytest.raises(InputError, match="not there"), open_h5(tmp_path / "absent.h5"):
+    with pytest.raises(InputError, match="does not exist"), open_h5(tmp_path / "absent.h5"):
         pass
 
 
@@ -99,7 +99,7 @@ def test_only_groups_of_the_file_itself_are_listed(tmp_path):
     assert list_h5_names(path) == ["db/10.jpg", "db/2.jpg", "db/sub/3.jpg", "q/1"]
     with h5py.File(path, "a") as file:
         file["db/sub/itself"] = file["db"]
-    with pytest.raises(InputError, match="has another name"):
+    with pytest.raises(InputError, match="has a second name"):
         list_h5_names(path)
 
 
@@ -162,14 +162,6 @@ def test_two_writers_of_a_file_lose_nothing(tmp_path, monkeypatch):
     with first:
         pass
     assert list_h5_names(tmp_path / "f.h5") == ["a", "b", "c"]
-
-
-def test_a_full_temporary_folder_is_said(tmp_path):
-    with GroupWriter(tmp_path / "f.h5", {}) as writer:
-        writer.names.database.execute("PRAGMA max_page_count = 20")
-        with pytest.raises(InputError, match="SQLITE_TMPDIR"):
-            for i in range(10000):
-                writer.begin(f"db/{i}.jpg")
 
 
 def test_a_gap_in_the_pieces_loses_none(tmp_path, monkeypatch):

@@ -130,7 +130,7 @@ def test_a_map_is_built_once(place, monkeypatch, caplog, capsys):
     message = refused(monkeypatch, caplog, *given, "--feature", "sift_sv32")
     assert "is of --feature colmap_sift_sv64." in message
     message = refused(monkeypatch, caplog, *given, "--matcher", "NN-mutual")
-    assert "is of --matcher NN-ratio." in message
+    assert "was built with --matcher NN-ratio." in message
     message = refused(
         monkeypatch, caplog, "--map", moved, "--outputs", outputs, "--map_images", images
     )
@@ -367,7 +367,7 @@ def test_a_projection_is_kept_with_the_map(place, tmp_path, monkeypatch):
 @pytest.mark.parametrize("exhaustive", [4, 3])
 def test_a_model_of_poses_only(place, aachen_layout, monkeypatch, exhaustive):
     """Without points nothing is covisible: all images are matched, or if many similar ones."""
-    monkeypatch.setattr(maps, "MAX_EXHAUSTIVE", exhaustive)
+    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", exhaustive)
     build, images, outputs = place
     model = aachen_layout / "3D-models/aachen_v_1_1"
     reference = pycolmap.Reconstruction(model)
@@ -423,7 +423,7 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, monkeypat
     pixels = cv2.imread(str(photos / "guess.png"))[:, :, ::-1]
     pose, info = localizer.localize(np.ascontiguousarray(pixels))
     assert info["intrinsics"] == "guess" and max(pose_error(pose, poses["guess.png"])) < 0.1
-    with pytest.raises(InputError, match="of 240x180 pixels, the photo has 480x360"):
+    with pytest.raises(InputError, match="has 240x180 pixels, the photo has 480x360"):
         localizer.localize(
             photos / "guess.png",
             pycolmap.Camera(model="SIMPLE_PINHOLE", width=240, height=180, params=[250, 120, 90]),
@@ -769,14 +769,14 @@ def files_of(folder, keypoints):
 def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeypatch, caplog):
     """And queries get them, too; the map is the same command's."""
     caplog.set_level("INFO")
-    reconstruct = maps.reconstruction.reconstruct
+    reconstruct = maps.build.reconstruction.main
 
     def fails_once(*args, once, **options):
         if once:
-            raise maps.reconstruction.NoModelError("COLMAP could not reconstruct the images.")
+            raise maps.build.reconstruction.NoModelError("COLMAP could not reconstruct the images.")
         return reconstruct(*args, once=once, **options)
 
-    monkeypatch.setattr(maps.reconstruction, "reconstruct", fails_once)
+    monkeypatch.setattr(maps.build.reconstruction, "main", fails_once)
     outputs = tmp_path / "outputs"
     build = ("--map_images", plane / "images", "--outputs", outputs)
     run(monkeypatch, *build)
@@ -791,7 +791,7 @@ def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeyp
     # the next run deletes what a killed run left, but not the user's own files
     name = "feats-dog-colmap_sift_sv64"
     (built.folder / f"{name}.h5.pieces").mkdir()
-    (built.folder / f"{name}_matches-NN.h5").touch()
+    (built.folder / f"{name}_matches-NN-mutual-ratio.8_pairs-db-exhaustive.h5").touch()
     (built.folder / f"{name}.safetensors").touch()
     (built.folder / "sfm_notes.txt").touch()
     run(monkeypatch, *build)
@@ -810,14 +810,14 @@ def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeyp
 def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatch, caplog):
     caplog.set_level("INFO")
     draw_noise(plane / "images", ["other"])
-    reconstruct = maps.reconstruction.reconstruct
+    reconstruct = maps.build.reconstruction.main
 
     def fails_again(*args, once, **options):
         if once:
             return reconstruct(*args, once=once, **options)
-        raise maps.reconstruction.NoModelError("COLMAP could not reconstruct the images.")
+        raise maps.build.reconstruction.NoModelError("COLMAP could not reconstruct the images.")
 
-    monkeypatch.setattr(maps.reconstruction, "reconstruct", fails_again)
+    monkeypatch.setattr(maps.build.reconstruction, "main", fails_again)
     outputs = tmp_path / "outputs"
     run(monkeypatch, "--map_images", plane / "images", "--outputs", outputs)
     assert caplog.text.count("5 of 6 photos are in the map.") == 3
@@ -831,14 +831,14 @@ def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatc
 
 def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch):
     """One retrieved photo each leaves two parts; all are in the map in the end."""
-    monkeypatch.setattr(maps, "MAX_EXHAUSTIVE", 4)
+    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", 4)
     outputs = tmp_path / "outputs"
     build = ("--map_images", plane / "images", "--outputs", outputs, "--num_covis", 1)
 
     def apart(descriptors, output, num_matched):
         parsers.write_pairs([("0.png", "1.png"), ("1.png", "2.png"), ("3.png", "4.png")], output)
 
-    monkeypatch.setattr(maps.pairs_from_retrieval, "main", apart)
+    monkeypatch.setattr(maps.build.pairs_from_retrieval, "main", apart)
     run(monkeypatch, *build)
     built = maps.Map(outputs / "map")
     assert len(built.names()) == 5
@@ -874,7 +874,7 @@ def test_a_map_of_other_pairs_is_refused(plane, tmp_path, monkeypatch, caplog):
     run(monkeypatch, *build)
     run(monkeypatch, *build, "--num_covis", 3)  # of which all pairs know nothing
     assert len(list(parsers.parse_pairs(outputs / "map/pairs-db-exhaustive.txt"))) == 10
-    monkeypatch.setattr(maps, "MAX_EXHAUSTIVE", 4)
+    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", 4)
     message = refused(monkeypatch, caplog, *build)
     assert "differs: num_covis and pairs" in message and "--overwrite" in message
 

@@ -225,7 +225,7 @@ def test_released_networks_are_downloaded_once_and_checked(tmp_path, monkeypatch
     monkeypatch.setattr(
         downloads, "urlopen", lambda url, timeout: asked.append(url) or io.BytesIO(content)
     )
-    with pytest.raises(InputError, match="HardNet_sv_dim24.pth: .* has not the sha256"):
+    with pytest.raises(InputError, match="HardNet_sv_dim24.pth: .* does not have the sha256"):
         projections.load("hardnet_sv24")
     assert not list(tmp_path.rglob("*.pth"))
     known = ("HardNet_sv_dim24.pth", hashlib.sha256(content).hexdigest())
@@ -296,7 +296,7 @@ def test_features_of_a_file(tmp_path):
         ({"name": "dog", "options": {"threshold": 1}}, "The DoG options"),
         ({"name": "dog", "options": {"peak_threshold": "low"}}, "The DoG options"),
         ({"name": "vlad"}, "Unknown extractor 'vlad'"),
-        ({"name": "hloc"}, "names none of hloc's|hloc is not installed"),
+        ({"name": "hloc"}, "needs the name of one of hloc's|hloc is not installed"),
     ],
 )
 def test_a_wrong_model_is_one_clear_error(model, message):

@@ -149,7 +149,7 @@ def test_runs_of_scans_and_of_a_map_of_ones_own(
     points.rename(tmp_path / "i/away")
     command.run(monkeypatch, report, *folders, "-o", output)
     for path in (points, sfm):
-        said = rf"in the report: Cannot open \S*{path.parent.name}/{path.name}: it is not there"
+        said = rf"in the report: Cannot open \S*{path.parent.name}/{path.name}: it does not exist"
         assert re.search(said, caplog.text)
     (tmp_path / "i/away").rename(points)
     features = next((tmp_path / "i").glob("feats-*_sv32.h5"))
@@ -158,7 +158,7 @@ def test_runs_of_scans_and_of_a_map_of_ones_own(
             file[name]["keypoints"][0] += 1
     (tmp_path / "other.h5").replace(features)
     command.run(monkeypatch, report, folders[0], "-o", output)
-    assert f"{points} is not of the keypoints of database/cutouts/" in caplog.text
+    assert f"{points} has no points of the present keypoints of database/cutouts/" in caplog.text
 
 
 def test_nothing_in_a_name_is_taken_for_html(compared, tmp_path, monkeypatch):

@@ -132,7 +132,8 @@ def test_a_negative_focal_length_is_not_refined():
     """RANSAC may return one; the gate refuses it."""
     camera = camera_of(1600, 1200, [-1400, 800, 600, 0], "SIMPLE_RADIAL")
     pose = Pose(POSE, camera, np.ones(50, bool), confidence=50)
-    found, doubt = absolute_pose._calibrate(pose, *matches(WHOLE, 30), REFINEMENTS["guess"])
+    given = absolute_pose._Matches(*matches(WHOLE, 30), camera, REFINEMENTS["guess"])
+    found, doubt = absolute_pose._calibrate(given, pose)
     assert found is pose and doubt is None
 
 

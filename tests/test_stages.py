@@ -87,9 +87,7 @@ def test_matches_do_not_overwrite_features(built, tmp_path, monkeypatch, caplog)
     name = built.features.stem
     command = ["--pairs", pairs, "--export_dir", built.features.parent, "--features", name]
     command += ["--matches", built.features, "--overwrite"]
-    assert "is what the matches are made of" in refused(
-        monkeypatch, caplog, match_features, *command
-    )
+    assert "is an input of the matching" in refused(monkeypatch, caplog, match_features, *command)
     assert built.features.read_bytes() == before
 
 
@@ -503,13 +501,13 @@ def test_retrieval_ranks_by_similarity(tmp_path, monkeypatch, block):
 def test_stamps_notice_changes(tmp_path):
     source, file = tmp_path / "source", tmp_path / "stamp.json"
     source.write_text("a")
-    made_from = provenance.stamp({"x": (1, 2)}, [source])
+    made_from = provenance.of_inputs({"x": (1, 2)}, [source])
     assert not provenance.is_current(file, made_from)
     provenance.write(file, made_from)
     assert provenance.is_current(file, made_from)
-    assert not provenance.is_current(file, provenance.stamp({"x": (1, 3)}, [source]))
+    assert not provenance.is_current(file, provenance.of_inputs({"x": (1, 3)}, [source]))
     source.write_text("ab")
-    assert not provenance.is_current(file, provenance.stamp({"x": (1, 2)}, [source]))
+    assert not provenance.is_current(file, provenance.of_inputs({"x": (1, 2)}, [source]))
 
 
 def test_a_query_that_cannot_be_localized_says_why(built):

@@ -127,7 +127,7 @@ def test_quantized_match_like_floats(tmp_path):
 
 def test_wrong_input(tmp_path, monkeypatch, caplog):
     path = write(tmp_path / "feats.h5", "uint8", "a.jpg")
-    with pytest.raises(InputError, match="made of itself"):
+    with pytest.raises(InputError, match="converted to itself"):
         storage.main(path, path)
     conf = {**extract_features.confs["sift"], "storage": "uint4"}
     with pytest.raises(InputError, match="Unknown storage 'uint4'"):

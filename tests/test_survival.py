@@ -113,9 +113,7 @@ cli.run(main)
     _, said = run.communicate(timeout=30)
     assert run.returncode == code
     (line,) = said.splitlines()
-    assert line.endswith(
-        "Interrupted. The same command, but for any --overwrite, goes on from here."
-    )
+    assert line.endswith("Interrupted. Run the same command again, without --overwrite, to resume.")
     with GroupWriter(tmp_path / "f.h5", {}) as writer:
         assert "done" in writer
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hloc_reduce import projections
-from hloc_reduce.evaluation.matching import average_precision
+from hloc_reduce.evaluation.ranking import nearest_neighbor_ap
 from hloc_reduce.projections import network
 from hloc_reduce.training import __main__ as training
 from hloc_reduce.training import loop, nested, pca, ss, sv, tracks, us
@@ -39,7 +39,7 @@ def held_out_precision(mlp):
     held_out = noisy_tracks(seed=7)
     views = torch.from_numpy(held_out.descriptors[:, 0, 0]).float()
     embedded = mlp(views) if mlp else views
-    return average_precision(embedded[0::4], embedded[1::4])
+    return nearest_neighbor_ap(embedded[0::4], embedded[1::4])
 
 
 def test_sampler_draws_matches():
@@ -213,7 +213,7 @@ def test_self_supervised_tells_clusters_apart(name, changes, tmp_path):
     views = torch.from_numpy(data.descriptors[:, 0, 0]).float()
     with torch.no_grad():
         embedded = mlp(views)
-    assert average_precision(embedded[0::4], embedded[1::4]) > 0.9
+    assert nearest_neighbor_ap(embedded[0::4], embedded[1::4]) > 0.9
     again = ss.train([data], 8, recipe, 0, tmp_path / "again")
     assert torch.equal(mlp.linears[0].weight, again.linears[0].weight)
 
@@ -363,22 +363,22 @@ def test_photometric_variants_are_images():
     assert all(view.min() >= 0 and view.max() <= 1 for view in views)
 
 
-def test_average_precision_by_hand():
+def test_nearest_neighbor_ap_by_hand():
     """Ranked: hit, miss, hit; the fourth misses: (1 + 2/3) / 4."""
     angles = torch.tensor([0.0, 1.0, 2.0, 3.0])
     shifted = torch.tensor([0.01, 1.95, 2.2, 1.1])
     unit = [torch.stack([a.cos(), a.sin()], 1) for a in (angles, shifted)]
     # nearest: 0 -> 0 (.01), 1 -> 3 (.1), 2 -> 1 (.05), 3 -> 2 (.8)
-    assert average_precision(*unit) == pytest.approx(1 / 4)
-    assert average_precision(unit[0], unit[0]) == pytest.approx(1)
+    assert nearest_neighbor_ap(*unit) == pytest.approx(1 / 4)
+    assert nearest_neighbor_ap(unit[0], unit[0]) == pytest.approx(1)
     angles = torch.tensor([0.0, 1.0, 2.0, 4.0])
     shifted = torch.tensor([0.01, 1.3, 2.2, 1.1])
     unit = [torch.stack([a.cos(), a.sin()], 1) for a in (angles, shifted)]
     # nearest: 0 -> 0 (.01), 1 -> 3 (.1), 2 -> 2 (.2), 3 -> 2 (1.8)
-    assert average_precision(*unit) == pytest.approx((1 + 2 / 3) / 4)
+    assert nearest_neighbor_ap(*unit) == pytest.approx((1 + 2 / 3) / 4)
     # a fifth descriptor in the way of the first: miss, miss, hit, miss
     distracted = torch.cat([unit[1], unit[0][:1]])
-    assert average_precision(unit[0], distracted) == pytest.approx(1 / 3 / 4)
+    assert nearest_neighbor_ap(unit[0], distracted) == pytest.approx(1 / 3 / 4)
 
 
 def test_a_map_is_trained_on(scene, tmp_path, monkeypatch):
@@ -417,7 +417,7 @@ def test_a_projection_of_another_training_is_not_replaced(scene, tmp_path, monke
     others = [], "sift", "pca", [16], tmp_path, tmp_path
     (path,) = training.main({"a": place}, *others)
     written = path.read_bytes()
-    with pytest.raises(InputError, match="is there already, of another training_data. Choose"):
+    with pytest.raises(InputError, match="exists, trained with another training_data. Choose"):
         training.main({"b": place}, *others)
     assert path.read_bytes() == written
 

@@ -132,7 +132,7 @@ def test_broken_sequences_are_refused(sequence, tmp_path):
     with pytest.raises(InputError, match="not a PhotoTour sequence"):
         patch_tracks.main(tmp_path, tmp_path / "cache")
     (folder / "patches0001.bmp").unlink()
-    with pytest.raises(InputError, match="300 patches, 1 sheets miss"):
+    with pytest.raises(InputError, match="300 patches, 1 sheets are missing"):
         patch_tracks.main(folder, tmp_path / "cache")
     (folder / "info.txt").write_text("1 0\nx 0\n")
     with pytest.raises(InputError, match="info.txt, line 2"):
