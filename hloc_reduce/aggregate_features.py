@@ -1,6 +1,7 @@
 """Aggregate local features into global descriptors, for retrieval without trained weights."""
 
 import argparse
+import hashlib
 from pathlib import Path
 
 import h5py
@@ -8,7 +9,7 @@ import numpy as np
 
 from . import logger
 from .confs import retrieval as retrieval_confs
-from .runtime.group_writer import GroupWriter, failures
+from .runtime.group_writer import failures, resume_or_replace
 from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.feature_files import get_descriptors
@@ -30,6 +31,8 @@ def main(
     vocabulary: Path | None = None,
 ) -> Path:
     """Compute a global descriptor of every image of a feature file that could be read.
+
+    Stale ones, of other features or another vocabulary, are replaced.
 
     Args:
         conf: an entry of `confs`.
@@ -56,25 +59,27 @@ def main(
     model = aggregators.load(conf["model"]).eval()
     failed = failures(features)
     names = [name for name in list_h5_names(features) if name not in failed]
-    made_by = {"model": conf["model"]}
-    if vocabulary is not None:
-        made_by["vocabulary"] = file_sha256(vocabulary)
+    learned_from = "\n".join(vocabulary_images or [])
+    made_by = {
+        "model": conf["model"],
+        "vocabulary": file_sha256(vocabulary)
+        if vocabulary
+        else hashlib.sha256(learned_from.encode()).hexdigest(),
+    }
     with open_h5(features) as file:
         made_by["features"] = file_provenance(file)
-        with GroupWriter(output, made_by, overwrite) as writer:
+        with resume_or_replace(output, made_by, overwrite) as writer:
             todo = [name for name in names if name not in writer]
             if not todo:
                 return output
             if vocabulary is None:
                 vocabulary = vocabulary_of(output)
-                if overwrite or not vocabulary.exists():
-                    if len(todo) < len(names):
-                        raise InputError(
-                            f"The vocabulary {vocabulary} of {output} is gone: overwrite."
-                        )
+                if len(todo) == len(names):
                     model.fit(_sample(file, vocabulary_images or [], conf["model"]["max_samples"]))
                     with replacing(vocabulary) as temporary:
                         temporary.write_bytes(save({"vocabulary": model.vocabulary}))
+                elif not vocabulary.exists():
+                    raise InputError(f"The vocabulary {vocabulary} of {output} is gone: overwrite.")
             model.vocabulary = read_vocabulary(vocabulary)
             for name in progress(todo, "Aggregating", "image"):
                 local = torch.from_numpy(get_descriptors(file, name).T)
@@ -85,13 +90,6 @@ def main(
                 writer.add(name, {"global_descriptor": descriptor.half().numpy()})
     logger.info("Global descriptors are in %s.", output)
     return output
-
-
-def files_of(features: Path) -> list[Path]:
-    """Return the files and folders that `main` may write next to a feature file."""
-    descriptors = features.with_name(f"{confs['vlad']['output']}_{features.stem}.h5")
-    pieces = descriptors.with_name(f"{descriptors.name}.pieces")
-    return [descriptors, pieces, vocabulary_of(descriptors)]
 
 
 def vocabulary_of(descriptors: Path) -> Path:

@@ -81,7 +81,7 @@ def test_a_query_that_cannot_be_read_does_not_stop_the_others(
     assert rows == {other: row for other, row in expected.items() if other != name}
     logs = log_file(outputs / summary["poses"])
     assert read_records(logs)[name]["reason"] == row["reason"]
-    line = f"1 of {len(expected)} queries could not be read and are not localized: {name} ({why})."
+    line = f"1 of {len(expected)} queries are unreadable and not localized: {name} ({why})."
     assert any(line in record.getMessage() for record in caplog.records)
     # nothing is done anew but that it is read again
     before = h5_files(outputs)

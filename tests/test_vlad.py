@@ -61,7 +61,7 @@ def test_new_images_use_the_old_vocabulary(features):
         before = file["db/1.jpg/global_descriptor"][()]
     with h5py.File(features, "a") as file:
         file["query/1.jpg/descriptors"] = file["db/1.jpg/descriptors"][()]
-    aggregate_features.main(CONF, features, ["db/0.jpg"])
+    aggregate_features.main(CONF, features, ["db/0.jpg", "db/4.jpg"])
     with h5py.File(output) as file:
         np.testing.assert_array_equal(file["query/1.jpg/global_descriptor"][()], before)
 
@@ -69,3 +69,13 @@ def test_new_images_use_the_old_vocabulary(features):
 def test_no_features_no_vocabulary(features):
     with pytest.raises(InputError, match="No image for the vocabulary"):
         aggregate_features.main(CONF, features, ["db/blank.jpg"])
+
+
+def test_descriptors_by_a_stale_vocabulary_are_replaced(features):
+    output = aggregate_features.main(CONF, features, ["db/0.jpg", "db/4.jpg"])
+    vocabulary = aggregate_features.vocabulary_of(output)
+    before = output.read_bytes(), vocabulary.read_bytes()
+    aggregate_features.main(CONF, features, ["db/0.jpg", "db/4.jpg"])
+    assert (output.read_bytes(), vocabulary.read_bytes()) == before
+    aggregate_features.main(CONF, features, ["db/1.jpg"])
+    assert output.read_bytes() != before[0] and vocabulary.read_bytes() != before[1]

@@ -151,10 +151,10 @@ class GroupWriter:
             )
 
 
-def resume_or_replace(path: Path, made_from: dict) -> GroupWriter:
+def resume_or_replace(path: Path, made_from: dict, overwrite: bool = False) -> GroupWriter:
     """Return a writer that resumes an intermediate file, or replaces it if it is stale."""
     try:
-        return GroupWriter(path, made_from)
+        return GroupWriter(path, made_from, overwrite)
     except InputError:  # stale, or broken
         return GroupWriter(path, made_from, overwrite=True)
 

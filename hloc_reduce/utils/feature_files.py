@@ -113,11 +113,11 @@ def stored_descriptors(file: h5py.File, name: str) -> h5py.Dataset:
     with reading(file.filename):
         key = QUANTIZED if f"{name}/{QUANTIZED}" in file else "descriptors"
         dataset, keypoints = get_dataset(file, name, key), file[name].get("keypoints")
-        shapes = [getattr(part, "shape", None) or () for part in (dataset, keypoints)]
-    if all(shapes) and shapes[0][-1] != shapes[1][0]:
+        shape, others = dataset.shape, getattr(keypoints, "shape", None)
+    if shape and others and shape[-1] != others[0]:
         raise InputError(
-            f"{file.filename}: the descriptors of {name} are {shapes[0]}, its keypoints "
-            f"{shapes[1]}: (D, N) and (N, 2) are expected."
+            f"{file.filename}: the descriptors of {name} are {shape}, its keypoints {others}: "
+            "(D, N) and (N, 2) are expected."
         )
     return dataset
 
