@@ -38,6 +38,9 @@ SEEDS = (1, 2, 3)
 MORE = 1.5  # times as many images tell that one camera took all
 MAX_DISTORTION = 1.0  # as COLMAP has it for images that it registers
 MANY = 3  # images of a camera from which on EXIF data do not bound its focal length
+# images of one viewpoint are closer than this share of their distance to the scene
+SAME_VIEWPOINT = 0.03
+VIEWPOINTS = 3  # of a model, at least: two do not fix the focal lengths
 
 
 class NoModelError(InputError):
@@ -277,8 +280,40 @@ def _plausible(
         if implausible:
             _keep_connected(model)
         dropped |= implausible
-    whole = [model for model in models if min(size(model)) > 1]
+    whole = []
+    for model in models:
+        if min(size(model)) < 2:
+            continue
+        if (number := count_viewpoints(model)) >= VIEWPOINTS:
+            whole.append(model)
+            continue
+        logger.info(
+            "A model of %d photos is not used: %d viewpoints do not fix their focal lengths.",
+            *(model.num_reg_images(), number),
+        )
     return sorted(whole, key=size, reverse=True), dropped
+
+
+def count_viewpoints(model: pycolmap.Reconstruction) -> int:
+    """Count the viewpoints of a model: a burst of photos from one place is one viewpoint."""
+    centres, depths = [], []
+    points = {number: point.xyz for number, point in model.points3D.items()}
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.images[image_id]
+        centre = image.cam_from_world().inverse().translation
+        seen = [points[p.point3D_id] for p in image.points2D if p.has_point3D()]
+        if seen:
+            centres.append(centre)
+            depths.append(np.median(np.linalg.norm(np.array(seen) - centre, axis=1)))
+    number = 0
+    centres, depths = np.array(centres).reshape(-1, 3), np.array(depths)
+    while len(centres):
+        apart = np.linalg.norm(centres - centres[0], axis=1) > SAME_VIEWPOINT * np.minimum(
+            depths, depths[0]
+        )
+        apart[0] = False
+        centres, depths, number = centres[apart], depths[apart], number + 1
+    return number
 
 
 def _keep_connected(model: pycolmap.Reconstruction) -> None:
@@ -307,8 +342,9 @@ def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
     if dropped:
         return f"COLMAP could not reconstruct the images of {image_dir}. {_said(dropped)}"
     return (
-        f"COLMAP could not reconstruct the images of {image_dir}. Do enough of them overlap? Take "
-        "photos from several places, each overlapping the one before by about two thirds."
+        f"COLMAP could not reconstruct the images of {image_dir} from {VIEWPOINTS} viewpoints or "
+        "more. Do enough of them overlap? Take photos from several places, each overlapping the "
+        "one before by about two thirds."
     )
 
 
