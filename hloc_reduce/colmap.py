@@ -465,17 +465,6 @@ def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
     return camera, camera.has_prior_focal_length
 
 
-def exif_camera_model(image: Path) -> str | None:
-    """Return which camera took a photo: its make, model, focal length and the size of the photo.
-
-    None where EXIF data do not tell, or before pycolmap 4.
-    """
-    if not hasattr(pycolmap.Bitmap, "exif_camera_model"):
-        return None
-    bitmap = pycolmap.Bitmap.read(image, False)
-    return bitmap.exif_camera_model() if bitmap is not None else None
-
-
 @contextmanager
 def _log(
     verbose: bool, least: pycolmap.logging.Level = pycolmap.logging.Level.WARNING

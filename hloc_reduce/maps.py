@@ -78,6 +78,7 @@ class Map:
             self.cameras = intrinsics.MapCameras(
                 {name: intrinsics.from_list(values) for name, values in known},
                 {(int(width), int(height)) for width, height in content.get("sizes", [])},
+                {str(model) for model in content.get("camera_models", [])},
             )
             conf = content["conf"]
             self._conf = {
@@ -335,6 +336,7 @@ def main(
             "points3D": sfm.num_points3D(),
             "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
             "sizes": sorted(cameras.sizes),
+            "camera_models": sorted(cameras.models),
             "seconds": folder.seconds(),
         }
         stamps.write(map_dir / FINISHED, summary)
