@@ -39,6 +39,8 @@ SEEDS = (1, 2, 3)
 MORE = 1.5  # times as many images show that one camera took all
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
 MANY = 3  # images of one camera estimate its focal length better than EXIF data do
+SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
+VIEWPOINTS = 3  # at least, of a model: two do not determine the focal lengths
 
 
 class NoModelError(InputError):
@@ -272,7 +274,17 @@ def _plausible(
         if implausible:
             _keep_connected(model)
         dropped |= implausible
-    whole = [model for model in models if min(size(model)) > 1]
+    whole = []
+    for model in models:
+        if min(size(model)) < 2:
+            continue
+        if (number := count_viewpoints(model)) >= VIEWPOINTS:
+            whole.append(model)
+            continue
+        logger.info(
+            "A model of %d photos is not used: %d viewpoints do not determine focal lengths.",
+            *(model.num_reg_images(), number),
+        )
     return sorted(whole, key=size, reverse=True), dropped
 
 
@@ -284,6 +296,27 @@ def _implausible(camera: pycolmap.Camera, initial: pycolmap.Camera, number: int)
         return f"focal length {focal_length:.0f}"
     distortion = max(camera.params[list(camera.extra_params_idxs())], key=abs, default=0.0)
     return f"distortion {distortion:.1f}" if abs(distortion) > MAX_DISTORTION else None
+
+
+def count_viewpoints(model: pycolmap.Reconstruction) -> int:
+    """Count the viewpoints of a model: a burst of photos from one place is one viewpoint."""
+    points = {number: point.xyz for number, point in model.points3D.items()}
+    left: list[tuple[np.ndarray, float]] = []  # centres of images, and distances of their points
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.images[image_id]
+        centre = image.projection_center()
+        seen = [points[p.point3D_id] for p in image.points2D if p.has_point3D()]
+        if seen:
+            left.append((centre, float(np.median(np.linalg.norm(np.array(seen) - centre, axis=1)))))
+    number = 0
+    while left:
+        number, (first, distance) = number + 1, left[0]
+        left = [
+            (centre, other)
+            for centre, other in left[1:]
+            if np.linalg.norm(centre - first) > SAME_VIEWPOINT * min(distance, other)
+        ]
+    return number
 
 
 def _keep_connected(model: pycolmap.Reconstruction) -> None:
@@ -316,7 +349,10 @@ def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
         "before by about two thirds."
     )
     hint = _lenses(dropped) if dropped else advice
-    return f"COLMAP could not reconstruct the images of {image_dir}. {hint}"
+    return (
+        f"COLMAP could not reconstruct the images of {image_dir} from {VIEWPOINTS} viewpoints or "
+        f"more. {hint}"
+    )
 
 
 def _lenses(dropped: dict[str, str]) -> str:

@@ -24,16 +24,15 @@ def map_of(cameras: list[int]) -> pycolmap.Reconstruction:
     return reconstruction
 
 
-def write_photo(path, make="Maker", focal_35mm=36, size=(480, 360)):
+def write_photo(path, make="Maker", focal_35mm=36, size=(480, 360), zoom=None):
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = make, "Phone 1"
     exif.get_ifd(0x8769)[0xA405] = focal_35mm
+    if zoom is not None:
+        exif.get_ifd(0x8769)[0xA404] = zoom
     Image.new("RGB", size, (90, 120, 150)).save(path, exif=exif)
 
 
-@pytest.mark.skipif(
-    not hasattr(pycolmap.Bitmap, "exif_camera_model"), reason="this pycolmap reads no camera model"
-)
 def test_the_camera_of_a_map_is_known_again(tmp_path):
     for i in range(4):
         write_photo(tmp_path / f"{i}.jpg")
@@ -48,8 +47,35 @@ def test_the_camera_of_a_map_is_known_again(tmp_path):
         assert intrinsics.infer(tmp_path / "new.jpg", known)[1] == "EXIF"
 
 
-def test_a_camera_of_few_photos_or_of_several_models_is_not_known(tmp_path, monkeypatch):
-    monkeypatch.setattr(colmap, "exif_camera_model", lambda path: "Maker-Phone 1-36-480x360")
+@pytest.mark.parametrize(
+    ("changed", "source"),
+    [
+        ({"zoom": 1.0}, "map"),
+        ({"zoom": 2.0}, "unknown"),  # phones write the same focal length
+        ({"zoom": 2.0, "make": "Other"}, "unknown"),
+        ({"size": (288, 216)}, "unknown"),  # cropped, or made smaller
+        ({"size": (288, 216), "make": "Other"}, "EXIF"),
+    ],
+)
+def test_what_was_zoomed_or_cut_keeps_its_exif_data(changed, source, tmp_path):
+    for i in range(3):
+        write_photo(tmp_path / f"{i}.jpg")
+    known = intrinsics.of_map(map_of([1, 1, 1]), tmp_path)
+    write_photo(tmp_path / "new.jpg", **changed)
+    camera, found = intrinsics.infer(tmp_path / "new.jpg", known)
+    assert found == source and (source != "unknown" or not camera.has_prior_focal_length)
+
+
+@pytest.mark.parametrize("content", [b"", b"no image", b"\xff\xd8\xff\xe1\x00\x10Exif\0\0MM"])
+def test_broken_exif_data_tell_nothing(content, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(content)
+    assert intrinsics.exif_camera(tmp_path / "a.jpg") is None
+    assert intrinsics.exif_camera(tmp_path / "absent.jpg") is None
+
+
+def test_a_camera_of_few_photos_or_of_several_models_is_not_known(tmp_path):
+    for i in range(4):
+        write_photo(tmp_path / f"{i}.jpg")
     assert intrinsics.of_map(map_of([1, 1]), tmp_path).known == {}
     assert intrinsics.of_map(map_of([1, 1, 1, 2]), tmp_path).known == {}
     assert len(intrinsics.of_map(map_of([1, 1, 1]), tmp_path).known) == 1

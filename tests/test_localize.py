@@ -600,8 +600,11 @@ def test_further_attempts_where_images_are_missing(scene, tmp_path, monkeypatch)
     assert attempts == [(6, 30)]
 
 
-def chain(cameras):
-    """Return a model of images that see points with the next one only, of cameras by number."""
+def chain(cameras, places=None):
+    """Return a model of images that see points with the next one only, of cameras by number.
+
+    The points are 5 units in front of the images, which are at other places along a line.
+    """
     model = pycolmap.Reconstruction()
     for i, number in enumerate(cameras):
         camera = pycolmap.Camera(
@@ -609,11 +612,12 @@ def chain(cameras):
         )
         pixels = np.random.default_rng(i).uniform(0, 400, (20, 2))
         image = pycolmap.Image(name=f"{i}.jpg", keypoints=pixels, camera_id=number, image_id=i + 1)
-        colmap.add_image(model, camera, image, pycolmap.Rigid3d())
+        place = np.array([i if places is None else places[i], 0, 0])
+        colmap.add_image(model, camera, image, pycolmap.Rigid3d(pycolmap.Rotation3d(), -place))
     for i in range(1, len(cameras)):
         for j in range(10):
             elements = [pycolmap.TrackElement(i, 10 + j), pycolmap.TrackElement(i + 1, j)]
-            model.add_point3D(np.zeros(3), pycolmap.Track(elements))
+            model.add_point3D(np.array([0, 0, 5]), pycolmap.Track(elements))
     given = {key: pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
     return model, given
 
@@ -663,6 +667,18 @@ def test_what_only_an_implausible_image_connects_is_dropped():
     model, given = chain([1, 2, 3])
     model.cameras[2].focal_length = 1e6
     assert reconstruction._plausible([model], given)[0] == []
+
+
+@pytest.mark.parametrize(
+    ("places", "viewpoints"),
+    [((0, 0.1, 2, 2.05, 2.1), 2), ((0, 0, 0, 0, 0), 1), ((0, 0.1, 2, 2.05, 4), 3)],
+)
+def test_bursts_from_two_viewpoints_are_no_map(places, viewpoints):
+    """Nothing fixes their focal lengths, so that their poses may be wrong by 30 degrees."""
+    model, given = chain([1, 2, 3, 4, 5], places)
+    assert reconstruction.count_viewpoints(model) == viewpoints
+    found, dropped = reconstruction._plausible([model], given)
+    assert bool(found) == (viewpoints >= 3) and not dropped
 
 
 def test_a_camera_of_many_photos_is_known_better_than_by_exif():

@@ -1,18 +1,22 @@
 """Intrinsics of queries without a list: those of the map's camera, from EXIF data, or guessed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pycolmap
+from PIL import Image
 
 from ..utils import colmap
 from ..utils.files import replacing
 from ..utils.parsers import to_line
 
+MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769  # EXIF tags
+ZOOM, FOCAL_35MM, FOCAL_LENGTH = 0xA404, 0xA405, 0x920A
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
 WELL_KNOWN = 3  # images from which the map knows the intrinsics of their camera
+MAX_ZOOM = 1.01
 _REFINED = {"refine_focal_length": True}
 # source of intrinsics -> options of `localize_sfm.main` that make up for their errors
 REFINEMENTS = {
@@ -28,16 +32,49 @@ REFINEMENTS = {
 }
 
 
+class ExifCamera(NamedTuple):
+    """The camera that took a photo, by its EXIF data.
+
+    Args:
+        model: make and model.
+        name: make, model, focal length and size of the photo, which determine its intrinsics.
+        zoomed: digitally, which changes the intrinsics but not always the focal length in EXIF.
+    """
+
+    model: str
+    name: str
+    zoomed: bool
+
+
+def exif_camera(image: Path) -> ExifCamera | None:
+    """Return the camera that took a photo, None if EXIF data do not tell."""
+    try:
+        with Image.open(image) as opened:
+            (width, height), exif = opened.size, opened.getexif()
+        more = exif.get_ifd(EXIF)
+        make, model = (str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL))
+        focal_length = float(more.get(FOCAL_35MM) or more.get(FOCAL_LENGTH) or 0)
+        zoom = float(more.get(ZOOM) or 1)
+    except Exception:  # Pillow raises many types for broken data
+        return None
+    if not (model and focal_length > 0):
+        return None
+    name = f"{make} {model}"
+    return ExifCamera(name, f"{name} {focal_length:g} mm {width}x{height}", zoom > MAX_ZOOM)
+
+
 class MapCameras(NamedTuple):
     """What a map tells about the intrinsics of other photos.
 
     Args:
-        known: cameras that took several of its photos, by their `colmap.exif_camera_model`.
+        known: cameras that took several of its photos, by their `ExifCamera.name`.
         sizes: (width, height) of its photos.
+        models: `ExifCamera.model` of all cameras that took its photos.
     """
 
     known: dict[str, pycolmap.Camera]
     sizes: set[tuple[int, int]]
+    models: Collection[str] = ()
 
 
 def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera, str]:
@@ -50,23 +87,30 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
     Returns:
         The camera and its source, a key of `REFINEMENTS`: "map" for a camera that the map knows,
         else a SIMPLE_RADIAL camera without distortion, from "EXIF" data or guessed. It is a "guess"
-        if map photos have the size of the photo, which then is hardly cropped, else "unknown".
+        if map photos have the size of the photo, which then is hardly cropped, else "unknown". So
+        are digital zooms, and photos by a camera of the map whose size no map photo has: their
+        EXIF data do not say what was cut off.
 
     Raises:
         InputError: if the image cannot be read.
     """
+    exif, has_focal_length = None, False
     if isinstance(image, np.ndarray):
         height, width = image.shape[:2]
         params = [GUESSED_FOCAL * max(width, height), width / 2, height / 2, 0]
         camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
     else:
         camera, has_focal_length = colmap.infer_camera(image)
-        if of_map.known and (same := of_map.known.get(colmap.exif_camera_model(image) or "")):
-            return same, "map"
-        if has_focal_length:
-            return camera, "EXIF"
+        exif = exif_camera(image)
     size = camera.width, camera.height
-    return camera, "guess" if {size, size[::-1]} & of_map.sizes else "unknown"
+    has_size = bool({size, size[::-1]} & of_map.sizes)
+    is_cut = exif is not None and (exif.zoomed or exif.model in of_map.models and not has_size)
+    if exif is not None and not is_cut and exif.name in of_map.known:
+        return of_map.known[exif.name], "map"
+    if has_focal_length and not is_cut:
+        return camera, "EXIF"
+    camera.has_prior_focal_length = False
+    return camera, "guess" if has_size and not is_cut else "unknown"
 
 
 def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> MapCameras:
@@ -77,16 +121,19 @@ def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> MapCamer
         image_dir: the folder of its photos.
     """
     sizes = {(camera.width, camera.height) for camera in reconstruction.cameras.values()}
+    models: set[str] = set()
     found: dict[str, list[int]] = {}
     for image in reconstruction.images.values():
-        if (name := colmap.exif_camera_model(image_dir / image.name)) is not None:
-            found.setdefault(name, []).append(image.camera_id)
+        if (exif := exif_camera(image_dir / image.name)) is not None:
+            models.add(exif.model)
+            if not exif.zoomed:
+                found.setdefault(exif.name, []).append(image.camera_id)
     known = {
         name: reconstruction.cameras[ids[0]]
         for name, ids in found.items()
         if len(ids) >= WELL_KNOWN and len(set(ids)) == 1
     }
-    return MapCameras(known, sizes)
+    return MapCameras(known, sizes, models)
 
 
 def to_list(camera: pycolmap.Camera) -> list:

@@ -203,6 +203,7 @@ class _Building:
             "points3D": sfm.num_points3D(),
             "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
             "sizes": sorted(cameras.sizes),
+            "camera_models": sorted(cameras.models),
             "seconds": self.folder.seconds(),
         }
         provenance.write(self.folder.path / FINISHED, summary)

@@ -79,6 +79,7 @@ class Map:
         self.cameras = intrinsics.MapCameras(
             {name: intrinsics.from_list(values) for name, values in known},
             {(int(width), int(height)) for width, height in content.get("sizes", [])},
+            {str(model) for model in content.get("camera_models", [])},
         )
         conf = dict(content["conf"])
         conf |= {key: dict(conf[key]) for key in ("model", "preprocessing")}

@@ -463,17 +463,6 @@ def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
     return camera, camera.has_prior_focal_length
 
 
-def exif_camera_model(image: Path) -> str | None:
-    """Return the camera of a photo: its make, model, focal length and the size of the photo.
-
-    Returns None if EXIF data do not tell, and with pycolmap 3.
-    """
-    if not hasattr(pycolmap.Bitmap, "exif_camera_model"):
-        return None
-    bitmap = pycolmap.Bitmap.read(image, False)
-    return bitmap.exif_camera_model() if bitmap is not None else None
-
-
 @contextmanager
 def _log(
     verbose: bool, least: pycolmap.logging.Level = pycolmap.logging.Level.WARNING
