@@ -80,6 +80,8 @@ def _main() -> None:
         epilog="example: python -m pipelines.aachen --feature colmap_sift_sv64 --demo",
         formatter_class=cli.HelpFormatter,
     )
+    truth = "<dataset>/queries/ground_truth_poses.txt"
+    options.add_dataset_options(parser, "datasets/aachen_v1.1", truth, NUMBERS["num_loc"])
     parser.add_argument(
         "--demo",
         action="store_true",
@@ -92,8 +94,6 @@ def _main() -> None:
         default=NUMBERS["num_covis"],
         help="other images that each map image is matched with",
     )
-    truth = "<dataset>/queries/ground_truth_poses.txt"
-    options.add_dataset_options(parser, "datasets/aachen_v1.1", truth, NUMBERS["num_loc"])
     given = options.parse(parser)
     is_demo = given.pop("demo")
     default = "datasets/demo_town" if is_demo else "datasets/aachen_v1.1"
