@@ -50,12 +50,13 @@ confs = {name: feature(name, base(name)) for name in SCHEMES} | {
 }
 
 
-def dimension(name: str) -> int:
-    """Return how many numbers the descriptors of a key of `confs` have."""
-    digits = re.search(r"\d+$", name)
-    if digits:
-        return int(digits[0])
-    return DIMS[0] if name.endswith("_nested") else DIM
+def dimension(name: str) -> int | None:
+    """Return the dimension of the descriptors of a key of `confs`; None if only its model knows."""
+    projection = confs[name]["model"].get("projection")
+    if projection is None:
+        return DIM if descriptor_of(confs[name]["model"]) else None
+    digits = re.search(r"\d+$", projection)
+    return int(digits[0]) if digits else DIMS[0]
 
 
 def table() -> str:
@@ -63,7 +64,8 @@ def table() -> str:
     lines = [("feature", "numbers", "bytes", "weights")]
     for name, conf in confs.items():
         dim = dimension(name)
-        lines.append((name, str(dim), str(2 * dim), _weights(conf["model"])))
+        numbers = (str(dim), str(2 * dim)) if dim else ("", "")
+        lines.append((name, *numbers, _weights(conf["model"])))
     return aligned(lines, left=4)
 
 
@@ -71,7 +73,9 @@ def _weights(model: dict) -> str:
     """Say where the weights of a model come from."""
     projection = model.get("projection")
     if projection is None:
-        descriptor = DESCRIPTORS.get(model["descriptor"])
+        descriptor = DESCRIPTORS.get(descriptor_of(model) or "")
+        if descriptor is None and model["name"] != "dog":
+            return f"see extractors/{model['name']}.py"
         return "downloaded on first use" if descriptor and descriptor.urls else "none needed"
     if projections.split_prefix(projection)[0] in projections.names():
         return "shipped"

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import torch
 
-from .. import aggregators, extractors
+from .. import aggregators, extractors, matchers
 from ..aggregators.vlad import read_vocabulary
 from ..confs import matchers as matchers_confs
 from ..localization import intrinsics, query
@@ -15,7 +15,6 @@ from ..localization.confidence import DEFAULT_GATE, Gate
 from ..localization.query import merged
 from ..localization.references import SfmMap
 from ..localize_sfm import RANSAC_THRESH
-from ..matchers.nearest_neighbor import mutual_nearest
 from ..pairs_from_retrieval import rank, read_global
 from ..runtime import parallel
 from ..utils import colmap
@@ -56,7 +55,7 @@ class Localizer:
         self.preprocessing = built.conf["preprocessing"]
         self.storage, self.cameras = built.storage, built.cameras
         matcher: dict = matchers_confs.confs[built.matcher]["model"]
-        self.ratio_threshold = matcher.get("ratio_threshold")
+        self.matcher = matchers.load(matcher).eval()
         self.gate = gate.of_matches(matcher, dimension(built.features))
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
         self.extractor = extractors.load(built.conf["model"]).eval().to(self.device)
@@ -141,11 +140,7 @@ class Localizer:
         """Match descriptors (N, D) with those of map images that show a point."""
 
         def match(name: str) -> np.ndarray:
-            shown = self.shown[name]
-            found, _ = mutual_nearest(
-                self.descriptors[name], descriptors, self.ratio_threshold, shown
-            )
-            matched = found >= 0
-            return torch.stack([found[matched], shown[matched]], dim=1).cpu().numpy()
+            described, shown = self.descriptors[name], self.shown[name]
+            return self.matcher.match_rows(descriptors, described, shown).cpu().numpy()
 
         return dict(zip(names, parallel.ordered("match", match, names), strict=True))

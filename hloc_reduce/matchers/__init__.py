@@ -34,6 +34,23 @@ class Matcher(BaseModel):
         found = [self({"descriptors0": a.T[None], "descriptors1": b.T[None]}) for a, b in pairs]
         return [(one["matches0"][0], one["matching_scores0"][0]) for one in found]
 
+    def match_rows(
+        self, descriptors0: torch.Tensor, descriptors1: torch.Tensor, rows1: torch.Tensor
+    ) -> torch.Tensor:
+        """Match a pair and keep the matches of some descriptors1; a subclass may skip the others.
+
+        Args:
+            descriptors0: (N, D) of unit norm.
+            descriptors1: (M, D) of unit norm.
+            rows1: (K,) int64, ascending rows of descriptors1.
+
+        Returns:
+            Matches (L, 2) int64, rows of descriptors0 and descriptors1.
+        """
+        ((matches0, _),) = self.match([(descriptors0, descriptors1)])
+        rows0 = torch.nonzero(torch.isin(matches0, rows1))[:, 0]
+        return torch.stack([rows0, matches0[rows0]], dim=1)
+
 
 def load(conf: dict) -> Matcher:
     """Make the matcher of a model configuration, whose `name` is a module of this package.

@@ -223,6 +223,20 @@ class NearestNeighbor(Matcher):
         results = (found[i] for i in range(len(pairs)))
         return [(m, torch.where(m >= 0, (cosine + 1) / 2, 0)) for m, cosine in results]
 
+    @torch.no_grad()
+    def match_rows(
+        self, descriptors0: torch.Tensor, descriptors1: torch.Tensor, rows1: torch.Tensor
+    ) -> torch.Tensor:
+        """Match only some descriptors1, see `Matcher.match_rows`."""
+        if not self.conf["do_mutual_check"]:
+            return super().match_rows(descriptors0, descriptors1, rows1)
+        matches1, _ = mutual_nearest(
+            *(descriptors1, descriptors0, self.conf["ratio_threshold"], rows1),
+            distance_threshold=self.conf["distance_threshold"],
+        )
+        matched = matches1 >= 0
+        return torch.stack([matches1[matched], rows1[matched]], dim=1)
+
     def _forward(self, data: dict) -> dict:
         pair = (data["descriptors0"][0].T.contiguous(), data["descriptors1"][0].T.contiguous())
         ((matches, scores),) = self.match([pair])
