@@ -16,7 +16,7 @@ from hloc_reduce.utils import cli
 from hloc_reduce.utils.paths import strings_as_paths
 
 from . import options
-from .run import DatasetRun, Settings
+from .run import SHARED_POINTS, DatasetRun, Settings
 
 NUMBERS = {"num_loc": 40}
 Place = InLoc
@@ -44,7 +44,7 @@ def main(
         settings: further arguments of `DatasetRun`.
     """
     place = InLoc(dataset)
-    points = features.with_name("points3D.h5") if features else None
+    points = features.with_name(SHARED_POINTS) if features else None
     with DatasetRun(place, outputs, feature, num_loc, features=features, **settings) as run:
         # by all cutouts, so that unreadable ones change no list
         lists = place.buildings(run.query_names, run.truth, run.map_names)

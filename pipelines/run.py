@@ -43,6 +43,7 @@ from hloc_reduce.utils.parsers import parse_pairs, parse_retrieval, write_pairs
 from hloc_reduce.utils.paths import strings_as_paths
 
 Thresholds = Mapping[str, tuple[tuple[float, float], ...]]  # of each query list, metres and degrees
+SHARED_POINTS = "points3D.h5"  # beside given features of InLoc: the 3D points of their keypoints
 GLOBAL_SUFFIXES = (".h5", ".hdf5")  # of global descriptors; other retrieval files are text
 
 

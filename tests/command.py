@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -16,7 +17,8 @@ from hloc_reduce.utils.h5 import iterate_h5_names
 def run(monkeypatch: pytest.MonkeyPatch, pipeline: ModuleType, *arguments) -> None:
     """Run its command line."""
     monkeypatch.setattr(sys, "argv", [pipeline.__name__, *map(str, arguments)])
-    cli.run(pipeline._main)
+    is_package = hasattr(pipeline, "__path__")
+    cli.run((import_module(f"{pipeline.__name__}.__main__") if is_package else pipeline)._main)
 
 
 def refused(

@@ -167,7 +167,7 @@ def test_retrieval_from_files(aachen_layout, tmp_path, monkeypatch, caplog):
     arguments[-1] = tmp_path / "outputs3"
     message = refused(monkeypatch, caplog, *arguments, "--retrieval", prose)
     assert "prose.txt:1" in message and not arguments[-1].exists()
-    assert "neither vlad nor a file" in refused(
+    assert "neither vlad nor an existing file" in refused(
         monkeypatch, caplog, *arguments, "--retrieval", tmp_path / "absent.h5"
     )
 
@@ -254,8 +254,11 @@ def test_features_are_listed(monkeypatch, capsys):
     with pytest.raises(SystemExit) as exit:
         run(monkeypatch, "--list_features")
     assert not exit.value.code
-    names = capsys.readouterr().out.split()
-    assert names[0] == "sift" and "sift_sv16" in names and "sift_pca64" in names
+    lines = capsys.readouterr().out.splitlines()
+    cells = [[cell.strip() for cell in line.split("|")] for line in lines]
+    rows = {name: values for name, *values in cells}
+    assert list(rows)[:2] == ["feature", "sift"]
+    assert rows["sift_sv16"] == ["16", "32", "shipped"] and rows["sift_pca64"][:2] == ["64", "128"]
 
 
 def test_herz_jesus(herz_jesus, tmp_path, monkeypatch):

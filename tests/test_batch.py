@@ -266,7 +266,7 @@ def test_a_job_that_fails_does_not_stop_the_others(aachen_layout, run_batch, mon
     with pytest.raises(SystemExit) as exit:
         run_batch(grid)
     assert exit.value.code == 2
-    assert "(3 in all)" in caplog.records[-1].getMessage()
+    assert "3 jobs failed" in caplog.records[-1].getMessage()
     rows = table(aachen_layout.parent / "out/jobs.csv")
     errors = [(row["dataset"], row["job"], row["error"]) for row in rows if row["error"]]
     nowhere = f"There is no folder {Path('nowhere').absolute()}."
@@ -389,7 +389,7 @@ def test_two_features_of_one_file_name(aachen_layout, run_batch, tmp_path, caplo
         grids.append({"dataset": str(aachen_layout), "feature": str(feature), "num_loc": dim})
     with pytest.raises(SystemExit):
         run_batch(*grids)
-    assert "my+num_loc16: feats-my.h5 is that of another feature, too" in caplog.text
+    assert "my+num_loc16: feats-my.h5 is the file of two features" in caplog.text
     rows = table(tmp_path / "out/jobs.csv")
     assert {row["job"]: row["descriptor_bytes"] for row in rows} == {
         "my+num_loc64": "128",
@@ -478,7 +478,7 @@ def test_what_can_be_known_is_refused_before_any_work(
             options=("--dry_run",),
         )
     errors = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
-    assert len(errors) == 4 and "(3 in all)" in errors[3]
+    assert len(errors) == 4 and "3 jobs failed" in errors[3]
     assert "lacks" in errors[0] and "query/night" in errors[0]
     assert "lacks 1 files of scans" in errors[1]
 

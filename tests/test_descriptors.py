@@ -109,7 +109,7 @@ def test_weights_are_downloaded_once_and_checked(tmp_path, monkeypatch):
 
     monkeypatch.setattr(downloads, "urlopen", urlopen)
     sent = {mirror: other, source: other[:9]}
-    with pytest.raises(InputError, match="resolve/main/tfeat.*not the sha256.*raw/master"):
+    with pytest.raises(InputError, match="resolve/main/tfeat.*not have the sha256.*raw/master"):
         Descriptor("tfeat")
     assert not path.exists()
     sent[source] = weights

@@ -537,7 +537,7 @@ def test_reconstruction_from_matches_alone(scene, tmp_path):
     assert not (tmp_path / "no").exists()
     cv2.imwrite(str(scene.images / "db/3.jpg"), np.zeros((100, 100), np.uint8))
     parsers.write_pairs([(a, b) for a in names for b in names if a < b], pairs)
-    with pytest.raises(InputError, match="share a camera with: db/3.jpg"):
+    with pytest.raises(InputError, match="share their camera: db/3.jpg"):
         reconstruction.main(tmp_path / "no", *arguments, **shared)
 
 

@@ -238,7 +238,7 @@ def test_released_networks_are_downloaded_once_and_checked(tmp_path, monkeypatch
         raise URLError("no network")
 
     monkeypatch.setattr(downloads, "urlopen", unreachable)
-    with pytest.raises(InputError, match="hardnet_sv64 are not there.*no network.*checkpoints"):
+    with pytest.raises(InputError, match="hardnet_sv64 are missing.*no network.*checkpoints"):
         projections.load("hardnet_sv64")
 
 

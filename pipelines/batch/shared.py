@@ -17,9 +17,10 @@ from hloc_reduce.runtime.outputs import STAGES, RunFolder
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.files import announce
 
 from ..layouts import pipeline_of
-from ..run import check_retrieval, readable, retrieve
+from ..run import SHARED_POINTS, check_retrieval, readable, retrieve
 from .jobs import Job
 
 RECORD = "shared.json"  # the feature file that VLAD uses, in later runs too
@@ -155,6 +156,8 @@ class Shared:
             self.failing(self.running()),
             RunFolder(self.folder, conf, overwrite) as folder,
         ):
+            for name in (SHARED_POINTS, f"{SHARED_POINTS}.pieces"):  # written by jobs
+                announce(self.folder / name)
             with folder.stage("extract_features"):
                 for group in self.groups():
                     with self.failing([j for j in self.running() if self.features[j] in group]):
