@@ -35,6 +35,7 @@ DISTORTED, UNCLEAR, RIGHT = 1.02, 1.05, 1.1
 # to contradict them, as many lists give focal lengths of EXIF data; and how uncertain a pose may be
 # if guessed intrinsics are all wrong, as those of a cropped photo
 LENIENT, CROPPED = 2.0, 3.0
+OFF_CENTRE = 0.15  # of the size of a photo, from its centre to its principal point
 
 
 @dataclass(frozen=True)
@@ -211,6 +212,12 @@ def _is_focal_length_free(config: dict) -> bool:
     )
 
 
+def _is_off_centre(camera: pycolmap.Camera) -> bool:
+    """Tell whether listed intrinsics are those of a crop, or wrong."""
+    point = np.array([camera.principal_point_x, camera.principal_point_y])
+    return bool((np.abs(point / [camera.width, camera.height] - 0.5) > OFF_CENTRE).any())
+
+
 def _refusal(
     pose: Pose,
     rivals: list[Pose],
@@ -245,13 +252,18 @@ def _refusal(
             f"the inliers do not fix the pose: its position is uncertain by {100 * position:.0f} % "
             f"of their distance, its rotation by {rotation:.1f} degrees"
         )
-    if config.get("photo", {}).get("cropped"):  # perhaps
+    is_cropped = config.get("photo", {}).get("cropped")  # perhaps
+    if is_cropped or _is_off_centre(camera):
         position, rotation = uncertainty(*chosen, pose.cam_from_world, pose.camera, resection.ALL)
         if position > CROPPED * MAX_POSITION or rotation > CROPPED * MAX_ROTATION:
+            why = (
+                "it may be cropped"
+                if is_cropped
+                else "its principal point is far from the centre of the photo"
+            )
             return (
-                "it may be cropped: its intrinsics are not known, and without them its position is "
-                f"uncertain by {100 * position:.0f} % of the distance, its rotation by "
-                f"{rotation:.1f} degrees"
+                f"{why}, and without its intrinsics its position is uncertain by "
+                f"{100 * position:.0f} % of the distance, its rotation by {rotation:.1f} degrees"
             )
     least = gate.least_agreement(pose.confidence)
     if pose.agreement < least:

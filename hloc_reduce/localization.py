@@ -34,7 +34,7 @@ from .storage import dimension
 
 CHUNK = 8  # queries
 SHOWN = 3  # queries that a message gives the reason of
-RECORDS = 9  # the version of what a record holds, and of the gate
+RECORDS = 10  # the version of what a record holds, and of the gate
 
 
 class Reference(Protocol):
