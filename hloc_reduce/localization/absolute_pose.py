@@ -37,6 +37,7 @@ RIGHT = 1.1  # above it, the other intrinsics are right
 # multiples of MAX_POSITION and MAX_ROTATION
 LENIENT = 2.0  # between poses of contradicting intrinsics: many lists have those of EXIF data
 CROPPED = 3.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
+OFF_CENTRE = 0.15  # distance of the principal point from the centre, as a share of the size
 
 
 @dataclass(frozen=True)
@@ -266,7 +267,10 @@ def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d
     inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
     limits = [(pose.degrees_of_freedom, 1.0, "the inliers do not fix the pose: its")]
     if matches.config.get("photo", {}).get("cropped"):
-        reason = "it may be cropped: its intrinsics are not known, and without them its"
+        reason = "it may be cropped, and without its intrinsics its"
+        limits.append((ALL, CROPPED, reason))
+    elif _is_off_centre(matches.camera):
+        reason = "its principal point is far from the centre of the photo, and without its intrinsics its"
         limits.append((ALL, CROPPED, reason))
     for freedom, limit, reason in limits:
         position, rotation = uncertainty(*inliers, cam_from_world, pose.camera, freedom)
@@ -276,6 +280,12 @@ def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d
                 f"rotation by {rotation:.1f} degrees"
             )
     return None
+
+
+def _is_off_centre(camera: pycolmap.Camera) -> bool:
+    """Tell whether listed intrinsics belong to a cropped photo, or are wrong."""
+    point = np.array([camera.principal_point_x, camera.principal_point_y])
+    return bool((np.abs(point / [camera.width, camera.height] - 0.5) > OFF_CENTRE).any())
 
 
 def differ(
