@@ -270,7 +270,7 @@ def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d
         reason = "it may be cropped, and without its intrinsics its"
         limits.append((ALL, CROPPED, reason))
     elif _is_off_centre(matches.camera):
-        reason = "its principal point is far from the centre of the photo, and without its intrinsics its"
+        reason = "its principal point is far from the centre, and without its intrinsics its"
         limits.append((ALL, CROPPED, reason))
     for freedom, limit, reason in limits:
         position, rotation = uncertainty(*inliers, cam_from_world, pose.camera, freedom)
