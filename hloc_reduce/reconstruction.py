@@ -119,6 +119,7 @@ def main(
         "overlays": "dropped",
         "attempts": attempts,
         "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
+        "viewpoints": VIEWPOINTS,
         "once": once,
     }
     made_from = provenance.of_inputs({**options, **chosen}, [pairs, features, matches])
