@@ -24,7 +24,7 @@ WHOLE = ("map.json", "queries.csv", "summary.json")  # mark a finished run, so d
 BOOKKEEPING = {CONF, STAGES, FILES, "summary.json", "queries.csv", "trace.json"}
 DELETING = {"is": "being deleted"}  # configuration of a folder whose deletion was interrupted
 NAMED = 3  # differences that a message names
-SHORT = 40  # characters of values that it shows
+SHORT = 60  # characters of values that it shows
 
 
 class Lock:
@@ -233,21 +233,23 @@ class RunFolder:
 
 
 def _changes(before: dict, after: dict) -> dict[str, str]:
-    """Return the keys whose values differ, with the differing entries of those that are dicts."""
+    """Return the keys whose values differ, with what differs in them."""
     changes = {}
     for key in {**before, **after}:
-        old, new = before.get(key), after.get(key)
-        if old == new:
-            continue
-        changes[key] = ""
-        if isinstance(old, dict) and isinstance(new, dict):
+        if before.get(key) != after.get(key):
+            old, new = _leaves(before.get(key, "not given")), _leaves(after.get(key, "not given"))
             names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+            said = []
+            for name in names[:NAMED]:
+                values = f"{old.get(name, 'not given')} before, {new.get(name, 'not given')} now"
+                said.append(f"{name} {values}".strip() if len(values) < SHORT else name)
             more = ", ..." if len(names) > NAMED else ""
-            said = [
-                f"{name} {old.get(name, 'not given')} before, {new.get(name, 'not given')} now"
-                if len(f"{old.get(name)}{new.get(name)}") < SHORT
-                else name
-                for name in names[:NAMED]
-            ]
-            changes[key] = f" ({', '.join(said)}{more})"
+            changes[key] = f" ({', '.join(said)}{more})" if any(said) else ""
     return changes
+
+
+def _leaves(value: object, name: str = "") -> dict[str, object]:
+    """Return the values in nested dicts by the names of their keys."""
+    if not isinstance(value, dict):
+        return {name: value}
+    return {key: leaf for name in value for key, leaf in _leaves(value[name], name).items()}
