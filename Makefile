@@ -22,9 +22,8 @@ test: $(VENV)/installed $(OLD)/installed
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
 	OMP_NUM_THREADS=1 PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest -n 2 --dist loadfile \
-		tests/test_dog.py tests/test_stages.py \
-		tests/test_aachen.py::test_plane tests/test_inloc.py::test_plane tests/test_localize.py \
-		-k "not test_localize or intrinsics or reconstruction or the_same_as"
+		tests/models/test_dog.py tests/stages tests/maps \
+		tests/pipelines/test_aachen.py::test_plane tests/pipelines/test_inloc.py::test_plane
 
 test-long: $(VENV)/installed
 	$(BIN)/python -m pytest -m long

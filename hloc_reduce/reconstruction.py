@@ -450,7 +450,10 @@ def shortfall(
         )
         tries.append("add photos between the parts, each overlapping the one before by two thirds")
     elif set(missing) - set(unmatched) - set(implausible):
-        tries.append("add photos between those in the map and those that are not")
+        tries.append(
+            "add photos between those in the map and those that are not, and leave out photos of "
+            "other places"
+        )
     if unmatched:
         said.append(f"No other photo matches {cli.some(unmatched)}.")
         tries.append("leave out photos of other places, and retake blurred or dark ones")

@@ -10,6 +10,7 @@ from types import ModuleType
 import h5py
 import pytest
 
+from hloc_reduce.runtime.outputs import LOCK
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.h5 import iterate_h5_names
 
@@ -42,6 +43,23 @@ def outcome(outputs: Path) -> tuple[dict, dict[str, dict]]:
     with (outputs / "queries.csv").open() as file:
         rows = {row["query"]: row for row in csv.DictReader(file)}
     return json.loads((outputs / "summary.json").read_text()), rows
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def state(folder: Path) -> dict[Path, int]:
+    """Return when each file in a folder was written."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
+    return {path: path.stat().st_mtime_ns for path in files}
 
 
 def contents(path: Path) -> dict:

@@ -1,10 +1,13 @@
 """What tests share: the folder of real data, and a small scene with answers known in advance."""
 
+import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import command
 import cv2
 import h5py
 import numpy as np
@@ -13,7 +16,8 @@ import pytest
 from scipy.io import savemat
 
 from hloc_reduce.descriptors import weights
-from hloc_reduce.utils import colmap
+from hloc_reduce.utils import cli, colmap
+from pipelines import batch
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -255,3 +259,45 @@ def scan_frame(number: int) -> np.ndarray:
     matrix[:3, :3] = cv2.Rodrigues(np.array([0.3 * number, -0.2, 0.5]))[0]
     matrix[:3, 3] = [number, 2, -1]
     return matrix
+
+
+@pytest.fixture(autouse=True)
+def propagated(monkeypatch) -> None:
+    """Has caplog hear what is logged. pytest decides before the test begins how it listens."""
+    monkeypatch.setattr(cli.logger, "propagate", True)
+
+
+@pytest.fixture
+def run(request, monkeypatch) -> Callable[..., None]:
+    """Runs the command line of the pipeline that is the PIPELINE of a test's file."""
+    return partial(command.run, monkeypatch, request.module.PIPELINE)
+
+
+@pytest.fixture
+def refused(request, monkeypatch, caplog) -> Callable[..., str]:
+    """The same with wrong input; returns the message."""
+    return partial(command.refused, monkeypatch, caplog, request.module.PIPELINE)
+
+
+@pytest.fixture
+def place(aachen_layout, tmp_path) -> tuple[tuple, Path, Path]:
+    """The options that build a map of the plane, its photos, and the folder of its outputs."""
+    model, images = aachen_layout / "3D-models/aachen_v_1_1", aachen_layout / "images_upright"
+    outputs = tmp_path / "outputs"
+    return ("--map", model, "--map_images", images, "--outputs", outputs), images, outputs
+
+
+@pytest.fixture
+def run_batch(tmp_path, monkeypatch, capsys) -> Callable[..., Path]:
+    """Runs the batch of a grid in this process and returns its outputs and what it printed."""
+
+    def run(*grids, options=()):
+        job_file = command.write(tmp_path / "jobs.yaml", json.dumps({"jobs": list(grids)}))
+        arguments = (job_file, "--outputs", tmp_path / "out", "--executor", "serial", *options)
+        try:
+            command.run(monkeypatch, batch, *arguments)
+        finally:
+            run.printed = capsys.readouterr().out
+        return tmp_path / "out"
+
+    return run

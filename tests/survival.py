@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import random
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -197,6 +198,32 @@ def _log_computed(log: Path) -> None:
     if not hasattr(pieces.add, "logs"):
         pieces.add = logging(pieces.add, lambda self: self.folder.name.removesuffix(".pieces"))
         records.add = logging(records.add, lambda self: self.path.name)
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from hloc_reduce import extract_features
+from hloc_reduce.runtime.executors import processes_of_this_machine
+from hloc_reduce.utils import cli
+from pipelines import aachen
+
+def main():
+    extract_features.CHUNK = 2
+    with processes_of_this_machine(2) as executor:
+        aachen.main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], executor=executor)
+
+cli.run(main)
+"""
+
+
+def start(place, outputs, workers=None):
+    """Start the pipeline for Aachen: its command line, or a program with so many processes."""
+    given = ["-m", "pipelines.aachen", "--dataset", place, "--outputs", outputs, "--feature"]
+    if workers:
+        given = ["-c", PROGRAM, place, outputs]
+    command = [sys.executable, *given, FEATURE]
+    return subprocess.Popen(command, stdout=-1, stderr=-1, text=True, start_new_session=True)
 
 
 def processes_of_session(session: int) -> list[str]:

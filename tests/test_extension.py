@@ -76,10 +76,6 @@ def test_nearest_neighbors_of_some_rows(do_mutual_check):
 def test_a_conf_of_hlocs_is_taken_word_for_word(tmp_path):
     conf = {
         "output": "matches-NN-mutual-dist.7",
-        "model": {
-            "name": "nearest_neighbor",
-            "do_mutual_check": True,
-            "distance_threshold": 0.7,
-        },
+        "model": {"name": "nearest_neighbor", "do_mutual_check": True, "distance_threshold": 0.7},
     }
     assert matchers.load(conf["model"]).conf["distance_threshold"] == 0.7

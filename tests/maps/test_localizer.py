@@ -1,0 +1,174 @@
+"""Photos localized one at a time in memory, as by files."""
+
+import shutil
+import sys
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from command import outcome
+
+from hloc_reduce import Localizer, maps
+from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.utils import cli, parsers
+from hloc_reduce.utils.cli import InputError
+from pipelines import aachen, localize
+
+PIPELINE = localize
+
+
+def test_the_same_as_the_pipeline_of_aachen(
+    place, aachen_layout, tmp_path, monkeypatch, capsys, run
+):
+    """And the same one photo at a time."""
+    build, images, outputs = place
+    queries = aachen_layout / "queries/*_time_queries_with_intrinsics.txt"
+    truth = aachen_layout / "queries/ground_truth_poses.txt"
+    new = ("--queries", queries, "--query_images", images, "--ground_truth", truth)
+    run(*build, *new, "--feature", "sift_sv24")
+    summary, rows = outcome(outputs / "queries-time_queries_with_intrinsics")
+    assert summary["intrinsics"] == {"list": 3} and summary["feature"] == "sift_sv24"
+    assert "100.0 / 100.0 / 100.0" in capsys.readouterr().out
+
+    place = ("--dataset", aachen_layout, "--outputs", tmp_path / "aachen")
+    monkeypatch.setattr(sys, "argv", ["aachen", *map(str, place), "--feature", "sift_sv24"])
+    cli.run(aachen._main)
+    expected = outcome(tmp_path / "aachen")[1]
+    assert rows == expected and rows["query/day/a.png"]["status"] == "localized"
+
+    localizer = Localizer(outputs / "map")
+    poses = parsers.parse_poses(outputs / "queries-time_queries_with_intrinsics" / summary["poses"])
+    for name, camera in [q for part in parsers.parse_query_lists(queries).values() for q in part]:
+        pose, info = localizer.localize(images / name, camera)
+        row = rows[name]
+        for key in ("num_matches", "num_correspondences", "num_inliers"):
+            assert info[key] == int(row[key])
+        assert info["confidence"] == float(row["confidence"])
+        assert (info["reason"] or "") == row["reason"]
+        assert info["retrieved"][0] == row["retrieved"] and info["intrinsics"] == "given"
+        if row["status"] == "localized":
+            assert max(pose_error(pose, poses[name])) < 1e-9
+            assert len(info["points2D"]) == len(info["points3D"]) == info["num_correspondences"]
+            assert info["inliers"].sum() == info["num_inliers"]
+            projected = camera.img_from_cam(
+                info["points3D"] @ pose.rotation.matrix().T + pose.translation
+            )
+            errors = np.linalg.norm(projected - info["points2D"], axis=1)
+            assert errors[info["inliers"]].max() < 12
+        else:
+            assert pose is None and info["num_inliers"] == 0
+
+
+def test_queries_called_as_map_photos(place, tmp_path, run):
+    """They are other photos: every pair is matched, also one that looks like another's reverse."""
+    build, images, outputs = place
+    new = tmp_path / "new/db"
+    new.mkdir(parents=True)
+    for name in ("0.png", "1.png", "3.png"):
+        shutil.copy(images / "query/day/a.png", new / name)
+    run(*build, "--query_images", new.parent)
+    summary, rows = outcome(outputs / "queries-new")
+    assert set(rows) == {"db/0.png", "db/1.png", "db/3.png"}
+    assert len({tuple(row.values())[2:] for row in rows.values()}) == 1
+    localizer = Localizer(outputs / "map")
+    pose, info = localizer.localize(new / "1.png")
+    assert (
+        info["num_matches"] == int(rows["db/1.png"]["num_matches"]) and len(info["retrieved"]) == 4
+    )
+    poses = parsers.parse_poses(outputs / "queries-new" / summary["poses"])
+    assert max(pose_error(pose, poses["db/1.png"])) < 1e-9
+
+
+def with_exif(photo, path, focal_35mm):
+    """Write a JPEG whose EXIF data give the focal length in 35 mm film."""
+    ifd = b"\x01\x00" + b"\x05\xa4\x03\x00\x01\x00\x00\x00" + focal_35mm.to_bytes(4, "little")
+    root = b"\x01\x00" + b"\x69\x87\x04\x00\x01\x00\x00\x00" + (26).to_bytes(4, "little")
+    tiff = b"II*\x00\x08\x00\x00\x00" + root + b"\x00" * 4 + ifd + b"\x00" * 4
+    segment = b"Exif\x00\x00" + tiff
+    _, jpeg = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    length = (len(segment) + 2).to_bytes(2, "big")
+    path.write_bytes(b"\xff\xd8\xff\xe1" + length + segment + jpeg.tobytes()[2:])
+
+
+def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, caplog, run):
+    """The camera has 500 pixels; 36 mm say 499 (of the diagonal), a guess is 576."""
+    build, images, outputs = place
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    photo = cv2.imread(str(images / "query/day/a.png"))
+    with_exif(photo, photos / "exif.jpg", 36)
+    cv2.imwrite(str(photos / "guess.png"), photo)
+    truth = parsers.parse_poses(aachen_layout / "queries/ground_truth_poses.txt")["query/day/a.png"]
+    caplog.set_level("INFO")
+    run(*build, "--query_images", photos)
+    assert "1 queries are from EXIF data" in caplog.text and "1 queries are guessed" in caplog.text
+    summary, rows = outcome(outputs / "queries-photos")
+    assert summary["intrinsics"] == {"EXIF": 1, "guess": 1}
+    listed = outputs / "queries-photos/queries_with_intrinsics.txt"
+    cameras = dict(parsers.parse_query_list(listed))
+    assert abs(cameras["exif.jpg"].params[0] - 499) < 1 and cameras["guess.png"].params[0] == 576
+    poses = parsers.parse_poses(outputs / "queries-photos" / summary["poses"])
+    localizer = Localizer(outputs / "map")
+    for name in ("exif.jpg", "guess.png"):
+        assert rows[name]["status"] == "localized"
+        metres, degrees = pose_error(poses[name], truth)
+        assert metres < 0.1 and degrees < 1, name  # 2.2 m away
+        pose, info = localizer.localize(photos / name)
+        assert max(pose_error(pose, poses[name])) < 1e-9
+        assert abs(info["camera"].params[0] - 500) < 25
+    # pixels are localized as files are, but have no EXIF data
+    pixels = cv2.imread(str(photos / "guess.png"))[:, :, ::-1]
+    pose, info = localizer.localize(np.ascontiguousarray(pixels))
+    assert info["intrinsics"] == "guess" and max(pose_error(pose, poses["guess.png"])) < 0.1
+    with pytest.raises(InputError, match="has 240x180 pixels, the photo has 480x360"):
+        localizer.localize(
+            photos / "guess.png",
+            pycolmap.Camera(model="SIMPLE_PINHOLE", width=240, height=180, params=[250, 120, 90]),
+        )
+    small = tmp_path / "small.txt"
+    small.write_text("guess.png SIMPLE_PINHOLE 240 180 250 120 90\n")
+    run(*build, "--query_images", photos, "--queries", small)
+    reason = "the intrinsics are for 240x180 pixels, the photo has 480x360"
+    assert f"Not localized: guess.png ({reason})." in caplog.text
+    for wrong in (pixels.astype(float), pixels[None], np.zeros((0, 3), np.uint8)):
+        with pytest.raises(InputError, match="uint8"):
+            localizer.localize(wrong)
+
+
+@pytest.mark.parametrize("by_model", [True, False])
+def test_names_with_spaces(by_model, plane, tmp_path, run):
+    """Of photos and of folders; hloc's lists cannot hold them, ours have tabs."""
+    images, new, outputs = tmp_path / "my photos", tmp_path / "new ones", tmp_path / "my outputs"
+    for folder in (images / "a b", new):
+        folder.mkdir(parents=True)
+    model = pycolmap.Reconstruction(plane / "model")
+    for image in model.images.values():
+        image.name = f"a b/my {image.name}"
+        shutil.copy(plane / "images" / image.name[-5:], images / image.name)
+    shutil.move(images / "a b/my 4.png", new / "I am 4.png")
+    query = model.find_image_with_name("a b/my 4.png")
+    true = query.cam_from_world()
+    model.deregister_frame(query.frame_id)
+    (tmp_path / "my model").mkdir()
+    model.write(tmp_path / "my model")
+    given = ("--map_images", images, "--query_images", new, "--outputs", outputs)
+    given += ("--feature", "sift_sv16")
+    run(*given, *(("--map", tmp_path / "my model") if by_model else ()))
+    summary, rows = outcome(outputs / "queries-new_ones")
+    row = rows["I am 4.png"]
+    assert row["status"] == "localized" and row["retrieved"].startswith("a b/my ")
+    assert maps.Map(outputs / "map").names() == [f"a b/my {i}.png" for i in range(4)]
+    poses = parsers.parse_poses(outputs / "queries-new_ones" / summary["poses"])
+    assert list(poses) == ["I am 4.png"]
+    pose, info = Localizer(outputs / "map").localize(new / "I am 4.png")
+    assert max(pose_error(pose, poses["I am 4.png"])) < 1e-9
+    assert info["retrieved"][0] == row["retrieved"]
+    if by_model:  # and with a list, of the right intrinsics
+        assert pose_error(pose, true)[0] < 0.2
+        camera = "SIMPLE_PINHOLE 480 360 500 240 180"
+        (tmp_path / "my list.txt").write_text(f"I am 4.png\t{camera}\n")
+        run(*given[2:], "--map", outputs / "map", "--queries", tmp_path / "my list.txt")
+        summary, rows = outcome(outputs / "queries-my_list")
+        poses = parsers.parse_poses(outputs / "queries-my_list" / summary["poses"])
+        assert pose_error(poses["I am 4.png"], true)[0] < 0.02

@@ -1,0 +1,244 @@
+"""A map on disk: built once, kept, moved, stale, broken."""
+
+import json
+import os
+import shutil
+
+import cv2
+import pycolmap
+import pytest
+from command import outcome, state
+
+from hloc_reduce import Localizer, maps, projections
+from hloc_reduce.training import tracks
+from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.utils import parsers
+from hloc_reduce.utils.cli import InputError
+from pipelines import localize
+
+PIPELINE = localize
+
+
+def test_a_map_is_built_once(place, capsys, run, refused):
+    build, images, outputs = place
+    run(*build)
+    assert "Localize photos in it with --query_images" in capsys.readouterr().out
+    before = state(outputs / "map")
+    for folder in ("query/day", "query/night"):
+        run(*build, "--query_images", images / folder)
+    assert state(outputs / "map") == before
+    summary, rows = outcome(outputs / "queries-day")
+    assert set(rows) == {"a.png", "grey.png"} and summary["intrinsics"] == {"guess": 2}
+    # a second run computes nothing, and writes no file anew
+    day = state(outputs / "queries-day")
+    run(*build, "--query_images", images / "query/day")
+    assert state(outputs / "queries-day") == day
+
+    # it may be moved, and used without what it was built from
+    moved = outputs.parent / "moved"
+    (outputs / "map").rename(moved)
+    shutil.move(images / "db", outputs.parent / "db")
+    run(
+        *("--map", moved, "--query_images", images / "query/day", "--outputs", outputs),
+        *("--feature", "colmap_sift_sv64"),
+    )
+    assert outcome(outputs / "queries-day")[0]["map"] == str(moved)
+    given = ("--map", moved, "--outputs", outputs)
+    message = refused(*given, "--feature", "sift_sv32")
+    assert "is of --feature colmap_sift_sv64." in message
+    message = refused(*given, "--matcher", "NN-mutual")
+    assert "was built with --matcher NN-ratio." in message
+    message = refused("--map", moved, "--outputs", outputs, "--map_images", images)
+    assert "leave out --map_images" in message
+
+
+def test_what_has_changed_is_noticed(place, aachen_layout, run, refused):
+    build, images, outputs = place
+    new = ("--query_images", images / "query/day")
+    run(*build, *new)
+    before, results = state(outputs / "map"), state(outputs / "queries-day")
+    message = refused(*build, "--feature", "sift_sv16")
+    assert (
+        "differs: feature (descriptor colmap_sift before, sift now, " in message
+        and "--overwrite" in message
+    )
+    photo = images / "db/2.png"
+    os.utime(photo, ns=(0, 0))  # copied, say: its content is what counts
+    run(*build)
+    content = photo.read_bytes()
+    cv2.imwrite(str(photo), 255 - cv2.imread(str(photo)))
+    assert "differs: images (db/2.png)" in refused(*build)
+    photo.unlink()
+    assert "1 of 4 images of the map are not in" in refused(*build)
+    photo.write_bytes(content)
+    model = aachen_layout / "3D-models/aachen_v_1_1"
+    reference = pycolmap.Reconstruction(model)
+    reference.deregister_frame(reference.find_image_with_name("db/3.png").frame_id)
+    reference.write(model)
+    message = refused(*build)
+    assert "images (db/3.png) and model (" in message and "images.bin" in message
+    assert state(outputs / "map") == before
+
+    # rebuilt on purpose: the results of the map before are not kept for it
+    run(*build, "--overwrite")
+    assert maps.Map(outputs / "map").names() == ["db/0.png", "db/1.png", "db/2.png"]
+    run(*build, *new)
+    after = state(outputs / "queries-day")
+    assert all(after[path] > results[path] for path in results if path.suffix in (".h5", ".csv"))
+    assert outcome(outputs / "queries-day")[0]["map_images"] == 3
+
+
+def test_inputs_are_not_deleted(place, tmp_path, run, refused):
+    build, images, outputs = place
+    run(*build)
+    before = state(outputs / "map")
+    arguments = ("--map", outputs / "map/sfm", *build[2:], "--overwrite", "--feature", "sift")
+    message = refused(*arguments)
+    assert "map/sfm is in" in message and "move it" in message
+    assert state(outputs / "map") == before
+
+
+def test_a_deletion_that_was_cut_short_goes_on(place, monkeypatch, run):
+    """Nothing of the map before gets into the new one."""
+    build, images, outputs = place
+    run(*build)
+    old = (outputs / "map/feats-dog-colmap_sift_sv64.h5").read_bytes()
+    unlink = type(outputs).unlink
+
+    def killed(path, *arguments, **options):
+        if path.name.startswith("feats-"):
+            raise KeyboardInterrupt
+        unlink(path, *arguments, **options)
+
+    with monkeypatch.context() as context:
+        context.setattr(type(outputs), "unlink", killed)
+        with pytest.raises(SystemExit):
+            run(*build, "--overwrite")
+    with pytest.raises(InputError, match="not a finished one"):
+        maps.Map(outputs / "map")
+    assert (outputs / "map/feats-dog-colmap_sift_sv64.h5").read_bytes() == old
+    run(*build)
+    assert (outputs / "map/feats-dog-colmap_sift_sv64.h5").read_bytes() != old  # it has another id
+
+
+def test_a_broken_map_is_refused(place, tmp_path, run, refused):
+    build, images, outputs = place
+    run(*build)
+    file = outputs / "map/map.json"
+    sound = json.loads(file.read_text())
+    for key, value in (
+        ("feature", "/../../x"),
+        ("matcher", "no_such"),
+        ("conf", {**sound["conf"], "output": "../x"}),
+        ("conf", {"output": "x"}),
+        ("conf", {**sound["conf"], "model": {"projection": "../x.safetensors"}}),
+        ("points3D", None),
+    ):
+        file.write_text(json.dumps({**sound, key: value}))
+        with pytest.raises(InputError, match=r"no sound map.json|Unknown matcher"):
+            maps.Map(outputs / "map")
+    file.write_text("[]")
+    arguments = ("--map", outputs / "map", "--outputs", tmp_path / "x", "--query_images", images)
+    assert "no sound map.json" in refused(*arguments)
+
+
+def test_a_map_with_a_broken_file_is_refused_before_any_work(place, tmp_path, run, refused):
+    build, images, outputs = place
+    run(*build, "--feature", "sift_sv16")
+    folder = outputs / "map"
+    given = ("--map", folder, "--outputs", tmp_path / "x", "--query_images", images / "query/day")
+    stem = "global-feats-vlad_feats-dog-sift_sv16"
+    for name in (
+        *("sfm/cameras.bin", "sfm/images.bin", "sfm/points3D.bin", "feats-dog-sift_sv16.h5"),
+        *(f"{stem}.h5", f"{stem}.vocabulary.safetensors", "sift_sv16.safetensors"),
+    ):
+        file = folder / name
+        content = file.read_bytes()
+        file.unlink()
+        message = refused(*given)
+        assert f"The map {folder} is broken: it has no {name}." in message
+        assert "--overwrite" in message
+        for damaged in (content[: len(content) // 2], b""):
+            file.write_bytes(damaged)
+            message = refused(*given)
+            assert str(file) in message or str(file.parent) in message, name
+        assert not (tmp_path / "x").exists()
+        file.write_bytes(content)
+    run(*given)
+
+
+def test_a_build_that_was_stopped_goes_on(place, run, refused):
+    build, images, outputs = place
+    photo = images / "db/3.png"
+    content = photo.read_bytes()
+    photo.write_bytes(b"no image")
+    assert "Cannot read image" in refused(*build)
+    with pytest.raises(InputError, match="not a finished one"):
+        maps.Map(outputs / "map")
+    message = refused("--map", outputs / "map", "--outputs", outputs, "--query_images", images)
+    assert "not a finished one" in message
+    photo.write_bytes(content)
+    run(*build)  # nothing was finished: the photo that changed is no matter
+    (outputs / "map/map.json").unlink()
+    before = state(outputs / "map")
+    run(*build)
+    again = state(outputs / "map")
+    kept = [path for path in before if path.suffix in (".h5", ".bin", ".txt")]
+    assert len(kept) > 6 and all(again[path] == before[path] for path in kept)
+
+
+def test_a_projection_is_kept_with_the_map(place, tmp_path, run):
+    """The map works when the file it was made with is gone."""
+    build, images, outputs = place
+    mine = tmp_path / "mine.safetensors"
+    shutil.copy(projections.find("sift_nested"), mine)
+    run(*build, "--feature", "sift", "--projection", f"{mine}@24")
+    built = maps.Map(outputs / "map")
+    assert built.feature == "mine@24"
+    built.check_feature("sift", f"{mine}@24")
+    shutil.copy(projections.find("mkd_nested"), mine)  # trained again, say
+    with pytest.raises(InputError, match="but not of the mine@24 that it is now"):
+        built.check_feature("sift", f"{mine}@24")
+    mine.unlink()
+    pose, info = Localizer(outputs / "map").localize(images / "query/day/a.png")
+    assert pose is not None and info["intrinsics"] == "guess"
+    run(
+        *("--map", outputs / "map", "--query_images", images / "query/day"),
+        *("--outputs", tmp_path / "other"),
+    )
+    assert outcome(tmp_path / "other/queries-day")[0]["bytes_per_keypoint"]["descriptor"] == 48
+
+
+@pytest.mark.parametrize("exhaustive", [4, 3])
+def test_a_model_of_poses_only(place, aachen_layout, monkeypatch, exhaustive, run):
+    """Without points nothing is covisible: all images are matched, or if many similar ones."""
+    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", exhaustive)
+    build, images, outputs = place
+    model = aachen_layout / "3D-models/aachen_v_1_1"
+    reference = pycolmap.Reconstruction(model)
+    for point in list(reference.point3D_ids()):
+        reference.delete_point3D(point)
+    reference.write(model)
+    run(*build, "--num_covis", 2)
+    name = "exhaustive" if exhaustive == 4 else "2"
+    pairs = list(parsers.parse_pairs(outputs / f"map/pairs-db-{name}.txt"))
+    assert len(pairs) == (6 if exhaustive == 4 else 8)
+    pose, _ = Localizer(outputs / "map").localize(images / "query/day/a.png")
+    assert pose is not None
+
+
+def test_a_map_to_train_on(place, run):
+    build, images, outputs = place
+    run(*build)
+    folders = images, outputs / "map/sfm"
+    assert parse_maps([str(outputs / "map")]) == {"outputs": folders}
+    assert parse_maps([f"{images}:{outputs / 'map/sfm'}"]) == {"dataset": folders}
+    with pytest.raises(InputError, match="another map is called outputs"):
+        parse_maps([str(outputs / "map")] * 2)
+    cache = outputs / "cache"
+    tracks.main(*folders, cache)
+    run(*build, "--overwrite")
+    with pytest.raises(InputError, match="tracks of another map"):
+        tracks.main(*folders, cache)
+    with pytest.raises(InputError, match="neither a map nor"):
+        parse_maps([str(outputs)])

@@ -1,0 +1,194 @@
+"""Maps from photos alone: how many photos, which cameras, keypoints and pairs."""
+
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pycolmap
+from alignment import similarity
+from command import outcome, state
+
+from hloc_reduce import Localizer, maps
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.utils import colmap, parsers
+from pipelines import localize
+
+PIPELINE = localize
+
+
+def draw_noise(folder, numbers):
+    """Write photos that match no other."""
+    generator = np.random.default_rng(1)
+    for number in numbers:
+        noise = cv2.GaussianBlur(generator.standard_normal((360, 480)), (0, 0), 3)
+        cv2.imwrite(str(folder / f"{number}.png"), 128 + 30 * noise / noise.std())
+
+
+def test_photos_alone(plane, tmp_path, run):
+    """A map without any model: what is localized in it has its frame and scale."""
+    images = plane / "images"
+    new = tmp_path / "new"
+    new.mkdir()
+    shutil.move(images / "4.png", new / "4.png")
+    outputs = tmp_path / "outputs"
+    run("--map_images", images, "--query_images", new, "--outputs", outputs)
+    built = maps.Map(outputs / "map")
+    summary, rows = outcome(outputs / "queries-new")
+    assert summary["map_images"] == len(built.names()) == 4
+    assert rows["4.png"]["status"] == "localized"
+    poses = parsers.parse_poses(outputs / "queries-new" / summary["poses"])
+    model = colmap.read_model(built.sfm)
+    poses |= {image.name: image.cam_from_world() for image in model.images.values()}
+    true = pycolmap.Reconstruction(plane / "model").images.values()
+    centres = np.array([poses[image.name].inverse().translation for image in true])
+    known = np.array([image.projection_center() for image in true])
+    # of 2.2: a plane says little about the focal length
+    assert np.linalg.norm(similarity(centres, known), axis=1).max() < 0.2
+
+
+def test_fewer_than_half_of_the_photos(plane, tmp_path, monkeypatch, caplog, run, refused):
+    """Are refused with their names, and accepted on demand without any work."""
+    images, outputs = plane / "images", tmp_path / "outputs"
+    draw_noise(images, range(5, 11))
+    build = ("--map_images", images, "--outputs", outputs)
+    message = refused(*build)
+    assert "Only 5 of 11 photos are in the map. Missing: 10.png, 5.png, 6.png" in message
+    assert "No other photo matches 10.png" in message and "retake blurred or dark ones" in message
+    assert "--accept_partial" in message
+    assert not (outputs / "map/map.json").exists()
+    caplog.clear()
+    monkeypatch.setattr(colmap, "incremental_mapping", None)
+    run(*build, "--accept_partial")
+    assert "Only 5 of 11 photos" in caplog.text
+    assert len(maps.Map(outputs / "map").names()) == 5
+    run(*build)  # is accepted for good
+
+
+def test_camera_modes(plane, tmp_path, caplog, run, refused):
+    images, outputs = plane / "images", tmp_path / "outputs"
+    build = ("--map_images", images, "--outputs", outputs)
+    assert "Unknown camera mode 'one'" in refused(*build, "--camera_mode", "one")
+    model = ("--map", plane / "model", "--camera_mode", "single")
+    assert "photos alone" in refused(*build, *model)
+    caplog.set_level("INFO")
+    run(*build, "--camera_mode", "single")
+    assert "so each has its own" not in caplog.text
+    assert colmap.read_model(outputs / "map/sfm").num_cameras() == 1
+    assert "--camera_mode single" in refused(*build)
+    features = outputs / "map/feats-dog-colmap_sift_sv64.h5"
+    before = features.stat().st_mtime_ns
+    (outputs / "map/map.json").unlink()  # not finished: the features are kept
+    run(*build, "--camera_mode", "PER_IMAGE")
+    assert colmap.read_model(outputs / "map/sfm").num_cameras() == 5
+    assert features.stat().st_mtime_ns == before
+
+
+def files_of(folder, keypoints):
+    """Return the files of a map that are of features with other keypoints than hloc's."""
+    return sorted(folder.glob(f"*feats-dog-colmap_sift_sv64{keypoints}[._]*"))
+
+
+def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeypatch, caplog, run):
+    """And queries get them, too; the map is the same command's."""
+    caplog.set_level("INFO")
+    reconstruct = maps.build.reconstruction.main
+
+    def fails_once(*args, once, **options):
+        if once:
+            raise maps.build.reconstruction.NoModelError("COLMAP could not reconstruct the images.")
+        return reconstruct(*args, once=once, **options)
+
+    monkeypatch.setattr(maps.build.reconstruction, "main", fails_once)
+    outputs = tmp_path / "outputs"
+    build = ("--map_images", plane / "images", "--outputs", outputs)
+    run(*build)
+    assert "0 of 5 photos are in the map." in caplog.text
+    assert "Trying again with more keypoints." in caplog.text
+    built = maps.Map(outputs / "map")
+    assert len(built.names()) == 5 and built.keypoints == "adaptive"
+    assert features_confs.keypoints_of(built.conf["model"]) == "colmap"
+    assert len(files_of(built.folder, "-keypoints_colmap")) == 4
+    assert not files_of(built.folder, "")
+    assert [path.name for path in built.folder.glob("sfm*")] == ["sfm-keypoints_colmap"]
+    # the next run deletes what a killed run left, but not the user's own files
+    name = "feats-dog-colmap_sift_sv64"
+    (built.folder / f"{name}.h5.pieces").mkdir()
+    (built.folder / f"{name}_matches-NN-mutual-ratio.8_pairs-db-exhaustive.h5").touch()
+    (built.folder / f"{name}.safetensors").touch()
+    (built.folder / "sfm_notes.txt").touch()
+    run(*build)
+    assert [path.name for path in files_of(built.folder, "")] == [f"{name}.safetensors"]
+    assert (built.folder / "sfm_notes.txt").exists()
+    (built.folder / f"{name}.safetensors").unlink()
+    written = state(built.folder)
+    new = tmp_path / "new"
+    new.mkdir()
+    shutil.copy(plane / "images/0.png", new)
+    run(*build, "--query_images", new, "--feature", "colmap_sift_sv64")
+    assert state(built.folder) == written
+    rows = outcome(outputs / "queries-new")[1]
+    _, info = Localizer(built.folder).localize(plane / "images/0.png")
+    assert rows["0.png"]["status"] == "localized" and info["reason"] is None
+    assert float(rows["0.png"]["confidence"]) == info["confidence"]
+
+
+def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatch, caplog, run):
+    """As is said of a photo that matches no other; most of them are a map."""
+    caplog.set_level("INFO")
+    draw_noise(plane / "images", ["other"])
+    reconstruct = maps.build.reconstruction.main
+
+    def fails_again(*args, once, **options):
+        if once:
+            return reconstruct(*args, once=once, **options)
+        raise maps.build.reconstruction.NoModelError("COLMAP could not reconstruct the images.")
+
+    monkeypatch.setattr(maps.build.reconstruction, "main", fails_again)
+    outputs = tmp_path / "outputs"
+    run("--map_images", plane / "images", "--outputs", outputs)
+    assert caplog.text.count("5 of 6 photos are in the map.") == 3
+    assert "1 of 6 images are not in the map: other.png." in caplog.text
+    assert "What to try" not in caplog.text
+    assert "so each has its own" in caplog.text  # PNG files have no EXIF data
+    built = maps.Map(outputs / "map")
+    assert features_confs.keypoints_of(built.conf["model"]) == "adaptive"
+    assert len(files_of(built.folder, "")) == 4
+    assert not files_of(built.folder, "-keypoints_colmap")
+    assert [path.name for path in built.folder.glob("sfm*")] == ["sfm"]
+
+
+def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch, run):
+    """One retrieved photo each leaves two parts; all are in the map in the end."""
+    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", 4)
+    outputs = tmp_path / "outputs"
+    build = ("--map_images", plane / "images", "--outputs", outputs, "--num_covis", 1)
+
+    def apart(descriptors, output, num_matched):
+        parsers.write_pairs([("0.png", "1.png"), ("1.png", "2.png"), ("3.png", "4.png")], output)
+
+    monkeypatch.setattr(maps.build.pairs_from_retrieval, "main", apart)
+    run(*build)
+    built = maps.Map(outputs / "map")
+    assert len(built.names()) == 5
+    lists = [outputs / f"map/pairs-db-1{end}.txt" for end in ("", "-1", "-2", "-3")]
+    sizes = [len(set(parsers.parse_pairs(path))) for path in lists]
+    assert sizes[0] == 3 < sizes[1] and sizes == sorted(sizes)
+    written = state(outputs / "map")
+    (outputs / "map/map.json").unlink()
+    run(*build)
+    again = state(outputs / "map")
+    assert all(again[path] == written[path] for path in written if path.suffix in (".h5", ".bin"))
+
+
+def test_a_map_of_other_pairs_is_refused(plane, tmp_path, monkeypatch, run, refused):
+    outputs = tmp_path / "outputs"
+    build = ("--map_images", plane / "images", "--outputs", outputs)
+    run(*build)
+    run(*build, "--num_covis", 3)  # of which all pairs know nothing
+    assert len(list(parsers.parse_pairs(outputs / "map/pairs-db-exhaustive.txt"))) == 10
+    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", 4)
+    message = refused(*build)
+    assert (
+        re.search(r"differs: num_covis( \(.*\))? and pairs", message) and "--overwrite" in message
+    )

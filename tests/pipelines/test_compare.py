@@ -1,0 +1,82 @@
+import csv
+import re
+
+import command
+import pytest
+
+from hloc_reduce.evaluation import published
+from hloc_reduce.runtime.outputs import LOCK
+from hloc_reduce.utils import cli
+from pipelines import compare, inloc
+
+# the lists of the plane, as if it were a data set of the paper
+PLANE = {"Plane": {"day": (2, "query/day/"), "night": (1, "query/night/")}}
+
+
+@pytest.fixture(autouse=True)
+def propagated(monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
+
+
+def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
+    outputs = tmp_path / "outputs"
+    (tmp_path / "broken.yaml").write_text("model: {name: dog, options: {peak_treshold: 1}}")
+    given = ("--dataset", aachen_layout, "--outputs", outputs, "--features")
+    features = ("sift_sv16", "colmap_sift_sv16", tmp_path / "broken.yaml")
+    with pytest.raises(SystemExit) as exit:
+        command.run(monkeypatch, compare, *given, *features)
+    # one failed, which the others do not suffer from
+    assert exit.value.code == 2 and "These failed, see above: broken" in caplog.text
+    lines = [
+        [cell.strip() for cell in line.split("|")] for line in capsys.readouterr().out.splitlines()
+    ]
+    assert lines == [
+        ["", "bytes", "day", "night"],
+        ["distance [m]", "", "0.25 / 0.5 / 5", "0.5 / 1 / 5"],
+        ["orient. [deg]", "", "2 / 5 / 10", "2 / 5 / 10"],
+        ["sift_sv16", "32", "50.0 / 50.0 / 50.0", "100.0 / 100.0 / 100.0"],
+        ["colmap_sift_sv16", "32", "50.0 / 50.0 / 50.0", "100.0 / 100.0 / 100.0"],
+    ]
+    page = (outputs / "report.html").read_text()
+    assert "colmap_sift_sv16" in page and "the paper" not in page
+    with (outputs / "compare.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 2 * 3
+    assert (rows[0]["recall_percent"], rows[0]["paper_percent"]) == ("50.0", "")
+
+    # if it were a data set of the paper
+    with monkeypatch.context() as other:
+        other.setattr(published, "DATASETS", PLANE)
+        command.run(other, compare, *given, *features[:2])
+    paper = "in the paper |       | 85.9 / 91.5 / 96.2 | 34.6 / 46.1 / 58.6"
+    assert re.sub(" +", " ", paper) in re.sub(" +", " ", capsys.readouterr().out)
+    assert "Rows in grey are the paper" in (outputs / "report.html").read_text()
+    with (outputs / "compare.csv").open() as file:
+        assert next(csv.DictReader(file))["paper_percent"] == "85.9"
+
+    # what is there is not run again
+    times = {path: path.stat().st_mtime_ns for path in (outputs / "sift_sv16").rglob("*")}
+    page = tmp_path / "p.html"
+    command.run(monkeypatch, compare, *given, "sift_sv16", "-o", page)
+    assert page.exists() and len(times) > 10
+    files = [path for path in times if path.is_file() and path.name != LOCK]
+    assert {path.name: path.stat().st_mtime_ns for path in files} == {
+        path.name: times[path] for path in files
+    }
+
+
+def test_compare_wrong_input(aachen_layout, inloc_layout, tmp_path, monkeypatch, caplog):
+    def message(dataset, *features):
+        command_line = ("--dataset", dataset, "--outputs", tmp_path / "o", "--features", *features)
+        return command.refused(monkeypatch, caplog, compare, *command_line)
+
+    assert "neither of the folders 3D-models and database" in message(tmp_path, "sift")
+    assert "Unknown feature 'sift_sv65'" in message(aachen_layout, "sift", "sift_sv65")
+    assert "is a folder: name the HTML file" in message(aachen_layout, "sift", "-o", tmp_path)
+    assert not (tmp_path / "o").exists()
+    (tmp_path / "o/sift/conf.json").mkdir(parents=True)
+    given = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--features", "sift")
+    with pytest.raises(SystemExit):
+        command.run(monkeypatch, compare, *given)
+    assert "sift failed: " in caplog.text and "None of 1 features could be run" in caplog.text
+    assert compare.pipeline_of(inloc_layout) is inloc

@@ -1,0 +1,88 @@
+"""Which results of queries are kept, and wrong input."""
+
+import shutil
+
+from command import outcome, state
+
+from pipelines import localize
+
+PIPELINE = localize
+
+
+def test_results_of_another_map_are_kept(place, tmp_path, run, refused):
+    build, images, outputs = place
+    new = ("--query_images", images / "query/day")
+    run(*build, *new)
+    results = state(outputs / "queries-day")
+    other = tmp_path / "other"
+    run(*build[:4], "--outputs", other)
+    message = refused("--map", other / "map", *new, "--outputs", outputs)
+    assert "differs: map" in message
+    assert state(outputs / "queries-day") == results
+
+
+def test_queries_of_the_same_name_have_folders_of_their_own(place, tmp_path, run):
+    build, images, outputs = place
+    run(*build, "--query_images", images / "query/day")
+    results = state(outputs / "queries-day")
+    other = shutil.move(images / "query/night", tmp_path / "day")
+    for _ in range(2):
+        run(*build, "--query_images", other)
+        assert state(outputs / "queries-day") == results
+        (found,) = outputs.glob("queries-day-*")
+        assert list(outcome(found)[1]) == ["a.png"]
+    # a list of that name is another one, too; the first keeps its folder
+    listed = tmp_path / "day.txt"
+    listed.write_text("a.png SIMPLE_PINHOLE 480 360 500 240 180\n")
+    run(*build, "--query_images", images / "query/day", "--queries", listed)
+    assert len(list(outputs.glob("queries-day-*"))) == 2
+    run(*build, "--query_images", images / "query/day")
+    assert state(outputs / "queries-day") == results
+
+
+def test_queries_that_have_changed_are_localized_anew(place, run):
+    build, images, outputs = place
+    run(*build, "--query_images", images / "query/day")
+    assert outcome(outputs / "queries-day")[1]["grey.png"]["status"] == "fallback"
+    shutil.copy(images / "query/day/a.png", images / "query/day/grey.png")
+    shutil.copy(images / "query/day/a.png", images / "query/day/new.png")
+    run(*build, "--query_images", images / "query/day")
+    rows = outcome(outputs / "queries-day")[1]
+    assert [row["status"] for row in rows.values()] == ["localized"] * 3
+    assert len({row["num_inliers"] for row in rows.values()}) == 1
+
+
+def test_wrong_input(place, tmp_path, run, refused):
+    build, images, outputs = place
+    assert "Give --map_images" in refused("--outputs", outputs)
+    assert "--query_images, too" in refused(*build, "--queries", "list.txt")
+    assert "is not a COLMAP model" in refused("--map", images, *build[2:])
+    assert "is not a map" in refused("--map", images, "--outputs", outputs)
+    message = refused(*build[:2], "--outputs", outputs)
+    assert "is a COLMAP model: give its photos" in message
+    message = refused("--map_images", tmp_path / "nowhere", *build[4:])
+    assert "no folder" in message and "nowhere" in message
+    message = refused("--map_images", images / "db/1.png", *build[4:])
+    assert message.endswith("1.png is a file, not a folder.")
+    one = tmp_path / "one"
+    one.mkdir()
+    shutil.copy(images / "db/1.png", one)
+    message = refused("--map_images", one, *build[4:])
+    assert "needs two or more" in message and not (outputs / "map").exists()
+    assert "Unknown matcher" in refused(*build, "--matcher", "NN")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in ("IMG\t1.png", "#2.png"):
+        shutil.copy(images / "db/1.png", photos / name)
+        message = refused("--map_images", photos, *build[4:])
+        assert repr(name) in message and "Rename" in message
+        (photos / name).unlink()
+    assert "Give --outputs" in refused(*build[:4])
+    assert "--num_covis 0" in refused(*build, "--num_covis", 0)
+    assert not (outputs / "map").exists()
+    run(*build)
+    queries = tmp_path / "list.txt"
+    queries.write_text("query/day/gone.png PINHOLE 480 360 500 500 240 180\n")
+    new = ("--queries", queries, "--query_images", images)
+    assert "query/day/gone.png" in refused(*build, *new)
+    assert not (outputs / "queries-list").exists()

@@ -1,0 +1,239 @@
+"""Queries of a scene whose poses are known."""
+
+import shutil
+import sys
+
+import h5py
+import numpy as np
+import pytest
+import small_map
+import torch
+from small_map import MATCHER
+
+from hloc_reduce import localize_sfm, match_features
+from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.localization import query, stage
+from hloc_reduce.localization.confidence import AGREEMENT, AGREEMENT_RATIO
+from hloc_reduce.localization.records import log_file, pose_of, read_records
+from hloc_reduce.localization.references import SfmMap
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import dimension
+from hloc_reduce.utils.h5 import list_h5_names
+from hloc_reduce.utils.parsers import parse_poses, write_pairs
+
+
+@pytest.fixture
+def built(scene):
+    return small_map.build(scene)
+
+
+def test_queries_are_localized_exactly(built):
+    records = built.localize()
+    for name, record in records.items():
+        assert record["localized"] and record["num_inliers"] == 300
+        assert record["num_matches"] == 6 * 300 and record["db"] == "db/0.jpg"
+        metres, degrees = pose_error(pose_of(record), built.poses[name])
+        assert metres < 1e-4 and degrees < 1e-2
+    lines = (built.root / "poses.txt").read_text().splitlines()
+    assert [line.split()[0] for line in lines] == ["6.jpg", "7.jpg"]
+    written = parse_poses(built.root / "poses.txt")["6.jpg"]
+    assert max(pose_error(written, built.poses["query/6.jpg"])) < 1e-2
+
+
+def test_localization_is_resumed_and_repeated_exactly(built):
+    first = built.localize()
+    poses = (built.root / "poses.txt").read_bytes()
+    log = built.root / "poses.txt_logs.jsonl"
+    lines = log.read_text().splitlines(keepends=True)
+    log.write_text("".join(lines[:2]) + lines[2][: len(lines[2]) // 2])  # killed while writing
+    assert built.localize() == first
+    assert (built.root / "poses.txt").read_bytes() == poses
+    assert log.read_text().splitlines(keepends=True) == lines
+    assert built.localize(overwrite=True) == first
+    assert built.localize(reference_sfm=built.map) == first
+
+
+def test_poses_do_not_depend_on_the_number_of_cores(built):
+    threads, records = torch.get_num_threads(), []
+    for number in (1, 3):
+        torch.set_num_threads(number)
+        records.append(built.localize(overwrite=True))
+    torch.set_num_threads(threads)
+    assert records[0] == records[1]
+
+
+def test_clusters_of_covisible_images_are_solved_by_themselves(built):
+    """Half of the points are seen by one half of the map, the others by the other."""
+    for image in built.map.images.values():
+        late = int(image.name[3]) > 2
+        for index, point in enumerate(built.seen[image.name]):
+            if (point < 120) == late:
+                built.map.delete_observation(image.image_id, index)
+    names = [f"db/{i}.jpg" for i in (5, 1, 3, 0, 2)]
+    clusters = [["db/1.jpg", "db/0.jpg", "db/2.jpg"], names[0:3:2]]
+    assert SfmMap(built.map, True).clusters(names) == clusters
+    assert SfmMap(built.map).clusters(names) == [names]
+    whole = built.localize(reference_sfm=built.map)["query/6.jpg"]
+    part = built.localize(reference_sfm=built.map, covisibility_clustering=True)["query/6.jpg"]
+    assert (whole["num_inliers"], part["num_inliers"]) == (300, 180)
+    assert (whole["num_matches"], part["num_matches"]) == (900, 540)
+    assert part["db"] == "db/3.jpg" and part["localized"]  # of the cluster
+
+
+def test_other_options_are_not_answered_from_the_log(built):
+    exact = built.localize()
+    strict = built.localize(ransac_thresh=1e-5)
+    assert strict["query/6.jpg"]["num_inliers"] < exact["query/6.jpg"]["num_inliers"]
+
+
+def test_hopeless_queries_fall_back_and_say_so(built):
+    """No features, no retrieved image, wrong matches: each gets a line, none is localized."""
+    with h5py.File(built.features, "a") as file:
+        for i, number in ((8, 0), (9, 40), (10, 40)):
+            group = file.create_group(f"query/{i}.jpg")
+            generator = np.random.default_rng(i)
+            group["keypoints"] = generator.uniform(0, 400, (number, 2)).astype(np.float32)
+    generator = np.random.default_rng(0)
+    with h5py.File(built.loc_matches, "a") as file:
+        file["query-8.jpg/db-3.jpg/matches0"] = np.zeros(0, np.int32)
+        file["query-8.jpg/db-3.jpg/matching_scores0"] = np.zeros(0, np.float16)
+        file["query-10.jpg/db-3.jpg/matches0"] = generator.permutation(300)[:40].astype(np.int32)
+        file["query-10.jpg/db-3.jpg/matching_scores0"] = np.ones(40, np.float16)
+    with built.loc_pairs.open("a") as file:
+        file.write("query/8.jpg db/3.jpg\nquery/10.jpg db/3.jpg\n")
+    with built.queries.open("a") as file:
+        for i in (8, 9, 10):
+            file.write(f"query/{i}.jpg SIMPLE_RADIAL 640 480 500 320 240 0.02\n")
+    records = built.localize(ransac_thresh=3)
+    for i, db in ((8, "db/3.jpg"), (9, None), (10, "db/3.jpg")):
+        record = records[f"query/{i}.jpg"]
+        assert not record["localized"] and record["db"] == db, record
+        pose = built.poses[db or "db/0.jpg"]
+        assert max(pose_error(pose_of(record), pose)) < 1e-6
+    assert records["query/8.jpg"]["num_inliers"] == 0
+    assert records["query/10.jpg"]["num_matches"] == 40
+    assert len((built.root / "poses.txt").read_text().splitlines()) == 5
+
+
+def test_three_inliers_are_no_localization(built):
+    with h5py.File(built.loc_matches, "a") as file:
+        for i in range(6):
+            matches = file[f"query-6.jpg/db-{i}.jpg/matches0"]
+            values = matches[:]
+            kept = np.isin(built.seen["query/6.jpg"], [0, 1, 2])
+            matches[:] = np.where(kept, values, -1)
+    record = built.localize()["query/6.jpg"]
+    assert record["num_matches"] == 18 and not record["localized"]
+
+
+def test_missing_inputs_are_named(built):
+    with pytest.raises(InputError, match="not in the match file"):
+        write_pairs([("query/6.jpg", "db/0.jpg")], built.root / "other.txt")
+        built.localize(retrieval=built.root / "other.txt", matches=built.matches)
+    with pytest.raises(InputError, match="above 0"):
+        built.localize(ransac_thresh=-3)
+    with pytest.raises(InputError, match="absent.h5"):
+        built.localize(features=built.root / "absent.h5")
+    with pytest.raises(InputError, match="no COLMAP model folder"):
+        built.localize(reference_sfm=built.root / "absent")
+    write_pairs([("db/0.jpg", "db/99.jpg")], built.pairs)
+    with pytest.raises(InputError, match="db/99.jpg is not in the reference model"):
+        built.triangulate()
+    with pytest.raises(InputError, match="db/99.jpg is not in the file"):
+        match_features.main(MATCHER, built.pairs, built.features, matches=built.matches)
+    shutil.rmtree(built.model)
+    built.model.mkdir()
+    (built.model / "cameras.bin").write_bytes(b"\x01")
+    with pytest.raises(InputError, match="not a COLMAP model"):
+        colmap.read_model(built.model)
+
+
+def test_matches_of_other_features_are_refused(built):
+    with h5py.File(built.features, "a") as file:
+        for name in ("query/6.jpg", "db/0.jpg"):
+            kept = {"keypoints": file[name]["keypoints"][:200]}
+            kept["descriptors"] = file[name]["descriptors"][:, :200]
+            for key, array in kept.items():
+                del file[name][key]
+                file[name][key] = array
+    with pytest.raises(InputError, match="belong to other features: query/6.jpg has only 200"):
+        built.localize()
+    with pytest.raises(InputError, match="belong to other features: db/0.jpg has only 200"):
+        built.triangulate()
+
+
+def test_a_query_that_cannot_be_localized_says_why(built):
+    """Its photo could not be read, or is of another size; or nothing was retrieved for it."""
+    with h5py.File(built.features, "r+") as file:
+        file["query/6.jpg/image_size"] = np.array([480, 640])
+    records = built.localize()
+    wrong, right = records["query/6.jpg"], records["query/7.jpg"]
+    assert right["localized"] and right["reason"] is None
+    assert wrong["reason"] == "the intrinsics are for 640x480 pixels, the photo has 480x640"
+    assert not wrong["localized"] and wrong["db"] == "db/0.jpg" and wrong["num_inliers"] == 0
+    with h5py.File(built.features, "r+") as file:
+        file["query/6.jpg"].attrs["failure"] = "Cannot read image query/6.jpg: it is empty."
+    records = built.localize()
+    assert records["query/6.jpg"]["reason"] == "Cannot read image query/6.jpg: it is empty."
+    assert records["query/7.jpg"] == right
+    cameras = [("query/6.jpg", None), ("query/7.jpg", None)]
+    records = built.localize(queries=cameras)
+    assert records["query/7.jpg"]["reason"] == "its intrinsics are not known"
+    assert records["query/7.jpg"]["camera"] is None
+    pairs = [("query/6.jpg", "db/0.jpg")]
+    write_pairs(pairs, built.loc_pairs)
+    assert built.localize()["query/7.jpg"]["reason"] == "no map image was retrieved"
+
+
+def test_the_command_line_of_localization(built, monkeypatch):
+    """Its options reach the stage."""
+    options = {
+        "reference_sfm": built.sfm,
+        "queries": built.queries,
+        "retrieval": built.loc_pairs,
+        "features": built.features,
+        "matches": built.loc_matches,
+        "results": built.root / "by_command.txt",
+        "min_inliers": 301,
+    }
+    words = [word for key, value in options.items() for word in (f"--{key}", str(value))]
+    monkeypatch.setattr(sys, "argv", ["localize_sfm", *words])
+    cli.run(localize_sfm._main)
+    records = read_records(log_file(options["results"]))
+    assert {record["reason"] for record in records.values()} == {
+        "too few inliers: 300, at least 301 are needed"
+    }
+
+
+@pytest.mark.parametrize(
+    ("conf", "agreement"),
+    [("NN-ratio", AGREEMENT_RATIO), ("NN-mutual", AGREEMENT), (None, AGREEMENT)],
+)
+def test_the_gate_knows_the_matcher_by_its_file(built, conf, agreement, monkeypatch):
+    """Match files of hloc do not say which matcher made them."""
+    if conf is None:
+        with h5py.File(built.loc_matches, "r+") as file:
+            del file.attrs["conf"]
+    else:
+        conf = match_features.confs[conf]
+        match_features.main(
+            conf, built.loc_pairs, built.features, matches=built.loc_matches, overwrite=True
+        )
+    gates, localize = [], query.localize
+    monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[-1]) or localize(*a))
+    assert built.localize()["query/6.jpg"]["localized"]
+    assert {gate.min_agreement for gate in gates} == {agreement}
+
+
+def test_the_gate_skips_images_without_descriptors(built, monkeypatch):
+    """As those that could not be read, or those of features that are matched otherwise."""
+    with h5py.File(built.features, "r+") as file:
+        del file["db/0.jpg/descriptors"]
+        file["db/1.jpg"].attrs["failure"] = "Cannot read it."
+    assert dimension(built.features) == 64
+    assert built.localize()["query/6.jpg"]["localized"]
+    with h5py.File(built.features, "r+") as file:
+        for name in list_h5_names(built.features):
+            file[name].pop("descriptors", None)
+    assert dimension(built.features) == 0

@@ -1,0 +1,116 @@
+"""Matching of pairs, and what it refuses."""
+
+import h5py
+import numpy as np
+import pytest
+import small_map
+from command import refused
+from small_map import MATCHER
+
+from hloc_reduce import match_features, pairs_from_retrieval
+from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.h5 import list_h5_names
+from hloc_reduce.utils.match_files import get_matches
+from hloc_reduce.utils.parsers import parse_pairs, write_pairs
+
+
+@pytest.fixture
+def built(scene):
+    return small_map.build(scene)
+
+
+def test_a_pair_that_is_listed_again_and_reversed_is_matched_once(built, tmp_path):
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("db/0.jpg db/1.jpg\ndb/1.jpg db/2.jpg\n" * 50 + "db/1.jpg db/0.jpg\n" * 50)
+    drawn = []
+    with GroupWriter(tmp_path / "matches.h5", {}) as writer:
+        for names in match_features.unmatched_pairs(parse_pairs(pairs), writer):
+            drawn.append(names)  # and not written before the next is drawn
+    assert drawn == [("db/0.jpg", "db/1.jpg"), ("db/1.jpg", "db/2.jpg")]
+    conf = match_features.confs["NN-ratio"]
+    matches = match_features.main(conf, pairs, built.features, matches=tmp_path / "m.h5")
+    assert len(list_h5_names(matches)) == 2
+
+
+def test_matches_do_not_overwrite_features(built, tmp_path, monkeypatch, caplog):
+    before = built.features.read_bytes()
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("db/0.jpg db/1.jpg\n")
+    name = built.features.stem
+    command = ["--pairs", pairs, "--export_dir", built.features.parent, "--features", name]
+    command += ["--matches", built.features, "--overwrite"]
+    assert "is an input of the matching" in refused(monkeypatch, caplog, match_features, *command)
+    assert built.features.read_bytes() == before
+
+
+def test_a_wrong_gpu_memory_is_refused(tmp_path, monkeypatch, caplog):
+    command = ["--pairs", tmp_path / "p.txt", "--export_dir", tmp_path, "--gpu_bytes", "0"]
+    assert "--gpu_bytes 0: at least 1" in refused(monkeypatch, caplog, match_features, *command)
+
+
+def test_matches_are_those_of_the_scene(built):
+    assert len(list_h5_names(built.matches)) == 15  # each unordered pair once
+    with h5py.File(built.matches) as file:
+        assert file[list_h5_names(built.matches)[0]]["matches0"].dtype == np.int32
+        for name0, name1 in (("db/0.jpg", "db/1.jpg"), ("db/4.jpg", "db/2.jpg")):
+            matches, scores = get_matches(file, name0, name1)
+            assert len(matches) == 300 and scores.min() > 0.99
+            same = built.seen[name0][matches[:, 0]] == built.seen[name1][matches[:, 1]]
+            assert same.all()
+
+
+def test_matching_goes_on_with_what_is_missing(built):
+    with h5py.File(built.matches, "a") as file:
+        del file["db-0.jpg/db-1.jpg"]
+        file["db-0.jpg/db-2.jpg/matches0"][:] = 7  # would be repaired if matched again
+    match_features.main(MATCHER, built.pairs, built.features, matches=built.matches)
+    with h5py.File(built.matches) as file:
+        assert (file["db-0.jpg/db-1.jpg/matches0"][:] >= 0).all()
+        assert (file["db-0.jpg/db-2.jpg/matches0"][:] == 7).all()
+
+
+def test_descriptors_in_memory_are_bounded(tmp_path):
+    path = tmp_path / "f.h5"
+    with GroupWriter(path, {}) as writer:
+        for name in "abcd":
+            writer.add(name, {"descriptors": np.full((4, 10), ord(name), np.float16)})
+    with h5py.File(path) as file:
+        read = match_features.DescriptorCache(max_bytes=2 * 4 * 10 * 4)
+        first = read(file, "a")
+        assert first.shape == (10, 4) and first.flags["C_CONTIGUOUS"]
+        read(file, "b")
+        assert read(file, "a") is first  # and is the last one used now
+        read(file, "c")
+        assert read(file, "a") is first
+        assert {name for _, name in read.kept} == {"a", "c"} and read.bytes == 320
+        assert read(file, "d")[0, 0] == ord("d")
+        small = match_features.DescriptorCache(max_bytes=1)
+        assert small(file, "a")[0, 0] == ord("a") and small(file, "b")[0, 0] == ord("b")
+        assert len(small.kept) == 1
+
+
+def test_features_made_anew_invalidate_their_matches(tmp_path):
+    """The same configuration, but other photos: an h5 file's id tells."""
+    features, pairs = tmp_path / "f.h5", tmp_path / "pairs.txt"
+    write_pairs([("a", "b")], pairs)
+    descriptors = {"descriptors": np.eye(4, 3, dtype=np.float16)}
+    for overwrite in (False, True):
+        with GroupWriter(features, {"x": 1}, overwrite) as writer:
+            writer.add("a", descriptors)
+            writer.add("b", descriptors)
+        if overwrite:
+            with pytest.raises(InputError, match="another configuration"):
+                match_features.main(MATCHER, pairs, features, matches=tmp_path / "m.h5")
+        else:
+            match_features.main(MATCHER, pairs, features, matches=tmp_path / "m.h5")
+            with GroupWriter(features, {"x": 1}) as writer:  # more images change nothing
+                writer.add("c", descriptors)
+            match_features.main(MATCHER, pairs, features, matches=tmp_path / "m.h5")
+
+
+def test_files_of_another_kind_are_refused(built):
+    with pytest.raises(InputError, match="not a file of global_descriptor"):
+        pairs_from_retrieval.main(built.features, built.root / "p.txt", 3)
+    with pytest.raises(InputError, match="not in the file|not a file of"):
+        match_features.main(MATCHER, built.pairs, built.matches, matches=built.root / "m.h5")
