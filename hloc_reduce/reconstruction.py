@@ -148,6 +148,7 @@ def reconstruct(
         "overlays": "dropped",
         "attempts": [{}, *attempts],
         "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
+        "viewpoints": VIEWPOINTS,
         "once": once,
     }
     made_from = stamps.stamp({**options, **chosen}, [pairs, features, matches])
