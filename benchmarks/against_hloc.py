@@ -75,7 +75,7 @@ def run(name: str, dataset: Path, outputs: Path) -> dict:
     sfm = outputs / "sfm"
     used["triangulate"](sfm, place.reference_model, place.images, sfm_pairs, features, matches)
     lap("triangulation")
-    # each list by itself: a base name may be in both
+    # separately for each list: both may have the same base name
     for key in lists:
         given = place.queries.with_name(f"{key}.txt")
         used["localize"](sfm, given, loc_pairs, features, loc_matches, outputs / f"{key}.txt")

@@ -218,7 +218,7 @@ cli.run(main)
 
 
 def start(place, outputs, workers=None):
-    """Start the pipeline for Aachen: its command line, or a program with so many processes."""
+    """Start the pipeline for Aachen: its command line, or a program with a number of processes."""
     given = ["-m", "pipelines.aachen", "--dataset", place, "--outputs", outputs, "--feature"]
     if workers:
         given = ["-c", PROGRAM, place, outputs]
@@ -290,7 +290,7 @@ def end_at_random(
     signals: tuple[int, ...],
     seed: int,
 ) -> tuple[Counter, list[float]]:
-    """End a pipeline at so many random moments of each stage, and resume it each time.
+    """End a pipeline at several random moments of each stage, and resume it each time.
 
     Checks that each file is whole, that nothing is computed again, that no process is left, that
     what is said is short, and that the results are those of an undisturbed run.

@@ -29,7 +29,4 @@ def load(conf: dict) -> Aggregator:
     Raises:
         InputError: when there is no such aggregator, or its configuration is wrong.
     """
-    aggregator = dynamic_load(sys.modules[__name__], str(conf.get("name")))(conf)
-    if not isinstance(aggregator, Aggregator):
-        raise TypeError(f"{type(aggregator).__name__} is not an Aggregator.")
-    return aggregator
+    return dynamic_load(sys.modules[__name__], str(conf.get("name")), Aggregator)(conf)

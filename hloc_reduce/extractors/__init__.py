@@ -71,10 +71,7 @@ def load(conf: dict) -> Extractor:
     ours = [module.name for module in pkgutil.iter_modules(__path__)]
     if name not in ours and (is_installed() or name.startswith("hloc.")):
         return load({"name": "hloc", "conf": conf})
-    extractor = dynamic_load(sys.modules[__name__], name)(conf)
-    if not isinstance(extractor, Extractor):
-        raise TypeError(f"{type(extractor).__name__} is not an Extractor.")
-    return extractor
+    return dynamic_load(sys.modules[__name__], name, Extractor)(conf)
 
 
 def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:

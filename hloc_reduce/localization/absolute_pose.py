@@ -24,7 +24,7 @@ from .resection import Resection
 
 SEED = 0
 MAX_ERROR = 12.0  # pixels, pycolmap's default
-CLEAR = 0.25  # inlier ratio above which no image is tried by itself
+CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MAX_IMAGES = 20  # tried by themselves, those with the most matches
 ROUNDS = 3  # of estimation from the inliers among all matches
 # poses that differ by more are rivals

@@ -48,7 +48,7 @@ def confidence(
     An a-contrario test in the manner of AC-RANSAC (Moulon, Monasse and Marlet, ACCV 2012). The
     number of false alarms is the expected number of poses with at least as many inliers if all
     matches are wrong: the number of poses that can be computed from them, times the probability
-    that a pose has so many inliers. It is the minimum over inlier thresholds up to RANSAC's.
+    that a pose has at least as many inliers. It is the least over inlier thresholds up to RANSAC's.
 
     A wrong match pairs a keypoint with a random one of the matched points. It is an inlier with the
     density of their projections around the keypoint, or of points spread evenly over the image,

@@ -58,7 +58,4 @@ def load(conf: dict) -> Matcher:
     Raises:
         InputError: when there is no such matcher, or its configuration is wrong.
     """
-    matcher = dynamic_load(sys.modules[__name__], str(conf.get("name")))(conf)
-    if not isinstance(matcher, Matcher):
-        raise TypeError(f"{type(matcher).__name__} is not a Matcher.")
-    return matcher
+    return dynamic_load(sys.modules[__name__], str(conf.get("name")), Matcher)(conf)

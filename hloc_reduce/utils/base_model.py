@@ -5,10 +5,13 @@ import inspect
 import pkgutil
 from numbers import Number
 from types import ModuleType
+from typing import TypeVar
 
 from torch import nn
 
 from .cli import InputError, choose
+
+Model = TypeVar("Model", bound="BaseModel")
 
 
 class BaseModel(nn.Module):
@@ -54,8 +57,8 @@ class BaseModel(nn.Module):
         raise NotImplementedError
 
 
-def dynamic_load(root: ModuleType, name: str) -> type[BaseModel]:
-    """Return the one BaseModel that the module `name` of the package `root` defines.
+def dynamic_load(root: ModuleType, name: str, base: type[Model]) -> type[Model]:
+    """Return the one subclass of `base` that the module `name` of the package `root` defines.
 
     Raises:
         InputError: when there is no such module.
@@ -66,6 +69,6 @@ def dynamic_load(root: ModuleType, name: str) -> type[BaseModel]:
     (model,) = (
         value
         for _, value in inspect.getmembers(module, inspect.isclass)
-        if value.__module__ == module.__name__ and issubclass(value, BaseModel)
+        if value.__module__ == module.__name__ and issubclass(value, base)
     )
     return model

@@ -54,7 +54,7 @@ class Job:
         num_covis: other images that each map image is matched with; default: the pipeline's.
         num_loc: retrieved map images per query; default: the pipeline's.
         min_confidence: what a pose must have for the query to be called localized.
-        min_inliers: likewise.
+        min_inliers: inliers that the pose must have, too.
     """
 
     dataset: Path

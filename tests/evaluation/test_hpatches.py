@@ -66,7 +66,7 @@ def test_hpatches(root, few, tmp_path, monkeypatch, capsys):
     picture = (outputs / "a.svg").read_text()
     assert "sift_sv16" in picture and "mean in the paper" in picture
 
-    # what is there is not computed again, and a smaller choice prints less
+    # existing scores are not computed again, and a smaller choice prints less
     monkeypatch.setattr(tasks, "matching", None)
     monkeypatch.setattr(data, "read_patches", None)
     run(monkeypatch, evaluation, *command, "--task", "matching")

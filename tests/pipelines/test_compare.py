@@ -54,7 +54,7 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
     with (outputs / "compare.csv").open() as file:
         assert next(csv.DictReader(file))["paper_percent"] == "85.9"
 
-    # what is there is not run again
+    # finished runs are not repeated
     times = {path: path.stat().st_mtime_ns for path in (outputs / "sift_sv16").rglob("*")}
     page = tmp_path / "p.html"
     command.run(monkeypatch, compare, *given, "sift_sv16", "-o", page)
