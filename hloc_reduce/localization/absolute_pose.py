@@ -1,6 +1,7 @@
 """The pose of a query from 2D-3D matches: RANSAC, other intrinsics, and whether to trust it."""
 
 import copy
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,9 +36,12 @@ DISTORTED = 1.02  # above it, the lens has a radial distortion
 UNCLEAR = 1.05  # above it, the other intrinsics may be right
 RIGHT = 1.1  # above it, the other intrinsics are right
 # multiples of MAX_POSITION and MAX_ROTATION
-LENIENT = 2.0  # between poses of contradicting intrinsics: many lists have those of EXIF data
+TOLERANT = 1.2  # between poses with listed and other focal lengths: many lists are 5 % off
 CROPPED = 3.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
-OFF_CENTRE = 0.15  # distance of the principal point from the centre, as a share of the size
+# distances of the principal point from the centre, as shares of the size
+OFF_CENTRE, CENTRED = 0.15, 0.02
+
+View = tuple[pycolmap.Rigid3d, pycolmap.Camera]
 
 
 @dataclass(frozen=True)
@@ -169,8 +173,8 @@ def _calibrate(matches: _Matches, pose: Pose) -> tuple[Pose, str | None]:
     """Test whether other intrinsics than those of a pose fit the matches better.
 
     If the focal length is unknown, they replace them: a distortion, or the aspect ratio and the
-    principal point, too, of a photo that was cropped or stretched. If it is known, they contradict
-    it. A skew, which no lens has, reveals a photo of a picture.
+    principal point, too, of a photo that was cropped or stretched. If it is known, another one
+    contradicts it. A skew, which no lens has, reveals a photo of a picture.
 
     Returns:
         The likelier pose, and a reason not to trust it, if any.
@@ -180,55 +184,79 @@ def _calibrate(matches: _Matches, pose: Pose) -> tuple[Pose, str | None]:
     if pose.camera.mean_focal_length() <= 0:  # as RANSAC may estimate it
         return pose, None
     image, pinhole = resection.undistort(matches.points2D, pose.camera)
-    points, start = (image, matches.points3D), (pose.cam_from_world, pinhole)
-    threshold = matches.max_error
-
-    def judged(found: Resection | None, freedom: int) -> Pose:
-        if found is None:
-            return replace(pose, camera=pinhole)
-        pose_and_camera, image = found[:2], found.points2D
-        value = confidence(image, matches.points3D, *pose_and_camera, threshold, freedom)
-        return Pose(*found[:3], confidence=value, degrees_of_freedom=freedom)
-
+    start = pose.cam_from_world, pinhole
     free = matches.is_focal_length_free and not resection.is_distorted(pose.camera)
-    assumed = pose
+    points3D, assumed = matches.points3D, pose
     if free:
-        radial = judged(resection.resect(*points, *start, threshold, RADIAL), RADIAL)
+        radial = _resect(matches, image, start, RADIAL) or pose
         if radial.confidence > DISTORTED * pose.confidence:
             assumed = radial
-    found = resection.resect_anew(*points, *start, threshold)
-    near = found[:2] if found else start
-    skewed = resection.resect(*points, *near, threshold, SKEW)
-    return _choose(assumed, judged(found, ALL), judged(skewed, SKEW), free, matches.points3D)
-
-
-def _choose(
-    assumed: Pose, other: Pose, skewed: Pose, free: bool, points3D: np.ndarray
-) -> tuple[Pose, str | None]:
-    """Choose between poses with assumed, other and skewed intrinsics, as `_calibrate` returns them.
-
-    Unless the assumed intrinsics are `free`, others do not replace them but contradict them.
-    """
-    likelier = max(assumed, other, key=_quality)
-    if skewed.confidence > RIGHT * likelier.confidence and differ(
-        skewed, likelier, points3D, MAX_POSITION, MAX_ROTATION
-    ):
+    found = resection.resect_anew(image, points3D, *start, matches.max_error)
+    other = _judged(matches, found, ALL)
+    skewed = _resect(matches, image, found[:2] if found else start, SKEW)
+    likelier = max(assumed, other or assumed, key=_quality)
+    fits = skewed is not None and skewed.confidence > RIGHT * likelier.confidence
+    if skewed and fits and differ(skewed, likelier, points3D, MAX_POSITION, MAX_ROTATION):
         reason = "it was warped, or is a photo of a picture: a skew fits much better"
-        return likelier if free else assumed, reason
-    if other.confidence <= (UNCLEAR if free else RIGHT) * assumed.confidence:
-        return assumed, None
-    if free and other.confidence > RIGHT * assumed.confidence:
+        return likelier if free else pose, reason
+    if not free:
+        centred = resection.centred(pose.cam_from_world, pose.camera)
+        guesses = (image, start), (matches.points2D, centred)
+        return pose, _contradiction(matches, pose, guesses)
+    return _choose(assumed, other, points3D) if other else (assumed, None)
+
+
+def _resect(matches: _Matches, points2D: np.ndarray, start: View, freedom: int) -> Pose | None:
+    """Refine a pose and PINHOLE intrinsics from image points, and judge them."""
+    found = resection.resect(points2D, matches.points3D, *start, matches.max_error, freedom)
+    return _judged(matches, found, freedom)
+
+
+def _judged(matches: _Matches, found: Resection | None, freedom: int) -> Pose | None:
+    """Return the pose of a resection, with its confidence."""
+    if found is None:
+        return None
+    view, points2D = found[:2], found.points2D
+    value = confidence(points2D, matches.points3D, *view, matches.max_error, freedom)
+    return Pose(*found[:3], confidence=value, degrees_of_freedom=freedom)
+
+
+def _contradiction(
+    matches: _Matches, pose: Pose, guesses: Iterable[tuple[np.ndarray, View]]
+) -> str | None:
+    """Say which focal length contradicts that of a pose, None if none does.
+
+    Args:
+        matches: of the query.
+        pose: with the listed intrinsics.
+        guesses: image points (M, 2), and a pose with PINHOLE intrinsics from which another focal
+            length is estimated.
+    """
+    limits = TOLERANT * MAX_POSITION, TOLERANT * MAX_ROTATION
+    for points2D, start in guesses:
+        other = _resect(matches, points2D, start, FOCAL)
+        if other is None or other.confidence <= pose.confidence:
+            continue
+        if differ(pose, other, matches.points3D, *limits):
+            return (
+                "its intrinsics contradict the map: a focal length of "
+                f"{other.camera.mean_focal_length():.0f} pixels fits better, and the pose differs"
+            )
+    return None
+
+
+def _choose(assumed: Pose, other: Pose, points3D: np.ndarray) -> tuple[Pose, str | None]:
+    """Choose between poses with assumed and with other intrinsics, as `_calibrate` returns them."""
+    if other.confidence > RIGHT * assumed.confidence:
         return other, None
-    limit = 1 if free else LENIENT
-    if not differ(assumed, other, points3D, limit * MAX_POSITION, limit * MAX_ROTATION):
+    if other.confidence <= UNCLEAR * assumed.confidence or not differ(
+        assumed, other, points3D, MAX_POSITION, MAX_ROTATION
+    ):
         return assumed, None
-    if free:
-        return assumed, (
-            "it may be cropped or stretched: another principal point and aspect ratio fit about as "
-            "well, and the pose differs"
-        )
-    reason = "its intrinsics contradict the map: others fit much better, and the pose differs"
-    return assumed, reason
+    return assumed, (
+        "it may be cropped or stretched: another principal point and aspect ratio fit about as "
+        "well, and the pose differs"
+    )
 
 
 def _refusal(matches: _Matches, pose: Pose, rivals: list[Pose], gate: Gate) -> str | None:
@@ -248,6 +276,8 @@ def _refusal(matches: _Matches, pose: Pose, rivals: list[Pose], gate: Gate) -> s
             f"no plausible focal length: {focal_length:.0f} pixels, {low:.0f} to {high:.0f} were "
             "expected"
         )
+    if _is_swapped(matches.camera):
+        return "the x and y of its listed principal point are swapped"
     if reason := _imprecision(matches, pose, pose.cam_from_world):
         return reason
     least = gate.least_agreement(pose.confidence)
@@ -284,8 +314,19 @@ def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d
 
 def _is_off_centre(camera: pycolmap.Camera) -> bool:
     """Tell whether listed intrinsics belong to a cropped photo, or are wrong."""
-    point = np.array([camera.principal_point_x, camera.principal_point_y])
-    return bool((np.abs(point / [camera.width, camera.height] - 0.5) > OFF_CENTRE).any())
+    x, y = camera.principal_point_x, camera.principal_point_y
+    return _off_centre(camera, x, y) > OFF_CENTRE
+
+
+def _is_swapped(camera: pycolmap.Camera) -> bool:
+    """Tell whether the principal point is in the centre only if its coordinates are swapped."""
+    x, y = camera.principal_point_x, camera.principal_point_y
+    return _off_centre(camera, y, x) < CENTRED < _off_centre(camera, x, y) / 2
+
+
+def _off_centre(camera: pycolmap.Camera, x: float, y: float) -> float:
+    """Return how far a point is from the centre, as a share of the size."""
+    return float(np.abs(np.array([x / camera.width, y / camera.height]) - 0.5).max())
 
 
 def differ(

@@ -139,6 +139,15 @@ def resect_anew(
     return best and resect(points2D, points3D, *best[:2], max_error, ALL)
 
 
+def centred(
+    cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera
+) -> tuple[pycolmap.Rigid3d, pycolmap.Camera]:
+    """Move the principal point to the middle, turn the camera accordingly, drop all distortion."""
+    (fx, _, cx), (_, _, cy), _ = camera.calibration_matrix()
+    pinhole = _camera(camera, "PINHOLE", fx, fx, cx, cy)
+    return _turned(cam_from_world, pinhole, 0.5 - cx / camera.width, 0.5 - cy / camera.height)
+
+
 def _turned(
     cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera, x: float, y: float
 ) -> tuple[pycolmap.Rigid3d, pycolmap.Camera]:
@@ -146,8 +155,8 @@ def _turned(
     fx, fy, cx, cy = camera.params
     x, y = x * camera.width, y * camera.height
     ray = np.array([x / fx, y / fy, 1])
-    axis = np.cross(ray, [0, 0, 1]) / np.hypot(*ray[:2])
-    rotation = pycolmap.Rotation3d(np.arctan(np.hypot(*ray[:2])) * axis)
+    axis, tangent = np.cross(ray, [0, 0, 1]), np.hypot(*ray[:2])
+    rotation = pycolmap.Rotation3d(np.arctan(tangent) / (tangent or 1) * axis)
     turn = pycolmap.Rigid3d(rotation, np.zeros(3))
     return turn * cam_from_world, _camera(camera, "PINHOLE", fx, fy, cx + x, cy + y)
 

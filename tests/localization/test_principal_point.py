@@ -44,3 +44,11 @@ def test_that_of_a_crop_is_taken_where_the_matches_tell():
     assert pose.refusal is None and error < 0.5
     pose, _ = solve(corner, corner, 12, depth=0.01)
     assert "principal point is far from the centre" in pose.refusal
+
+
+def test_swapped_coordinates_are_named():
+    """80 matches fit them, with a rotation 6 degrees off."""
+    pose, _ = solve([2600, 2600, 600, 450], [2600, 2600, 450, 600], 80)
+    assert pose.refusal == "the x and y of its listed principal point are swapped"
+    corner = [2600, 2600, 460, 330]
+    assert solve(corner, corner, 80)[0].refusal is None

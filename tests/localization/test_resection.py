@@ -117,6 +117,15 @@ def test_intrinsics_that_contradict_the_map_are_refused(params):
     assert solve(*matches(WHOLE, 300), WHOLE, "list").refusal is None
 
 
+def test_a_listed_focal_length_that_moves_the_camera_is_refused():
+    """In a flat scene no other intrinsics fit by 10 % better."""
+    given = matches(WHOLE, 400, depth=1.2, noise=3, wrong=0)
+    listed = camera_of(1600, 1200, [1.1 * 1400, 800, 600, 0], "SIMPLE_RADIAL")
+    found = solve(*given, listed, "list")
+    assert "a focal length of 1" in found.refusal
+    assert solve(*given, WHOLE, "list").refusal is None
+
+
 def test_given_intrinsics_stay_as_they_are():
     """Errors of up to 5 % of listed focal lengths are no contradiction."""
     lens = [1400, 1400, 800, 600, -0.2, 0.03, 0.001, 0]
