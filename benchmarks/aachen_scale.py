@@ -31,7 +31,7 @@ from hloc_reduce.pairs_from_covisibility import most_covisible
 from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.feature_files import STORAGES, store
+from hloc_reduce.utils.codes import CODED, STORAGES, store
 from hloc_reduce.utils.h5 import get_dataset, open_h5
 from hloc_reduce.utils.match_files import find_pair, get_matches
 from hloc_reduce.utils.parsers import (
@@ -211,7 +211,7 @@ def _main() -> None:
     parser.add_argument("--storage", default=STORAGES[0], help=f"one of {', '.join(STORAGES)}")
     parser.add_argument("--once", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
-    cli.choose("storage", args.storage, STORAGES)
+    cli.choose("storage", args.storage, [name for name in STORAGES if name not in CODED])
     if not all(0 < share <= 1 for share in args.share) or len(set(args.share)) < len(args.share):
         raise InputError("--share: different numbers above 0 and at most 1.")
     cli.check_positive(args, "dim")

@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 
 from hloc_reduce.datasets.aachen import Aachen
-from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.images import read_image

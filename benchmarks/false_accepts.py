@@ -36,14 +36,13 @@ from hloc_reduce.localization.query import merged
 from hloc_reduce.localization.references import Reference, ScanMap, SfmMap
 from hloc_reduce.localize_sfm import RANSAC_THRESH
 from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
-from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.codes import restore, store
 from hloc_reduce.utils.feature_files import (
     get_colmap_keypoints,
     get_descriptors,
     get_image_size,
-    restore,
-    store,
 )
 from hloc_reduce.utils.files import replacing, write_csv
 from hloc_reduce.utils.h5 import open_h5

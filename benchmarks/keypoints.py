@@ -18,7 +18,7 @@ import cv2
 import darken_place
 import numpy as np
 
-from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.images import read_image
 from pipelines.layouts import pipeline_of

@@ -26,8 +26,8 @@ from hloc_reduce import projections
 from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, DIM
 from hloc_reduce.evaluation.ranking import nearest_neighbor_ap
 from hloc_reduce.training import nested, tracks
-from hloc_reduce.training.__main__ import parse_maps
 from hloc_reduce.training.sampling import matchable
+from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 

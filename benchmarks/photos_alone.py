@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from hloc_reduce import maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.maps import build
-from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 

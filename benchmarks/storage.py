@@ -15,10 +15,10 @@ from matching_ap import KINDS, draw_all, measure
 
 from hloc_reduce import projections
 from hloc_reduce.training import tracks
-from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.feature_files import restore, store
+from hloc_reduce.utils.codes import restore, store
 
 COMPARED = ("float16", "uint8")
 

@@ -37,18 +37,22 @@ def __getattr__(name: str) -> "type[Localizer]":
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "torch.Tensor":
+def describe_patches(
+    patches: "torch.Tensor", feature: str = "sift_sv64", storage: str = "float32"
+) -> "torch.Tensor":
     """Describe image patches.
 
     Args:
         patches: (N, 1, 32, 32) float in [0, 1], on any device.
         feature: a base descriptor such as "sift", or one with a shipped projection.
+        storage: how a feature file would store them: "float32", "float16", "uint8", "uint4",
+            "uint2" or "uint1".
 
     Returns:
-        (N, D) float32 of unit norm, on the same device.
+        (N, D) float32 of unit norm, on the same device; rounded as matching would read them.
 
     Raises:
-        InputError: for an unknown feature.
+        InputError: for an unknown feature or storage, or one without levels for it.
         ValueError: for patches of another shape or type.
 
     Example:
@@ -59,8 +63,9 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
     import torch
 
     from . import projections
-    from .confs.features import of_patches
+    from .confs.features import get, levels, of_patches
     from .descriptors.model import Descriptor
+    from .utils.codes import restore, store
 
     if not isinstance(patches, torch.Tensor):
         raise ValueError(f"Patches are a torch.Tensor, not {type(patches).__name__}.")
@@ -70,10 +75,14 @@ def describe_patches(patches: "torch.Tensor", feature: str = "sift_sv64") -> "to
             f"{patches.dtype}."
         )
     base, projection = of_patches(feature)
+    found = levels(get(feature, storage=storage)[1])
     descriptors = Descriptor(base).to(patches.device)(patches.float())
     if projection is not None:
         descriptors = projections.load(projection).to(patches.device)(descriptors)
-    return descriptors
+    if storage == "float32":
+        return descriptors
+    rounded = restore(*store({"descriptors": descriptors.cpu().numpy().T}, storage, found))
+    return torch.from_numpy(rounded).to(patches.device)
 
 
 def register(features: "Iterable[Path] | Path" = ()) -> list[str]:

@@ -1,7 +1,7 @@
 """Extract local features from images into an h5 file."""
 
 import argparse
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack, closing
 from functools import partial
@@ -15,11 +15,11 @@ from .confs import features as features_confs
 from .descriptors import DESCRIPTORS, check_weights
 from .runtime import parallel, processes
 from .runtime.executors import SERIAL, Executor, Results
-from .runtime.group_writer import FAILURE, Group, GroupWriter, failures, fill
+from .runtime.group_writer import FAILURE, Arrays, Group, GroupWriter, failures, fill
 from .runtime.trace import span
 from .utils import cli
 from .utils.cli import InputError
-from .utils.feature_files import STORAGES, store
+from .utils.codes import FLOATS, STORAGES, store
 from .utils.images import UnreadableImage, list_images
 from .utils.parsers import image_names
 from .utils.paths import strings_as_paths
@@ -44,6 +44,7 @@ def main(
     overwrite: bool = False,
     executor: Executor = SERIAL,
     strict: bool = True,
+    queries: Collection[str] = (),
 ) -> Path:
     """Extract the features of all images of a folder, or of a list of them.
 
@@ -57,6 +58,7 @@ def main(
         overwrite: extract all features again.
         executor: runs the extraction.
         strict: stop at an image that cannot be read, instead of recording the failure.
+        queries: images whose descriptors are stored as floats even if `conf` has another storage.
 
     Returns:
         The feature file. Images that it has already are skipped.
@@ -77,7 +79,8 @@ def main(
     if overwrite:
         check_model(conf)
     with GroupWriter(feature_path, provenance(conf, as_half), overwrite) as writer:
-        extract_several({feature_path: (stored, writer)}, image_dir, names, executor, strict)
+        features = {feature_path: (stored, writer)}
+        extract_several(features, image_dir, names, executor, strict, queries)
     return feature_path
 
 
@@ -87,6 +90,7 @@ def extract_several(
     names: list[str],
     executor: Executor = SERIAL,
     strict: bool = True,
+    queries: Collection[str] = (),
 ) -> None:
     """Extract several features of images at once.
 
@@ -100,6 +104,8 @@ def extract_several(
         executor: runs the extraction.
         strict: stop at an image that cannot be read. Otherwise it gets the features of a black
             image and a `group_writer.FAILURE`, and a later run tries to read it again.
+        queries: images whose descriptors are stored as floats. They are not kept for long, so that
+            rounding them would save little.
 
     Raises:
         UnreadableImage: if `strict`.
@@ -109,7 +115,7 @@ def extract_several(
     missing = [(name, [path for path in writers if name not in writers[path]]) for name in names]
     todo = [(name, paths) for name, paths in missing if paths]
     if todo:
-        extract = partial(_extract, confs, image_dir, strict)
+        extract = partial(_extract, confs, image_dir, strict, frozenset(queries))
         groups = sum(len(paths) for _, paths in todo)
         with closing(fill(writers, extract, todo, executor, CHUNK, gpu=True)) as written:
             for _ in progress(written, "Extracting features", "image", groups):
@@ -122,6 +128,7 @@ def _extract(
     confs: Mapping[Path, dict],
     image_dir: Path,
     strict: bool,
+    queries: Collection[str],
     items: Iterable[tuple[str, list[Path]]],
 ) -> Results[tuple[Path, Group]]:
     """Yield the groups of images for those feature files that lack them.
@@ -136,7 +143,10 @@ def _extract(
     items, preprocessing = list(items), next(iter(confs.values()))["preprocessing"]
     device = "cuda" if torch.cuda.is_available() else "cpu"
     models = {path: extractors.load(confs[path]["model"]).eval().to(device) for path in confs}
-    storages = {path: confs[path]["storage"] for path in confs}
+    stores = {
+        path: partial(_store, conf["storage"], features_confs.levels(conf), queries)
+        for path, conf in confs.items()
+    }
     detect = next(iter(models.values())).detect
     workers = min(parallel.cores(), len(items)) if detect else 1
     with ExitStack() as stack:
@@ -146,7 +156,7 @@ def _extract(
         extract = partial(
             extractors.extract_several, preprocessing=preprocessing, device=device, detect=detect
         )
-        work = partial(_extract_image, extract, models, storages, image_dir, strict)
+        work = partial(_extract_image, extract, models, stores, image_dir, strict)
         extracted: Iterable[list[tuple[Path, Group]]]
         if workers == 1:
             extracted = map(span("extract")(work), items)
@@ -174,7 +184,7 @@ def _detect_elsewhere(
 def _extract_image(
     extract: Callable[..., list[dict[str, np.ndarray]]],
     models: Mapping[Path, "Extractor"],
-    storages: Mapping[Path, str],
+    stores: Mapping[Path, Callable[..., tuple[Arrays, dict[str, dict]]]],
     image_dir: Path,
     strict: bool,
     item: tuple[str, list[Path]],
@@ -195,7 +205,7 @@ def _extract_image(
     groups = []
     for path, features in zip(paths, extracted, strict=True):
         uncertainty = features.pop("uncertainty")
-        arrays, attrs = store(features, storages[path])
+        arrays, attrs = stores[path](name, features)
         attrs["keypoints"] = {"uncertainty": uncertainty}
         if failure is not None:
             attrs[""] = {FAILURE: failure}
@@ -203,11 +213,25 @@ def _extract_image(
     return groups
 
 
+def _store(
+    storage: str,
+    levels: np.ndarray | None,
+    queries: Collection[str],
+    name: str,
+    features: dict[str, np.ndarray],
+) -> tuple[Arrays, dict[str, dict]]:
+    """Return what a file stores of the features of an image."""
+    if name in queries and storage not in FLOATS:
+        storage = FLOATS[0]
+    return store(features, storage, levels)
+
+
 def provenance(conf: dict, as_half: bool = True) -> dict:
     """Return what determines the features: the configuration and the projection's checksum.
 
     Raises:
-        InputError: when the projection or the weights of its base descriptor cannot be found.
+        InputError: when the projection, its levels or the weights of its base descriptor cannot be
+            found.
     """
     made_by = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
     if "storage" in conf:
@@ -216,6 +240,7 @@ def provenance(conf: dict, as_half: bool = True) -> dict:
         # the name only, as the file may be moved
         made_by["model"] = {**conf["model"], "projection": Path(projection).name}
         made_by["projection_sha256"] = projections.checksum(projection)
+    features_confs.levels(conf)
     descriptor = features_confs.descriptor_of(conf["model"])
     if descriptor in list(DESCRIPTORS):  # one from a YAML file may be unhashable
         check_weights(descriptor)

@@ -20,7 +20,7 @@ from .runtime.executors import SERIAL, Executor, Results
 from .runtime.group_writer import Arrays, Group, GroupWriter, fill
 from .utils import cli
 from .utils.cli import InputError
-from .utils.feature_files import get_descriptors
+from .utils.feature_files import StoredDescriptors, read_descriptors
 from .utils.h5 import file_provenance, open_h5
 from .utils.match_files import names_to_pair
 from .utils.parsers import parse_pairs
@@ -188,7 +188,7 @@ def _match_batch(
 
 
 class DescriptorCache:
-    """Reads descriptors and keeps the last used ones in memory.
+    """Reads descriptors and keeps the last used ones in memory, codes as codes.
 
     Args:
         max_bytes: maximum size of the descriptors in memory.
@@ -196,20 +196,44 @@ class DescriptorCache:
 
     def __init__(self, max_bytes: int):
         self.max_bytes, self.bytes = max_bytes, 0
-        self.kept: OrderedDict[tuple[str, str], np.ndarray] = OrderedDict()
+        self.kept: OrderedDict[tuple[str, str], StoredDescriptors | np.ndarray] = OrderedDict()
+        self.levels: dict[str, tuple[np.ndarray, str]] = {}  # with the first image, by data set
 
     def __call__(self, file: h5py.File, name: str) -> np.ndarray:
-        """Return the descriptors (N, D) float32 of an image in an open feature file."""
+        """Return the descriptors (N, D) float32 of an image in an open feature file.
+
+        Raises:
+            InputError: when they are broken, or are codes with other levels than those before.
+        """
         key = file.filename, name
         if key in self.kept:
             self.kept.move_to_end(key)
-            return self.kept[key]
-        descriptors = get_descriptors(file, name)
-        self.kept[key] = descriptors
-        self.bytes += descriptors.nbytes
+            kept = self.kept[key]
+            return kept if isinstance(kept, np.ndarray) else kept.restore()
+        stored = read_descriptors(file, name)
+        descriptors = stored.restore()
+        self._check(stored)
+        self.kept[key] = descriptors if stored.is_float else stored
+        self.bytes += _nbytes(self.kept[key])
         while self.bytes > self.max_bytes and len(self.kept) > 1:
-            self.bytes -= self.kept.popitem(last=False)[1].nbytes
+            self.bytes -= _nbytes(self.kept.popitem(last=False)[1])
         return descriptors
+
+    def _check(self, stored: StoredDescriptors) -> None:
+        """Refuse codes with other levels: they are of another projection."""
+        levels = stored.attrs.get("levels")
+        if levels is None:
+            return
+        known, first = self.levels.setdefault(stored.key, (levels, stored.place))
+        if not np.array_equal(known, levels):
+            raise InputError(
+                f"The codes of {stored.place} have other levels than those of {first}: they are "
+                "of different projections."
+            )
+
+
+def _nbytes(descriptors: StoredDescriptors | np.ndarray) -> int:
+    return (descriptors if isinstance(descriptors, np.ndarray) else descriptors.array).nbytes
 
 
 def _main() -> None:

@@ -1,8 +1,9 @@
-"""Convert the storage of the descriptors of a feature file: float16, float32 or uint8.
+"""Convert the storage of the descriptors of a feature file.
 
 hloc reads float16 and float32. uint8 takes half the space of float16: the range of the numbers of
-each image is divided into 255 steps. Its data set is `descriptors_uint8`, so that hloc reports
-missing descriptors instead of reading steps as numbers.
+each image is divided into 255 steps. uint4, uint2 and uint1 keep 4, 2 and 1 bits of a number, the
+index of one of the levels that belong to the projection. Their data sets are `descriptors_uint8`
+and so on, so that hloc reports missing descriptors instead of reading steps as numbers.
 """
 
 import argparse
@@ -11,18 +12,25 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from . import logger
+from . import logger, projections
 from .runtime.group_writer import GroupWriter
 from .utils import cli
 from .utils.cli import InputError
-from .utils.feature_files import QUANTIZED, STORAGES, get_descriptors, store
+from .utils.codes import CODED, QUANTIZED, STORAGES, storage_of, store
+from .utils.feature_files import get_descriptors
 from .utils.h5 import file_provenance, list_h5_names, open_h5
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
 
 @strings_as_paths
-def main(features: Path, output: Path, storage: str = "float16", overwrite: bool = False) -> Path:
+def main(
+    features: Path,
+    output: Path,
+    storage: str = "float16",
+    overwrite: bool = False,
+    projection: str | Path | None = None,
+) -> Path:
     """Write a feature file with another storage of descriptors; other data sets are copied.
 
     Args:
@@ -30,20 +38,29 @@ def main(features: Path, output: Path, storage: str = "float16", overwrite: bool
         output: the new feature file. Images that it has already are skipped.
         storage: one of `STORAGES`.
         overwrite: convert all images again.
+        projection: name or file of the projection of the features, whose levels are needed for
+            uint4, uint2 and uint1.
 
     Returns:
         `output`.
 
     Raises:
-        InputError: when the input is missing or broken, the storage is unknown, or both files are
-            the same.
+        InputError: when the input is missing or broken, the storage is unknown or needs a
+            projection, or both files are the same.
     """
     cli.choose("storage", storage, STORAGES)
+    levels = None
+    if storage in CODED:
+        if projection is None:
+            raise InputError(f"--storage {storage} needs --projection, the one of the features.")
+        levels = projections.levels(projection, storage)
     if output.resolve() == features.resolve():
         raise InputError(f"{output} cannot be converted to itself: choose another --output.")
     names = list_h5_names(features)
     with open_h5(features) as file:
         made_by = {"converted": file_provenance(file), "storage": storage}
+        if projection is not None:
+            made_by["projection_sha256"] = projections.checksum(projection)
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [name for name in names if name not in writer]
             for name in progress(todo, "Converting features", "image"):
@@ -54,10 +71,17 @@ def main(features: Path, output: Path, storage: str = "float16", overwrite: bool
                 }
                 arrays = {key: np.asarray(d[()], d.dtype) for key, d in datasets.items()}
                 attrs = {key: dict(dataset.attrs) for key, dataset in datasets.items()}
-                if storage != "uint8" or QUANTIZED not in arrays:
-                    stored, own = store({"descriptors": get_descriptors(file, name).T}, storage)
+                if storage not in QUANTIZED or storage_of(file[name]) != storage:
+                    descriptors = get_descriptors(file, name).T
+                    if levels is not None and len(levels) != len(descriptors):
+                        raise InputError(
+                            f"{features}: the descriptors of {name} are {len(descriptors)}-D, "
+                            f"those of {projection} are {len(levels)}-D."
+                        )
+                    stored, own = store({"descriptors": descriptors}, storage, levels)
+                    for key in ("descriptors", *QUANTIZED.values()):
+                        arrays.pop(key, None)
                     arrays, attrs = arrays | stored, attrs | own
-                arrays.pop("descriptors" if storage == "uint8" else QUANTIZED, None)
                 writer.add(name, arrays, attrs)
     logger.info("%d images, descriptors as %s: %s", len(names), storage, output)
     return output
@@ -73,6 +97,10 @@ def _main() -> None:
     parser.add_argument("--features", type=Path, required=True, help="feature file")
     parser.add_argument("--output", type=Path, required=True, help="the new feature file")
     parser.add_argument("--storage", default="float16", help=f"one of {', '.join(STORAGES)}")
+    parser.add_argument(
+        "--projection",
+        help="projection of the features, by name or file; needed for uint4, uint2 and uint1",
+    )
     parser.add_argument("--overwrite", action="store_true", help="convert all images again")
     main(**vars(parser.parse_args()))
 

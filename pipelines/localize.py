@@ -35,7 +35,7 @@ from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.parsers import parse_query_lists, write_pairs
 from hloc_reduce.utils.paths import strings_as_paths
@@ -196,7 +196,10 @@ def main(
 
         with run.stage("extract_features"):
             features = extract_features.main(
-                built.conf, query_images, outputs, image_list=names, strict=strict
+                *(built.conf, query_images, outputs),
+                image_list=names,
+                strict=strict,
+                queries=names,
             )
         photos.forget(failures(features))
         loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"

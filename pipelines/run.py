@@ -35,7 +35,7 @@ from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.runtime.versions import versions
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.files import write_csv
 from hloc_reduce.utils.h5 import get_text, list_h5_names, open_h5
 from hloc_reduce.utils.images import list_images
@@ -144,7 +144,7 @@ class Run:
                 name: summarize_list([row for row in rows if row["list"] == name], thresholds[name])
                 for name in lists
             },
-            "bytes_per_keypoint": bytes_per_keypoint(features),
+            "bytes_per_keypoint": bytes_per_keypoint(files["map_features"] or features),
             "seconds": self.folder.seconds(),
             "bytes": self.folder.bytes(),
             "versions": versions(),
@@ -188,7 +188,7 @@ class DatasetRun(Run):
         ground_truth: true poses of the queries; default: those of the data set.
         overwrite: recompute existing results.
         projection: projection file to use with the base descriptor of `feature`.
-        storage: how descriptors are stored.
+        storage: how descriptors of map images are stored.
         keypoints: settings of the DoG detector.
         executor: where the work is done.
         features: feature file to use instead of extracting features.
@@ -279,6 +279,7 @@ class DatasetRun(Run):
                     image_list=[*self.map_names, *self.query_names],
                     executor=self.executor,
                     strict=self._strict,
+                    queries=self.query_names,
                 )
             kept = extract_features.keep_readable(
                 self.features, self.map_names, self._accept_partial

@@ -8,12 +8,14 @@ import re
 from argparse import ArgumentParser
 from pathlib import Path
 
+import numpy as np
+
 from .. import projections
 from ..descriptors import COLMAP, DESCRIPTORS, DIM
 from ..detectors.dog import HLOC, KEYPOINTS
 from ..projections.released import FILES as RELEASED
 from ..utils.cli import InputError, choose
-from ..utils.feature_files import STORAGES
+from ..utils.codes import CODED, STORAGES
 from ..utils.parsers import read_yaml
 from ..utils.tables import aligned
 
@@ -96,7 +98,7 @@ def get(
         name: a key of `confs`, or a YAML file with a `model` and perhaps `preprocessing`, which
             names the feature.
         projection: file of another projection of the same base, which names the feature.
-        storage: of the descriptors, one of `feature_files.STORAGES`.
+        storage: of the descriptors, one of `codes.STORAGES`.
         keypoints: settings of DoG, one of `detectors.dog.KEYPOINTS`; "adaptive" keeps those of a
             YAML file.
 
@@ -146,6 +148,23 @@ def keypoints_of(model: dict) -> str | None:
     return found.get("keypoints") if found.get("options", HLOC) == HLOC else None
 
 
+def levels(conf: dict) -> np.ndarray | None:
+    """Return the levels (D, 2**bits) by which a feature is stored; None if they are not codes.
+
+    Raises:
+        InputError: when its storage needs levels that its projection does not have.
+    """
+    storage, projection = conf.get("storage"), conf["model"].get("projection")
+    if storage not in CODED:
+        return None
+    if projection is None:
+        raise InputError(
+            f"--storage {storage} needs a projection with levels, such as {RECOMMENDED}; "
+            f"{conf['output'].removeprefix('feats-dog-')} has none. --storage uint8 needs none."
+        )
+    return projections.levels(projection, storage)
+
+
 def of_patches(name: str) -> tuple[str, str | None]:
     """Return the base descriptor and the projection, if any, of a feature of patches.
 
@@ -167,7 +186,8 @@ def add_storage_option(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--storage",
         default=STORAGES[0],
-        help=f"storage of descriptors, one of {', '.join(STORAGES)}; hloc cannot read uint8",
+        help=f"storage of the map's descriptors, one of {', '.join(STORAGES)}; uint4 keeps two "
+        "numbers in a byte. Queries stay floats. hloc reads floats only",
     )
 
 

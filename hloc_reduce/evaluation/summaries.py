@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 
 from ..localization.records import pose_of
+from ..utils.codes import storage_of
 from ..utils.feature_files import stored_descriptors
 from ..utils.files import replacing
 from ..utils.h5 import list_h5_names, open_h5
@@ -80,17 +81,22 @@ def bytes_per_keypoint(features: Path) -> dict:
     """Measure the size of descriptors and of a feature file.
 
     Returns:
-        `descriptor`, bytes of one; `storage`, the type of its numbers; `feature_file`, bytes of the
-        file for each keypoint; and `keypoints`, of all images.
+        `descriptor`, bytes of one of a map image; `storage`, how it is stored; `feature_file`,
+        bytes of the file for each keypoint; and `keypoints`, of all images.
     """
     names = list_h5_names(features)
     with open_h5(features) as file:
         descriptors = [stored_descriptors(file, name) for name in names]
         total = sum(dataset.shape[1] for dataset in descriptors)
-        size = descriptors[0].shape[0] * descriptors[0].dtype.itemsize
+        # queries in the same file may be floats
+        size, name = min(
+            (dataset.shape[0] * dataset.dtype.itemsize, name)
+            for dataset, name in zip(descriptors, names, strict=True)
+        )
+        storage = storage_of(file[name])
     return {
         "descriptor": size,
-        "storage": descriptors[0].dtype.name,
+        "storage": storage,
         "feature_file": round(features.stat().st_size / total, 1) if total else 0.0,
         "keypoints": total,
     }

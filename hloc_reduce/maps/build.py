@@ -30,7 +30,7 @@ from ..runtime import provenance
 from ..runtime.outputs import RunFolder
 from ..utils import colmap
 from ..utils.cli import InputError
-from ..utils.feature_files import STORAGES
+from ..utils.codes import STORAGES
 from ..utils.files import replacing
 from ..utils.images import list_images
 from ..utils.paths import strings_as_paths

@@ -19,7 +19,8 @@ from ..pairs_from_retrieval import rank, read_global
 from ..runtime import parallel
 from ..utils import colmap
 from ..utils.cli import InputError
-from ..utils.feature_files import dimension, get_descriptors, restore, store, to_colmap
+from ..utils.codes import FLOATS
+from ..utils.feature_files import dimension, get_descriptors, to_colmap
 from ..utils.h5 import open_h5
 from .map import RETRIEVAL, Map
 
@@ -53,7 +54,9 @@ class Localizer:
         built = Map(Path(map_dir))
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.preprocessing = built.conf["preprocessing"]
-        self.storage, self.cameras = built.storage, built.cameras
+        self.cameras = built.cameras
+        # queries stay floats, rounded as in a feature file
+        self.dtype = built.storage if built.storage in FLOATS else FLOATS[0]
         matcher: dict = matchers_confs.confs[built.matcher]["model"]
         self.matcher = matchers.load(matcher).eval()
         self.gate = gate.of_matches(matcher, dimension(built.features))
@@ -109,8 +112,8 @@ class Localizer:
                 f"The camera has {camera.width}x{camera.height} pixels, the photo has "
                 f"{width}x{height}."
             )
-        # rounded as in the map
-        descriptors = torch.from_numpy(restore(*store(features, self.storage)))
+        rounded = features["descriptors"].T.astype(self.dtype)
+        descriptors = torch.from_numpy(rounded.astype(np.float32, order="C"))
         lap("extraction")
         retrieved = self._retrieve(descriptors)
         lap("retrieval")

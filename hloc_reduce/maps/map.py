@@ -11,7 +11,7 @@ from ..detectors.dog import KEYPOINTS
 from ..localization import intrinsics
 from ..utils import colmap
 from ..utils.cli import InputError, choose, no_folder
-from ..utils.feature_files import STORAGES
+from ..utils.codes import STORAGES
 from ..utils.h5 import file_provenance, open_h5
 from ..utils.paths import strings_as_paths
 

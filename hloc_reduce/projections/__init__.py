@@ -2,14 +2,14 @@
 
 from typing import TYPE_CHECKING
 
-from .files import checksum, find, names, split_prefix
+from .files import checksum, find, levels, names, split_prefix
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from .network import Projection
 
-__all__ = ["checksum", "find", "load", "names", "split_prefix"]
+__all__ = ["checksum", "find", "levels", "load", "names", "split_prefix"]
 
 
 def load(projection: "str | Path") -> "Projection":

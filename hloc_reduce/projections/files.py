@@ -3,8 +3,11 @@
 import re
 from pathlib import Path
 
+import numpy as np
+
 from ..descriptors import DESCRIPTORS
 from ..utils.cli import InputError
+from ..utils.codes import check_levels
 from ..utils.files import file_sha256
 from . import released
 
@@ -59,6 +62,34 @@ def split_prefix(projection: str | Path) -> tuple[str, str]:
     """Split `name@24` into the name and the prefix, "" without one."""
     match = PREFIX.fullmatch(str(projection))
     return (match[1], match[2]) if match else (str(projection), "")
+
+
+def level_key(storage: str, prefix: str | int = "") -> str:
+    """Return the name of the tensor with the levels of a storage, for a prefix if any."""
+    return f"levels.{storage}" + (f"@{prefix}" if prefix else "")
+
+
+def levels(projection: str | Path, storage: str) -> np.ndarray:
+    """Return the levels (D, 2**bits) float32 of a projection for a storage in `codes.CODED`.
+
+    Raises:
+        InputError: when it has none, or they are broken.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path, (name, prefix) = find(projection), split_prefix(projection)
+    key = level_key(storage, prefix)
+    try:
+        with safe_open(path, "np") as file:
+            return check_levels(file.get_tensor(key), storage)
+    except SafetensorError:
+        raise InputError(
+            f"The projection {Path(name).stem} has no levels for {key.removeprefix('levels.')}. "
+            f"Add them with 'python -m hloc_reduce.training.levels --projection {path} "
+            "--map IMAGES:MODEL', or use --storage uint8."
+        ) from None
+    except ValueError as error:
+        raise InputError(f"{path} has {error}.") from None
 
 
 def checksum(projection: str | Path) -> str:

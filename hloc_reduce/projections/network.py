@@ -1,7 +1,7 @@
 """The networks of projections: trained, frozen, and their files."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import torch
@@ -85,16 +85,23 @@ class Projection(nn.Module):
         return nn.functional.normalize(self.linears[-1](descriptors), dim=1)
 
 
-def save(mlp: MLP, metadata: dict, path: Path) -> None:
+def save(
+    mlp: MLP, metadata: dict, path: Path, levels: Mapping[str, torch.Tensor] | None = None
+) -> None:
     """Write a trained network as safetensors; weights as float16, statistics as float32.
 
-    `metadata` holds strings, numbers, lists and dicts of these.
+    Args:
+        mlp: the network.
+        metadata: strings, numbers, lists and dicts of these.
+        path: the file.
+        levels: by `files.level_key`, stored as float16.
     """
     tensors = {
         key: (value.half() if key.startswith("linears.") else value.float()).contiguous()
         for key, value in mlp.state_dict().items()
         if not key.endswith("num_batches_tracked")
     }
+    tensors |= {key: value.half().contiguous() for key, value in (levels or {}).items()}
     metadata = {**metadata, "layers": list(mlp.sizes)}
     header = {key: json.dumps(value) for key, value in metadata.items()}
     with replacing(path) as temporary:
@@ -133,7 +140,11 @@ def read_safetensors(path: Path) -> tuple[MLP, dict]:
     """Read a network and its metadata; a broken file raises any error."""
     with safe_open(path, "pt") as file:
         metadata = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
-        state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
+        state = {
+            key: file.get_tensor(key).float()
+            for key in file.keys()  # noqa: SIM118
+            if not key.startswith("levels.")
+        }
     layers = metadata["layers"]
     sizes = [len(state[f"linears.{i}.bias"]) for i in range(len(layers) - 1)]
     if (

@@ -15,14 +15,13 @@ from ..confs import features as features_confs
 from ..datasets import phototour as layout
 from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM, check_weights
 from ..evaluation import patch_verification as verification
-from ..maps.map import Map, is_map
 from ..projections import network
 from ..runtime.versions import versions
 from ..utils import cli
 from ..utils.cli import InputError
 from ..utils.files import file_sha256
 from ..utils.paths import strings_as_paths
-from . import nested, patch_tracks, pca, ss, sv, tracks, us
+from . import levels, nested, patch_tracks, pca, ss, sv, tracks, us
 
 SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
 RECIPE_NAMES = ("best", "paper", "tune")
@@ -107,7 +106,7 @@ def main(
             checkpoint = path.with_suffix(".ckpt")
             made_from = json.dumps(metadata, sort_keys=True)
             mlp = trainer.train(data, dim, settings[dim], seed, checkpoint, made_from)
-            network.save(mlp, metadata, path)
+            network.save(mlp, metadata, path, levels.of_projection(mlp, metadata, data))
             for file in (checkpoint, ss.clusters_of(checkpoint)):
                 file.unlink(missing_ok=True)
             logger.info("Saved %s.", path)
@@ -153,37 +152,6 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
     if recipe == "tune":
         settings |= {"begin_with": name, "begin_with_sha256": projections.checksum(name)}
     return settings
-
-
-def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
-    """Parse `images:model`, or folders of maps of `pipelines.localize`.
-
-    A map is named after the parent of its images folder, or of the folder of the built map.
-
-    Returns:
-        From name to the folders of images and of the COLMAP model.
-
-    Raises:
-        InputError: when a folder does not exist, or two maps have the same name.
-    """
-    folders: dict[str, tuple[Path, Path]] = {}
-    for value in values:
-        if is_map(Path(value)):
-            built = Map(Path(value))
-            images, model, folder = built.images, built.sfm, built.folder
-        else:
-            before, separator, after = value.rpartition(":")
-            if not separator:
-                raise InputError(f"--map {value}: neither a map nor of the form images:model.")
-            images, model, folder = Path(before), Path(after), Path(before)
-        for part in (images, model):
-            if not part.is_dir():
-                raise InputError(f"--map {value}: there is no folder {part}.")
-        name = folder.resolve().parent.name
-        if name in folders:
-            raise InputError(f"--map {value}: another map is called {name}, too.")
-        folders[name] = images, model
-    return folders
 
 
 def validate(folder: Path, outputs: Path, descriptor: str, paths: list[Path]) -> None:
@@ -287,7 +255,7 @@ def _main() -> None:
         conf["model"] = features_confs.base_of(conf["model"])
         args.descriptor = [args.base.stem]
     _check(args, conf)
-    maps = parse_maps(args.map)
+    maps = tracks.parse_maps(args.map)
     names = [*maps, *(folder.resolve().name for folder in args.phototour)]
     for name in names:
         if names.count(name) > 1:

@@ -74,6 +74,37 @@ class Tracks:
         return Tracks(**{key: value[kept] for key, value in vars(self).items()})
 
 
+def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
+    """Parse `images:model`, or folders of maps of `pipelines.localize`.
+
+    A map is named after the parent of its images folder, or of the folder of the built map.
+
+    Returns:
+        From name to the folders of images and of the COLMAP model.
+
+    Raises:
+        InputError: when a folder does not exist, or two maps have the same name.
+    """
+    folders: dict[str, tuple[Path, Path]] = {}
+    for value in values:
+        if is_map(Path(value)):
+            built = Map(Path(value))
+            images, model, folder = built.images, built.sfm, built.folder
+        else:
+            before, separator, after = value.rpartition(":")
+            if not separator:
+                raise InputError(f"--map {value}: neither a map nor of the form images:model.")
+            images, model, folder = Path(before), Path(after), Path(before)
+        for part in (images, model):
+            if not part.is_dir():
+                raise InputError(f"--map {value}: there is no folder {part}.")
+        name = folder.resolve().parent.name
+        if name in folders:
+            raise InputError(f"--map {value}: another map is called {name}, too.")
+        folders[name] = images, model
+    return folders
+
+
 @strings_as_paths
 def main(
     images: Path,

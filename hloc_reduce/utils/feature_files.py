@@ -1,12 +1,14 @@
-"""Feature files in hloc's format, and how they store descriptors."""
+"""Feature files in hloc's format."""
 
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from .cli import InputError
+from .codes import QUANTIZED, restore
 from .h5 import get_array, get_dataset, iterate_h5_names, open_h5, reading
 
 
@@ -46,64 +48,6 @@ def to_colmap(keypoints: np.ndarray) -> np.ndarray:
     return keypoints.astype(np.float64) + 0.5
 
 
-STORAGES = ("float16", "float32", "uint8")  # hloc has the first two, as `as_half`
-QUANTIZED = "descriptors_uint8"
-STEPS = 255
-
-
-def store(
-    features: dict[str, np.ndarray], storage: str
-) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
-    """Convert the features of an image to what a file stores.
-
-    Args:
-        features: arrays of floats or integers, with `descriptors` (D, N).
-        storage: one of `STORAGES`. Keypoints stay float32; with uint8, floats that are not
-            descriptors become float16.
-
-    Returns:
-        The arrays, with `descriptors_uint8` instead of quantized `descriptors`, and the attributes
-        of each array: `scale` and `offset` of quantized descriptors.
-    """
-    floats = np.float32 if storage == "float32" else np.float16
-    stored = {
-        key: array.astype(floats) if key != "keypoints" and array.dtype.kind == "f" else array
-        for key, array in features.items()
-    }
-    if storage != "uint8":
-        return stored, {}
-    del stored["descriptors"]
-    quantized, scale, offset = quantize(features["descriptors"])
-    return stored | {QUANTIZED: quantized}, {QUANTIZED: {"scale": scale, "offset": offset}}
-
-
-def quantize(descriptors: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Round descriptors to 256 levels between their minimum and maximum.
-
-    Returns:
-        Levels (uint8, same shape), scale and offset: descriptors are offset + scale * level.
-    """
-    if not descriptors.size:
-        return descriptors.astype(np.uint8), 1.0, 0.0
-    offset = float(descriptors.min())
-    scale = (float(descriptors.max()) - offset) / STEPS or 1.0
-    levels = np.round((descriptors.astype(np.float32) - offset) / scale)
-    return levels.clip(0, STEPS).astype(np.uint8), scale, offset
-
-
-def restore(stored: dict[str, np.ndarray], attrs: dict[str, dict]) -> np.ndarray:
-    """Return descriptors (N, D) float32 from what `store` returned.
-
-    Quantized descriptors are normalized.
-    """
-    if QUANTIZED not in stored:
-        return np.ascontiguousarray(stored["descriptors"].T, np.float32)
-    scale, offset = (np.float32(attrs[QUANTIZED][key]) for key in ("scale", "offset"))
-    descriptors = np.ascontiguousarray(stored[QUANTIZED].T, np.float32) * scale + offset
-    norm = np.linalg.norm(descriptors, axis=1, keepdims=True)
-    return descriptors / np.maximum(norm, np.finfo(np.float32).tiny)
-
-
 def stored_descriptors(file: h5py.File, name: str) -> h5py.Dataset:
     """Return the data set of an image's descriptors (D, N), floats or quantized.
 
@@ -111,7 +55,8 @@ def stored_descriptors(file: h5py.File, name: str) -> h5py.Dataset:
         InputError: when it is missing, or their number is not that of the keypoints.
     """
     with reading(file.filename):
-        key = QUANTIZED if f"{name}/{QUANTIZED}" in file else "descriptors"
+        keys = (key for key in QUANTIZED.values() if f"{name}/{key}" in file)
+        key = next(keys, "descriptors")
         dataset, keypoints = get_dataset(file, name, key), file[name].get("keypoints")
         shape, others = dataset.shape, getattr(keypoints, "shape", None)
     if shape and others and shape[-1] != others[0]:
@@ -127,10 +72,51 @@ def dimension(features: Path) -> int:
     with open_h5(features) as file:
         for name in iterate_h5_names(file.id):
             with suppress(InputError):
-                shape = stored_descriptors(file, name).shape
-                if len(shape) == 2:
-                    return shape[0]
+                dataset = stored_descriptors(file, name)
+                if len(dataset.shape) == 2:
+                    return len(dataset.attrs.get("levels", range(dataset.shape[0])))
     return 0
+
+
+@dataclass(frozen=True)
+class StoredDescriptors:
+    """The descriptors of an image as a file stores them.
+
+    Args:
+        place: file and image, for messages.
+        key: name of their data set.
+        array: (D, N) floats or steps, or packed codes.
+        attrs: attributes of the data set.
+    """
+
+    place: str
+    key: str
+    array: np.ndarray
+    attrs: dict
+
+    @property
+    def is_float(self) -> bool:
+        """Whether they are floats."""
+        return self.key not in QUANTIZED.values()
+
+    def restore(self) -> np.ndarray:
+        """Return them as (N, D) float32; raise an InputError if they are broken."""
+        try:
+            return restore({self.key: self.array}, {self.key: self.attrs})
+        except KeyError as error:
+            raise InputError(f"{self.place}: its {self.key} have no {error.args[0]}.") from None
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{self.place}: its {self.key} have {error}.") from None
+
+
+def read_descriptors(file: h5py.File, name: str) -> StoredDescriptors:
+    """Read the descriptors of an image; raise an InputError if they are missing or broken."""
+    dataset = stored_descriptors(file, name)
+    key = dataset.name.rpartition("/")[2]
+    array = get_array(file, name, key, (0, 0))
+    with reading(file.filename):
+        attrs = dict(dataset.attrs)
+    return StoredDescriptors(f"{name} in {file.filename}", key, array, attrs)
 
 
 def get_descriptors(file: h5py.File, name: str) -> np.ndarray:
@@ -139,12 +125,4 @@ def get_descriptors(file: h5py.File, name: str) -> np.ndarray:
     Raises:
         InputError: when they are missing or broken.
     """
-    dataset = stored_descriptors(file, name)
-    key = dataset.name.rpartition("/")[2]
-    array = get_array(file, name, key, (0, 0))
-    try:
-        with reading(file.filename):
-            attrs = dict(dataset.attrs)
-        return restore({key: array}, {key: attrs})
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"{file.filename}: {name} has no scale and offset.") from None
+    return read_descriptors(file, name).restore()

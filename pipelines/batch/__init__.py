@@ -8,13 +8,11 @@ the others. An interrupted batch resumes.
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from hloc_reduce import logger
 from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.runtime.outputs import SHARED, Lock
 from hloc_reduce.utils import cli
-from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.codes import STORAGES, descriptor_bytes
 from hloc_reduce.utils.h5 import list_h5_names
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned
@@ -149,8 +147,8 @@ def steps(shared: Shared, overwrite: bool) -> Iterator[tuple[str, str, int, str,
         for path in group:
             done = path.exists() and not overwrite
             missing = set(shared.images()) - set(list_h5_names(path) if done else ())
-            number_bytes = np.dtype(shared.confs[path].get("storage", STORAGES[0])).itemsize
-            each = FEATURE_BYTES + shared.dims[path] * number_bytes
+            storage = shared.confs[path].get("storage", STORAGES[0])
+            each = FEATURE_BYTES + descriptor_bytes(shared.dims[path], storage)
             size += len(missing) * KEYPOINTS * each
             todo |= missing
         names = ", ".join(path.stem.removeprefix("feats-dog-") for path in group)

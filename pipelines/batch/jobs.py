@@ -25,7 +25,7 @@ from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.runtime.outputs import SHARED
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.parsers import read_yaml
 
 SHIPPED = Path(__file__).parents[2] / "confs/jobs"

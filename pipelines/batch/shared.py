@@ -16,7 +16,7 @@ from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.runtime.outputs import STAGES, RunFolder
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.feature_files import STORAGES
+from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.files import announce
 
 from ..layouts import pipeline_of
@@ -175,7 +175,7 @@ class Shared:
                 writer = stack.enter_context(GroupWriter(path, made_by))
                 features[path] = {"storage": STORAGES[0], **self.confs[path]}, writer
             extract_features.extract_several(
-                features, self._place.images, self.images(), executor, strict
+                features, self._place.images, self.images(), executor, strict, self.query_names
             )
 
     def _retrieve(self, jobs: list[Job], accept_partial: bool) -> None:

@@ -11,7 +11,7 @@ from command import outcome, state
 
 from hloc_reduce import Localizer, maps, projections
 from hloc_reduce.training import tracks
-from hloc_reduce.training.__main__ import parse_maps
+from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import parsers
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize

@@ -10,14 +10,8 @@ from hypothesis import strategies as st
 from hloc_reduce import extract_features, match_features, storage
 from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.feature_files import (
-    QUANTIZED,
-    get_descriptors,
-    quantize,
-    restore,
-    store,
-    stored_descriptors,
-)
+from hloc_reduce.utils.codes import QUANTIZED, quantize, restore, store
+from hloc_reduce.utils.feature_files import get_descriptors, stored_descriptors
 
 
 def unit(number, dim, seed):
@@ -86,12 +80,12 @@ def test_command_converts_to_hlocs_format(tmp_path, monkeypatch):
     run(monkeypatch, storage, "--features", quantized, "--output", output)  # all is there
     same = storage.main(quantized, tmp_path / "same.h5", "uint8")
     with h5py.File(quantized) as before, h5py.File(same) as after:
-        levels = [file["b.jpg"][QUANTIZED] for file in (before, after)]
+        levels = [file["b.jpg"][QUANTIZED["uint8"]] for file in (before, after)]
         assert (levels[0][()] == levels[1][()]).all()
         assert dict(levels[0].attrs) == dict(levels[1].attrs)
     back = storage.main(output, tmp_path / "back.h5", "uint8")
     with h5py.File(quantized) as before, h5py.File(back) as after:
-        levels = [file["b.jpg"][QUANTIZED][()].astype(int) for file in (before, after)]
+        levels = [file["b.jpg"][QUANTIZED["uint8"]][()].astype(int) for file in (before, after)]
     assert np.abs(levels[0] - levels[1]).max() <= 1
 
 
@@ -101,7 +95,7 @@ def test_conversion_copies_other_data_sets_as_they_are(tmp_path):
         writer.add("a.jpg", {"descriptors": unit(3, 16, 0).T, "scores": scores})
     storage.main(tmp_path / "a.h5", tmp_path / "b.h5", "uint8")
     with h5py.File(tmp_path / "b.h5") as file:
-        assert sorted(file["a.jpg"]) == [QUANTIZED, "scores"]
+        assert sorted(file["a.jpg"]) == [QUANTIZED["uint8"], "scores"]
         np.testing.assert_array_equal(file["a.jpg/scores"], scores)
 
 
@@ -129,12 +123,12 @@ def test_wrong_input(tmp_path, monkeypatch, caplog):
     path = write(tmp_path / "feats.h5", "uint8", "a.jpg")
     with pytest.raises(InputError, match="converted to itself"):
         storage.main(path, path)
-    conf = {**extract_features.confs["sift"], "storage": "uint4"}
-    with pytest.raises(InputError, match="Unknown storage 'uint4'"):
+    conf = {**extract_features.confs["sift"], "storage": "uint3"}
+    with pytest.raises(InputError, match="Unknown storage 'uint3'"):
         extract_features.main(conf, tmp_path, tmp_path)
     with h5py.File(path, "a") as file:
-        del file["a.jpg"][QUANTIZED].attrs["scale"]
-    with pytest.raises(InputError, match="no scale and offset"):
+        del file["a.jpg"][QUANTIZED["uint8"]].attrs["scale"]
+    with pytest.raises(InputError, match="have no scale"):
         storage.main(path, tmp_path / "new.h5")
-    command = ["--features", path, "--output", tmp_path / "c.h5", "--storage", "uint4"]
-    assert "Unknown storage 'uint4'" in refused(monkeypatch, caplog, storage, *command)
+    command = ["--features", path, "--output", tmp_path / "c.h5", "--storage", "uint3"]
+    assert "Unknown storage 'uint3'" in refused(monkeypatch, caplog, storage, *command)

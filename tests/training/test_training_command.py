@@ -119,11 +119,11 @@ def test_the_command_for_what_does_not_ship_is_one(tmp_path, monkeypatch):
 def test_maps_are_parsed(place):
     images, model = place
     given = f"{images}:{model}"
-    assert training.parse_maps([given]) == {"town": place}
+    assert tracks.parse_maps([given]) == {"town": place}
     with pytest.raises(InputError, match="images:model"):
-        training.parse_maps([str(images)])
+        tracks.parse_maps([str(images)])
     with pytest.raises(InputError, match="another map"):
-        training.parse_maps([given] * 2)
+        tracks.parse_maps([given] * 2)
     model.rmdir()
     with pytest.raises(InputError, match="no folder"):
-        training.parse_maps([given])
+        tracks.parse_maps([given])

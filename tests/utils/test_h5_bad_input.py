@@ -8,7 +8,8 @@ from hostile import overwrite, refuses_or_reads
 from hloc_reduce.runtime import group_writer
 from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.feature_files import get_descriptors, get_image_size, get_keypoints, store
+from hloc_reduce.utils.codes import store
+from hloc_reduce.utils.feature_files import get_descriptors, get_image_size, get_keypoints
 from hloc_reduce.utils.h5 import file_provenance, list_h5_names, open_h5
 from hloc_reduce.utils.match_files import get_matches, names_to_pair
 

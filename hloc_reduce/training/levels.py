@@ -1,0 +1,145 @@
+"""Add the levels of codes to projections, fitted on the tracks of maps.
+
+A code of 4, 2 or 1 bits is the index of one of 16, 4 or 2 levels of a number. The levels of each
+number are those with the least mean squared error on the tracks (Lloyd-Max), for all storages.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from .. import logger, projections
+from ..projections import network
+from ..projections.files import level_key
+from ..utils import cli
+from ..utils.cli import InputError
+from ..utils.codes import CODED
+from ..utils.files import file_sha256
+from ..utils.paths import strings_as_paths
+from . import nested, tracks
+from .tracks import Tracks
+
+SAMPLE = 100_000  # descriptors that levels are fitted to
+ROUNDS = 100  # of Lloyd's algorithm
+
+
+def fit(numbers: torch.Tensor, bits: int) -> torch.Tensor:
+    """Find the levels with the least mean squared error by Lloyd's algorithm.
+
+    Args:
+        numbers: (N, D) float32.
+        bits: of a code.
+
+    Returns:
+        The ascending levels of each dimension (D, 2**bits).
+    """
+    ordered = numbers.T.contiguous().sort(dim=1).values  # (D, N)
+    number, count = ordered.shape[1], 2**bits
+    # with sums up to each place, the mean of an interval is a difference
+    sums = nn.functional.pad(ordered.double().cumsum(1), (1, 0))
+    place = ((torch.arange(count) + 0.5) * number / count).long()
+    levels = ordered[:, place].contiguous()
+    for _ in range(ROUNDS):
+        middle = ((levels[:, 1:] + levels[:, :-1]) / 2).contiguous()
+        inner = torch.searchsorted(ordered, middle)
+        ends = nn.functional.pad(nn.functional.pad(inner, (1, 0)), (0, 1), value=number)
+        size = ends.diff(dim=1)
+        means = sums.gather(1, ends).diff(dim=1) / size.clamp(min=1)
+        renewed = torch.where(size > 0, means.float(), levels)
+        if torch.equal(renewed, levels):
+            break
+        levels = renewed
+    return levels
+
+
+def of_projection(mlp: network.MLP, metadata: dict, maps: list[Tracks]) -> dict[str, torch.Tensor]:
+    """Fit the levels of a trained projection, of all its prefixes if it is nested.
+
+    Args:
+        mlp: the projection.
+        metadata: of it.
+        maps: the tracks of maps.
+
+    Returns:
+        Levels (D, 2**bits) by `projections.files.level_key`.
+    """
+    size = mlp.sizes[0]
+    # all variants, so that codes are good in the dark, too
+    everything = np.concatenate([part.descriptors[:, 0].reshape(-1, size) for part in maps])
+    observed = torch.from_numpy(everything[:: -(-len(everything) // SAMPLE)]).float()
+    prefixes = nested.PREFIXES if metadata.get("scheme") == "nested" else [mlp.sizes[-1]]
+    found = {}
+    for dim in prefixes:
+        cut = network.Projection(mlp).cut(dim)
+        numbers = torch.cat([cut(part) for part in observed.split(4096)])
+        for storage, bits in CODED.items():
+            prefix = "" if dim == mlp.sizes[-1] else dim
+            found[level_key(storage, prefix)] = fit(numbers, bits)
+    return found
+
+
+@strings_as_paths
+def main(projection: Path, maps: dict[str, tuple[Path, Path]], cache: Path, seed: int = 0) -> Path:
+    """Add levels to the file of a projection, or replace them.
+
+    Args:
+        projection: the file, with metadata of its training.
+        maps: from the name of each map to the folders of its images and its COLMAP model.
+        cache: folder for the tracks, which trainings share.
+        seed: of the tracks.
+
+    Returns:
+        `projection`.
+
+    Raises:
+        InputError: when the file is not a projection of this project, or a map cannot be used.
+    """
+    if projection.suffix != ".safetensors":
+        raise InputError(f"{projection}: levels are kept in .safetensors files only.")
+    mlp, metadata = network.read(projection)
+    descriptor, base = metadata["descriptor"], metadata.get("base")
+    files = [
+        tracks.main(images, model, cache / name, descriptor, seed, base)
+        for name, (images, model) in maps.items()
+    ]
+    data = [tracks.load(file) for file in files]
+    size = data[0].descriptors.shape[-1]
+    if size != mlp.sizes[0]:
+        raise InputError(f"{projection} is for {mlp.sizes[0]}-D descriptors, not for {size}-D.")
+    metadata["levels"] = {name: file_sha256(file) for name, file in zip(maps, files, strict=True)}
+    network.save(mlp, metadata, projection, of_projection(mlp, metadata, data))
+    logger.info("Added levels for %s to %s.", ", ".join(CODED), projection)
+    return projection
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m hloc_reduce.training.levels "
+        "--projection weights/sift_sv32.safetensors --map town/images:town/sparse",
+        formatter_class=cli.HelpFormatter,
+    )
+    parser.add_argument(
+        "--projection", nargs="+", required=True, help="projections, by name or file"
+    )
+    parser.add_argument(
+        "--map",
+        action="append",
+        required=True,
+        metavar="IMAGES:MODEL|MAP",
+        help="folder of images and folder of their COLMAP model, or a map of pipelines.localize; "
+        "may be repeated",
+    )
+    default = Path("outputs/training/maps")
+    parser.add_argument("--cache", type=Path, default=default, help="folder for the tracks")
+    args = parser.parse_args()
+    maps = tracks.parse_maps(args.map)
+    for projection in args.projection:
+        main(projections.find(projection), maps, args.cache)
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,135 @@
+"""Levels of codes: fitted to numbers, kept in the projection, used by features."""
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from command import refused
+
+from hloc_reduce import extract_features, match_features, projections, storage
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.projections import network
+from hloc_reduce.training import levels
+from hloc_reduce.training.tracks import Tracks
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import dimension, get_descriptors
+
+
+def make_tracks(number=2000, dim=128):
+    drawn = np.random.default_rng(0).standard_normal((number, 2, 1, dim))
+    drawn /= np.linalg.norm(drawn, axis=-1, keepdims=True)
+    track = np.arange(number) // 2
+    xy = np.zeros((number, 2), np.float32)
+    return Tracks(drawn.astype(np.float16), track, track % 5, xy, np.ones(number, bool))
+
+
+@pytest.fixture
+def projection(tmp_path):
+    """A projection to 16 numbers with levels."""
+    torch.manual_seed(0)
+    mlp, metadata = network.MLP([128, 16]).eval(), {"descriptor": "sift", "scheme": "sv", "dim": 16}
+    path = tmp_path / "mine_sv16.safetensors"
+    network.save(mlp, metadata, path, levels.of_projection(mlp, metadata, [make_tracks()]))
+    return path
+
+
+def test_levels_of_a_normal_distribution():
+    """Max (1960) lists them."""
+    numbers = torch.randn(100_000, 2, generator=torch.Generator().manual_seed(0))
+    found = levels.fit(numbers, 2)
+    expected = torch.tensor([-1.510, -0.4528, 0.4528, 1.510]).expand(2, 4)
+    torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
+    assert torch.equal(levels.fit(torch.ones(10, 1), 1), torch.ones(1, 2))
+
+
+def test_a_projection_keeps_its_levels(projection):
+    for kind, number in (("uint4", 16), ("uint2", 4), ("uint1", 2)):
+        found = projections.levels(projection, kind)
+        assert found.shape == (16, number) and (np.diff(found) > 0).all()
+    assert projections.load(projection).dim == 16
+
+
+def test_prefixes_have_levels_of_their_own(tmp_path):
+    mlp, metadata = network.MLP([128, 64]).eval(), {"descriptor": "sift", "scheme": "nested"}
+    path = tmp_path / "own_nested.safetensors"
+    network.save(mlp, metadata, path, levels.of_projection(mlp, metadata, [make_tracks()]))
+    whole = projections.levels(path, "uint4")
+    part = projections.levels(f"{path}@24", "uint4")
+    assert whole.shape == (64, 16) and part.shape == (24, 16)
+    assert np.ptp(part) > np.ptp(whole[:24])  # fewer numbers of a unit vector are larger
+
+
+def test_features_are_stored_as_codes_and_queries_as_floats(projection, textured, tmp_path):
+    import cv2
+
+    for name in ("map.png", "query.png"):
+        cv2.imwrite(str(tmp_path / name), textured)
+    _, conf = features_confs.get("sift", projection, "uint4")
+    path = extract_features.main(
+        conf, tmp_path, tmp_path, image_list=["map.png", "query.png"], queries=["query.png"]
+    )
+    with h5py.File(path) as file:
+        coded, number = file["map.png/descriptors_uint4"], len(file["map.png/keypoints"])
+        assert coded.shape == (8, number) and coded.dtype == np.uint8
+        assert file["query.png/descriptors"].shape == (16, number)
+        assert file["query.png/descriptors"].dtype == np.float16
+        cosine = (get_descriptors(file, "map.png") * get_descriptors(file, "query.png")).sum(axis=1)
+    assert dimension(path) == 16
+    assert cosine.mean() > 0.95
+    back = storage.main(path, tmp_path / "float.h5")
+    again = storage.main(back, tmp_path / "codes.h5", "uint4", projection=projection)
+    with h5py.File(path) as before, h5py.File(again) as after:
+        codes = [file["map.png/descriptors_uint4"][()] for file in (before, after)]
+    assert (codes[0] == codes[1]).mean() > 0.99  # normalized in between
+
+
+def test_features_without_levels_are_refused(projection, tmp_path, monkeypatch, caplog):
+    with pytest.raises(InputError, match="sift has none. --storage uint8 needs none"):
+        extract_features.provenance(features_confs.get("sift", None, "uint4")[1])
+    mlp, metadata = network.read(projection)
+    network.save(mlp, metadata, projection)
+    with pytest.raises(InputError, match="no levels for uint2. Add them with 'python -m hloc_red"):
+        extract_features.provenance(features_confs.get("sift", projection, "uint2")[1])
+    broken = {"levels.uint4": torch.zeros(16, 3)}
+    network.save(mlp, metadata, projection, broken)
+    with pytest.raises(InputError, match=r"levels of shape \(16, 3\), not \(D, 16\)"):
+        projections.levels(projection, "uint4")
+    features = tmp_path / "a.h5"
+    with h5py.File(features, "w") as file:
+        file["a.jpg/descriptors"] = np.eye(16, dtype=np.float16)
+    command = ["--features", features, "--output", tmp_path / "b.h5", "--storage", "uint4"]
+    said = refused(monkeypatch, caplog, storage, *command)
+    assert said == "--storage uint4 needs --projection, the one of the features."
+
+
+def test_broken_codes_are_refused(projection, tmp_path):
+    path, codes = tmp_path / "a.h5", np.zeros((8, 3), np.uint8)
+    with h5py.File(path, "w") as file:
+        for name in ("whole", "narrow", "lost"):
+            file[f"{name}/descriptors_uint4"] = codes[: 4 if name == "narrow" else 8]
+            if name != "lost":
+                file[f"{name}/descriptors_uint4"].attrs["levels"] = np.tile(
+                    np.arange(16.0), (16, 1)
+                )
+        assert get_descriptors(file, "whole").shape == (3, 16)
+        with pytest.raises(
+            InputError, match="narrow in .*: its .* have 4 bytes a descriptor, but levels of 16"
+        ):
+            get_descriptors(file, "narrow")
+        with pytest.raises(InputError, match="lost in .* have no levels"):
+            get_descriptors(file, "lost")
+
+
+def test_codes_of_different_levels_are_not_matched(projection, tmp_path):
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("a b\n")
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for name, factor in (("a", 1), ("b", 2)):
+            dataset = file.create_dataset(
+                f"{name}/descriptors_uint4", data=np.eye(8, dtype=np.uint8)
+            )
+            dataset.attrs["levels"] = factor * np.tile(np.arange(16.0), (16, 1))
+    conf = match_features.confs["NN-ratio"]
+    with pytest.raises(InputError, match="other levels than those of a in .* different project"):
+        match_features.main(conf, pairs, path, matches=tmp_path / "m.h5")
