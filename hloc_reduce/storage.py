@@ -16,7 +16,7 @@ from . import logger, projections
 from .runtime.group_writer import GroupWriter
 from .utils import cli
 from .utils.cli import InputError
-from .utils.codes import CODED, QUANTIZED, STORAGES, storage_of, store
+from .utils.codes import CODED, QUANTIZED, STORAGES, store
 from .utils.feature_files import get_descriptors
 from .utils.h5 import file_provenance, list_h5_names, open_h5
 from .utils.paths import strings_as_paths
@@ -71,7 +71,7 @@ def main(
                 }
                 arrays = {key: np.asarray(d[()], d.dtype) for key, d in datasets.items()}
                 attrs = {key: dict(dataset.attrs) for key, dataset in datasets.items()}
-                if storage not in QUANTIZED or storage_of(file[name]) != storage:
+                if QUANTIZED.get(storage) not in arrays:
                     descriptors = get_descriptors(file, name).T
                     if levels is not None and len(levels) != len(descriptors):
                         raise InputError(
