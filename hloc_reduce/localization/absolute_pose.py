@@ -33,11 +33,11 @@ SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the median depth of the inliers
 # ratios of the confidence with other intrinsics to the confidence with the assumed ones
 DISTORTED = 1.02  # above it, the lens has a radial distortion
-UNCLEAR = 1.05  # above it, the other intrinsics may be right
+UNCLEAR = 1.05  # above it, the other intrinsics may be right; 1 if the photo may be cropped
 RIGHT = 1.1  # above it, the other intrinsics are right
 # multiples of MAX_POSITION and MAX_ROTATION
 TOLERANT = 1.2  # between poses with listed and other focal lengths: many lists are 5 % off
-CROPPED = 3.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
+CROPPED = 3.0, 2.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
 # distances of the principal point from the centre, as shares of the size
 OFF_CENTRE, CENTRED = 0.15, 0.02
 
@@ -87,6 +87,10 @@ class _Matches:
     @property
     def max_error(self) -> float:
         return self.config.get("estimation", {}).get("ransac", {}).get("max_error", MAX_ERROR)
+
+    @property
+    def may_be_cropped(self) -> bool:
+        return bool(self.config.get("photo", {}).get("cropped"))
 
     @property
     def is_focal_length_guessed(self) -> bool:
@@ -203,7 +207,8 @@ def _calibrate(matches: _Matches, pose: Pose) -> tuple[Pose, str | None]:
         centred = resection.centred(pose.cam_from_world, pose.camera)
         guesses = (image, start), (matches.points2D, centred)
         return pose, _contradiction(matches, pose, guesses)
-    return _choose(assumed, other, points3D) if other else (assumed, None)
+    unclear = 1.0 if matches.may_be_cropped else UNCLEAR
+    return _choose(assumed, other, points3D, unclear) if other else (assumed, None)
 
 
 def _resect(matches: _Matches, points2D: np.ndarray, start: View, freedom: int) -> Pose | None:
@@ -245,11 +250,16 @@ def _contradiction(
     return None
 
 
-def _choose(assumed: Pose, other: Pose, points3D: np.ndarray) -> tuple[Pose, str | None]:
-    """Choose between poses with assumed and with other intrinsics, as `_calibrate` returns them."""
+def _choose(
+    assumed: Pose, other: Pose, points3D: np.ndarray, unclear: float
+) -> tuple[Pose, str | None]:
+    """Choose between poses with assumed and with other intrinsics, as `_calibrate` returns them.
+
+    Neither is trusted if the ratio of their confidences is above `unclear`, and they differ.
+    """
     if other.confidence > RIGHT * assumed.confidence:
         return other, None
-    if other.confidence <= UNCLEAR * assumed.confidence or not differ(
+    if other.confidence <= unclear * assumed.confidence or not differ(
         assumed, other, points3D, MAX_POSITION, MAX_ROTATION
     ):
         return assumed, None
@@ -295,16 +305,16 @@ def _refusal(matches: _Matches, pose: Pose, rivals: list[Pose], gate: Gate) -> s
 def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d) -> str | None:
     """Return how the inliers fail to determine a pose, None if they determine it."""
     inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
-    limits = [(pose.degrees_of_freedom, 1.0, "the inliers do not fix the pose: its")]
-    if matches.config.get("photo", {}).get("cropped"):
+    limits = [(pose.degrees_of_freedom, (1.0, 1.0), "the inliers do not fix the pose: its")]
+    if matches.may_be_cropped:
         reason = "it may be cropped, and without its intrinsics its"
         limits.append((ALL, CROPPED, reason))
     elif _is_off_centre(matches.camera):
         reason = "its principal point is far from the centre, and without its intrinsics its"
         limits.append((ALL, CROPPED, reason))
-    for freedom, limit, reason in limits:
+    for freedom, (far, turned), reason in limits:
         position, rotation = uncertainty(*inliers, cam_from_world, pose.camera, freedom)
-        if position > limit * MAX_POSITION or rotation > limit * MAX_ROTATION:
+        if position > far * MAX_POSITION or rotation > turned * MAX_ROTATION:
             return (
                 f"{reason} position is uncertain by {100 * position:.0f} % of the distance, its "
                 f"rotation by {rotation:.1f} degrees"

@@ -94,6 +94,17 @@ def test_few_matches_of_a_cropped_photo_are_refused_or_right(photo, number):
         assert position < 0.05 and rotation < 2
 
 
+@pytest.mark.parametrize("unclear, is_trusted", [(absolute_pose.UNCLEAR, True), (1.0, False)])
+def test_a_slightly_better_fit_turns_a_photo_that_may_be_cropped(unclear, is_trusted):
+    """7 of 98 accepted crops were turned by 5 to 16 degrees: the right pose had fitted better."""
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.1, 0])), np.zeros(3))
+    inliers, points3D = np.ones(50, bool), matches(WHOLE, 50, wrong=0)[1]
+    assumed = Pose(turn * POSE, guessed(1600, 1200), inliers, confidence=100, degrees_of_freedom=7)
+    right = Pose(POSE, WHOLE, inliers, confidence=103, degrees_of_freedom=ALL)
+    found, doubt = absolute_pose._choose(assumed, right, points3D, unclear)
+    assert found is assumed and (doubt is None) == is_trusted
+
+
 def test_the_principal_point_of_a_flat_scene_is_not_made_up():
     """A plane does not tell it, so it stays in the middle."""
     found = solve(*matches(WHOLE, 300, depth=0.05), guessed(1600, 1200), "guess")
