@@ -9,7 +9,6 @@ other maps, and draws other photos of other places. Results go to trials.csv, an
 false_accepts.svg; an interrupted run resumes with the next place.
 """
 
-import argparse
 import copy
 import csv
 import os
@@ -460,11 +459,10 @@ def plot(rows: list[dict], same: list[set[str]], path: Path) -> None:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/false_accepts.py --map scenes/fox/images:scenes/fox/"
-        "sparse --map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv64",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__,
+        "--map scenes/fox/images:scenes/fox/sparse "
+        "--map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv64",
     )
     parser.add_argument(
         "--map", action="append", default=[], metavar="IMAGES:MODEL", help="may be repeated"

@@ -1,6 +1,5 @@
 """Extract local features from images into an h5 file."""
 
-import argparse
 from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack, closing
@@ -312,12 +311,7 @@ def with_reasons(failed: Mapping[str, str]) -> str:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.extract_features --conf colmap_sift_sv64 "
-        "--image_dir photos --export_dir outputs",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--conf colmap_sift_sv64 --image_dir photos --export_dir outputs")
     parser.add_argument("--image_dir", type=Path, required=True, help="folder of images")
     parser.add_argument("--export_dir", type=Path, help="folder for the feature file")
     parser.add_argument("--feature_path", type=Path, help="the feature file itself")

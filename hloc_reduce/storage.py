@@ -6,7 +6,6 @@ index of one of the levels that belong to the projection. Their data sets are `d
 and so on, so that hloc reports missing descriptors instead of reading steps as numbers.
 """
 
-import argparse
 from pathlib import Path
 
 import h5py
@@ -88,12 +87,7 @@ def main(
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.storage --features feats-dog-sift_sv16.h5 "
-        "--output for_hloc.h5",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--features feats-dog-sift_sv16.h5 --output for_hloc.h5")
     parser.add_argument("--features", type=Path, required=True, help="feature file")
     parser.add_argument("--output", type=Path, required=True, help="the new feature file")
     parser.add_argument("--storage", default="float16", help=f"one of {', '.join(STORAGES)}")

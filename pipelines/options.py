@@ -1,6 +1,5 @@
 """The options that the pipelines share."""
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,9 +15,7 @@ from hloc_reduce.utils.cli import InputError
 SUBMIT = "For recall, submit {} to https://www.visuallocalization.net."
 
 
-def add_dataset_options(
-    parser: argparse.ArgumentParser, datasets: str, truth: str, num_loc: int
-) -> None:
+def add_dataset_options(parser: cli.Parser, datasets: str, truth: str, num_loc: int) -> None:
     """Add the options of the pipelines of data sets.
 
     Args:
@@ -34,16 +31,21 @@ def add_dataset_options(
         help="folder for the results of one configuration (default: outputs/<dataset>/<feature>)",
     )
     add_feature_options(parser)
+    add_retrieval_option(parser)
+    add_localization_options(parser, truth, num_loc)
+
+
+def add_retrieval_option(parser: cli.Parser) -> None:
+    """Add --retrieval."""
     parser.add_argument(
         "--retrieval",
         default="vlad",
         metavar="vlad|FILE",
         help="vlad, or hloc's text file of pairs or h5 file of global descriptors",
     )
-    add_localization_options(parser, truth, num_loc)
 
 
-def add_feature_options(parser: argparse.ArgumentParser) -> None:
+def add_feature_options(parser: cli.Parser) -> None:
     """Add the options of features and their matching."""
     parser.add_argument(
         "--feature",
@@ -63,7 +65,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list_features", action="store_true", help="list the features and exit")
 
 
-def add_localization_options(parser: argparse.ArgumentParser, truth: str, num_loc: int) -> None:
+def add_localization_options(parser: cli.Parser, truth: str, num_loc: int) -> None:
     """Add the options of localization; `truth` is the default of --ground_truth, for its help."""
     parser.add_argument(
         "--num_loc", type=int, default=num_loc, help="retrieved map images per query"
@@ -89,7 +91,7 @@ def add_localization_options(parser: argparse.ArgumentParser, truth: str, num_lo
     )
 
 
-def parse(parser: argparse.ArgumentParser) -> dict:
+def parse(parser: cli.Parser) -> dict:
     """Parse and check the options of a pipeline.
 
     Returns:

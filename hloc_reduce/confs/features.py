@@ -5,7 +5,6 @@
 """
 
 import re
-from argparse import ArgumentParser
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from .. import projections
 from ..descriptors import COLMAP, DESCRIPTORS, DIM
 from ..detectors.dog import HLOC, KEYPOINTS
 from ..projections.released import FILES as RELEASED
-from ..utils.cli import InputError, choose
+from ..utils.cli import InputError, Parser, choose
 from ..utils.codes import CODED, STORAGES
 from ..utils.parsers import read_yaml
 from ..utils.tables import aligned
@@ -181,7 +180,7 @@ def of_patches(name: str) -> tuple[str, str | None]:
     return choose("descriptor", descriptor, DESCRIPTORS), conf["model"].get("projection")
 
 
-def add_storage_option(parser: ArgumentParser) -> None:
+def add_storage_option(parser: Parser) -> None:
     """Add --storage."""
     parser.add_argument(
         "--storage",
@@ -191,7 +190,7 @@ def add_storage_option(parser: ArgumentParser) -> None:
     )
 
 
-def add_keypoints_option(parser: ArgumentParser) -> None:
+def add_keypoints_option(parser: Parser) -> None:
     """Add --keypoints."""
     parser.add_argument(
         "--keypoints",

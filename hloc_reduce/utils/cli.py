@@ -5,6 +5,7 @@ import difflib
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from .. import logger
 from . import interrupts
@@ -24,8 +25,9 @@ def run(main: Callable[[], None]) -> None:
     try:
         interrupts.hear()
         # argparse would name a module by its file
-        if spec := sys.modules["__main__"].__spec__:
-            sys.argv[0] = f"python -m {spec.name.removesuffix('.__main__')}"
+        spec = sys.modules["__main__"].__spec__
+        module = spec and f"-m {spec.name.removesuffix('.__main__')}"
+        sys.argv[0] = f"python {module or sys.argv[0]}"
         main()
         if spec and spec.name.startswith(interrupts.COMMANDS):
             interrupts.ignore()
@@ -83,6 +85,25 @@ def some(names: Iterable[str], number: int = 5) -> str:
     """Join the first few of many names."""
     names = list(names)
     return ", ".join(names[:number]) + (", ..." if len(names) > number else "")
+
+
+class Parser(argparse.ArgumentParser):
+    """A command line. Its options must be spelled out, and its help ends with an example.
+
+    Args:
+        description: what the command does, such as the docstring of its module.
+        example: arguments to show.
+        settings: further arguments of argparse's parser.
+    """
+
+    def __init__(self, description: str | None, example: str = "", **settings: Any):
+        super().__init__(
+            description=description,
+            epilog=f"example: %(prog)s {example}" if example else None,
+            formatter_class=HelpFormatter,
+            allow_abbrev=False,
+            **{"prog": sys.argv[0], **settings},
+        )
 
 
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
