@@ -145,6 +145,7 @@ def replacing_map(
             f"{sfm_dir} is not a map that this program or hloc triangulated, so it is not "
             "replaced. Choose another folder."
         )
+    cli.check_folder(sfm_dir)
     announce(sfm_dir)
     building = sfm_dir.with_name(f".{sfm_dir.name}.tmp")
     shutil.rmtree(building, ignore_errors=True)

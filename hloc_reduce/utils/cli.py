@@ -34,8 +34,12 @@ def run(main: Callable[[], None]) -> None:
     except BrokenPipeError:  # a pager or `head` has read enough
         sys.stdout = None
         sys.exit(1)
-    except (InputError, OSError) as error:
+    except InputError as error:
         logger.error(error)
+        sys.exit(2)
+    except OSError as error:
+        file = error.filename2 or error.filename
+        logger.error(f"{file}: {error.strerror}." if file and error.strerror else error)
         sys.exit(2)
     except KeyboardInterrupt as interrupt:
         interrupts.end(interrupt)
@@ -74,7 +78,17 @@ def check_folder(path: Path) -> None:
             raise InputError(f"{part} is a file: choose a folder for the results.")
 
 
-def check_file(path: Path, what: str) -> None:
+def make_folder(path: Path) -> None:
+    """Create a folder for results, and its parents, unless it exists.
+
+    Raises:
+        InputError: if there is a file in its place.
+    """
+    check_folder(path)
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def check_file(path: Path, what: str = "a file") -> None:
     """Raise an InputError if a folder prevents a file from being written."""
     if path.is_dir():
         raise InputError(f"{path} is a folder: name {what} in it.")

@@ -78,6 +78,9 @@ def test_wrong_input(place, tmp_path, run, refused):
         assert repr(name) in message and "Rename" in message
         (photos / name).unlink()
     assert "Give --outputs" in refused(*build[:4])
+    photo = images / "db/1.png"
+    message = f"{photo} is a file: choose a folder for the results."
+    assert refused(*build[:4], "--outputs", photo) == message
     assert "--num_covis 0" in refused(*build, "--num_covis", 0)
     assert not (outputs / "map").exists()
     run(*build)
