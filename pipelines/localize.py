@@ -167,7 +167,7 @@ def main(
         lists = {stem: [name for name, _ in part] for stem, part in given.items()}
         names = [name for part in lists.values() for name in part]
         sources = dict.fromkeys(names, "list")
-    check_queries(query_images, names, strict)
+        check_queries(query_images, names, strict)
     map_names = built.names()  # a broken model is found before photos are read
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 

@@ -128,15 +128,19 @@ def run_on_dataset(main: Callable[..., dict], dataset: Path, options: dict) -> N
 
 def print_result(summary: dict, outputs: Path, unknown: str) -> None:
     """Print recall or, where no true poses are known, the message `unknown`."""
+    unreadable = summary["queries_unreadable"]
     logger.info(
-        "Localized %d of %d queries in %.0f s; %d bytes a descriptor. Results are in %s.",
+        "Localized %d of %d queries%s in %.0f s; %d bytes a descriptor. Results are in %s.",
         summary["queries_localized"],
         summary["queries"],
+        f" ({unreadable} unreadable)" * bool(unreadable),
         sum(summary["seconds"].values()),
         summary["bytes_per_keypoint"]["descriptor"],
         outputs,
     )
     if any("recall_percent" in result for result in summary["lists"].values()):
         print(recall_table(summary["feature"], summary["lists"]))
+    elif not summary["queries_localized"]:
+        print(f"No query is localized. {outputs / 'queries.csv'} gives the reasons.")
     else:
         print(f"The true poses are not known here. {unknown.format(outputs / summary['poses'])}")
