@@ -57,7 +57,8 @@ def add_feature_options(parser: cli.Parser) -> None:
         type=Path,
         help="projection file to use with the base descriptor of --feature",
     )
-    features_confs.add_storage_option(parser)
+    of = "the descriptors of map images (those of queries stay floats)"
+    features_confs.add_storage_option(parser, of)
     features_confs.add_keypoints_option(parser)
     parser.add_argument(
         "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"

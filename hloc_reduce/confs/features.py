@@ -158,8 +158,8 @@ def levels(conf: dict) -> np.ndarray | None:
         return None
     if projection is None:
         raise InputError(
-            f"--storage {storage} needs a projection with levels, such as {RECOMMENDED}; "
-            f"{conf['output'].removeprefix('feats-dog-')} has none. --storage uint8 needs none."
+            f"{conf['output'].removeprefix('feats-dog-')} has no projection, but --storage "
+            f"{storage} needs one with levels: use a feature with a projection, or --storage uint8."
         )
     return projections.levels(projection, storage)
 
@@ -180,13 +180,14 @@ def of_patches(name: str) -> tuple[str, str | None]:
     return choose("descriptor", descriptor, DESCRIPTORS), conf["model"].get("projection")
 
 
-def add_storage_option(parser: Parser) -> None:
+def add_storage_option(parser: Parser, of: str = "descriptors") -> None:
     """Add --storage."""
     parser.add_argument(
         "--storage",
         default=STORAGES[0],
-        help=f"storage of the map's descriptors, one of {', '.join(STORAGES)}; uint4 keeps two "
-        "numbers in a byte. Queries stay floats. hloc reads floats only",
+        help=f"storage of {of}, one of {', '.join(STORAGES)}: uint8 keeps a number in a byte; "
+        "uint4, uint2 and uint1 keep it in 4, 2 and 1 bits and need a projection with levels, see "
+        "hloc_reduce.training.levels. hloc reads floats only",
     )
 
 
