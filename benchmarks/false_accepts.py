@@ -240,17 +240,14 @@ def run(
     model = matchers_confs.confs[matcher]["model"]
     ratio_threshold = model.get("ratio_threshold")
     tried = list(trials(place, others, output, number, seed))
-    shown = {}
-    with open_h5(place.features) as file:
-        for name in place.names:
-            count = len(get_colmap_keypoints(file, name)[0])
-            ids, _ = place.reference.lift(name, np.arange(count))
-            shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
-    rows = []
     describe = Described(feature)
+    shown, rows = {}, []
     with open_h5(place.features) as file:
         described = {name: describe(file, name) for name in place.names}
         sizes = {get_image_size(file, name) for name in place.names}
+    for name, descriptors in described.items():
+        ids, _ = place.reference.lift(name, np.arange(len(descriptors)))
+        shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
     gate = DEFAULT_GATE.of_matches(model, described[place.names[0]].shape[1])
     for source, name, camera, truth, path, kind in tried:
         with open_h5(path) as file:

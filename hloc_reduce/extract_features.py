@@ -324,16 +324,10 @@ def _main() -> None:
     features_confs.add_storage_option(parser)
     features_confs.add_keypoints_option(parser)
     parser.add_argument("--overwrite", action="store_true", help="extract all features again")
-    args = parser.parse_args()
-    _, conf = features_confs.get(args.conf, storage=args.storage, keypoints=args.keypoints)
-    main(
-        conf,
-        args.image_dir,
-        args.export_dir,
-        image_list=args.image_list,
-        feature_path=args.feature_path,
-        overwrite=args.overwrite,
-    )
+    args = vars(parser.parse_args())
+    settings = {name: args.pop(name) for name in ("storage", "keypoints")}
+    _, args["conf"] = features_confs.get(args["conf"], **settings)
+    main(**args)
 
 
 if __name__ == "__main__":

@@ -143,9 +143,8 @@ def _main() -> None:
         type=Path,
         help="folder with a folder for each feature (default: outputs/<dataset>)",
     )
-    parser.add_argument(
-        "-o", "--output", type=Path, help="the report (default: <outputs>/report.html)"
-    )
+    page = "the report (default: <outputs>/report.html)"
+    parser.add_argument("-o", "--output", type=Path, dest="page", metavar="OUTPUT", help=page)
     add_retrieval_option(parser)
     parser.add_argument(
         "--ground_truth",
@@ -153,18 +152,10 @@ def _main() -> None:
         help="true poses of the queries (default: as in finished runs, else those of the data set)",
     )
     add_gate_options(parser)
-    args = parser.parse_args()
-    outputs = args.outputs or Path("outputs") / args.dataset.resolve().name
-    failed = main(
-        args.dataset,
-        args.features,
-        outputs,
-        args.output,
-        args.retrieval,
-        args.ground_truth,
-        Gate(args.min_confidence, args.min_inliers),
-    )
-    if failed:
+    args = vars(parser.parse_args())
+    args["outputs"] = args["outputs"] or Path("outputs") / args["dataset"].resolve().name
+    gate = Gate(args.pop("min_confidence"), args.pop("min_inliers"))
+    if failed := main(**args, gate=gate):
         raise InputError(
             f"These failed, see above: {', '.join(failed)}. The others are in the report."
         )
