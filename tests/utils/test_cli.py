@@ -1,5 +1,7 @@
 """What all command lines do alike."""
 
+from pathlib import Path
+
 import pytest
 
 from hloc_reduce.utils import cli
@@ -21,3 +23,11 @@ def test_options_must_be_spelled_out(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         parser.parse_args(["sub", "--help"])
     assert "example: python -m place sub --min_confidence 3\n" in capsys.readouterr().out
+
+
+def test_every_command_line_is_such_a_parser():
+    root = Path(__file__).parents[2]
+    tops = ("hloc_reduce", "pipelines", "benchmarks")
+    paths = [path for top in tops for path in (root / top).rglob("*.py")]
+    made = [path.name for path in paths if "argparse.ArgumentParser(" in path.read_text()]
+    assert len(paths) > 100 and made == []
