@@ -195,11 +195,7 @@ def print_row(row: dict, columns: list[str]) -> None:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/aachen_scale.py --data aachen_v1.1 --share 0.01 0.02",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--data aachen_v1.1 --share 0.01 0.02")
     parser.add_argument(
         "--data", type=Path, required=True, help="folder of database_images.txt and query lists"
     )

@@ -96,11 +96,7 @@ def run(name: str, dataset: Path, outputs: Path) -> dict:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/against_hloc.py --dataset herz-jesus",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--dataset herz-jesus")
     parser.add_argument("--dataset", type=Path, required=True, help="with true poses of queries")
     parser.add_argument(
         "--feature", nargs="+", default=["sift_sv64", "colmap_sift_sv64"], help="of this project"

@@ -6,7 +6,6 @@ Prints a Markdown table: milliseconds per pair (the least of several rounds), th
 and the share of the exact 64-D matches that is found.
 """
 
-import argparse
 import itertools
 import time
 from collections.abc import Callable
@@ -57,11 +56,7 @@ def methods() -> dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]]
 
 @torch.no_grad()
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/coarse_to_fine.py --features feats-dog-sift_nested.h5",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--features feats-dog-sift_nested.h5")
     parser.add_argument("--features", type=Path, required=True, help="feature file of sift_nested")
     parser.add_argument("--images", type=int, default=8, help="images whose pairs are matched")
     parser.add_argument("--rounds", type=int, default=3, help="rounds in which all take turns")

@@ -5,7 +5,6 @@ by a gain, blurred, made noisy and rounded to 8 bits again, with parameters that
 seed. Run pipelines.aachen on the data set; benchmarks/summaries.py then prints the table.
 """
 
-import argparse
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -106,12 +105,7 @@ def main(images: Path, model: Path, output: Path, vary: Vary, scale: float = 1.0
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/darken_place.py --map sceaux/images:sceaux/sparse "
-        "--output datasets/sceaux_dark",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--map sceaux/images:sceaux/sparse --output datasets/sceaux_dark")
     parser.add_argument("--map", required=True, metavar="IMAGES:MODEL")
     parser.add_argument(
         "--gain",

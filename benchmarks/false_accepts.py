@@ -9,7 +9,6 @@ other maps, and draws other photos of other places. Results go to trials.csv, an
 false_accepts.svg; an interrupted run resumes with the next place.
 """
 
-import argparse
 import copy
 import csv
 import os
@@ -241,17 +240,14 @@ def run(
     model = matchers_confs.confs[matcher]["model"]
     ratio_threshold = model.get("ratio_threshold")
     tried = list(trials(place, others, output, number, seed))
-    shown = {}
-    with open_h5(place.features) as file:
-        for name in place.names:
-            count = len(get_colmap_keypoints(file, name)[0])
-            ids, _ = place.reference.lift(name, np.arange(count))
-            shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
-    rows = []
     describe = Described(feature)
+    shown, rows = {}, []
     with open_h5(place.features) as file:
         described = {name: describe(file, name) for name in place.names}
         sizes = {get_image_size(file, name) for name in place.names}
+    for name, descriptors in described.items():
+        ids, _ = place.reference.lift(name, np.arange(len(descriptors)))
+        shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
     gate = DEFAULT_GATE.of_matches(model, described[place.names[0]].shape[1])
     for source, name, camera, truth, path, kind in tried:
         with open_h5(path) as file:
@@ -460,11 +456,10 @@ def plot(rows: list[dict], same: list[set[str]], path: Path) -> None:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/false_accepts.py --map scenes/fox/images:scenes/fox/"
-        "sparse --map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv64",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__,
+        "--map scenes/fox/images:scenes/fox/sparse "
+        "--map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv64",
     )
     parser.add_argument(
         "--map", action="append", default=[], metavar="IMAGES:MODEL", help="may be repeated"

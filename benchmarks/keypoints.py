@@ -5,7 +5,6 @@ with darker, blurred or noisy queries. These and the given data sets are run wit
 and adaptive. Prints a Markdown table of keypoints, points, recall, inliers, seconds and memory.
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -95,11 +94,7 @@ def run(dataset: Path, outputs: Path, feature: str, keypoints: str) -> tuple[dic
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/keypoints.py --map sceaux/images:sceaux/sparse",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--map sceaux/images:sceaux/sparse")
     parser.add_argument("--map", action="append", default=[], metavar="IMAGES:MODEL")
     parser.add_argument(
         "--dataset", type=Path, action="append", default=[], help="in Aachen's or InLoc's layout"

@@ -1,6 +1,5 @@
 """Time a Localizer on photos, one at a time, stage by stage."""
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +14,7 @@ STAGES = ("extraction", "retrieval", "matching", "pose")
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/localizer.py --map outputs/place/map "
-        "--query_images photos",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--map outputs/place/map --query_images photos")
     parser.add_argument("--map", type=Path, required=True, help="map of pipelines.localize")
     parser.add_argument("--query_images", type=Path, required=True, help="folder of photos")
     args = parser.parse_args()

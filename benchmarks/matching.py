@@ -7,7 +7,6 @@ Prints milliseconds per pair, the least of several rounds in which all take turn
 over hloc. A tenth of the descriptors of a pair match.
 """
 
-import argparse
 import sys
 import time
 from collections.abc import Callable
@@ -131,11 +130,7 @@ def measure(number: int, dim: int, pairs: int, rounds: int, device: str) -> dict
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/matching.py --keypoints 8000",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--keypoints 8000")
     parser.add_argument("--keypoints", type=int, default=8000, help="of each image")
     parser.add_argument("--pairs", type=int, default=8, help="pairs in a run")
     parser.add_argument("--rounds", type=int, default=5, help="rounds in which all take turns")

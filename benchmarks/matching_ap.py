@@ -13,7 +13,6 @@ its own row and one for each shipped projection and each `--projection` whose na
 name of the descriptor; then one of the means by number of dimensions.
 """
 
-import argparse
 import itertools
 import re
 from collections import defaultdict
@@ -102,11 +101,7 @@ def measure(project: torch.nn.Module, draws: list) -> float:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/matching_ap.py --map sceaux/images:sceaux/sparse",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--map sceaux/images:sceaux/sparse")
     parser.add_argument("--map", action="append", required=True, metavar="IMAGES:MODEL")
     parser.add_argument(
         "--descriptor", nargs="+", default=["sift", "mkd", "tfeat"], help="base descriptors"

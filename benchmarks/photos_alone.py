@@ -6,7 +6,6 @@ default options. A similarity aligns the positions of a map with the given ones.
 in percent of the largest distance between two given positions.
 """
 
-import argparse
 import shutil
 import time
 from pathlib import Path
@@ -167,11 +166,8 @@ def main(
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/photos_alone.py --map fox/images:fox/sparse "
-        "--subset 10 --stock --output outputs/photos_alone",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__, "--map fox/images:fox/sparse --subset 10 --stock --output outputs/photos_alone"
     )
     parser.add_argument("--map", nargs="+", required=True, metavar="IMAGES:MODEL")
     parser.add_argument("--output", type=Path, required=True, help="folder of the maps")
@@ -180,7 +176,7 @@ def _main() -> None:
     parser.add_argument("--subset", type=int, default=0, help="photos per subset; 0: all")
     parser.add_argument("--subsets", type=int, default=1, help="subsets of each place")
     parser.add_argument("--stock", action="store_true", help="also run stock pycolmap")
-    parser.add_argument("--camera_mode", default="auto", help="which photos share a camera")
+    colmap.add_camera_mode(parser)
     parser.add_argument(
         "--num_covis", type=int, default=20, help="pairs of each photo, unless all are matched"
     )

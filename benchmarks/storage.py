@@ -5,7 +5,6 @@ photo, are quantized together, like those of an image in a feature file. Prints 
 bytes per keypoint and percentages, means over the maps.
 """
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
 
@@ -34,12 +33,7 @@ def through_file(project: Callable[[torch.Tensor], torch.Tensor], storage: str) 
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/storage.py --feature sift_sv16 "
-        "--map sceaux/images:sceaux/sparse",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--feature sift_sv16 --map sceaux/images:sceaux/sparse")
     parser.add_argument("--map", action="append", required=True, metavar="IMAGES:MODEL")
     parser.add_argument(
         "--feature", nargs="+", default=["sift_sv64", "sift_sv32", "sift_sv24", "sift_sv16"]

@@ -1,6 +1,5 @@
 """Print a Markdown table of finished runs of any pipeline."""
 
-import argparse
 import json
 from pathlib import Path
 
@@ -39,11 +38,7 @@ def rows(summary: dict) -> list[str]:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python benchmarks/summaries.py outputs/demo_town/*",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "outputs/demo_town/*")
     parser.add_argument("outputs", type=Path, nargs="+", help="outputs folders of runs")
     args = parser.parse_args()
     lines = [HEADER, "| --- | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]

@@ -1,6 +1,5 @@
 """Aggregate local features into global descriptors, for retrieval without trained weights."""
 
-import argparse
 import hashlib
 from pathlib import Path
 
@@ -115,11 +114,8 @@ def _sample(file: h5py.File, names: list[str], max_samples: int) -> np.ndarray:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.aggregate_features "
-        "--features outputs/feats-dog-colmap_sift_sv64.h5 --model outputs/sfm",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__, "--features outputs/feats-dog-colmap_sift_sv64.h5 --model outputs/sfm"
     )
     parser.add_argument("--features", type=Path, required=True, help="feature file")
     parser.add_argument("--model", type=Path, required=True, help="COLMAP model of the map images")

@@ -1,6 +1,5 @@
 """Extract local features from images into an h5 file."""
 
-import argparse
 from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack, closing
@@ -312,12 +311,7 @@ def with_reasons(failed: Mapping[str, str]) -> str:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.extract_features --conf colmap_sift_sv64 "
-        "--image_dir photos --export_dir outputs",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--conf colmap_sift_sv64 --image_dir photos --export_dir outputs")
     parser.add_argument("--image_dir", type=Path, required=True, help="folder of images")
     parser.add_argument("--export_dir", type=Path, help="folder for the feature file")
     parser.add_argument("--feature_path", type=Path, help="the feature file itself")
@@ -330,16 +324,10 @@ def _main() -> None:
     features_confs.add_storage_option(parser)
     features_confs.add_keypoints_option(parser)
     parser.add_argument("--overwrite", action="store_true", help="extract all features again")
-    args = parser.parse_args()
-    _, conf = features_confs.get(args.conf, storage=args.storage, keypoints=args.keypoints)
-    main(
-        conf,
-        args.image_dir,
-        args.export_dir,
-        image_list=args.image_list,
-        feature_path=args.feature_path,
-        overwrite=args.overwrite,
-    )
+    args = vars(parser.parse_args())
+    settings = {name: args.pop(name) for name in ("storage", "keypoints")}
+    _, args["conf"] = features_confs.get(args["conf"], **settings)
+    main(**args)
 
 
 if __name__ == "__main__":

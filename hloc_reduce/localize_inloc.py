@@ -1,6 +1,5 @@
 """Localize the queries of InLoc: 2D-3D matches through the scans of cutouts, PnP + RANSAC."""
 
-import argparse
 import hashlib
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import closing
@@ -177,12 +176,11 @@ def _lift(
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.localize_inloc --dataset_dir datasets/inloc "
-        "--retrieval pairs-query-netvlad40.txt --features outputs/feats-dog-colmap_sift_sv64.h5 "
-        "--matches outputs/matches.h5 --results outputs/poses.txt",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__,
+        "--dataset_dir datasets/inloc --retrieval pairs-query-netvlad40.txt "
+        "--features outputs/feats-dog-colmap_sift_sv64.h5 --matches outputs/matches.h5 "
+        "--results outputs/poses.txt",
     )
     parser.add_argument("--dataset_dir", type=Path, required=True, help="folder of the data set")
     parser.add_argument(

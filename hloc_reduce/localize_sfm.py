@@ -1,6 +1,5 @@
 """Localize queries in a COLMAP model: 2D-3D matches through retrieved images, PnP + RANSAC."""
 
-import argparse
 from collections.abc import Mapping
 from functools import lru_cache, partial
 from pathlib import Path
@@ -121,12 +120,11 @@ def _config(config: dict, refinements: Mapping[str, dict], name: str, _: pycolma
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.localize_sfm --reference_sfm outputs/sfm "
-        "--queries queries.txt --retrieval pairs.txt --matches outputs/matches.h5 "
-        "--features outputs/feats-dog-colmap_sift_sv64.h5 --results outputs/poses.txt",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__,
+        "--reference_sfm outputs/sfm --queries queries.txt --retrieval pairs.txt "
+        "--matches outputs/matches.h5 --features outputs/feats-dog-colmap_sift_sv64.h5 "
+        "--results outputs/poses.txt",
     )
     parser.add_argument("--reference_sfm", type=Path, required=True, help="folder of the map")
     parser.add_argument(

@@ -1,6 +1,5 @@
 """Match the local features of image pairs into an h5 file."""
 
-import argparse
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from contextlib import closing
@@ -237,11 +236,8 @@ def _nbytes(descriptors: StoredDescriptors | np.ndarray) -> int:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.match_features --pairs pairs.txt "
-        "--features feats-dog-colmap_sift_sv64 --export_dir outputs",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__, "--pairs pairs.txt --features feats-dog-colmap_sift_sv64 --export_dir outputs"
     )
     parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
     parser.add_argument(

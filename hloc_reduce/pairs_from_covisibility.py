@@ -1,6 +1,5 @@
 """Pair each image of a COLMAP model with the images that share most points with it."""
 
-import argparse
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -77,12 +76,7 @@ def most_covisible(point3D_ids: Iterable[np.ndarray], number: int) -> Iterator[n
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.pairs_from_covisibility "
-        "--model 3D-models/aachen_v_1_1 --output pairs.txt",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--model 3D-models/aachen_v_1_1 --output pairs.txt")
     parser.add_argument("--model", type=Path, required=True, help="COLMAP model folder")
     parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
     parser.add_argument(

@@ -1,6 +1,5 @@
 """Pair all images of a list or a feature file with each other, or with reference images."""
 
-import argparse
 from collections.abc import Iterable
 from itertools import combinations, product
 from pathlib import Path
@@ -68,11 +67,8 @@ def _names(images: Path | str | Iterable[str] | None, features: Path | None) -> 
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.pairs_from_exhaustive --output pairs.txt "
-        "--features outputs/feats-dog-colmap_sift_sv64.h5",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__, "--output pairs.txt --features outputs/feats-dog-colmap_sift_sv64.h5"
     )
     parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
     images = parser.add_mutually_exclusive_group(required=True)

@@ -1,6 +1,5 @@
 """Pair each query with the database images of the most similar global descriptors."""
 
-import argparse
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -202,11 +201,8 @@ def read_global(path: Path, names: list[str]) -> np.ndarray:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.pairs_from_retrieval --descriptors global.h5 "
-        "--output pairs.txt --query_prefix query/ --db_prefix db/",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__, "--descriptors global.h5 --output pairs.txt --query_prefix query/ --db_prefix db/"
     )
     parser.add_argument("--descriptors", type=Path, required=True, help="global descriptors")
     parser.add_argument("--output", type=Path, required=True, help="text file of pairs")

@@ -1,6 +1,5 @@
 """Add pairs of images that the verified matches of a list of pairs connect poorly."""
 
-import argparse
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from itertools import islice
@@ -204,12 +203,10 @@ def _verify(
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.pairs_from_verification --output more.txt "
-        "--image_dir photos --pairs pairs.txt --features features.h5 --matches matches.h5 "
-        "--descriptors global.h5",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__,
+        "--output more.txt --image_dir photos --pairs pairs.txt --features features.h5 "
+        "--matches matches.h5 --descriptors global.h5",
     )
     parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
     parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
@@ -226,7 +223,7 @@ def _main() -> None:
         default=0,
         help="maximum number of new pairs per well connected image",
     )
-    parser.add_argument("--camera_mode", default="auto", help="which photos share a camera")
+    colmap.add_camera_mode(parser)
     parser.add_argument("--image_list", type=Path, help="text file of names, one per line")
     args = parser.parse_args()
     main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})

@@ -1,6 +1,5 @@
 """Reconstruct a map from matches of images without known poses or intrinsics."""
 
-import argparse
 import shutil
 from collections import Counter
 from collections.abc import Iterable
@@ -13,7 +12,7 @@ import pycolmap
 from . import logger
 from .localization.confidence import focal_lengths
 from .runtime import provenance
-from .triangulation import STAMP, read_matches, replacing_map
+from .triangulation import STAMP, add_options, read_matches, replacing_map
 from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.h5 import list_h5_names
@@ -464,45 +463,20 @@ def shortfall(
     return f"{' '.join(said)} What to try: {'; '.join(tries)}."
 
 
-def add_camera_mode(parser: argparse.ArgumentParser) -> None:
-    """Add --camera_mode."""
-    modes = ", ".join(mode.lower() for mode in pycolmap.CameraMode.__members__)
-    parser.add_argument(
-        "--camera_mode",
-        default="auto",
-        help=f"which photos share a camera, as in COLMAP: {modes}; auto, COLMAP's default: those "
-        "of the same make, model, focal length and size by EXIF data",
-    )
-
-
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.reconstruction --sfm_dir outputs/sfm "
-        "--image_dir photos --pairs pairs.txt --features outputs/feats-dog-colmap_sift_sv64.h5 "
-        "--matches outputs/matches.h5",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__,
+        "--sfm_dir outputs/sfm --image_dir photos --pairs pairs.txt "
+        "--features outputs/feats-dog-colmap_sift_sv64.h5 --matches outputs/matches.h5",
     )
-    parser.add_argument("--sfm_dir", type=Path, required=True, help="folder of the new model")
-    parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
-    parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
-    parser.add_argument("--features", type=Path, required=True, help="feature file")
-    parser.add_argument("--matches", type=Path, required=True, help="match file")
-    add_camera_mode(parser)
+    add_options(parser)
+    colmap.add_camera_mode(parser)
     parser.add_argument(
         "--accept_partial",
         action="store_true",
         help="accept a map that has fewer than half of the photos",
     )
-    parser.add_argument(
-        "--skip_geometric_verification", action="store_true", help="use all matches"
-    )
-    parser.add_argument(
-        "--min_match_score", type=float, help="use only matches with a higher score"
-    )
     parser.add_argument("--image_list", type=Path, help="text file of names, one per line")
-    parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
-    parser.add_argument("--overwrite", action="store_true", help="reconstruct again")
     args = parser.parse_args()
     main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})
 

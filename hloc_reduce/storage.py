@@ -1,12 +1,12 @@
-"""Convert the storage of the descriptors of a feature file.
+"""Convert how a feature file stores descriptors.
 
-hloc reads float16 and float32. uint8 takes half the space of float16: the range of the numbers of
-each image is divided into 255 steps. uint4, uint2 and uint1 keep 4, 2 and 1 bits of a number, the
-index of one of the levels that belong to the projection. Their data sets are `descriptors_uint8`
-and so on, so that hloc reports missing descriptors instead of reading steps as numbers.
+hloc reads only float16 and float32. uint8 takes half the space of float16: the range of the numbers
+of each image is divided into 255 steps. uint4, uint2 and uint1 keep 4, 2 and 1 bits of a number:
+the index of one of the levels in the file of the projection. All but floats are in data sets such
+as `descriptors_uint8`, so that hloc reports missing descriptors instead of reading steps as
+numbers. What rounding has lost stays lost when descriptors are converted back to floats.
 """
 
-import argparse
 from pathlib import Path
 
 import h5py
@@ -45,15 +45,15 @@ def main(
         `output`.
 
     Raises:
-        InputError: when the input is missing or broken, the storage is unknown or needs a
-            projection, or both files are the same.
+        InputError: when the input is missing or broken, the storage is unknown, needs a
+            projection or needs none, or both files are the same.
     """
     cli.choose("storage", storage, STORAGES)
-    levels = None
-    if storage in CODED:
-        if projection is None:
-            raise InputError(f"--storage {storage} needs --projection, the one of the features.")
-        levels = projections.levels(projection, storage)
+    if storage in CODED and projection is None:
+        raise InputError(f"--storage {storage} needs --projection, the one of the features.")
+    if storage not in CODED and projection is not None:
+        raise InputError(f"--storage {storage} needs no --projection: leave it out.")
+    levels = None if projection is None else projections.levels(projection, storage)
     if output.resolve() == features.resolve():
         raise InputError(f"{output} cannot be converted to itself: choose another --output.")
     names = list_h5_names(features)
@@ -88,18 +88,14 @@ def main(
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.storage --features feats-dog-sift_sv16.h5 "
-        "--output for_hloc.h5",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--features feats-dog-sift_sv16.h5 --output for_hloc.h5")
     parser.add_argument("--features", type=Path, required=True, help="feature file")
     parser.add_argument("--output", type=Path, required=True, help="the new feature file")
     parser.add_argument("--storage", default="float16", help=f"one of {', '.join(STORAGES)}")
     parser.add_argument(
         "--projection",
-        help="projection of the features, by name or file; needed for uint4, uint2 and uint1",
+        help="projection of the features, by name or file; for uint4, uint2 and uint1, which need "
+        "its levels, see hloc_reduce.training.levels",
     )
     parser.add_argument("--overwrite", action="store_true", help="convert all images again")
     main(**vars(parser.parse_args()))

@@ -1,6 +1,5 @@
 """Triangulate a map from matches of images whose poses are known."""
 
-import argparse
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -146,6 +145,7 @@ def replacing_map(
             f"{sfm_dir} is not a map that this program or hloc triangulated, so it is not "
             "replaced. Choose another folder."
         )
+    cli.check_folder(sfm_dir)
     announce(sfm_dir)
     building = sfm_dir.with_name(f".{sfm_dir.name}.tmp")
     shutil.rmtree(building, ignore_errors=True)
@@ -288,15 +288,30 @@ def epipolar_errors(
     return errors[0], errors[1]
 
 
-def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.triangulation --sfm_dir outputs/sfm "
-        "--reference_model 3D-models/aachen_v_1_1 --image_dir images --pairs pairs.txt "
-        "--features outputs/feats-dog-colmap_sift_sv64.h5 --matches outputs/matches.h5",
-        formatter_class=cli.HelpFormatter,
-    )
+def add_options(parser: cli.Parser) -> None:
+    """Add the options of making a model from matches, with or without known poses."""
     parser.add_argument("--sfm_dir", type=Path, required=True, help="folder of the new model")
+    parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
+    parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
+    parser.add_argument("--features", type=Path, required=True, help="feature file")
+    parser.add_argument("--matches", type=Path, required=True, help="match file")
+    parser.add_argument(
+        "--skip_geometric_verification", action="store_true", help="use all matches, unverified"
+    )
+    parser.add_argument(
+        "--min_match_score", type=float, help="use only matches with a higher score"
+    )
+    parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing model")
+
+
+def _main() -> None:
+    parser = cli.Parser(
+        __doc__,
+        "--sfm_dir outputs/sfm --reference_model 3D-models/aachen_v_1_1 --image_dir images "
+        "--pairs pairs.txt --features outputs/feats-dog-colmap_sift_sv64.h5 "
+        "--matches outputs/matches.h5",
+    )
     parser.add_argument(
         "--reference_model",
         "--reference_sfm_model",
@@ -304,23 +319,12 @@ def _main() -> None:
         required=True,
         help="model with the poses",
     )
-    parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
-    parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
-    parser.add_argument("--features", type=Path, required=True, help="feature file")
-    parser.add_argument("--matches", type=Path, required=True, help="match file")
-    parser.add_argument(
-        "--skip_geometric_verification", action="store_true", help="triangulate all matches"
-    )
+    add_options(parser)
     parser.add_argument(
         "--estimate_two_view_geometries",
         action="store_true",
         help="verify with geometries estimated from the matches, not with the known poses",
     )
-    parser.add_argument(
-        "--min_match_score", type=float, help="use only matches with a higher score"
-    )
-    parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
-    parser.add_argument("--overwrite", action="store_true", help="triangulate again")
     main(**vars(parser.parse_args()))
 
 

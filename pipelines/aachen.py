@@ -4,7 +4,6 @@ Extracts features, triangulates a map with the poses of the reference model, ret
 for each query and estimates its pose. An interrupted run resumes.
 """
 
-import argparse
 from pathlib import Path
 from typing import Unpack
 
@@ -75,11 +74,7 @@ def main(
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m pipelines.aachen --feature colmap_sift_sv64 --demo",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--feature colmap_sift_sv64 --demo")
     truth = "<dataset>/queries/ground_truth_poses.txt"
     options.add_dataset_options(parser, "datasets/aachen_v1.1", truth, NUMBERS["num_loc"])
     parser.add_argument(

@@ -5,7 +5,6 @@ themselves the paper's recall is shown below each feature. Each feature has its 
 like those of pipelines.aachen and pipelines.inloc, so an interrupted comparison resumes.
 """
 
-import argparse
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned, joined
 
 from .layouts import pipeline_of
+from .options import add_retrieval_option
 
 
 @strings_as_paths
@@ -130,12 +130,7 @@ def table(tables: list[dict]) -> str:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.compare --dataset datasets/demo_town "
-        "--features sift sift_sv64 sift_sv16",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--dataset datasets/demo_town --features sift sift_sv64 sift_sv16")
     parser.add_argument("--dataset", type=Path, required=True, help="folder of the data set")
     parser.add_argument(
         "--features",
@@ -148,33 +143,19 @@ def _main() -> None:
         type=Path,
         help="folder with a folder for each feature (default: outputs/<dataset>)",
     )
-    parser.add_argument(
-        "-o", "--output", type=Path, help="the report (default: <outputs>/report.html)"
-    )
-    parser.add_argument(
-        "--retrieval",
-        default="vlad",
-        metavar="vlad|FILE",
-        help="vlad, or hloc's text file of pairs or h5 file of global descriptors",
-    )
+    page = "the report (default: <outputs>/report.html)"
+    parser.add_argument("-o", "--output", type=Path, dest="page", metavar="OUTPUT", help=page)
+    add_retrieval_option(parser)
     parser.add_argument(
         "--ground_truth",
         type=Path,
         help="true poses of the queries (default: as in finished runs, else those of the data set)",
     )
     add_gate_options(parser)
-    args = parser.parse_args()
-    outputs = args.outputs or Path("outputs") / args.dataset.resolve().name
-    failed = main(
-        args.dataset,
-        args.features,
-        outputs,
-        args.output,
-        args.retrieval,
-        args.ground_truth,
-        Gate(args.min_confidence, args.min_inliers),
-    )
-    if failed:
+    args = vars(parser.parse_args())
+    args["outputs"] = args["outputs"] or Path("outputs") / args["dataset"].resolve().name
+    gate = Gate(args.pop("min_confidence"), args.pop("min_inliers"))
+    if failed := main(**args, gate=gate):
         raise InputError(
             f"These failed, see above: {', '.join(failed)}. The others are in the report."
         )

@@ -4,7 +4,6 @@ Extracts features, retrieves cutouts for each query, lifts their keypoints to 3D
 estimates the pose of the query. An interrupted run resumes.
 """
 
-import argparse
 from pathlib import Path
 from typing import Unpack
 
@@ -71,12 +70,7 @@ def main(
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m pipelines.inloc --feature colmap_sift_sv64 "
-        "--retrieval pairs-query-netvlad40.txt",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "--feature colmap_sift_sv64 --retrieval pairs-query-netvlad40.txt")
     truth = "<dataset>/ground_truth_poses.txt"
     options.add_dataset_options(parser, "datasets/inloc", truth, NUMBERS["num_loc"])
     given = options.parse(parser)

@@ -5,7 +5,6 @@ localize other photos in it. Without --query_images only the map is built. A new
 colmap_sift_sv64 and the matcher NN-ratio unless you choose others.
 """
 
-import argparse
 import hashlib
 import os
 import re
@@ -22,7 +21,6 @@ from hloc_reduce import (
     logger,
     maps,
     pairs_from_retrieval,
-    reconstruction,
 )
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
@@ -169,7 +167,7 @@ def main(
         lists = {stem: [name for name, _ in part] for stem, part in given.items()}
         names = [name for part in lists.values() for name in part]
         sources = dict.fromkeys(names, "list")
-    check_queries(query_images, names, strict)
+        check_queries(query_images, names, strict)
     map_names = built.names()  # a broken model is found before photos are read
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
@@ -326,11 +324,8 @@ def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> P
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m pipelines.localize --map sparse --map_images photos "
-        "--query_images new --outputs outputs/place",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__, "--map sparse --map_images photos --query_images new --outputs outputs/place"
     )
     parser.add_argument(
         "--map",
@@ -357,7 +352,7 @@ def _main() -> None:
     parser.add_argument(
         "--num_covis", type=int, default=20, help="other images that each map image is matched with"
     )
-    reconstruction.add_camera_mode(parser)
+    colmap.add_camera_mode(parser)
     options.add_feature_options(parser)
     options.add_localization_options(parser, "none", 50)
     # None: what an old map was built with

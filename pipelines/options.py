@@ -1,6 +1,5 @@
 """The options that the pipelines share."""
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,9 +15,7 @@ from hloc_reduce.utils.cli import InputError
 SUBMIT = "For recall, submit {} to https://www.visuallocalization.net."
 
 
-def add_dataset_options(
-    parser: argparse.ArgumentParser, datasets: str, truth: str, num_loc: int
-) -> None:
+def add_dataset_options(parser: cli.Parser, datasets: str, truth: str, num_loc: int) -> None:
     """Add the options of the pipelines of data sets.
 
     Args:
@@ -34,16 +31,21 @@ def add_dataset_options(
         help="folder for the results of one configuration (default: outputs/<dataset>/<feature>)",
     )
     add_feature_options(parser)
+    add_retrieval_option(parser)
+    add_localization_options(parser, truth, num_loc)
+
+
+def add_retrieval_option(parser: cli.Parser) -> None:
+    """Add --retrieval."""
     parser.add_argument(
         "--retrieval",
         default="vlad",
         metavar="vlad|FILE",
         help="vlad, or hloc's text file of pairs or h5 file of global descriptors",
     )
-    add_localization_options(parser, truth, num_loc)
 
 
-def add_feature_options(parser: argparse.ArgumentParser) -> None:
+def add_feature_options(parser: cli.Parser) -> None:
     """Add the options of features and their matching."""
     parser.add_argument(
         "--feature",
@@ -55,7 +57,8 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="projection file to use with the base descriptor of --feature",
     )
-    features_confs.add_storage_option(parser)
+    of = "the descriptors of map images (those of queries stay floats)"
+    features_confs.add_storage_option(parser, of)
     features_confs.add_keypoints_option(parser)
     parser.add_argument(
         "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
@@ -63,7 +66,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list_features", action="store_true", help="list the features and exit")
 
 
-def add_localization_options(parser: argparse.ArgumentParser, truth: str, num_loc: int) -> None:
+def add_localization_options(parser: cli.Parser, truth: str, num_loc: int) -> None:
     """Add the options of localization; `truth` is the default of --ground_truth, for its help."""
     parser.add_argument(
         "--num_loc", type=int, default=num_loc, help="retrieved map images per query"
@@ -89,7 +92,7 @@ def add_localization_options(parser: argparse.ArgumentParser, truth: str, num_lo
     )
 
 
-def parse(parser: argparse.ArgumentParser) -> dict:
+def parse(parser: cli.Parser) -> dict:
     """Parse and check the options of a pipeline.
 
     Returns:
@@ -126,15 +129,19 @@ def run_on_dataset(main: Callable[..., dict], dataset: Path, options: dict) -> N
 
 def print_result(summary: dict, outputs: Path, unknown: str) -> None:
     """Print recall or, where no true poses are known, the message `unknown`."""
+    unreadable = summary["queries_unreadable"]
     logger.info(
-        "Localized %d of %d queries in %.0f s; %d bytes a descriptor. Results are in %s.",
+        "Localized %d of %d queries%s in %.0f s; %d bytes a descriptor. Results are in %s.",
         summary["queries_localized"],
         summary["queries"],
+        f" ({unreadable} unreadable)" * bool(unreadable),
         sum(summary["seconds"].values()),
         summary["bytes_per_keypoint"]["descriptor"],
         outputs,
     )
     if any("recall_percent" in result for result in summary["lists"].values()):
         print(recall_table(summary["feature"], summary["lists"]))
+    elif not summary["queries_localized"]:
+        print(f"No query is localized. {outputs / 'queries.csv'} gives the reasons.")
     else:
         print(f"The true poses are not known here. {unknown.format(outputs / summary['poses'])}")

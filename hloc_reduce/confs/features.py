@@ -5,7 +5,6 @@
 """
 
 import re
-from argparse import ArgumentParser
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from .. import projections
 from ..descriptors import COLMAP, DESCRIPTORS, DIM
 from ..detectors.dog import HLOC, KEYPOINTS
 from ..projections.released import FILES as RELEASED
-from ..utils.cli import InputError, choose
+from ..utils.cli import InputError, Parser, choose
 from ..utils.codes import CODED, STORAGES
 from ..utils.parsers import read_yaml
 from ..utils.tables import aligned
@@ -159,8 +158,8 @@ def levels(conf: dict) -> np.ndarray | None:
         return None
     if projection is None:
         raise InputError(
-            f"--storage {storage} needs a projection with levels, such as {RECOMMENDED}; "
-            f"{conf['output'].removeprefix('feats-dog-')} has none. --storage uint8 needs none."
+            f"{conf['output'].removeprefix('feats-dog-')} has no projection, but --storage "
+            f"{storage} needs one with levels: use a feature with a projection, or --storage uint8."
         )
     return projections.levels(projection, storage)
 
@@ -181,17 +180,18 @@ def of_patches(name: str) -> tuple[str, str | None]:
     return choose("descriptor", descriptor, DESCRIPTORS), conf["model"].get("projection")
 
 
-def add_storage_option(parser: ArgumentParser) -> None:
+def add_storage_option(parser: Parser, of: str = "descriptors") -> None:
     """Add --storage."""
     parser.add_argument(
         "--storage",
         default=STORAGES[0],
-        help=f"storage of the map's descriptors, one of {', '.join(STORAGES)}; uint4 keeps two "
-        "numbers in a byte. Queries stay floats. hloc reads floats only",
+        help=f"storage of {of}, one of {', '.join(STORAGES)}: uint8 keeps a number in a byte; "
+        "uint4, uint2 and uint1 keep it in 4, 2 and 1 bits and need a projection with levels, see "
+        "hloc_reduce.training.levels. hloc reads floats only",
     )
 
 
-def add_keypoints_option(parser: ArgumentParser) -> None:
+def add_keypoints_option(parser: Parser) -> None:
     """Add --keypoints."""
     parser.add_argument(
         "--keypoints",

@@ -55,8 +55,10 @@ def read_transformation(path: Path) -> np.ndarray:
     try:
         lines = path.read_text().splitlines()[TRANSFORMATION]
         matrix = np.array([[float(word) for word in line.split()] for line in lines])
-    except (OSError, ValueError) as error:
-        raise InputError(f"Cannot read the transformation {path} ({error}).") from None
+    except OSError as error:
+        raise InputError(f"Cannot read the transformation {path}: {error.strerror}.") from None
+    except ValueError:
+        matrix = np.zeros(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"{path} has no 4x4 matrix in its lines 8 to 11.")
     return matrix

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Callable, Iterable
-from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -175,25 +174,22 @@ def evaluate_phototour(args: argparse.Namespace) -> None:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=cli.HelpFormatter)
+    parser = cli.Parser(__doc__)
     commands = parser.add_subparsers(required=True, metavar="poses|hpatches|phototour")
-    add = partial(commands.add_parser, formatter_class=cli.HelpFormatter)
-    _add_poses(add)
-    _add_hpatches(add)
-    _add_phototour(add)
+    for add in (_add_poses, _add_hpatches, _add_phototour):
+        add(commands.add_parser)
     args = parser.parse_args()
     args.evaluate(args)
 
 
-def _add_poses(add: Callable[..., argparse.ArgumentParser]) -> None:
+def _add_poses(add: Callable[..., cli.Parser]) -> None:
     command = add(
         "poses",
         help="compare estimated with true poses",
         description="Compare estimated with true poses, both camera from world: recall, median "
         "errors, cumulative curves. A query without an estimate is a failure. Estimates have the "
         "full names of queries or, as in a submission, the last parts of these.",
-        epilog="example: python -m hloc_reduce.evaluation poses --estimates poses.txt "
-        "--ground_truth ground_truth_poses.txt",
+        example="--estimates poses.txt --ground_truth ground_truth_poses.txt",
     )
     command.add_argument(
         "--estimates",
@@ -224,13 +220,13 @@ def _add_poses(add: Callable[..., argparse.ArgumentParser]) -> None:
     command.set_defaults(evaluate=evaluate_poses)
 
 
-def _add_hpatches(add: Callable[..., argparse.ArgumentParser]) -> None:
+def _add_hpatches(add: Callable[..., cli.Parser]) -> None:
     command = add(
         "hpatches",
         help="evaluate features on HPatches",
         description="Evaluate features of patches in the tasks of HPatches: matching, verification "
         "and retrieval, mean average precision in percent next to the paper's.",
-        epilog="example: python -m hloc_reduce.evaluation hpatches --root hpatches-release "
+        example="--root hpatches-release "
         "--task_lists hpatches-benchmark/tasks --feature sift sift_sv64",
     )
     _add_features(command)
@@ -250,14 +246,13 @@ def _add_hpatches(add: Callable[..., argparse.ArgumentParser]) -> None:
     command.set_defaults(evaluate=evaluate_hpatches)
 
 
-def _add_phototour(add: Callable[..., argparse.ArgumentParser]) -> None:
+def _add_phototour(add: Callable[..., cli.Parser]) -> None:
     command = add(
         "phototour",
         help="evaluate features on PhotoTour",
         description="Verify the pairs m50_100000_100000_0.txt of a PhotoTour sequence: false "
         "positive rate at 95 % recall.",
-        epilog="example: python -m hloc_reduce.evaluation phototour --root phototour "
-        "--name notredame --feature sift sift_sv64",
+        example="--root phototour --name notredame --feature sift sift_sv64",
     )
     _add_features(command)
     command.add_argument("--name", required=True, help="folder of a sequence in --root")
@@ -267,7 +262,7 @@ def _add_phototour(add: Callable[..., argparse.ArgumentParser]) -> None:
     command.set_defaults(evaluate=evaluate_phototour)
 
 
-def _add_features(command: argparse.ArgumentParser) -> None:
+def _add_features(command: cli.Parser) -> None:
     command.add_argument("--root", type=Path, required=True, help="folder of the sequences")
     command.add_argument(
         "--feature",

@@ -36,11 +36,8 @@ def main(name: str, args: list[str]) -> None:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.hloc extract_features --conf sift_sv64 "
-        "--image_dir photos --export_dir outputs",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__, "extract_features --conf sift_sv64 --image_dir photos --export_dir outputs"
     )
     parser.add_argument(
         "--feature",

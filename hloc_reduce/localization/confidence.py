@@ -1,13 +1,12 @@
 """Tell right poses from chance, and precise poses from uncertain ones."""
 
-from argparse import ArgumentParser
 from dataclasses import dataclass, replace
 from math import lgamma
 
 import numpy as np
 import pycolmap
 
-from ..utils.cli import InputError
+from ..utils.cli import InputError, Parser
 from .projection import POSE, photo_scale, project, reprojection_errors
 
 SOLUTIONS = 4  # poses that a minimal sample may have
@@ -247,7 +246,7 @@ class Gate:
 DEFAULT_GATE = Gate()
 
 
-def add_gate_options(parser: ArgumentParser) -> None:
+def add_gate_options(parser: Parser) -> None:
     """Add --min_confidence and --min_inliers."""
     parser.add_argument(
         "--min_confidence",

@@ -1,6 +1,5 @@
 """Localize the queries of feature and match files in any map, and record each."""
 
-from argparse import ArgumentParser
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
@@ -221,7 +220,7 @@ def read_queries(queries: Path) -> list[tuple[str, pycolmap.Camera]]:
     return [query for part in parse_query_lists(queries).values() for query in part]
 
 
-def add_options(parser: ArgumentParser, ransac_thresh: float, pixels: str) -> None:
+def add_options(parser: cli.Parser, ransac_thresh: float, pixels: str) -> None:
     """Add the options of `run`, with the default and the unit of --ransac_thresh."""
     pairs = "pairs of queries and map images"
     parser.add_argument("--retrieval", type=Path, required=True, help=pairs)
@@ -234,7 +233,7 @@ def add_options(parser: ArgumentParser, ransac_thresh: float, pixels: str) -> No
     parser.add_argument("--overwrite", action="store_true", help="localize all queries again")
 
 
-def run(parser: ArgumentParser, main: Callable[..., object]) -> None:
+def run(parser: cli.Parser, main: Callable[..., object]) -> None:
     """Call the `main` of a localization stage with the options of the command line."""
     args = vars(parser.parse_args())
     gate = Gate(args.pop("min_confidence"), args.pop("min_inliers"))

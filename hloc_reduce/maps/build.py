@@ -145,7 +145,7 @@ def _list(
 ) -> list[str]:
     """List the images of a map: those of the model, or without it all images in a folder."""
     if reference is None:
-        names = list_images(image_dir)
+        names = keep_present(image_dir, list_images(image_dir), accept_partial)
         if len(names) == 1:
             raise InputError(f"A map of photos alone needs two or more: {image_dir} has one.")
         return names

@@ -83,10 +83,16 @@ def levels(projection: str | Path, storage: str) -> np.ndarray:
         with safe_open(path, "np") as file:
             return check_levels(file.get_tensor(key), storage)
     except SafetensorError:
+        said = f"The projection {Path(name).stem}{prefix and '@' + prefix} has no levels"
+        if path.suffix != ".safetensors":
+            said += ", and a .pth file can have none: use --storage uint8."
+            raise InputError(said) from None
+        # with other levels, a shipped file would make all files that were made with it stale
+        is_shipped = path.parent == WEIGHTS
+        add = f"copy {path} and add levels to the copy" if is_shipped else "add levels"
         raise InputError(
-            f"The projection {Path(name).stem} has no levels for {key.removeprefix('levels.')}. "
-            f"Add them with 'python -m hloc_reduce.training.levels --projection {path} "
-            "--map IMAGES:MODEL', or use --storage uint8."
+            f"{said} for {storage}: use --storage uint8, or {add} with 'python -m hloc_reduce."
+            f"training.levels --projection {'COPY' if is_shipped else path} --map IMAGES:MODEL'."
         ) from None
     except ValueError as error:
         raise InputError(f"{path} has {error}.") from None

@@ -1,6 +1,5 @@
 """Write an HTML page about one run of a pipeline, or several side by side."""
 
-import argparse
 from pathlib import Path
 
 from ..utils import cli
@@ -8,11 +7,7 @@ from . import NUM_QUERIES, main
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.report outputs/herz-jesus/sift* -o report.html",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "outputs/herz-jesus/sift* -o report.html")
     parser.add_argument(
         "folders",
         type=Path,

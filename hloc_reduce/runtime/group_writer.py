@@ -14,7 +14,7 @@ from typing import TypeVar
 import h5py
 import numpy as np
 
-from ..utils.cli import InputError
+from ..utils.cli import InputError, check_file, make_folder
 from ..utils.files import announce, replacing
 from ..utils.h5 import get_text, iterate_h5_names, open_h5, reading, set_text, write_h5
 from . import trace
@@ -58,7 +58,8 @@ class GroupWriter:
         self.folder = path.with_name(path.name + ".pieces")
         announce(path)
         announce(self.folder)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        check_file(path)
+        make_folder(path.parent)
         if overwrite:
             self._drop_pieces()
             path.unlink(missing_ok=True)

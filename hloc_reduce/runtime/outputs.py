@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .. import logger
-from ..utils.cli import InputError
+from ..utils.cli import InputError, make_folder
 from ..utils.files import delete, observing
 from . import provenance, trace
 
@@ -36,11 +36,11 @@ class Lock:
         folder: created if missing.
 
     Raises:
-        InputError: when another run has locked it.
+        InputError: when it is a file, or another run has locked it.
     """
 
     def __init__(self, folder: Path):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self.file = None
         if not os.access(folder, os.W_OK):  # nobody writes to it
             return

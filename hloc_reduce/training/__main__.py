@@ -164,11 +164,9 @@ def validate(folder: Path, outputs: Path, descriptor: str, paths: list[Path]) ->
 
 
 def _parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.training --descriptor sift --scheme sv --dim 64 "
-        "--map town/images:town/sparse --output weights",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__,
+        "--descriptor sift --scheme sv --dim 64 --map town/images:town/sparse --output weights",
     )
     add = parser.add_argument
     base = parser.add_mutually_exclusive_group()
@@ -183,14 +181,7 @@ def _parse() -> argparse.Namespace:
     )
     add("--scheme", nargs="+", default=["sv"], help=f"schemes: {', '.join(SCHEMES)}")
     add("--dim", type=int, nargs="+", default=[64], help="output dimensions; not for nested")
-    add(
-        "--map",
-        action="append",
-        default=[],
-        metavar="IMAGES:MODEL|MAP",
-        help="folder of images and folder of their COLMAP model, or a map of pipelines.localize; "
-        "may be repeated",
-    )
+    tracks.add_map_option(parser, required=False)
     add(
         "--phototour",
         type=Path,
@@ -235,6 +226,8 @@ def _check(args: argparse.Namespace, conf: dict | None) -> None:
         cli.choose("scheme", scheme, SCHEMES)
     if "ss" in args.scheme:
         ss.check()
+    for folder in (args.output, args.cache):
+        cli.check_folder(folder)
     cli.choose("recipe", args.recipe, RECIPE_NAMES)
     if not args.map and not args.phototour:
         raise InputError("There is nothing to train on. Give --map or --phototour.")

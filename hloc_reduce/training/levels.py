@@ -1,10 +1,11 @@
-"""Add the levels of codes to projections, fitted on the tracks of maps.
+"""Add the levels that --storage uint4, uint2 and uint1 need to projections, from tracks of maps.
 
 A code of 4, 2 or 1 bits is the index of one of 16, 4 or 2 levels of a number. The levels of each
-number are those with the least mean squared error on the tracks (Lloyd-Max), for all storages.
+number are those with the least mean squared error on the tracks (Lloyd-Max), for all storages. The
+file of the projection is replaced, so that what was made with it becomes stale; copy a shipped
+projection first.
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -116,23 +117,13 @@ def main(projection: Path, maps: dict[str, tuple[Path, Path]], cache: Path, seed
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m hloc_reduce.training.levels "
-        "--projection weights/sift_sv32.safetensors --map town/images:town/sparse",
-        formatter_class=cli.HelpFormatter,
+    parser = cli.Parser(
+        __doc__, "--projection weights/sift_sv32.safetensors --map town/images:town/sparse"
     )
     parser.add_argument(
-        "--projection", nargs="+", required=True, help="projections, by name or file"
+        "--projection", nargs="+", required=True, help="projections to change, by name or file"
     )
-    parser.add_argument(
-        "--map",
-        action="append",
-        required=True,
-        metavar="IMAGES:MODEL|MAP",
-        help="folder of images and folder of their COLMAP model, or a map of pipelines.localize; "
-        "may be repeated",
-    )
+    tracks.add_map_option(parser, required=True)
     default = Path("outputs/training/maps")
     parser.add_argument("--cache", type=Path, default=default, help="folder for the tracks")
     args = parser.parse_args()

@@ -27,7 +27,7 @@ from ..maps.map import Map, is_map
 from ..runtime import provenance
 from ..runtime.group_writer import resume_or_replace
 from ..utils import colmap
-from ..utils.cli import InputError, choose
+from ..utils.cli import InputError, Parser, choose
 from ..utils.colmap import point3D_ids
 from ..utils.feature_files import get_colmap_keypoints, get_descriptors
 from ..utils.files import replacing
@@ -72,6 +72,19 @@ class Tracks:
     def only(self, kept: np.ndarray) -> "Tracks":
         """Select observations by indices or a mask. Points keep their numbers."""
         return Tracks(**{key: value[kept] for key, value in vars(self).items()})
+
+
+def add_map_option(parser: Parser, required: bool) -> None:
+    """Add --map, whose values `parse_maps` takes."""
+    parser.add_argument(
+        "--map",
+        action="append",
+        default=[],
+        required=required,
+        metavar="IMAGES:MODEL|MAP",
+        help="folder of images and folder of their COLMAP model, or a map of pipelines.localize; "
+        "may be repeated",
+    )
 
 
 def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:

@@ -5,6 +5,7 @@ import difflib
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from .. import logger
 from . import interrupts
@@ -24,16 +25,21 @@ def run(main: Callable[[], None]) -> None:
     try:
         interrupts.hear()
         # argparse would name a module by its file
-        if spec := sys.modules["__main__"].__spec__:
-            sys.argv[0] = f"python -m {spec.name.removesuffix('.__main__')}"
+        spec = sys.modules["__main__"].__spec__
+        module = spec and f"-m {spec.name.removesuffix('.__main__')}"
+        sys.argv[0] = f"python {module or sys.argv[0]}"
         main()
         if spec and spec.name.startswith(interrupts.COMMANDS):
             interrupts.ignore()
     except BrokenPipeError:  # a pager or `head` has read enough
         sys.stdout = None
         sys.exit(1)
-    except (InputError, OSError) as error:
+    except InputError as error:
         logger.error(error)
+        sys.exit(2)
+    except OSError as error:
+        file = error.filename2 or error.filename
+        logger.error(f"{file}: {error.strerror}." if file and error.strerror else error)
         sys.exit(2)
     except KeyboardInterrupt as interrupt:
         interrupts.end(interrupt)
@@ -72,7 +78,17 @@ def check_folder(path: Path) -> None:
             raise InputError(f"{part} is a file: choose a folder for the results.")
 
 
-def check_file(path: Path, what: str) -> None:
+def make_folder(path: Path) -> None:
+    """Create a folder for results, and its parents, unless it exists.
+
+    Raises:
+        InputError: if there is a file in its place.
+    """
+    check_folder(path)
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def check_file(path: Path, what: str = "a file") -> None:
     """Raise an InputError if a folder prevents a file from being written."""
     if path.is_dir():
         raise InputError(f"{path} is a folder: name {what} in it.")
@@ -83,6 +99,25 @@ def some(names: Iterable[str], number: int = 5) -> str:
     """Join the first few of many names."""
     names = list(names)
     return ", ".join(names[:number]) + (", ..." if len(names) > number else "")
+
+
+class Parser(argparse.ArgumentParser):
+    """A command line. Its options must be spelled out, and its help ends with an example.
+
+    Args:
+        description: what the command does, such as the docstring of its module.
+        example: arguments to show.
+        settings: further arguments of argparse's parser.
+    """
+
+    def __init__(self, description: str | None, example: str = "", **settings: Any):
+        super().__init__(
+            description=description,
+            epilog=f"example: %(prog)s {example}" if example else None,
+            formatter_class=HelpFormatter,
+            allow_abbrev=False,
+            **{"prog": sys.argv[0], **settings},
+        )
 
 
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from .cli import InputError, choose, some
+from .cli import InputError, Parser, choose, some
 from .files import replacing
 from .interrupts import interruptible
 from .parsers import CAMERA_MODELS, check_names, parse_pairs, write_pairs
@@ -279,6 +279,17 @@ def camera_mode(name: str) -> pycolmap.CameraMode:
     """
     modes = {mode.lower(): value for mode, value in pycolmap.CameraMode.__members__.items()}
     return modes[choose("camera mode", name.lower(), modes)]
+
+
+def add_camera_mode(parser: Parser) -> None:
+    """Add --camera_mode."""
+    modes = ", ".join(mode.lower() for mode in pycolmap.CameraMode.__members__)
+    parser.add_argument(
+        "--camera_mode",
+        default="auto",
+        help=f"which photos share a camera, as in COLMAP: {modes}; auto, COLMAP's default: those "
+        "of the same make, model, focal length and size by EXIF data",
+    )
 
 
 def import_images(

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from .cli import check_file, make_folder
+
 _observers: list[Callable[[Path], None]] = []
 
 
@@ -33,9 +35,13 @@ def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path` and move it into place when the block succeeds.
 
     A file that is replaced by an equal one keeps its time, so that nothing derived gets stale.
+
+    Raises:
+        InputError: if there is a folder in its place, or a file in the place of its folder.
     """
     announce(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    check_file(path)
+    make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with naming(path):

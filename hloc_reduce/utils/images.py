@@ -11,8 +11,12 @@ from .cli import InputError, no_folder, some
 from .parsers import check_names, image_names
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
-# images of these types are ignored
-OTHER_SUFFIXES = {".bmp", ".gif", ".heic", ".jp2", ".ppm", ".tif", ".tiff", ".webp"}
+# photos and videos of other types, which are named and ignored
+_OTHERS = (
+    "arw avif bmp cr2 cr3 dng gif heic heif jp2 nef orf ppm raf rw2 tif tiff webp "
+    "3gp avi m4v mkv mov mp4 mpeg mpg mts webm wmv"
+)
+OTHER_SUFFIXES = {f".{name}" for name in _OTHERS.split()}
 
 
 def list_images(
@@ -32,7 +36,7 @@ def list_images(
     if not within.is_dir():
         raise no_folder(within)
     if image_list is None:
-        files = sorted(path.relative_to(image_dir) for path in within.rglob("*"))
+        files = sorted(p.relative_to(image_dir) for p in within.rglob("*") if not p.is_dir())
         names = [file.as_posix() for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
         others = [str(file) for file in files if file.suffix.lower() in OTHER_SUFFIXES]
         read = ", ".join(sorted(IMAGE_SUFFIXES))
@@ -41,7 +45,7 @@ def list_images(
             raise InputError(f"There is no image in {within}.{there_are}")
         if others:
             logger.warning(
-                "%d images in %s are ignored, as only %s are read: %s.",
+                "%d photos and videos in %s are ignored, as only %s are read: %s.",
                 *(len(others), within, read, some(others)),
             )
         return check_names(names, within)

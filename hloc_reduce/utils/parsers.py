@@ -20,6 +20,11 @@ CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != 
 _ENDS = r"\t\n\v\f\r\x1c-\x1f\x85\u2028\u2029"  # ends of lines and of names
 _LETTER = rf"[^{_ENDS}/\0\ud800-\udfff]"
 _PART = rf"(?!\.\.?(?:/|$))(?!\s){_LETTER}+(?<!\s)"  # not . or ..
+# lines of the lists that users write
+IMAGE = "name"
+QUERY = "name MODEL width height params..."
+PAIR = "name0 name1"
+POSE = "name qw qx qy qz tx ty tz"
 _NUMBER = re.compile(r"[-+]?\d+\.\d+(e[-+]?\d+)?")
 _NAME = re.compile(rf"(?!#){_PART}(?:/{_PART})*")
 
@@ -44,11 +49,12 @@ def check_names(names: list[str], place: Path | str) -> list[str]:
     return names
 
 
-def _lines(path: Path, names: int = 1) -> Iterator[tuple[str, list[str]]]:
+def _lines(path: Path, form: str) -> Iterator[tuple[str, list[str]]]:
     """Yield ("file:number", words) for every line that is neither empty nor a comment.
 
-    The first `names` words are image names.
+    The words in `form` that begin with "name" stand for image names.
     """
+    names = form.count("name")
     try:
         with path.open(encoding="utf-8-sig") as file:  # Windows may add a byte order mark
             for number, line in enumerate(file, 1):
@@ -57,8 +63,26 @@ def _lines(path: Path, names: int = 1) -> Iterator[tuple[str, list[str]]]:
                     place = f"{path}:{number}"
                     check_names(words[:names], place)
                     yield place, words
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"Cannot read {path}: {error}.") from None
+    except UnicodeDecodeError:
+        raise _not_text(path, f"A list has lines `{form}`.") from None
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror}.") from None
+
+
+def _not_text(path: Path, expected: str) -> InputError:
+    """Return the error for a file that is not UTF-8; `expected` says what it should contain."""
+    data, line = path.read_bytes(), 1
+    try:
+        data.decode()
+    except UnicodeDecodeError as error:
+        line += data.count(b"\n", 0, error.start)
+    return InputError(f"{path}:{line}: not text in UTF-8. {expected}")
+
+
+def _wrong(place: str, what: str, form: str, reason: str = "", hint: str = "") -> InputError:
+    """Return the error for a line that is not of the form."""
+    said = f" ({reason})" if reason else ""
+    return InputError(f"{place}: not {what}{said}. A line must look like `{form}`{hint}.")
 
 
 def _words(line: str, names: int) -> list[str]:
@@ -94,6 +118,8 @@ def read_yaml(path: Path) -> object:
     """
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError:
+        raise _not_text(path, "A YAML file is expected.") from None
     except Exception as error:  # yaml raises many types for broken values
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise InputError(f"{path} cannot be read ({reason}).") from None
@@ -101,7 +127,7 @@ def read_yaml(path: Path) -> object:
 
 def parse_image_list(path: Path) -> list[str]:
     """Read image names, the first word of every line."""
-    return [words[0] for _, words in _lines(path)]
+    return [words[0] for _, words in _lines(path, IMAGE)]
 
 
 def image_names(images: Path | str | Iterable[str]) -> list[str]:
@@ -123,40 +149,60 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
     """Read queries with intrinsics, one `name MODEL width height params...` a line.
 
     Raises:
-        InputError: for a broken line, with file and line number, a name that is listed twice, or
-            an empty list.
+        InputError: for a broken line, with file and line number, a name that is listed twice, an
+            empty list, or COLMAP's cameras.txt.
     """
     queries: dict[str, pycolmap.Camera] = {}
-    for place, words in _lines(path):
+    for place, (name, *words) in _lines(path, QUERY):
         try:
-            name, model, width, height, *params = words
-            choose("camera model", model, CAMERA_MODELS)
-            camera = pycolmap.Camera(
-                model=model,
-                width=int(width),
-                height=int(height),
-                params=np.array(params, float),
-            )
-            if not camera.verify_params():
-                raise ValueError(f"wrong number of parameters for {model}")
-            # COLMAP crashes when a panorama, which has none, is asked for a focal length
-            focal_lengths = camera.params[camera.focal_length_idxs()]
-            sizes = camera.width, camera.height, *focal_lengths
-            if not (np.isfinite(camera.params).all() and min(sizes) > 0):
-                raise ValueError("sizes and focal lengths are positive and finite")
-        except (ValueError, TypeError, AttributeError, RuntimeError) as error:
-            reason = str(error).strip().splitlines()[0]
-            spaced = not any(word in CAMERA_MODELS for word in words[1:2])
-            raise InputError(
-                f"{place}: not a query `name MODEL width height params...` ({reason})"
-                + ("; put a tab after a name that has spaces." if spaced else ".")
-            ) from None
+            camera = _camera(words)
+        except ValueError as error:
+            # a name with spaces, or commas between the words, leave no model behind the name
+            spaced = not any(word in CAMERA_MODELS for word in words[:1])
+            hint = "; put spaces between the words, and put a tab after a name that has spaces"
+            raise _wrong(place, "a query", QUERY, str(error), hint * spaced) from None
         if name in queries:
             raise InputError(f"{place}: query {name} is listed twice.")
         queries[name] = camera
     if not queries:
         raise InputError(f"{path} lists no query.")
+    if all(name.isdecimal() for name in queries):
+        raise InputError(
+            f"{path} lists cameras by their numbers, as COLMAP's cameras.txt does, and no images. "
+            f"A query list has lines `{QUERY}`, one for each photo."
+        )
     return list(queries.items())
+
+
+def _camera(words: list[str]) -> pycolmap.Camera:
+    """Return the camera of the words `MODEL width height params...`.
+
+    Raises:
+        ValueError: with what is wrong.
+    """
+    if len(words) < 3:
+        raise ValueError("it has no camera model, width and height")
+    model, *sizes = words[:3]
+    try:
+        choose("camera model", model, CAMERA_MODELS)
+    except InputError as error:
+        raise ValueError(str(error).rstrip(".")) from None
+    camera = pycolmap.Camera(model=model)
+    try:
+        camera.width, camera.height = map(int, sizes)
+    except (ValueError, TypeError):  # a TypeError if it is not of 64 bits
+        raise ValueError(f"{' '.join(sizes)} are not a width and a height in pixels") from None
+    try:
+        camera.params = list(map(float, words[3:]))
+    except ValueError:
+        raise ValueError("its parameters are not all numbers") from None
+    if not camera.verify_params():
+        raise ValueError(f"the parameters of {model} are {camera.params_info}")
+    # COLMAP crashes when a panorama, which has none, is asked for a focal length
+    focal_lengths = camera.params[camera.focal_length_idxs()]
+    if not (np.isfinite(camera.params).all() and min(*map(int, sizes), *focal_lengths) > 0):
+        raise ValueError("sizes and focal lengths are positive and finite")
+    return camera
 
 
 def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]]]:
@@ -183,11 +229,10 @@ def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]
 
 def parse_pairs(path: Path) -> Iterator[tuple[str, str]]:
     """Yield pairs, one `name0 name1` a line, without reading the whole list."""
-    for place, words in _lines(path, names=2):
+    for place, words in _lines(path, PAIR):
         if len(words) != 2:
-            raise InputError(
-                f"{place}: not a pair `name0 name1`; put a tab between names that have spaces."
-            )
+            hint = "; put a tab between names that have spaces"
+            raise _wrong(place, "a pair", PAIR, hint=hint)
         yield words[0], words[1]
 
 
@@ -216,7 +261,7 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
         InputError: for a broken line, or a name that is listed twice.
     """
     poses = {}
-    for place, (name, *values) in _lines(path):
+    for place, (name, *values) in _lines(path, POSE):
         if name in poses:
             raise InputError(
                 f"{place}: {name} is listed twice: full names are needed, as in the "
@@ -231,7 +276,7 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
             rotation = pycolmap.Rotation3d(quaternion / norm)
             poses[name] = pycolmap.Rigid3d(rotation, np.array(translation).reshape(3))
         except ValueError:
-            raise InputError(f"{place}: not a pose `name qw qx qy qz tx ty tz`.") from None
+            raise _wrong(place, "a pose", POSE) from None
     return poses
 
 

@@ -1,6 +1,5 @@
 """Run the jobs of a file: grids of data sets, features, matchers and options of the pipelines."""
 
-import argparse
 from pathlib import Path
 
 from hloc_reduce.runtime import executors
@@ -11,11 +10,7 @@ from . import dry_run, jobs, main
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: python -m pipelines.batch confs/jobs/aachen_table1.yaml --dry_run",
-        formatter_class=cli.HelpFormatter,
-    )
+    parser = cli.Parser(__doc__, "confs/jobs/aachen_table1.yaml --dry_run")
     parser.add_argument("job_file", type=Path, help="YAML file of jobs, see docs/operations.md")
     parser.add_argument(
         "--outputs", type=Path, help="folder for all results (default: the one that the file names)"

@@ -1,5 +1,8 @@
 """Intrinsics of photos that no list gives."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 import pytest
@@ -10,6 +13,13 @@ from hloc_reduce.localization.intrinsics import MapCameras
 from hloc_reduce.utils import colmap
 
 PARAMS = [500.0, 240.0, 180.0, -0.05]
+
+
+def test_the_docs_name_every_source():
+    text = (Path(__file__).parents[2] / "docs/localize.md").read_text()
+    section = text.partition("\n## Intrinsics\n")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
+    assert set(rows) == {*intrinsics.REFINEMENTS, "given"}
 
 
 def map_of(cameras: list[int]) -> pycolmap.Reconstruction:

@@ -65,7 +65,9 @@ def test_wrong_input(aachen_layout, tmp_path, refused):
     truth.unlink()
     file = tmp_path / "file"
     file.touch()
-    assert str(file) in refused(*arguments[:2], "--outputs", file)
+    message = f"{file} is a file: choose a folder for the results."
+    assert refused(*arguments[:2], "--outputs", file) == message
+    assert refused(*arguments[:2], "--outputs", file / "a/b") == message
     assert "--num_loc 0" in refused(*arguments, "--num_loc", 0)
     message = refused(*arguments, "--ground_truth", tmp_path / "truth.txt")
     assert "truth.txt" in message

@@ -149,7 +149,7 @@ def test_a_full_disk_ends_a_batch(aachen_layout, run_batch, monkeypatch, caplog)
     with pytest.raises(SystemExit):
         run_batch({"dataset": str(aachen_layout), "feature": ["sift", "sift_sv16"]})
     (line,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
-    assert line == "[Errno 28] No space left on device: 'a file'"
+    assert line == "a file: No space left on device."
 
 
 def test_what_can_be_known_is_refused_before_any_work(

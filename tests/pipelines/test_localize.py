@@ -2,6 +2,7 @@
 
 import shutil
 
+import pytest
 from command import outcome, state
 
 from pipelines import localize
@@ -52,6 +53,28 @@ def test_queries_that_have_changed_are_localized_anew(place, run):
     assert len({row["num_inliers"] for row in rows.values()}) == 1
 
 
+@pytest.mark.parametrize("kind", ["text", "dangling link"])
+def test_a_folder_with_a_broken_photo_only(kind, place, tmp_path, run, refused, caplog, capsys):
+    build, images, outputs = place
+    photo = tmp_path / "new/a.png"
+    photo.parent.mkdir()
+    if kind == "text":
+        photo.write_text("no image")
+    else:
+        photo.symlink_to(tmp_path / "gone.png")
+    given = (*build, "--query_images", photo.parent, "--feature", "sift_sv16")
+    assert f"Cannot read image {photo}" in refused(*given, "--strict")
+    run(*given)
+    assert "Localized 0 of 1 queries (1 unreadable) in" in caplog.text
+    results = outputs / "queries-new"
+    printed = capsys.readouterr().out
+    assert printed == f"No query is localized. {results / 'queries.csv'} gives the reasons.\n"
+    assert f"Cannot read image {photo}" in outcome(results)[1]["a.png"]["reason"]
+    shutil.copy(images / "db/1.png", photo.parent)
+    message = refused("--map_images", photo.parent, "--outputs", tmp_path / "o")
+    assert "a.png" in message and str(photo.parent) in message
+
+
 def test_wrong_input(place, tmp_path, run, refused):
     build, images, outputs = place
     assert "Give --map_images" in refused("--outputs", outputs)
@@ -78,6 +101,9 @@ def test_wrong_input(place, tmp_path, run, refused):
         assert repr(name) in message and "Rename" in message
         (photos / name).unlink()
     assert "Give --outputs" in refused(*build[:4])
+    photo = images / "db/1.png"
+    message = f"{photo} is a file: choose a folder for the results."
+    assert refused(*build[:4], "--outputs", photo) == message
     assert "--num_covis 0" in refused(*build, "--num_covis", 0)
     assert not (outputs / "map").exists()
     run(*build)

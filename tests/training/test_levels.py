@@ -84,11 +84,11 @@ def test_features_are_stored_as_codes_and_queries_as_floats(projection, textured
 
 
 def test_features_without_levels_are_refused(projection, tmp_path, monkeypatch, caplog):
-    with pytest.raises(InputError, match="sift has none. --storage uint8 needs none"):
+    with pytest.raises(InputError, match="sift has no projection, but --storage uint4 needs"):
         extract_features.provenance(features_confs.get("sift", None, "uint4")[1])
     mlp, metadata = network.read(projection)
     network.save(mlp, metadata, projection)
-    with pytest.raises(InputError, match="no levels for uint2. Add them with 'python -m hloc_red"):
+    with pytest.raises(InputError, match="no levels for uint2: use --storage uint8, or add"):
         extract_features.provenance(features_confs.get("sift", projection, "uint2")[1])
     broken = {"levels.uint4": torch.zeros(16, 3)}
     network.save(mlp, metadata, projection, broken)
@@ -100,6 +100,25 @@ def test_features_without_levels_are_refused(projection, tmp_path, monkeypatch, 
     command = ["--features", features, "--output", tmp_path / "b.h5", "--storage", "uint4"]
     said = refused(monkeypatch, caplog, storage, *command)
     assert said == "--storage uint4 needs --projection, the one of the features."
+    before = features.read_bytes()
+    for message, *wrong in (
+        ("Unknown storage 'uint3'", "--storage", "uint3"),
+        ("sift_sv99 does not ship", "--projection", "sift_sv99"),
+        ("no projection file", "--projection", tmp_path / "gone.safetensors"),
+        ("no levels, and a .pth file can have none", "--projection", tmp_path / "a.pth"),
+        ("no levels for uint4: use --storage uint8, or add", "--projection", projection),
+        ("needs no --projection", "--projection", projection, "--storage", "uint8"),
+    ):
+        (tmp_path / "a.pth").write_bytes(b"")
+        network.save(mlp, metadata, projection)
+        assert message in refused(monkeypatch, caplog, storage, *command, *wrong)
+    # levels go to a copy of a shipped projection, which they would change
+    monkeypatch.setattr(projections.files, "WEIGHTS", tmp_path)
+    network.save(mlp, metadata, tmp_path / "shipped.safetensors")
+    for shipped in ("shipped", "shipped@24"):
+        said = refused(monkeypatch, caplog, storage, *command, "--projection", shipped)
+        assert f"{shipped} has no levels for uint4: " in said and "--projection COPY --map" in said
+    assert features.read_bytes() == before and not (tmp_path / "b.h5").exists()
 
 
 def test_broken_codes_are_refused(projection, tmp_path):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.images import UnreadableImage, list_images, read_image
 
@@ -108,13 +107,14 @@ def test_a_folder_is_no_image(tmp_path):
         read_image(tmp_path)
 
 
-def test_images_of_other_types_are_named(tmp_path, picture, caplog, monkeypatch):
-    monkeypatch.setattr(cli.logger, "propagate", True)
-    (tmp_path / "a.webp").write_bytes(b"")
+@pytest.mark.parametrize("name", ["a.webp", "a.dng", "a.mp4", "a.MOV"])
+def test_photos_and_videos_of_other_types_are_named(name, tmp_path, picture, caplog):
+    (tmp_path / name).write_bytes(b"")
     (tmp_path / "notes.txt").write_text("")
-    message = "no image in .* It has a.webp, but only .jpeg, .jpg, .png"
+    (tmp_path / "folder.png").mkdir()
+    message = f"no image in .* It has {name}, but only .jpeg, .jpg, .png"
     with pytest.raises(InputError, match=message):
         list_images(tmp_path)
     cv2.imwrite(str(tmp_path / "b.png"), picture)
     assert list_images(tmp_path) == ["b.png"]
-    assert "1 images in" in caplog.text and "a.webp" in caplog.text
+    assert "1 photos and videos in" in caplog.text and name in caplog.text

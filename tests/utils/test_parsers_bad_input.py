@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from hloc_reduce.localization import intrinsics
 from hloc_reduce.utils import parsers
+from hloc_reduce.utils.cli import InputError
 
 
 def read_poses(path):
@@ -43,6 +44,40 @@ TEXTS = {
 @pytest.mark.parametrize("kind", TEXTS)
 def test_text_files_are_read_or_refused(kind, tmp_path):
     check_text(tmp_path / "l.txt", *TEXTS[kind])
+
+
+# what is no list of queries -> what the message says; it also shows a line
+NO_QUERIES = {
+    "b.jpg,PINHOLE,640,480,500,501,320,240": "2: not a query (it has no camera model",
+    "b.jpg, PINHOLE, 640, 480, 500, 501, 320, 240": "2: not a query (Unknown camera model 'PINHOLE",
+    "b.jpg PINHOLE 640.5 480 500 501 320 240": "(640.5 480 are not a width and a height in pixels)",
+    "b.jpg PINHOLE 640 480 500 501 320 2x": "(its parameters are not all numbers)",
+    "b.jpg PINHOLE 640 480 500 501 320": "(the parameters of PINHOLE are fx, fy, cx, cy)",
+    b"\xff\xd8\xff\xe0": "2: not text in UTF-8",
+    "\n2 PINHOLE 640 480 500 501 320 240": "COLMAP's cameras.txt",
+}
+
+
+@pytest.mark.parametrize("line", NO_QUERIES)
+def test_other_files_are_no_lists_of_queries(line, tmp_path):
+    path, words = tmp_path / "l.txt", NO_QUERIES[line]
+    first = b"1 PINHOLE 640 480 500 501 320 240\n"
+    path.write_bytes(first + (line if isinstance(line, bytes) else line.encode()))
+    with pytest.raises(InputError) as error:
+        parsers.parse_query_list(path)
+    message = str(error.value)
+    assert str(path) in message and words in message and f"`{parsers.QUERY}`" in message
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+def test_photos_and_folders_are_no_lists(kind, tmp_path):
+    _, read = TEXTS[kind]
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(b"a.jpg\n\xff\xd8\xff\xe0\x00\x10JFIF")
+    with pytest.raises(InputError, match="photo.jpg:2: not text in UTF-8. A list has lines `name"):
+        read(path)
+    with pytest.raises(InputError, match=f"Cannot read {tmp_path}: Is a directory."):
+        read(tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["images", "queries", "pairs", "poses"])
@@ -87,7 +122,7 @@ def test_names_of_lists_round_trip(tmp_path, names):
 
 @fuzzed
 @given(
-    name=some_names.map(min),
+    name=some_names.map(min).filter(lambda name: not name.isdecimal()),
     model=st.sampled_from(parsers.CAMERA_MODELS),
     size=st.tuples(st.integers(1, 10**6), st.integers(1, 10**6)),
     seed=st.integers(0, 2**32 - 1),
