@@ -56,6 +56,14 @@ def fit(numbers: torch.Tensor, bits: int) -> torch.Tensor:
     return levels
 
 
+def sample(maps: list[Tracks]) -> torch.Tensor:
+    """Choose base descriptors (N, D) float32 to fit levels to, evenly from all observations."""
+    # all variants, so that codes are good in the dark, too
+    size = maps[0].descriptors.shape[-1]
+    everything = np.concatenate([part.descriptors[:, 0].reshape(-1, size) for part in maps])
+    return torch.from_numpy(everything[:: -(-len(everything) // SAMPLE)]).float()
+
+
 def of_projection(mlp: network.MLP, metadata: dict, maps: list[Tracks]) -> dict[str, torch.Tensor]:
     """Fit the levels of a trained projection, of all its prefixes if it is nested.
 
@@ -67,10 +75,7 @@ def of_projection(mlp: network.MLP, metadata: dict, maps: list[Tracks]) -> dict[
     Returns:
         Levels (D, 2**bits) by `projections.files.level_key`.
     """
-    size = mlp.sizes[0]
-    # all variants, so that codes are good in the dark, too
-    everything = np.concatenate([part.descriptors[:, 0].reshape(-1, size) for part in maps])
-    observed = torch.from_numpy(everything[:: -(-len(everything) // SAMPLE)]).float()
+    observed = sample(maps)
     prefixes = nested.PREFIXES if metadata.get("scheme") == "nested" else [mlp.sizes[-1]]
     found = {}
     for dim in prefixes:
