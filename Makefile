@@ -29,7 +29,7 @@ test-long: $(VENV)/installed
 	$(BIN)/python -m pytest -m long
 
 # torch by itself first: a pinned version is a CPU build where an index offers one
-$(VENV)/installed: pyproject.toml constraints.txt
+$(VENV)/installed: pyproject.toml setup.py hloc_reduce/utils/best_two.cpp constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet $$(grep '^torch==' constraints.txt)
 	$(BIN)/pip install --quiet $(PIP_FLAGS) --editable '.[dev]'

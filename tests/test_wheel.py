@@ -1,5 +1,6 @@
 """The wheel has everything that the commands need outside the repository."""
 
+import platform
 import shutil
 import subprocess
 import sys
@@ -15,7 +16,7 @@ def test_wheel_is_complete(tmp_path):
     source = tmp_path / "source"
     for folder in ("confs", "hloc_reduce", "pipelines"):
         shutil.copytree(ROOT / folder, source / folder)
-    for file in ("pyproject.toml", "README.md", "LICENSE"):
+    for file in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / file, source)
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path]
     subprocess.run([*command, source], check=True, capture_output=True)
@@ -31,6 +32,8 @@ def test_wheel_is_complete(tmp_path):
         f"hloc_reduce/projections/weights/{name}.safetensors" for name in projections.names()
     }
     assert weights and weights <= names
+    if shutil.which("c++") and platform.system() == "Linux":
+        assert any(name.startswith("hloc_reduce/utils/_best_two.") for name in names)
     assert "hloc_reduce/aggregators/vlad_sift_sv64.safetensors" in names
     assert {f"hloc_reduce/report/page.{kind}" for kind in ("html", "css", "js")} <= names
     assert "hloc_reduce/evaluation/published/localization_recall.csv" in names

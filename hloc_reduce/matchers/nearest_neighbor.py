@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch.nn.utils.rnn import pad_sequence
 
+from ..utils import best_two
+from ..utils.codes import UNIT
 from . import GPU_BYTES, Matcher, Tensors
 
 PART_BYTES = 2**19  # of descriptors1 at once: they stay in the cache of a core
@@ -21,8 +23,8 @@ def nearest(
     """Find the nearest descriptor1 of every descriptor0 that passes the tests.
 
     Args:
-        descriptors0: (N, D) of unit norm.
-        descriptors1: (M, D) of unit norm, M > 0, and M > 1 for a ratio test.
+        descriptors0: (N, D) of unit norm, or int16 from `utils.codes.to_integers`.
+        descriptors1: (M, D) like these, M > 0, and M > 1 for a ratio test.
         ratio_threshold: maximum ratio of the distances to the nearest and the second nearest; None
             for no ratio test.
         gpu_bytes: GPU memory for similarities at once.
@@ -30,6 +32,46 @@ def nearest(
 
     Returns:
         Its index (N,) int64, -1 where it does not pass, and its cosine (N,).
+    """
+    if descriptors0.dtype == torch.int16:
+        index, cosine, runner_up = _nearest_integers(descriptors0, descriptors1)
+    else:
+        index, cosine, runner_up = _nearest_floats(
+            descriptors0, descriptors1, ratio_threshold is not None, gpu_bytes
+        )
+    accepted = _is_near(cosine, distance_threshold)
+    if ratio_threshold is not None:
+        accepted &= _is_distinct(cosine, runner_up, ratio_threshold)
+    return torch.where(accepted, index, -1), cosine
+
+
+def _nearest_integers(
+    descriptors0: torch.Tensor, descriptors1: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Find the nearest neighbours of integers (N, D) among (M, D), as `_nearest_floats` does.
+
+    Whether by compiled code or by torch, the products are the same integers.
+    """
+    if best_two.instructions():
+        arrays = best_two.best_two(descriptors0.numpy(), descriptors1.numpy())
+        index, best, second = map(torch.from_numpy, arrays)
+        index = index.long()
+    else:
+        index, best, second = _nearest_floats(descriptors0.float(), descriptors1.float())
+    return index, best.float() / UNIT**2, second.float() / UNIT**2
+
+
+def _nearest_floats(
+    descriptors0: torch.Tensor,
+    descriptors1: torch.Tensor,
+    two: bool = True,
+    gpu_bytes: int = GPU_BYTES,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Find the largest product of every descriptor0 (N, D) with one of (M, D).
+
+    Returns:
+        The index of the nearest descriptor1 (N,) int64, the first of equal ones; the product
+        (N,); and, if `two`, the second largest (N,).
     """
     number, dim = descriptors0.shape
     on_cpu = descriptors0.is_cpu
@@ -48,19 +90,18 @@ def nearest(
             index[i, chosen] = _argmax(tile)
             nearest_one = index[i, chosen, None]
             torch.gather(tile, 1, nearest_one, out=best[i, chosen, None])
-            if ratio_threshold is not None:
+            if two:
                 # hiding the best and searching again is faster than topk
                 tile.scatter_(1, nearest_one, -torch.inf)
                 torch.amax(tile, 1, out=second[i, chosen])
         index[i] += i * len(parts[0])
-    cosine, winner = best.max(dim=0, keepdim=True)
-    accepted = _is_near(cosine[0], distance_threshold)
-    if ratio_threshold is not None:
-        runner_up = torch.maximum(
-            second.gather(0, winner), best.scatter(0, winner, -torch.inf).amax(0, keepdim=True)
-        )
-        accepted &= _is_distinct(cosine[0], runner_up[0], ratio_threshold)
-    return torch.where(accepted, index.gather(0, winner)[0], -1), cosine[0]
+    largest, winner = best.max(dim=0, keepdim=True)
+    if two:
+        others = best.scatter(0, winner, -torch.inf).amax(0, keepdim=True)
+        runner_up = torch.maximum(second.gather(0, winner), others)
+    else:
+        runner_up = largest
+    return index.gather(0, winner)[0], largest[0], runner_up[0]
 
 
 def _is_near(cosine: torch.Tensor, distance_threshold: float | None) -> torch.Tensor:
@@ -97,8 +138,8 @@ def mutual_nearest(
     """Match descriptors that are each other's nearest and pass the tests of `nearest` both ways.
 
     Args:
-        descriptors0: (N, D) of unit norm.
-        descriptors1: (M, D) of unit norm.
+        descriptors0: (N, D), see `nearest`.
+        descriptors1: (M, D), see `nearest`.
         ratio_threshold: see `nearest`.
         rows: (K,) rows of descriptors0 to match; default: all.
         gpu_bytes: see `nearest`.
@@ -111,7 +152,7 @@ def mutual_nearest(
     chosen = descriptors0 if rows is None else descriptors0[rows]
     if min(len(chosen), len(descriptors1)) == 0:
         unmatched = torch.full((len(chosen),), -1, device=chosen.device)
-        return unmatched, chosen.new_zeros(len(chosen))
+        return unmatched, torch.zeros(len(chosen), device=chosen.device)
     # as in hloc, a lone descriptor on either side has no second nearest and skips the test
     if min(len(descriptors0), len(descriptors1)) == 1:
         ratio_threshold = None
@@ -196,6 +237,7 @@ def _nearest_padded(
 class NearestNeighbor(Matcher):
     """The matches of hloc's `nearest_neighbor`, with its options."""
 
+    takes_integers = True
     default_conf = {
         "ratio_threshold": None,
         "distance_threshold": None,

@@ -10,6 +10,8 @@ from hloc_reduce.matchers.nearest_neighbor import (
     mutual_nearest,
     mutual_nearest_padded,
 )
+from hloc_reduce.utils import best_two
+from hloc_reduce.utils.codes import to_integers
 
 
 def unit(number, dim, seed):
@@ -79,6 +81,46 @@ def test_tiles_of_any_size_give_the_same(part, tile, ratio_threshold, monkeypatc
     matches, _ = match(descriptors0, descriptors1, ratio_threshold)
     assert matches.tolist() == by_definition(descriptors0, descriptors1, ratio_threshold)
     assert (matches >= 0).sum() >= 30
+
+
+def integers(descriptors):
+    return torch.from_numpy(to_integers(descriptors.numpy()))
+
+
+@pytest.fixture(params=["compiled", "torch"])
+def arithmetic(request, monkeypatch):
+    if request.param == "torch":
+        monkeypatch.setattr(best_two, "instructions", list)
+    elif not best_two.instructions():
+        pytest.skip("integer matching was not compiled: no C++ compiler?")
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+@pytest.mark.parametrize("ratio_threshold", [None, 0.8, 0.95])
+@pytest.mark.parametrize("sizes", [(200, 300), (300, 2), (2, 2), (5, 1), (1, 5), (0, 5), (5, 0)])
+def test_integers_match_as_floats(sizes, ratio_threshold, options, arithmetic):
+    base = unit(300, 16, 0)
+    other = torch.nn.functional.normalize(base + 0.3 * unit(300, 16, 1), dim=1).flip(0)
+    pair = base[: sizes[0]], other[: sizes[1]]
+    matcher = NearestNeighbor({"ratio_threshold": ratio_threshold, **options})
+    assert matcher.takes_integers
+    rounded = tuple(integers(one) for one in pair)
+    ((matches, scores),) = matcher.match([rounded])
+    ((expected, expected_scores),) = matcher.match([pair])
+    assert matches.tolist() == expected.tolist()
+    torch.testing.assert_close(scores, expected_scores, atol=1e-3, rtol=0)
+    rows1 = torch.arange(0, sizes[1], 2)
+    found = matcher.match_rows(*rounded, rows1)
+    assert found.tolist() == matcher.match_rows(*pair, rows1).tolist()
+
+
+def test_integers_match_the_same_in_either_order(arithmetic):
+    pair = integers(unit(400, 8, 0)), integers(unit(300, 8, 1))  # random: near ties abound
+    matcher = NearestNeighbor({"ratio_threshold": 0.95})
+    ((forward, _),) = matcher.match([pair])
+    ((backward, _),) = matcher.match([pair[::-1]])
+    found = {(i, j) for i, j in enumerate(forward.tolist()) if j >= 0}
+    assert found and found == {(i, j) for j, i in enumerate(backward.tolist()) if i >= 0}
 
 
 @pytest.mark.parametrize("sizes", [(0, 5), (5, 0), (0, 0)])

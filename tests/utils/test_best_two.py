@@ -1,0 +1,90 @@
+"""The best two products of integers: compiled code, torch and the definition agree."""
+
+import numpy as np
+import pytest
+import torch
+
+from hloc_reduce.matchers import nearest_neighbor
+from hloc_reduce.utils import best_two
+from hloc_reduce.utils.codes import UNIT, to_integers
+
+LOWEST = np.iinfo(np.int32).min
+compiled = pytest.mark.skipif(
+    not best_two.instructions(), reason="integer matching was not compiled: no C++ compiler?"
+)
+
+
+def by_definition(rows0, rows1):
+    products = rows0.astype(np.int64) @ rows1.astype(np.int64).T
+    index = products.argmax(axis=1)
+    descending = np.sort(products, axis=1)[:, ::-1]
+    second = descending[:, 1] if len(rows1) > 1 else np.full(len(rows0), LOWEST)
+    return index, descending[:, 0], second
+
+
+def draw(number, dim, kind, seed):
+    """Rows that are random; of few values, so that many products tie; all equal; or extreme."""
+    generator = np.random.default_rng(seed)
+    if kind == "extreme":  # the longest rows that there are: products of 2**24
+        rows = np.zeros((number, dim), np.int16)
+        rows[np.arange(number), generator.integers(0, dim, number)] = UNIT
+        return rows * generator.choice([-1, 1], (number, 1)).astype(np.int16)
+    if kind == "equal":
+        return np.full((number, dim), -3, np.int16)
+    low, high = {"random": (-350, 350), "ties": (-1, 2)}[kind]
+    return generator.integers(low, high, (number, dim)).astype(np.int16)
+
+
+SIZES = [(0, 1), (1, 1), (1, 2), (2, 1), (3, 2), (4, 15), (5, 16), (7, 17), (33, 100)]
+DIMS = [1, 2, 3, 16, 17, 31, 64, 128]
+KINDS = ["random", "ties", "equal", "extreme"]
+
+
+@compiled
+@pytest.mark.parametrize("instruction_set", best_two.instructions())
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_instruction_set_agrees_with_the_definition(kind, instruction_set):
+    for number0, number1 in SIZES:
+        for dim in DIMS:
+            rows0, rows1 = draw(number0, dim, kind, 0), draw(number1, dim, kind, 1)
+            found = best_two.best_two(rows0, rows1, instruction_set)
+            for values, right in zip(found, by_definition(rows0, rows1), strict=True):
+                assert values.dtype == np.int32
+                np.testing.assert_array_equal(values, right)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_torch_agrees_with_the_definition(kind, monkeypatch):
+    """Whatever the machine; in tiles, so that winners of parts are compared, too."""
+    monkeypatch.setattr(best_two, "instructions", list)
+    monkeypatch.setattr(nearest_neighbor, "PART_BYTES", 4 * 16 * 7)
+    for number0, number1 in SIZES[1:]:
+        for dim in DIMS:
+            rows0, rows1 = draw(number0, dim, kind, 0), draw(number1, dim, kind, 1)
+            index, best, second = nearest_neighbor._nearest_integers(
+                torch.from_numpy(rows0), torch.from_numpy(rows1)
+            )
+            right = by_definition(rows0, rows1)
+            assert index.tolist() == right[0].tolist()
+            assert torch.equal(best, torch.from_numpy(right[1]).float() / UNIT**2)
+            if number1 > 1:
+                assert torch.equal(second, torch.from_numpy(right[2]).float() / UNIT**2)
+
+
+@compiled
+def test_rows_that_are_not_contiguous():
+    rows0, rows1 = draw(20, 40, "random", 0)[::2, ::2], draw(40, 20, "random", 1).T[:, ::2]
+    found = best_two.best_two(rows0, rows1)
+    for values, right in zip(found, by_definition(rows0, rows1), strict=True):
+        np.testing.assert_array_equal(values, right)
+
+
+def test_products_of_unit_vectors_are_exact_in_float32():
+    for dim in (1, 16, 128):
+        vectors = np.random.default_rng(dim).standard_normal((1000, dim)).astype(np.float32)
+        vectors[0] = 1  # the worst: each number is rounded in the same direction
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        integers = to_integers(vectors)
+        assert integers.dtype == np.int16
+        np.testing.assert_allclose(integers / UNIT, vectors, atol=0.51 / UNIT)
+        assert (integers.astype(np.int64) ** 2).sum(axis=1).max() < 2**24
