@@ -19,6 +19,7 @@ from .runtime.executors import SERIAL, Executor, Results
 from .runtime.group_writer import Arrays, Group, GroupWriter, fill
 from .utils import cli
 from .utils.cli import InputError
+from .utils.codes import to_integers
 from .utils.feature_files import StoredDescriptors, read_descriptors
 from .utils.h5 import file_provenance, open_h5
 from .utils.match_files import names_to_pair
@@ -34,7 +35,8 @@ CACHE_BYTES = 2**30  # descriptors in memory: 500 images of 8,000 x 64
 CHUNK = 64  # pairs
 PAIRS_ON_GPU = 16  # given to a matcher at once, which batches as many as its memory allows
 
-DescribedPair = tuple[str, np.ndarray, np.ndarray]  # name of its group, descriptors (N, D), (M, D)
+Described = np.ndarray | StoredDescriptors  # (N, D) float32, or codes
+DescribedPair = tuple[str, Described, Described]  # name of its group, descriptors
 
 
 @strings_as_paths
@@ -159,10 +161,14 @@ def _describe(
 ) -> DescribedPair:
     """Read the descriptors of a pair."""
     descriptors0, descriptors1 = read(file0, pair[0]), read(file1, pair[1])
-    if descriptors0.shape[1] != descriptors1.shape[1]:
+    dim0, dim1 = (
+        one.shape[1] if isinstance(one, np.ndarray) else one.dim
+        for one in (descriptors0, descriptors1)
+    )
+    if dim0 != dim1:
         raise InputError(
-            f"{file1.filename}: the descriptors of {pair[1]} are {descriptors1.shape[1]}-D, those "
-            f"of {pair[0]} are {descriptors0.shape[1]}-D."
+            f"{file1.filename}: the descriptors of {pair[1]} are {dim1}-D, those of {pair[0]} are "
+            f"{dim0}-D."
         )
     return names_to_pair(*pair), descriptors0, descriptors1
 
@@ -173,9 +179,22 @@ def _match_batch(
     """Match pairs and return their groups."""
     import torch
 
-    arrays = {id(array): array for _, *pair in batch for array in pair}  # pairs share images
-    moved = {key: torch.from_numpy(array).to(device) for key, array in arrays.items()}
-    found = matcher.match([(moved[id(a)], moved[id(b)]) for _, a, b in batch], gpu_bytes)
+    moved: dict[tuple[int, bool], torch.Tensor] = {}  # pairs share images
+
+    def move(descriptors: Described, as_integers: bool) -> torch.Tensor:
+        key = id(descriptors), as_integers
+        if key not in moved:
+            array = descriptors if isinstance(descriptors, np.ndarray) else descriptors.restore()
+            moved[key] = torch.from_numpy(to_integers(array) if as_integers else array).to(device)
+        return moved[key]
+
+    pairs = []
+    for _, *pair in batch:
+        # a code is rounded much more than integers are, and they are faster
+        coded = any(isinstance(one, StoredDescriptors) for one in pair)
+        as_integers = coded and matcher.takes_integers and device == "cpu"
+        pairs.append((move(pair[0], as_integers), move(pair[1], as_integers)))
+    found = matcher.match(pairs, gpu_bytes)
     groups: list[tuple[None, Group]] = []
     for (name, _, _), (matches, scores) in zip(batch, found, strict=True):
         matched: Arrays = {
@@ -195,11 +214,11 @@ class DescriptorCache:
 
     def __init__(self, max_bytes: int):
         self.max_bytes, self.bytes = max_bytes, 0
-        self.kept: OrderedDict[tuple[str, str], StoredDescriptors | np.ndarray] = OrderedDict()
+        self.kept: OrderedDict[tuple[str, str], Described] = OrderedDict()
         self.levels: dict[str, tuple[np.ndarray, str]] = {}  # with the first image, by data set
 
-    def __call__(self, file: h5py.File, name: str) -> np.ndarray:
-        """Return the descriptors (N, D) float32 of an image in an open feature file.
+    def __call__(self, file: h5py.File, name: str) -> Described:
+        """Return the descriptors of an image in an open feature file.
 
         Raises:
             InputError: when they are broken, or are codes with other levels than those before.
@@ -207,13 +226,13 @@ class DescriptorCache:
         key = file.filename, name
         if key in self.kept:
             self.kept.move_to_end(key)
-            kept = self.kept[key]
-            return kept if isinstance(kept, np.ndarray) else kept.restore()
+            return self.kept[key]
         stored = read_descriptors(file, name)
-        descriptors = stored.restore()
+        restored = stored.restore()  # which checks them
         self._check(stored)
-        self.kept[key] = descriptors if stored.is_float else stored
-        self.bytes += _nbytes(self.kept[key])
+        descriptors = restored if stored.is_float else stored
+        self.kept[key] = descriptors
+        self.bytes += _nbytes(descriptors)
         while self.bytes > self.max_bytes and len(self.kept) > 1:
             self.bytes -= _nbytes(self.kept.popitem(last=False)[1])
         return descriptors
@@ -231,7 +250,7 @@ class DescriptorCache:
             )
 
 
-def _nbytes(descriptors: StoredDescriptors | np.ndarray) -> int:
+def _nbytes(descriptors: Described) -> int:
     return (descriptors if isinstance(descriptors, np.ndarray) else descriptors.array).nbytes
 
 

@@ -19,8 +19,8 @@ from ..pairs_from_retrieval import rank, read_global
 from ..runtime import parallel
 from ..utils import colmap
 from ..utils.cli import InputError
-from ..utils.codes import FLOATS
-from ..utils.feature_files import dimension, get_descriptors, to_colmap
+from ..utils.codes import FLOATS, to_integers
+from ..utils.feature_files import dimension, read_descriptors, to_colmap
 from ..utils.h5 import open_h5
 from .map import RETRIEVAL, Map
 
@@ -70,8 +70,13 @@ class Localizer:
         self.descriptors, self.shown = {}, {}
         with open_h5(built.features) as file:
             for name in self.names:
-                descriptors = torch.from_numpy(get_descriptors(file, name))
-                self.descriptors[name] = descriptors.to(self.device)
+                stored = read_descriptors(file, name)
+                # a code is rounded much more than integers are, and they are faster
+                coded = not stored.is_float and self.matcher.takes_integers
+                descriptors = stored.restore()
+                if coded and self.device == "cpu":
+                    descriptors = to_integers(descriptors)
+                self.descriptors[name] = torch.from_numpy(descriptors).to(self.device)
                 shown = np.flatnonzero(self.reference.point_rows(name) >= 0)
                 self.shown[name] = torch.from_numpy(shown).to(self.device)
 
@@ -141,9 +146,11 @@ class Localizer:
 
     def _match(self, descriptors: torch.Tensor, names: list[str]) -> dict[str, np.ndarray]:
         """Match descriptors (N, D) with those of map images that show a point."""
+        integers = torch.from_numpy(to_integers(descriptors.cpu().numpy()))
 
         def match(name: str) -> np.ndarray:
             described, shown = self.descriptors[name], self.shown[name]
-            return self.matcher.match_rows(descriptors, described, shown).cpu().numpy()
+            query = integers if described.dtype == integers.dtype else descriptors
+            return self.matcher.match_rows(query, described, shown).cpu().numpy()
 
         return dict(zip(names, parallel.ordered("match", match, names), strict=True))

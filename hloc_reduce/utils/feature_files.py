@@ -99,6 +99,11 @@ class StoredDescriptors:
         """Whether they are floats."""
         return self.key not in QUANTIZED.values()
 
+    @property
+    def dim(self) -> int:
+        """Numbers of a descriptor."""
+        return len(self.attrs.get("levels", self.array))
+
     def restore(self) -> np.ndarray:
         """Return them as (N, D) float32; raise an InputError if they are broken."""
         try:
