@@ -4,12 +4,17 @@ import h5py
 import numpy as np
 import pytest
 import small_map
+import torch
 from command import refused
 from small_map import MATCHER
 
-from hloc_reduce import match_features, pairs_from_retrieval
+from hloc_reduce import match_features, matchers, pairs_from_retrieval
+from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
 from hloc_reduce.runtime.group_writer import GroupWriter
+from hloc_reduce.utils import best_two
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.codes import CODED, store
+from hloc_reduce.utils.feature_files import get_descriptors
 from hloc_reduce.utils.h5 import list_h5_names
 from hloc_reduce.utils.match_files import get_matches
 from hloc_reduce.utils.parsers import parse_pairs, write_pairs
@@ -88,6 +93,76 @@ def test_descriptors_in_memory_are_bounded(tmp_path):
         small = match_features.DescriptorCache(max_bytes=1)
         assert small(file, "a")[0, 0] == ord("a") and small(file, "b")[0, 0] == ord("b")
         assert len(small.kept) == 1
+
+
+@pytest.fixture
+def coded(tmp_path):
+    """A feature file of a float query and the same descriptors, changed a little, as codes."""
+    generator = np.random.default_rng(0)
+    query = generator.standard_normal((200, 32))
+    path = tmp_path / "f.h5"
+    with GroupWriter(path, {}) as writer:
+        for storage in ("float16", "uint8", *CODED):
+            own = query[::-1] + 0.3 * generator.standard_normal(query.shape)
+            own /= np.linalg.norm(own, axis=1, keepdims=True)
+            number = 2 ** CODED.get(storage, 0)
+            levels = np.tile(np.linspace(-0.3, 0.3, number, dtype=np.float32), (32, 1))
+            stored = store({"descriptors": own.T.astype(np.float32)}, storage, levels)
+            writer.add(f"{storage}.jpg", *stored)
+        query /= np.linalg.norm(query, axis=1, keepdims=True)
+        writer.add("query.jpg", {"descriptors": query.T.astype(np.float16)})
+    return path
+
+
+def matched(path, names, output):
+    write_pairs([names], output.with_suffix(".txt"))
+    match_features.main(MATCHER, output.with_suffix(".txt"), path, matches=output)
+    with h5py.File(output) as file:
+        group = file[list_h5_names(output)[0]]
+        return group["matches0"][()], group["matching_scores0"][()]
+
+
+@pytest.mark.parametrize("name", ["query.jpg", "uint8.jpg", "uint4.jpg"])
+@pytest.mark.parametrize("storage", ["uint8", *CODED])
+def test_codes_match_as_the_floats_they_stand_for(storage, name, coded, tmp_path, monkeypatch):
+    names = name, f"{storage}.jpg"
+    if names[0] == names[1]:
+        names = name, "float16.jpg"
+    matches, scores = matched(coded, names, tmp_path / "a.h5")
+    with h5py.File(coded) as file:
+        pair = [torch.from_numpy(get_descriptors(file, one)) for one in names]
+    expected, cosine = mutual_nearest(*pair, MATCHER["model"].get("ratio_threshold"))
+    assert matches.tolist() == expected.tolist() and (matches >= 0).sum() > 100
+    is_match = matches >= 0
+    np.testing.assert_allclose(scores[is_match], (cosine[is_match] + 1) / 2, atol=2e-3)
+    backward, _ = matched(coded, names[::-1], tmp_path / "b.h5")
+    assert {(i, j) for i, j in enumerate(matches) if j >= 0} == {
+        (i, j) for j, i in enumerate(backward) if i >= 0
+    }
+    monkeypatch.setattr(best_two, "instructions", list)  # as without a compiler
+    by_torch = matched(coded, names, tmp_path / "c.h5")
+    assert (by_torch[0] == matches).all() and (by_torch[1] == scores).all()
+
+
+def test_codes_stay_codes_in_memory(coded):
+    read = match_features.DescriptorCache(max_bytes=10**9)
+    with h5py.File(coded) as file:
+        sizes = [read.bytes, *(read(file, f"{name}.jpg") and read.bytes for name in CODED)]
+    assert np.diff(sizes).tolist() == [200 * 32 * bits // 8 for bits in CODED.values()]
+
+
+def test_only_matchers_that_take_integers_get_them(coded):
+    class Nearest(matchers.Matcher):
+        def _forward(self, data):
+            assert all(data[f"descriptors{i}"].dtype == torch.float32 for i in (0, 1))
+            number = data["descriptors0"].shape[2]
+            return {"matches0": torch.zeros(1, number), "matching_scores0": torch.ones(1, number)}
+
+    with h5py.File(coded) as file:
+        read = match_features.DescriptorCache(10**9)
+        pair = match_features._describe(read, file, file, ("query.jpg", "uint4.jpg"))
+    ((_, (name, arrays, _)),) = match_features._match_batch(Nearest({}), "cpu", 1, [pair])
+    assert name == "query.jpg/uint4.jpg" and len(arrays["matches0"]) == 200
 
 
 def test_features_made_anew_invalidate_their_matches(tmp_path):
