@@ -104,6 +104,9 @@ extern "C" {
 const char* best_two_name(int instructions) {
     const int number = sizeof ALL / sizeof *ALL;
     if (instructions >= number) return nullptr;
+#if defined(__x86_64__)
+    __builtin_cpu_init();  // which Clang's runtime does not always do by itself
+#endif
     return ALL[instructions].is_supported() ? ALL[instructions].name : "";
 }
 
