@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from command import outcome
 
 from hloc_reduce import Localizer, maps
@@ -61,17 +62,22 @@ def test_the_same_as_the_pipeline_of_aachen(
 
 
 def test_queries_called_as_map_photos(place, tmp_path, run):
-    """They are other photos: every pair is matched, also one that looks like another's reverse."""
+    """They are other photos: every pair is matched, also one that looks like another's reverse.
+
+    Here as codes, in files and in memory.
+    """
     build, images, outputs = place
     new = tmp_path / "new/db"
     new.mkdir(parents=True)
     for name in ("0.png", "1.png", "3.png"):
         shutil.copy(images / "query/day/a.png", new / name)
-    run(*build, "--query_images", new.parent)
+    run(*build, "--query_images", new.parent, "--storage", "uint8")
     summary, rows = outcome(outputs / "queries-new")
     assert set(rows) == {"db/0.png", "db/1.png", "db/3.png"}
     assert len({tuple(row.values())[2:] for row in rows.values()}) == 1
     localizer = Localizer(outputs / "map")
+    if localizer.device == "cpu":
+        assert {part.dtype for part in localizer.descriptors.values()} == {torch.int16}
     pose, info = localizer.localize(new / "1.png")
     assert (
         info["num_matches"] == int(rows["db/1.png"]["num_matches"]) and len(info["retrieved"]) == 4
