@@ -1,8 +1,9 @@
 """What tests share: the folder of real data, and a small scene with answers known in advance."""
 
+import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +21,24 @@ from hloc_reduce.utils import cli, colmap
 from pipelines import batch
 
 SHARED = Path(__file__).parents[2] / "shared"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def detected_once() -> Iterator[None]:
+    """Has keypoints of a photo detected once: most runs in this process are of the same few."""
+    found, detect = {}, colmap.detect_dog
+
+    def once(image: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray]:
+        pixels = hashlib.sha256(image.tobytes()).digest(), image.shape
+        key = *pixels, json.dumps(options, sort_keys=True)
+        if key not in found:
+            found[key] = detect(image, options)
+        keypoints, descriptors = found[key]
+        return keypoints.copy(), descriptors.copy()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(colmap, "detect_dog", once)
+        yield
 
 
 @pytest.fixture(scope="session")
