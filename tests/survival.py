@@ -38,11 +38,14 @@ TRIES = 4  # to end a run in a stage, one after the other, before the stage is l
 TIMEOUT = 120  # seconds
 
 context = multiprocessing.get_context("forkserver")
+# what runs import when they first need it
+MODELS = "extractors.reduced", "descriptors.sift", "matchers.nearest_neighbor", "aggregators.vlad"
 
 
 def _start_server() -> None:
     """Start the process that runs are forked from: imports take seconds."""
-    context.set_forkserver_preload(["survival"])
+    imported = [f"hloc_reduce.{name}" for name in MODELS]
+    context.set_forkserver_preload(["survival", "sklearn.cluster", *imported])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # else nothing is found there
         patch.setenv("OMP_NUM_THREADS", "1")

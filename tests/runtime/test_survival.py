@@ -82,7 +82,7 @@ cli.run(main)
 @pytest.mark.parametrize(
     "pipeline, workers, signals, number",
     [
-        ("aachen", None, KILL, 1),
+        ("aachen", None, KILL, 2),
         ("inloc", 2, KILL, 1),
         ("aachen", 2, STOP, 1),
         ("inloc", None, STOP, 1),
