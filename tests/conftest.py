@@ -129,15 +129,15 @@ def scene(tmp_path) -> SimpleNamespace:
     )
 
 
-SIZE = (480, 360)
-FOCAL = 500.0
+SIZE = (360, 270)
+FOCAL = 375.0
 
 
 @pytest.fixture
 def plane(tmp_path):
     """Photos of the plane z = 0 and a COLMAP model of their poses with covisibility."""
     generator = np.random.default_rng(0)
-    texture = np.zeros((800, 800))
+    texture = np.zeros((600, 600))
     for sigma in (2, 4, 8):
         noise = cv2.GaussianBlur(generator.standard_normal(texture.shape), (0, 0), sigma)
         texture += noise / noise.std()
@@ -158,8 +158,8 @@ def plane(tmp_path):
         rotation = cv2.Rodrigues(np.array([0.1 * i - 0.2, 0.15 * i - 0.3, 0.2 * i]))[0]
         translation = np.array([0.05 * i, -0.05, 2.2 + 0.1 * i])
         poses.append(pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
-        # texture index (u, v) -> plane (u - 399.5, v - 399.5) / 400 -> image index
-        to_plane = np.array([[1 / 400, 0, -399.5 / 400], [0, 1 / 400, -399.5 / 400], [0, 0, 1]])
+        # texture index (u, v) -> plane (u - 299.5, v - 299.5) / 300 -> image index
+        to_plane = np.array([[1 / 300, 0, -299.5 / 300], [0, 1 / 300, -299.5 / 300], [0, 0, 1]])
         matrix = np.column_stack([rotation[:, :2], translation])
         calibration = camera.calibration_matrix() - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         homography = calibration @ matrix @ to_plane

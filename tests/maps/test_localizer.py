@@ -98,7 +98,7 @@ def with_exif(photo, path, focal_35mm):
 
 
 def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, caplog, run):
-    """The camera has 500 pixels; 36 mm say 499 (of the diagonal), a guess is 576."""
+    """The camera has 375 pixels; 36 mm say 374 (of the diagonal), a guess is 432."""
     build, images, outputs = place
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -113,7 +113,7 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, caplog, r
     assert summary["intrinsics"] == {"EXIF": 1, "guess": 1}
     listed = outputs / "queries-photos/queries_with_intrinsics.txt"
     cameras = dict(parsers.parse_query_list(listed))
-    assert abs(cameras["exif.jpg"].params[0] - 499) < 1 and cameras["guess.png"].params[0] == 576
+    assert abs(cameras["exif.jpg"].params[0] - 374) < 1 and cameras["guess.png"].params[0] == 432
     poses = parsers.parse_poses(outputs / "queries-photos" / summary["poses"])
     localizer = Localizer(outputs / "map")
     for name in ("exif.jpg", "guess.png"):
@@ -122,12 +122,12 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, caplog, r
         assert metres < 0.1 and degrees < 1, name  # 2.2 m away
         pose, info = localizer.localize(photos / name)
         assert max(pose_error(pose, poses[name])) < 1e-9
-        assert abs(info["camera"].params[0] - 500) < 25
+        assert abs(info["camera"].params[0] - 375) < 19
     # pixels are localized as files are, but have no EXIF data
     pixels = cv2.imread(str(photos / "guess.png"))[:, :, ::-1]
     pose, info = localizer.localize(np.ascontiguousarray(pixels))
     assert info["intrinsics"] == "guess" and max(pose_error(pose, poses["guess.png"])) < 0.1
-    with pytest.raises(InputError, match="has 240x180 pixels, the photo has 480x360"):
+    with pytest.raises(InputError, match="has 240x180 pixels, the photo has 360x270"):
         localizer.localize(
             photos / "guess.png",
             pycolmap.Camera(model="SIMPLE_PINHOLE", width=240, height=180, params=[250, 120, 90]),
@@ -135,7 +135,7 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, caplog, r
     small = tmp_path / "small.txt"
     small.write_text("guess.png SIMPLE_PINHOLE 240 180 250 120 90\n")
     run(*build, "--query_images", photos, "--queries", small)
-    reason = "the intrinsics are for 240x180 pixels, the photo has 480x360"
+    reason = "the intrinsics are for 240x180 pixels, the photo has 360x270"
     assert f"Not localized: guess.png ({reason})." in caplog.text
     for wrong in (pixels.astype(float), pixels[None], np.zeros((0, 3), np.uint8)):
         with pytest.raises(InputError, match="uint8"):
@@ -172,7 +172,7 @@ def test_names_with_spaces(by_model, plane, tmp_path, run):
     assert info["retrieved"][0] == row["retrieved"]
     if by_model:  # and with a list, of the right intrinsics
         assert pose_error(pose, true)[0] < 0.2
-        camera = "SIMPLE_PINHOLE 480 360 500 240 180"
+        camera = "SIMPLE_PINHOLE 360 270 375 180 135"
         (tmp_path / "my list.txt").write_text(f"I am 4.png\t{camera}\n")
         run(*given[2:], "--map", outputs / "map", "--queries", tmp_path / "my list.txt")
         summary, rows = outcome(outputs / "queries-my_list")

@@ -113,6 +113,6 @@ def test_outputs_of_another_configuration_are_refused(aachen_layout, tmp_path, r
 
 def test_grey_photos_only_give_an_empty_map(aachen_layout, tmp_path, refused):
     for path in (aachen_layout / "images_upright").rglob("*.png"):
-        cv2.imwrite(str(path), np.full((360, 480), 128, np.uint8))
+        cv2.imwrite(str(path), np.full((270, 360), 128, np.uint8))
     arguments = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--feature", "sift")
     assert "The map is empty" in refused(*arguments)

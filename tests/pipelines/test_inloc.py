@@ -130,7 +130,7 @@ def test_queries_of_the_benchmark(inloc_layout, tmp_path, run):
     assert place.query_names() == [f"query/iphone7/{name}.JPG" for name in ("a", "b", "grey")]
     run("--dataset", inloc_layout, "--outputs", tmp_path / "o")
     _, rows = outcome(tmp_path / "o")
-    # its focal length is 373 pixels there, not 500: the camera would be closer
+    # its focal length is 280 pixels there, not 375: the camera would be closer
     assert 0.05 < float(rows["a.JPG"]["position_error_m"]) < 1
     assert rows["a.JPG"]["reason"].startswith("its intrinsics contradict the map")
 

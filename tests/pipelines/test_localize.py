@@ -34,7 +34,7 @@ def test_queries_of_the_same_name_have_folders_of_their_own(place, tmp_path, run
         assert list(outcome(found)[1]) == ["a.png"]
     # a list of that name is another one, too; the first keeps its folder
     listed = tmp_path / "day.txt"
-    listed.write_text("a.png SIMPLE_PINHOLE 480 360 500 240 180\n")
+    listed.write_text("a.png SIMPLE_PINHOLE 360 270 375 180 135\n")
     run(*build, "--query_images", images / "query/day", "--queries", listed)
     assert len(list(outputs.glob("queries-day-*"))) == 2
     run(*build, "--query_images", images / "query/day")
@@ -108,7 +108,7 @@ def test_wrong_input(place, tmp_path, run, refused):
     assert not (outputs / "map").exists()
     run(*build)
     queries = tmp_path / "list.txt"
-    queries.write_text("query/day/gone.png PINHOLE 480 360 500 500 240 180\n")
+    queries.write_text("query/day/gone.png PINHOLE 360 270 375 375 180 135\n")
     new = ("--queries", queries, "--query_images", images)
     assert "query/day/gone.png" in refused(*build, *new)
     assert not (outputs / "queries-list").exists()

@@ -117,13 +117,13 @@ def test_intrinsics_of_another_size(place, monkeypatch, caplog):
     folder = next(path for path in photo.parents if list(path.rglob("*_with_intrinsics.txt")))
     (path,) = (p for p in folder.rglob("*_with_intrinsics.txt") if name in p.read_text())
     lines = path.read_text().splitlines()
-    wrong = [line.replace(" 480 360 ", " 100 100 ") if name in line else line for line in lines]
+    wrong = [line.replace(" 360 270 ", " 100 100 ") if name in line else line for line in lines]
     path.write_text("\n".join(wrong))
     command.run(monkeypatch, pipeline, *arguments)
     row = outcome(outputs)[1][name]
     assert row["status"] != "localized" and row["num_inliers"] == "0"
-    assert row["reason"] == "the intrinsics are for 100x100 pixels, the photo has 480x360"
-    reason = "the intrinsics are for 100x100 pixels, the photo has 480x360"
+    assert row["reason"] == "the intrinsics are for 100x100 pixels, the photo has 360x270"
+    reason = "the intrinsics are for 100x100 pixels, the photo has 360x270"
     assert "Not localized: " in caplog.text and f"{name} ({reason})" in caplog.text
     path.write_text("\n".join(lines))
     command.run(monkeypatch, pipeline, *arguments)
