@@ -1,13 +1,12 @@
 """The demo town: its files, its model, its seed, and interrupted runs."""
 
-import copy
-import dataclasses
 import json
 import os
 
 import numpy as np
 import pycolmap
 import pytest
+from demo_photos import scaled
 
 from hloc_reduce import demo
 from hloc_reduce.demo import cameras, town
@@ -31,13 +30,8 @@ def small(tmp_path_factory):
 
 def small_photos(seed):
     photos = cameras.list_photos(seed)
-    return [scaled(photo) for photo in photos[:7] + photos[-20:-18] + photos[-2:]]
-
-
-def scaled(photo):
-    camera = copy.deepcopy(photo.camera)
-    camera.rescale(256, 192)
-    return dataclasses.replace(photo, camera=camera)
+    chosen = photos[:7] + photos[-20:-18] + photos[-2:]
+    return [scaled(photo, 256, 192) for photo in chosen]
 
 
 def test_the_layout_is_that_of_aachen(small):
