@@ -131,6 +131,8 @@ def scene(tmp_path) -> SimpleNamespace:
 
 SIZE = (360, 270)
 FOCAL = 375.0
+# the lists of the plane, as if it were a data set of the paper
+PLANE = {"Plane": {"day": (2, "query/day/"), "night": (1, "query/night/")}}
 
 
 @pytest.fixture

@@ -1,21 +1,13 @@
-import csv
+"""Features compared on one data set."""
+
 import re
 
 import command
 import pytest
+from conftest import PLANE
 
 from hloc_reduce.evaluation import published
-from hloc_reduce.runtime.outputs import LOCK
-from hloc_reduce.utils import cli
 from pipelines import compare, inloc
-
-# the lists of the plane, as if it were a data set of the paper
-PLANE = {"Plane": {"day": (2, "query/day/"), "night": (1, "query/night/")}}
-
-
-@pytest.fixture(autouse=True)
-def propagated(monkeypatch):
-    monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
 
 
 def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
@@ -39,8 +31,7 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
     ]
     page = (outputs / "report.html").read_text()
     assert "colmap_sift_sv16" in page and "the paper" not in page
-    with (outputs / "compare.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = command.table(outputs / "compare.csv")
     assert len(rows) == 2 * 2 * 3
     assert (rows[0]["recall_percent"], rows[0]["paper_percent"]) == ("50.0", "")
 
@@ -51,18 +42,14 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
     paper = "in the paper |       | 85.9 / 91.5 / 96.2 | 34.6 / 46.1 / 58.6"
     assert re.sub(" +", " ", paper) in re.sub(" +", " ", capsys.readouterr().out)
     assert "Rows in grey are the paper" in (outputs / "report.html").read_text()
-    with (outputs / "compare.csv").open() as file:
-        assert next(csv.DictReader(file))["paper_percent"] == "85.9"
+    assert command.table(outputs / "compare.csv")[0]["paper_percent"] == "85.9"
 
     # finished runs are not repeated
-    times = {path: path.stat().st_mtime_ns for path in (outputs / "sift_sv16").rglob("*")}
+    times = command.state(outputs / "sift_sv16")
     page = tmp_path / "p.html"
     command.run(monkeypatch, compare, *given, "sift_sv16", "-o", page)
     assert page.exists() and len(times) > 10
-    files = [path for path in times if path.is_file() and path.name != LOCK]
-    assert {path.name: path.stat().st_mtime_ns for path in files} == {
-        path.name: times[path] for path in files
-    }
+    assert command.state(outputs / "sift_sv16") == times
 
 
 def test_compare_wrong_input(aachen_layout, inloc_layout, tmp_path, monkeypatch, caplog):

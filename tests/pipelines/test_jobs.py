@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from command import write
 
 from hloc_reduce.evaluation import published
 from hloc_reduce.localization.confidence import Gate
@@ -14,11 +15,6 @@ from pipelines.batch.shared import Shared
 
 def names(found):
     return [f"{job.dataset.name}/{job.name}" for job in found]
-
-
-def write(path, text):
-    path.write_text(text)
-    return path
 
 
 def test_a_grid_with_exclusions(tmp_path):

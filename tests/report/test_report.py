@@ -7,20 +7,15 @@ import shutil
 import command
 import h5py
 import pytest
+from conftest import PLANE
 
 from hloc_reduce.evaluation import published
 from hloc_reduce.report import __main__ as report
 from hloc_reduce.report import pictures, runs
-from hloc_reduce.utils import cli
 from hloc_reduce.utils.h5 import iterate_h5_names
 from pipelines import aachen, compare, inloc, localize
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-
-
-@pytest.fixture(autouse=True)
-def propagated(monkeypatch):
-    monkeypatch.setattr(cli.logger, "propagate", True)  # for caplog
 
 
 @pytest.fixture(scope="module")
@@ -185,10 +180,6 @@ def test_runs_of_one_feature_are_told_apart(compared, tmp_path, show):
     rows = text_of(show(compared[0], other, "--num_queries", 1))
     for label, recall in zip(labels, (["50.0"] * 3, ["11.0", "22.0", "33.0"]), strict=True):
         assert recall in [row[1:4] for row in rows if row[0] == label and len(row) == 7]
-
-
-# the lists of the plane, as if it were a data set of the paper
-PLANE = {"Plane": {"day": (2, "query/day/"), "night": (1, "query/night/")}}
 
 
 def test_without_true_poses_columns_stay_in_place(
