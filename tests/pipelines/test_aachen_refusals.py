@@ -6,7 +6,7 @@ import shutil
 import cv2
 import numpy as np
 import torch
-from command import outcome
+from command import outcome, results
 
 from hloc_reduce import projections
 from pipelines import aachen
@@ -93,19 +93,29 @@ def test_wrong_input(aachen_layout, tmp_path, refused):
 
 def test_outputs_of_another_configuration_are_refused(aachen_layout, tmp_path, run, refused):
     outputs = tmp_path / "outputs"
-    arguments = ("--dataset", aachen_layout, "--outputs", outputs, "--feature", "sift")
-    run(*arguments)
-    before = (outputs / "summary.json").read_bytes()
-    message = refused(*arguments, "--matcher", "NN-mutual")
-    assert "matcher" in message and "--overwrite" in message
-    assert (outputs / "summary.json").read_bytes() == before
+    place = ("--dataset", aachen_layout, "--outputs", outputs, "--feature")
+    run(*place, "sift_sv16")
+    before = results(outputs)
+    for others, named in (
+        (["sift_sv16", "--num_loc", 3], "differs: num_loc (50 before, 3 now). "),
+        (["sift_sv16", "--storage", "uint8"], "differs: feature (storage "),
+        (["sift_sv16", "--matcher", "NN-mutual"], "differs: matcher ("),
+        (
+            ["sift_sv32", "--matcher", "NN-mutual"],
+            "differs: feature (projection sift_sv16 before, sift_sv32 now, projection_sha256) and",
+        ),
+    ):
+        message = refused(*place, *others)
+        assert f"What {outputs} was made from {named}" in message
+        assert "Choose other --outputs" in message and "--overwrite" in message
+    assert results(outputs) == before
     foreign = ("settings.json", "sfm_notes.txt", "my-feats-1.h5", ".mine.tmp", "sfm_old/a.bin")
     for name in foreign:
         (outputs / name).parent.mkdir(exist_ok=True)
         (outputs / name).write_text("mine")
     left = outputs / ".summary.json.123.tmp"  # of a killed run
     left.write_text("{")
-    run(*arguments, "--matcher", "NN-mutual", "--overwrite")
+    run(*place, "sift_sv16", "--matcher", "NN-mutual", "--overwrite")
     assert outcome(outputs)[0]["matcher"] == "NN-mutual" and not left.exists()
     assert all((outputs / name).read_text() == "mine" for name in foreign)
     assert not list(outputs.glob("*_NN-mutual-ratio.8_*")) and not list(outputs.glob("sfm_*ratio"))

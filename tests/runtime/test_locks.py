@@ -1,4 +1,4 @@
-"""An outputs folder is of one run at a time and of one configuration."""
+"""An outputs folder is of one run at a time."""
 
 import os
 import subprocess
@@ -32,25 +32,6 @@ lock = Lock(Path({str(outputs)!r})); print('held', flush=True); time.sleep(60)"
         other.wait()
     command.run(monkeypatch, aachen, *given)
     assert command.outcome(outputs)[0]["queries_localized"] == 2
-
-
-def test_outputs_of_another_configuration_are_refused(aachen_layout, tmp_path, monkeypatch, caplog):
-    outputs = tmp_path / "outputs"
-    given = ["--dataset", aachen_layout, "--outputs", outputs, "--feature"]
-    command.run(monkeypatch, aachen, *given, "sift_sv16")
-    before = command.results(outputs)
-    for others, named in (
-        (["sift_sv16", "--num_loc", 3], "differs: num_loc (50 before, 3 now). "),
-        (["sift_sv16", "--storage", "uint8"], "differs: feature (storage "),
-        (
-            ["sift_sv32", "--matcher", "NN-mutual"],
-            "differs: feature (projection sift_sv16 before, sift_sv32 now, projection_sha256) and",
-        ),
-    ):
-        message = command.refused(monkeypatch, caplog, aachen, *given, *others)
-        assert f"What {outputs} was made from {named}" in message
-        assert "Choose other --outputs" in message
-    assert command.results(outputs) == before
 
 
 def test_a_lock_ends_with_its_block(tmp_path):
