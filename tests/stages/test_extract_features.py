@@ -133,15 +133,9 @@ def test_photos_of_any_size(size, feature, tmp_path):
         assert (features["keypoints"].max(axis=0) < features["image_size"] - 0.5).all()
 
 
-@pytest.fixture
-def picture(textured):
-    """A colour image (240, 320, 3) uint8."""
-    return np.dstack([textured, textured[::-1], 255 - textured])
-
-
-def test_other_failures_are_not_those_of_an_image(picture, tmp_path):
+def test_other_failures_are_not_those_of_an_image(textured, tmp_path):
     """Without `strict` only an image that cannot be read is passed over."""
-    cv2.imwrite(str(tmp_path / "a.png"), picture)
+    cv2.imwrite(str(tmp_path / "a.png"), np.dstack([textured] * 3))
     conf = {**features_confs.confs["sift"], "preprocessing": {"resize_max": 1600}}  # in colour
     with pytest.raises(InputError, match="DoG needs grey images"):
         extract_features.main(conf, tmp_path, tmp_path / "o", strict=False)
