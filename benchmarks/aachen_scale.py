@@ -71,6 +71,14 @@ def unit(generator: np.random.Generator, number: int, dim: int) -> np.ndarray:
 def synthesize(places: dict[str, int], path: Path, dim: int, number: int, storage: str) -> None:
     """Write the features of images, given their places in the row, and the ids of landmarks."""
     made_by = {"synthesized": [dim, number, storage]}
+    levels = None
+    if storage in CODED:
+        import torch  # not at the top, as runs measure memory
+
+        from hloc_reduce.training.levels import fit
+
+        drawn = torch.from_numpy(unit(np.random.default_rng(2), 100_000, dim))
+        levels = fit(drawn, CODED[storage]).numpy()
     with GroupWriter(path, made_by) as writer, GroupWriter(shown(path), made_by) as known:
         for name, place in places.items():
             ids = ids_of(place, number)
@@ -87,7 +95,7 @@ def synthesize(places: dict[str, int], path: Path, dim: int, number: int, storag
             features = {key: np.zeros(number, np.float32) for key in ("scales", "oris", "scores")}
             features["keypoints"] = np.zeros((number, 2), np.float32)
             features["descriptors"] = np.concatenate([views, clutter])[order].T
-            writer.add(name, *store(features, storage))
+            writer.add(name, *store(features, storage, levels))
             ids = np.concatenate([ids, np.full(number - len(ids), -1)])[order]
             known.add(name, {"ids": ids})
 
@@ -207,7 +215,7 @@ def _main() -> None:
     parser.add_argument("--storage", default=STORAGES[0], help=f"one of {', '.join(STORAGES)}")
     parser.add_argument("--once", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
-    cli.choose("storage", args.storage, [name for name in STORAGES if name not in CODED])
+    cli.choose("storage", args.storage, STORAGES)
     if not all(0 < share <= 1 for share in args.share) or len(set(args.share)) < len(args.share):
         raise InputError("--share: different numbers above 0 and at most 1.")
     cli.check_positive(args, "dim")

@@ -37,7 +37,7 @@ from hloc_reduce.localize_sfm import RANSAC_THRESH
 from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
-from hloc_reduce.utils.codes import restore, store
+from hloc_reduce.utils.codes import FLOATS, restore, store
 from hloc_reduce.utils.feature_files import (
     get_colmap_keypoints,
     get_descriptors,
@@ -201,16 +201,17 @@ class Described:
 
     def __init__(self, feature: str):
         name, _, storage = feature.partition(":")
-        conf = features_confs.get(name)[1]["model"]
-        projection = conf.get("projection")
+        self.storage = storage or FLOATS[0]
+        _, conf = features_confs.get(name, storage=self.storage)
+        projection, self.levels = conf["model"].get("projection"), features_confs.levels(conf)
         self.project = projections.load(projection) if projection else torch.nn.Identity()
-        self.storage = storage or "float16"
 
     @torch.no_grad()
-    def __call__(self, file: h5py.File, name: str) -> torch.Tensor:
-        """Return the descriptors (N, D) of an image of an open feature file."""
+    def __call__(self, file: h5py.File, name: str, is_query: bool = False) -> torch.Tensor:
+        """Return the descriptors (N, D) of an image of an open feature file; queries as floats."""
         described = self.project(torch.from_numpy(get_descriptors(file, name))).numpy()
-        return torch.from_numpy(restore(*store({"descriptors": described.T}, self.storage)))
+        storage = FLOATS[0] if is_query else self.storage
+        return torch.from_numpy(restore(*store({"descriptors": described.T}, storage, self.levels)))
 
 
 def trials(
@@ -251,7 +252,10 @@ def run(
     gate = DEFAULT_GATE.of_matches(model, described[place.names[0]].shape[1])
     for source, name, camera, truth, path, kind in tried:
         with open_h5(path) as file:
-            query, (keypoints, _) = describe(file, name), get_colmap_keypoints(file, name)
+            query, (keypoints, _) = (
+                describe(file, name, is_query=True),
+                get_colmap_keypoints(file, name),
+            )
             size = get_image_size(file, name)
         matches = {}
         for other in place.names:
@@ -471,7 +475,7 @@ def _main() -> None:
         "--feature",
         nargs="+",
         default=[MAP_FEATURE],
-        help=f"{BASE} or projections of it, NAME or NAME:uint8",
+        help=f"{BASE} or projections of it, NAME or NAME:STORAGE",
     )
     parser.add_argument(
         "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"

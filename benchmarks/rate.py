@@ -85,7 +85,7 @@ def inliers(folders: list[Path]) -> list[tuple[int, str, str, dict[str, float]]]
         summary = json.loads(path.read_text())
         lists = {n.split("_")[0]: r["mean_inliers"] for n, r in summary["lists"].items()}
         size = summary["bytes_per_keypoint"]["descriptor"]
-        found.append((size, summary["feature"], summary["storage"], lists))
+        found.append((size, summary["feature"], summary["bytes_per_keypoint"]["storage"], lists))
     return sorted(found, key=lambda row: -row[0])
 
 
