@@ -211,7 +211,9 @@ class Described:
         """Return the descriptors (N, D) of an image of an open feature file; queries as floats."""
         described = self.project(torch.from_numpy(get_descriptors(file, name))).numpy()
         storage = FLOATS[0] if is_query else self.storage
-        return torch.from_numpy(restore(*store({"descriptors": described.T}, storage, self.levels)))
+        return torch.from_numpy(
+            restore(*store({"descriptors": described.T}, storage, self.levels), unbiased=True)
+        )
 
 
 def trials(

@@ -105,7 +105,7 @@ def methods(data: list[Pair], device: str) -> dict[str, Callable[[list[Pair]], l
         return [matches for part in found for matches, _ in part]
 
     def match_codes(pair: tuple) -> torch.Tensor:
-        integers = (torch.from_numpy(to_integers(restore(*part))) for part in pair)
+        integers = (torch.from_numpy(to_integers(restore(*part, unbiased=True))) for part in pair)
         return ours.match([tuple(integers)])[0][0]
 
     compared = {

@@ -184,7 +184,11 @@ def _match_batch(
     def move(descriptors: Described, as_integers: bool) -> torch.Tensor:
         key = id(descriptors), as_integers
         if key not in moved:
-            array = descriptors if isinstance(descriptors, np.ndarray) else descriptors.restore()
+            array = (
+                descriptors
+                if isinstance(descriptors, np.ndarray)
+                else descriptors.restore(unbiased=matcher.takes_codes)
+            )
             moved[key] = torch.from_numpy(to_integers(array) if as_integers else array).to(device)
         return moved[key]
 
@@ -192,7 +196,7 @@ def _match_batch(
     for _, *pair in batch:
         # a code is rounded much more than integers are, and they are faster
         coded = any(isinstance(one, StoredDescriptors) for one in pair)
-        as_integers = coded and matcher.takes_integers and device == "cpu"
+        as_integers = coded and matcher.takes_codes and device == "cpu"
         pairs.append((move(pair[0], as_integers), move(pair[1], as_integers)))
     found = matcher.match(pairs, gpu_bytes)
     groups: list[tuple[None, Group]] = []

@@ -72,8 +72,8 @@ class Localizer:
             for name in self.names:
                 stored = read_descriptors(file, name)
                 # a code is rounded much more than integers are, and they are faster
-                coded = not stored.is_float and self.matcher.takes_integers
-                descriptors = stored.restore()
+                coded = not stored.is_float and self.matcher.takes_codes
+                descriptors = stored.restore(unbiased=coded)
                 if coded and self.device == "cpu":
                     descriptors = to_integers(descriptors)
                 self.descriptors[name] = torch.from_numpy(descriptors).to(self.device)

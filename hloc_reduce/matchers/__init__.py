@@ -16,11 +16,11 @@ class Matcher(BaseModel):
 
     A subclass writes `_forward`: from `descriptors0` (1, D, N) and `descriptors1` (1, D, M) of unit
     norm to `matches0` (1, N) int64, the index in 1 or -1, and `matching_scores0` (1, N) in [0, 1].
-    If its `match` and `match_rows` also take pairs of int16 descriptors from
-    `utils.codes.to_integers`, on a CPU, it sets `takes_integers`.
+    It sets `takes_codes` if its `match` and `match_rows` also take unbiased codes, whose norms are
+    above 1 (`utils.codes.restore`), and, on a CPU, pairs of int16 descriptors (`to_integers`).
     """
 
-    takes_integers = False
+    takes_codes = False
 
     required_inputs = ("descriptors0", "descriptors1")
 

@@ -237,7 +237,7 @@ def _nearest_padded(
 class NearestNeighbor(Matcher):
     """The matches of hloc's `nearest_neighbor`, with its options."""
 
-    takes_integers = True
+    takes_codes = True
     default_conf = {
         "ratio_threshold": None,
         "distance_threshold": None,
@@ -263,7 +263,7 @@ class NearestNeighbor(Matcher):
                 matched = mutual_nearest_padded(descriptors0, descriptors1, **options)
             found.update(zip(batch, matched, strict=True))
         results = (found[i] for i in range(len(pairs)))
-        return [(m, torch.where(m >= 0, (cosine + 1) / 2, 0)) for m, cosine in results]
+        return [(m, torch.where(m >= 0, (cosine.clamp(max=1) + 1) / 2, 0)) for m, cosine in results]
 
     @torch.no_grad()
     def match_rows(

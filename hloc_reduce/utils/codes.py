@@ -15,7 +15,8 @@ QUANTIZED = {storage: f"descriptors_{storage}" for storage in STORAGES if storag
 STEPS = 255
 # integers that stand for 1: products of unit vectors are integers below 2**24, which a float32
 # represents exactly, and 99.9 % of the matches of real descriptors stay the same
-UNIT = 4000
+UNIT = 3000
+LEAST_NORM = 0.75  # of what codes stand for, on average: sets a limit to the products
 
 
 def descriptor_bytes(dim: int, storage: str) -> int:
@@ -57,8 +58,19 @@ def store(
     return stored | {key: quantized}, {key: {"scale": scale, "offset": offset}}
 
 
-def restore(stored: Mapping[str, np.ndarray], attrs: Mapping[str, Mapping]) -> np.ndarray:
+def restore(
+    stored: Mapping[str, np.ndarray], attrs: Mapping[str, Mapping], unbiased: bool = False
+) -> np.ndarray:
     """Return descriptors (N, D) float32 from what `store` returned; those not floats normalized.
+
+    What codes stand for is shorter than the descriptors that were coded, and its direction is
+    another. So the cosines of matches come out too small, and a ratio test refuses too many.
+
+    Args:
+        stored: the arrays.
+        attrs: their attributes.
+        unbiased: give codes norms above 1 instead, so that their products estimate the cosines of
+            the descriptors that were coded.
 
     Raises:
         KeyError, TypeError, ValueError: for missing or wrong attributes.
@@ -74,14 +86,17 @@ def restore(stored: Mapping[str, np.ndarray], attrs: Mapping[str, Mapping]) -> n
         scale, offset = (np.float32(attrs[key][name]) for name in ("scale", "offset"))
         descriptors = stored[key].T.astype(np.float32) * scale + offset
     norm = np.linalg.norm(descriptors, axis=1, keepdims=True)
-    return np.ascontiguousarray(descriptors / np.maximum(norm, np.finfo(np.float32).tiny))
+    descriptors /= np.maximum(norm, np.finfo(np.float32).tiny)
+    if unbiased and storage in CODED and len(norm):
+        descriptors /= norm.mean().clip(LEAST_NORM, 1)
+    return np.ascontiguousarray(descriptors)
 
 
 def to_integers(descriptors: np.ndarray) -> np.ndarray:
     """Round descriptors to multiples of 1 / `UNIT`, for fast matching.
 
     Args:
-        descriptors: (N, D) float32 of unit norm.
+        descriptors: (N, D) float32 from `restore`.
 
     Returns:
         (N, D) int16.

@@ -104,10 +104,14 @@ class StoredDescriptors:
         """Numbers of a descriptor."""
         return len(self.attrs.get("levels", self.array))
 
-    def restore(self) -> np.ndarray:
-        """Return them as (N, D) float32; raise an InputError if they are broken."""
+    def restore(self, unbiased: bool = False) -> np.ndarray:
+        """Return them as (N, D) float32, see `codes.restore`.
+
+        Raises:
+            InputError: if they are broken.
+        """
         try:
-            return restore({self.key: self.array}, {self.key: self.attrs})
+            return restore({self.key: self.array}, {self.key: self.attrs}, unbiased)
         except KeyError as error:
             raise InputError(f"{self.place}: its {self.key} have no {error.args[0]}.") from None
         except (TypeError, ValueError) as error:

@@ -10,8 +10,9 @@ from hloc_reduce.matchers.nearest_neighbor import (
     mutual_nearest,
     mutual_nearest_padded,
 )
+from hloc_reduce.training.levels import fit
 from hloc_reduce.utils import best_two
-from hloc_reduce.utils.codes import to_integers
+from hloc_reduce.utils.codes import restore, store, to_integers
 
 
 def unit(number, dim, seed):
@@ -103,7 +104,7 @@ def test_integers_match_as_floats(sizes, ratio_threshold, options, arithmetic):
     other = torch.nn.functional.normalize(base + 0.3 * unit(300, 16, 1), dim=1).flip(0)
     pair = base[: sizes[0]], other[: sizes[1]]
     matcher = NearestNeighbor({"ratio_threshold": ratio_threshold, **options})
-    assert matcher.takes_integers
+    assert matcher.takes_codes
     rounded = tuple(integers(one) for one in pair)
     ((matches, scores),) = matcher.match([rounded])
     ((expected, expected_scores),) = matcher.match([pair])
@@ -112,6 +113,23 @@ def test_integers_match_as_floats(sizes, ratio_threshold, options, arithmetic):
     rows1 = torch.arange(0, sizes[1], 2)
     found = matcher.match_rows(*rounded, rows1)
     assert found.tolist() == matcher.match_rows(*pair, rows1).tolist()
+
+
+def test_codes_pass_the_ratio_test(arithmetic):
+    """Rounding shrinks the cosines of matches, so that a third of them failed the ratio test."""
+    base = unit(1000, 32, 0)
+    other = torch.nn.functional.normalize(base + 0.8 * unit(1000, 32, 1), dim=1)
+    stored = store({"descriptors": other.numpy().T}, "uint2", fit(other, 2).numpy())
+    matcher = NearestNeighbor({"ratio_threshold": 0.8})
+    right = {}
+    for unbiased in (False, True):
+        coded = torch.from_numpy(to_integers(restore(*stored, unbiased=unbiased)))
+        ((matches, scores),) = matcher.match([(integers(base), coded)])
+        right[unbiased] = int((matches == torch.arange(1000)).sum())
+        assert scores.max() <= 1
+    ((matches, _),) = matcher.match([(base, other)])
+    floats = int((matches == torch.arange(1000)).sum())
+    assert right[False] < 0.75 * floats and right[True] > 0.8 * floats
 
 
 def test_integers_match_the_same_in_either_order(arithmetic):

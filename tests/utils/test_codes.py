@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hloc_reduce.training.levels import fit
 from hloc_reduce.utils.codes import (
     CODED,
     check_levels,
@@ -60,6 +62,20 @@ def test_32_numbers_take_16_8_and_4_bytes(storage, size):
     np.testing.assert_allclose(np.linalg.norm(restored, axis=1), 1, atol=1e-6)
     again, _ = store({"descriptors": restored.T}, storage, levels)
     assert again[f"descriptors_{storage}"].shape == (size, 50)
+
+
+@pytest.mark.parametrize("storage, biased", [("uint4", 0.99), ("uint2", 0.95), ("uint1", 0.8)])
+def test_unbiased_codes_estimate_cosines(storage, biased):
+    drawn = np.random.default_rng(0).standard_normal((2, 5000, 32)).astype(np.float32)
+    first = drawn[0] / np.linalg.norm(drawn[0], axis=1, keepdims=True)
+    second = first + 0.1 * drawn[1]
+    second /= np.linalg.norm(second, axis=1, keepdims=True)
+    levels = fit(torch.from_numpy(first), CODED[storage]).numpy()
+    arrays = store({"descriptors": first.T}, storage, levels)
+    cosine = (first * second).sum(axis=1).mean()
+    for unbiased, expected in ((False, biased * cosine), (True, cosine)):
+        restored = restore(*arrays, unbiased=unbiased)
+        assert (restored * second).sum(axis=1).mean() == pytest.approx(expected, rel=0.015)
 
 
 def test_broken_levels_are_refused():
