@@ -1,9 +1,14 @@
-"""The table of finished runs that the documentation shows."""
+"""What the benchmarks of the documentation say to those who lack a run, or hloc."""
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
+
+from hloc_reduce.utils.cli import InputError
 
 ROOT = Path(__file__).parents[1]
 SUMMARY = {
@@ -32,3 +37,10 @@ def test_what_is_no_finished_run_is_left_out(tmp_path):
     ]
     alone = table(report)
     assert alone.returncode == 2 and f"no summary.json in {report}" in alone.stderr
+
+
+def test_without_hloc_the_comparison_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("hloc_reduce.utils.hloc.is_installed", lambda: False)
+    stages_of = runpy.run_path(str(ROOT / "benchmarks/against_hloc.py"))["stages_of"]
+    with pytest.raises(InputError, match="hloc is not installed: pip install"):
+        stages_of("hloc")
