@@ -22,6 +22,7 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import pose_error, recall
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.hloc import extractors_package
 from hloc_reduce.utils.parsers import parse_poses, write_pairs
 
 STAGES = ("extraction", "matching", "triangulation", "localization")
@@ -31,6 +32,7 @@ HLOC = "hloc"
 def stages_of(name: str) -> dict[str, Callable]:
     """Return the stages of hloc or of this project, and the configurations they run with."""
     if name == HLOC:
+        extractors_package()  # says what to install where hloc is missing or too old
         from hloc import extract_features, localize_sfm, match_features, triangulation
 
         conf = extract_features.confs["sift"]

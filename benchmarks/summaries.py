@@ -1,8 +1,13 @@
-"""Print a Markdown table of finished runs of any pipeline."""
+"""Print a Markdown table of finished runs of any pipeline.
+
+What is no outputs folder of a finished run, such as a report beside the folders, is named and left
+out.
+"""
 
 import json
 from pathlib import Path
 
+from hloc_reduce import logger
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 
@@ -42,11 +47,14 @@ def _main() -> None:
     parser.add_argument("outputs", type=Path, nargs="+", help="outputs folders of runs")
     args = parser.parse_args()
     lines = [HEADER, "| --- | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
-    for folder in args.outputs:
-        path = folder / "summary.json"
-        if not path.is_file():
-            raise InputError(f"{folder} has no summary.json: has the run finished?")
-        lines += rows(json.loads(path.read_text()))
+    finished = [folder for folder in args.outputs if (folder / "summary.json").is_file()]
+    others = ", ".join(str(path) for path in args.outputs if path not in finished)
+    if not finished:
+        raise InputError(f"There is no summary.json in {others}: has the run finished?")
+    if others:
+        logger.warning("Left out, no finished runs: %s.", others)
+    for folder in finished:
+        lines += rows(json.loads((folder / "summary.json").read_text()))
     print("\n".join(lines))
 
 

@@ -1,0 +1,46 @@
+"""What the benchmarks of the documentation say to those who lack a run, or hloc."""
+
+import json
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hloc_reduce.utils.cli import InputError
+
+ROOT = Path(__file__).parents[1]
+SUMMARY = {
+    "feature": "sift",
+    "bytes_per_keypoint": {"descriptor": 256},
+    "map_points3D": 3871,
+    "seconds": {"extract_features": 3.2, "match_features": 1.1},
+    "lists": {"night_time": {"localized": 2, "queries": 3, "mean_inliers": 51.6}},
+}
+
+
+def table(*paths):
+    command = [sys.executable, ROOT / "benchmarks/summaries.py", *paths]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
+
+
+def test_what_is_no_finished_run_is_left_out(tmp_path):
+    run, report = tmp_path / "sift", tmp_path / "report.html"
+    run.mkdir()
+    (run / "summary.json").write_text(json.dumps(SUMMARY))
+    report.write_text("<html>")
+    shown = table(run, report)
+    assert shown.returncode == 0 and f"Left out, no finished runs: {report}." in shown.stderr
+    assert shown.stdout.splitlines()[2:] == [
+        "| sift | 256 | night | 2 of 3 |  |  | 52 | 3,871 | 4 |"
+    ]
+    alone = table(report)
+    assert alone.returncode == 2 and f"no summary.json in {report}" in alone.stderr
+
+
+def test_without_hloc_the_comparison_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("hloc_reduce.utils.hloc.is_installed", lambda: False)
+    stages_of = runpy.run_path(str(ROOT / "benchmarks/against_hloc.py"))["stages_of"]
+    with pytest.raises(InputError, match="hloc is not installed: pip install"):
+        stages_of("hloc")
