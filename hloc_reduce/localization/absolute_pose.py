@@ -206,7 +206,7 @@ def _calibrate(matches: _Matches, pose: Pose) -> tuple[Pose, str | None]:
     if not free:
         centred = resection.centred(pose.cam_from_world, pose.camera)
         guesses = (image, start), (matches.points2D, centred)
-        return pose, _contradiction(matches, pose, guesses)
+        return pose, _contradiction(matches, pose, other, guesses)
     unclear = 1.0 if matches.may_be_cropped else UNCLEAR
     return _choose(assumed, other, points3D, unclear) if other else (assumed, None)
 
@@ -227,13 +227,14 @@ def _judged(matches: _Matches, found: Resection | None, freedom: int) -> Pose | 
 
 
 def _contradiction(
-    matches: _Matches, pose: Pose, guesses: Iterable[tuple[np.ndarray, View]]
+    matches: _Matches, pose: Pose, anew: Pose | None, guesses: Iterable[tuple[np.ndarray, View]]
 ) -> str | None:
-    """Say which focal length contradicts that of a pose, None if none does.
+    """Say which intrinsics contradict those of a pose, None if none do.
 
     Args:
         matches: of the query.
         pose: with the listed intrinsics.
+        anew: with intrinsics that do not depend on them, all of them estimated.
         guesses: image points (M, 2), and a pose with PINHOLE intrinsics from which another focal
             length is estimated.
     """
@@ -247,7 +248,14 @@ def _contradiction(
                 "its intrinsics contradict the map: a focal length of "
                 f"{other.camera.mean_focal_length():.0f} pixels fits better, and the pose differs"
             )
-    return None
+    if anew is None or anew.confidence <= RIGHT * pose.confidence:
+        return None
+    if not differ(pose, anew, matches.points3D, *limits):
+        return None
+    return (
+        "its intrinsics contradict the map: another principal point and aspect ratio fit much "
+        "better, and the pose differs"
+    )
 
 
 def _choose(

@@ -137,6 +137,15 @@ def test_a_listed_focal_length_that_moves_the_camera_is_refused():
     assert solve(*given, WHOLE, "list").refusal is None
 
 
+def test_a_centred_principal_point_of_a_cropped_photo_is_refused():
+    """Half of such lists were accepted, and the camera turned by 4 to 8 degrees."""
+    right = camera_of(1600, 1000, [1400, 1400, 800, 400], "PINHOLE")  # the upper sixth is cut off
+    listed = camera_of(1600, 1000, [1400, 1400, 800, 500], "PINHOLE")
+    given = matches(right, 300)
+    assert "another principal point" in solve(*given, listed, "list").refusal
+    assert solve(*given, right, "list").refusal is None
+
+
 def test_given_intrinsics_stay_as_they_are():
     """Errors of up to 5 % of listed focal lengths are no contradiction."""
     lens = [1400, 1400, 800, 600, -0.2, 0.03, 0.001, 0]
