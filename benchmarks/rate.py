@@ -95,7 +95,7 @@ def panel(axis, points: dict[str, list[tuple[int, float]]], label: str) -> None:
         best = {size: max(v for s, v in values if s == size) for size, _ in values}
         sizes = sorted(best)
         axis.plot(sizes, [best[s] for s in sizes], marker="o", color=colour, label=name)
-    axis.set(xscale="log", xlabel="bytes of a descriptor", ylabel=label)
+    axis.set(xscale="log", xlabel="bytes of a descriptor", ylabel=label, ylim=(0, None))
     ticks = [8, 16, 32, 64, 128, 256]
     axis.set_xticks(ticks, [str(tick) for tick in ticks])
     axis.minorticks_off()
@@ -136,7 +136,7 @@ def _main() -> None:
         ]
 
     if args.map:
-        found: list[Row] = []
+        measured: list[Row] = []
         for descriptor in args.descriptor:
             pairs = [draw_all(data, args.draws) for data in load(args.map, descriptor)]
             fitted = levels.sample(load(args.fit, descriptor)) if args.fit else None
@@ -149,24 +149,25 @@ def _main() -> None:
                 or any(f"_{scheme}" in name for scheme in args.schemes)
             }
             for row in rows(chosen, pairs, fitted):
-                found.append(row)
+                measured.append(row)
                 print(*row, flush=True)
         print(f"| bytes | feature | storage | {' / '.join(KINDS)} | both sides stored |")
         print("| ---: | --- | --- | ---: | ---: |")
-        for size, name, storage, *both in sorted(found, key=lambda row: -row[0]):
+        for size, name, storage, *both in sorted(measured, key=lambda row: -row[0]):
             cells = (" / ".join(f"{value:.1f}" for value in values) for values in both)
             print(f"| {size} | {name} | {storage} | {' | '.join(cells)} |")
-        mean = families([(size, name, np.mean(ap)) for size, name, _, ap, _ in found])
+        mean = families([(size, name, np.mean(ap)) for size, name, _, ap, _ in measured])
         panels.append(partial(panel, points=mean, label="matching AP [%]"))
     if args.outputs:
         print("| bytes | feature | storage | mean inliers, day | night |")
         print("| ---: | --- | --- | ---: | ---: |")
-        values = []
-        for size, name, storage, lists in inliers(args.outputs):
+        found = inliers(args.outputs)
+        for size, name, storage, lists in found:
             cells = " | ".join(f"{value:,.0f}" for value in lists.values())
             print(f"| {size} | {name} | {storage} | {cells} |")
-            values.append((size, name, float(np.mean(list(lists.values())))))
-        panels.append(partial(panel, points=families(values), label="mean inliers"))
+        for which in found[0][-1]:
+            values = [(size, name, lists[which]) for size, name, _, lists in found]
+            panels.append(partial(panel, points=families(values), label=f"inliers, {which}"))
     if args.plot:
         plots.save(plots.figure(panels, columns=len(panels)), args.plot)
 
