@@ -95,7 +95,8 @@ def panel(axis, points: dict[str, list[tuple[int, float]]], label: str) -> None:
         best = {size: max(v for s, v in values if s == size) for size, _ in values}
         sizes = sorted(best)
         axis.plot(sizes, [best[s] for s in sizes], marker="o", color=colour, label=name)
-    axis.set(xscale="log", xlabel="bytes of a descriptor", ylabel=label, ylim=(0, None))
+    axis.set(xscale="log", xlabel="bytes of a descriptor", ylabel=label)
+    axis.set_ylim(0, 1.08 * axis.get_ylim()[1])
     ticks = [8, 16, 32, 64, 128, 256]
     axis.set_xticks(ticks, [str(tick) for tick in ticks])
     axis.minorticks_off()

@@ -35,7 +35,8 @@ RELAXED = {
 FEW = 100  # images: further attempts take little time, even for one missing image
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
 SEEDS = (1, 2, 3)
-MORE = 1.5  # times as many images show that one camera took all
+MORE = 1.5  # times as many images, or points, show that one camera took all
+SPREAD = 1.2  # ratio of focal lengths above which they may be wrong
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
 MANY = 3  # images of one camera estimate its focal length better than EXIF data do
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
@@ -73,8 +74,9 @@ def main(
     If images are missing (of more than 100 images, more than a fifth), further attempts follow, and
     the model with the most images is kept: an attempt with lower thresholds and, for up to 30
     images, some with other initial pairs. With `camera_mode` AUTO, if at most two thirds of the
-    images are in the model and one camera may have taken all of them, the mapper runs with one
-    shared camera; its model is kept if it has at least 1.5 times as many images.
+    images are in the model, or focal lengths differ by more than a factor of 1.2, and one camera
+    may have taken all of them, the mapper runs with one shared camera; its model is kept if it has
+    at least 1.5 times as many images, or as many images and 1.5 times as many points.
 
     Args:
         sfm_dir: folder of the new COLMAP model; a model made from the same inputs is read instead.
@@ -118,6 +120,7 @@ def main(
         "overlays": "dropped",
         "attempts": attempts,
         "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
+        "spread": SPREAD,
         "viewpoints": VIEWPOINTS,
         "once": once,
     }
@@ -172,14 +175,17 @@ class _Mapper:
         """Write the best model, its database and its registration."""
         database = self.write_database(camera_mode)
         models, dropped = self.run(database)
-        registered = _size(models)[0]
+        registered, points = _size(models)
         alike = camera_mode == pycolmap.CameraMode.AUTO and _are_alike(database)
         several = len(self.attempts) > 1
-        if alike and several and MORE * registered <= len(_matched(database)):
+        few = several and MORE * registered <= len(_matched(database))
+        if alike and (few or _spread(models) > SPREAD):
             logger.info("Trying again with one camera for all images.")
             shared = self.write_database(pycolmap.CameraMode.SINGLE)
             found, implausible = self.run(shared)
-            if found and _size(found)[0] >= MORE * registered:
+            images, more = _size(found)
+            as_many = images >= registered and more >= MORE * points
+            if found and (images >= MORE * registered or as_many):
                 models, dropped, database, alike = found, implausible, shared, False
         if not models:
             raise NoModelError(nothing(self.image_dir, dropped))
@@ -193,6 +199,7 @@ class _Mapper:
             "unmatched": sorted(set(self.names) - _matched(database)),
             "implausible": {name: lens for name, lens in dropped.items() if name in missing},
             "alike": alike,
+            "spread": round(_spread(models), 2),
         }
         provenance.write(self.folder / REGISTRATION, state)
         database.rename(self.folder / "database.db")
@@ -245,6 +252,13 @@ def _are_alike(database: Path) -> bool:
     """Tell whether one camera may have taken all images, although each has its own."""
     cameras = colmap.read_cameras(database).values()
     return len(cameras) > len({(c.width, c.height, *c.params) for c in cameras}) == 1
+
+
+def _spread(models: list[pycolmap.Reconstruction]) -> float:
+    """Return the ratio of the largest and the smallest focal length in the largest model, or 1."""
+    cameras = {image.camera_id for image in models[0].images.values()} if models else ()
+    focal_lengths = [models[0].cameras[i].mean_focal_length() for i in cameras]
+    return max(focal_lengths) / min(focal_lengths) if focal_lengths else 1.0
 
 
 def _plausible(
@@ -391,10 +405,17 @@ def check(sfm_dir: Path, accept_partial: bool) -> None:
         InputError: if it has fewer than half of the images, unless `accept_partial`.
     """
     state = provenance.read(sfm_dir / REGISTRATION)
-    missing, number = state["missing"], state["images"]
+    missing, number, spread = state["missing"], state["images"], state.pop("spread", 1.0)
     registered = number - len(missing)
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
-        if state["alike"]:
+        if state["alike"] and spread > SPREAD:
+            logger.warning(
+                "The map may be wrong: its photos have the same size, but their estimated focal "
+                "lengths differ by a factor of %.2f. If one camera with a fixed zoom took all, run "
+                "again with --camera_mode single; otherwise add photos from more viewpoints.",
+                spread,
+            )
+        elif state["alike"]:
             logger.info(
                 "EXIF data do not say which images share a camera, so each has its own. If one "
                 "camera with a fixed zoom took all, --camera_mode single gives better poses."

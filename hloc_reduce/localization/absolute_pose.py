@@ -324,8 +324,9 @@ def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d
         position, rotation = uncertainty(*inliers, cam_from_world, pose.camera, freedom)
         if position > far * MAX_POSITION or rotation > turned * MAX_ROTATION:
             return (
-                f"{reason} position is uncertain by {100 * position:.0f} % of the distance, its "
-                f"rotation by {rotation:.1f} degrees"
+                f"{reason} position is uncertain by {100 * position:.1f} % of the distance, its "
+                f"rotation by {rotation:.1f} degrees; at most {100 * far * MAX_POSITION:.0f} % and "
+                f"{turned * MAX_ROTATION:.0f} degrees are accepted"
             )
     return None
 
