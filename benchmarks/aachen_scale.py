@@ -205,7 +205,11 @@ def print_row(row: dict, columns: list[str]) -> None:
 def _main() -> None:
     parser = cli.Parser(__doc__, "--data aachen_v1.1 --share 0.01 0.02")
     parser.add_argument(
-        "--data", type=Path, required=True, help="folder of database_images.txt and query lists"
+        "--data",
+        type=Path,
+        required=True,
+        help="folder of database_images.txt, which lists the map images, of the query lists and of "
+        "hloc's pairs-query-netvlad50.txt",
     )
     parser.add_argument(
         "--share", type=float, nargs="+", default=[0.01, 0.02], help="of the data set, in (0, 1]"
