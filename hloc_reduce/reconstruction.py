@@ -35,8 +35,8 @@ RELAXED = {
 FEW = 100  # images: further attempts take little time, even for one missing image
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
 SEEDS = (1, 2, 3)
-MORE = 1.5  # times as many images, or points, show that one camera took all
-SPREAD = 1.2  # ratio of focal lengths above which they may be wrong
+MORE = 1.5  # times as many images show that one camera took all
+SPREAD = 1.2  # ratio of focal lengths above which as many images and points show it, too
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
 MANY = 3  # images of one camera estimate its focal length better than EXIF data do
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
@@ -75,8 +75,8 @@ def main(
     the model with the most images is kept: an attempt with lower thresholds and, for up to 30
     images, some with other initial pairs. With `camera_mode` AUTO, if at most two thirds of the
     images are in the model, or focal lengths differ by more than a factor of 1.2, and one camera
-    may have taken all of them, the mapper runs with one shared camera; its model is kept if it has
-    at least 1.5 times as many images, or as many images and 1.5 times as many points.
+    may have taken all of them, the mapper runs with one shared camera. Its model is kept if it has
+    at least 1.5 times as many images, or as many images and points where focal lengths differ.
 
     Args:
         sfm_dir: folder of the new COLMAP model; a model made from the same inputs is read instead.
@@ -179,13 +179,14 @@ class _Mapper:
         alike = camera_mode == pycolmap.CameraMode.AUTO and _are_alike(database)
         several = len(self.attempts) > 1
         few = several and MORE * registered <= len(_matched(database))
-        if alike and (few or _spread(models) > SPREAD):
+        spread = _spread(models)
+        if alike and (few or spread > SPREAD):
             logger.info("Trying again with one camera for all images.")
             shared = self.write_database(pycolmap.CameraMode.SINGLE)
             found, implausible = self.run(shared)
             images, more = _size(found)
-            as_many = images >= registered and more >= MORE * points
-            if found and (images >= MORE * registered or as_many):
+            as_good = spread > SPREAD and images >= registered and more >= points
+            if found and (images >= MORE * registered or as_good):
                 models, dropped, database, alike = found, implausible, shared, False
         if not models:
             raise NoModelError(nothing(self.image_dir, dropped))
