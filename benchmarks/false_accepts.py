@@ -254,10 +254,8 @@ def run(
     gate = DEFAULT_GATE.of_matches(model, described[place.names[0]].shape[1])
     for source, name, camera, truth, path, kind in tried:
         with open_h5(path) as file:
-            query, (keypoints, _) = (
-                describe(file, name, is_query=True),
-                get_colmap_keypoints(file, name),
-            )
+            query = describe(file, name, is_query=True)
+            keypoints, _ = get_colmap_keypoints(file, name)
             size = get_image_size(file, name)
         matches = {}
         for other in place.names:

@@ -16,6 +16,7 @@ name of the descriptor; then one of the means by number of dimensions.
 import itertools
 import re
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 
 KINDS = ("matched", "completed", "dark", "photo pairs")
+Describe = Callable[[torch.Tensor], torch.Tensor]  # base descriptors (N, 128) to (N, D)
 MIN_SHARED = 30  # points that a pair of photos must share
 
 
@@ -95,9 +97,10 @@ def draw_all(data: tracks.Tracks, draws: int) -> dict[str, list]:
     }
 
 
-def measure(project: torch.nn.Module, draws: list) -> float:
-    """Return the mean AP of projected pairs in percent."""
-    return np.mean([100 * nearest_neighbor_ap(*map(project, views)) for views in draws])
+def measure(project: Describe, draws: list, reference: Describe | None = None) -> float:
+    """Return the mean AP in percent of pairs, the second ones projected by `reference` if given."""
+    reference = reference or project
+    return np.mean([100 * nearest_neighbor_ap(project(a), reference(b)) for a, b in draws])
 
 
 def _main() -> None:

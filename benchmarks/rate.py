@@ -8,25 +8,24 @@ descriptors first.
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from matching_ap import KINDS, draw_all, load_projections
+from matching_ap import KINDS, Describe, draw_all, family, load_projections, measure
 
 from hloc_reduce import projections
 from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, DIM
 from hloc_reduce.evaluation import plots
-from hloc_reduce.evaluation.ranking import nearest_neighbor_ap
 from hloc_reduce.training import levels, tracks
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import CODED, STORAGES, descriptor_bytes, restore, store
+from hloc_reduce.utils.progress import progress
 
 MEASURED = [storage for storage in STORAGES if storage != "float32"]
-Describe = Callable[[torch.Tensor], torch.Tensor]  # base descriptors (N, 128) to (N, D)
 Row = tuple[int, str, str, list[float], list[float]]  # bytes, feature, storage, AP twice
 
 
@@ -36,7 +35,7 @@ def stored(descriptors: torch.Tensor, storage: str, table: np.ndarray | None) ->
 
 
 def level_table(
-    name: str, storage: str, project: Describe, fitted: torch.Tensor | None
+    name: str | Path, storage: str, project: Describe, fitted: torch.Tensor | None
 ) -> np.ndarray | None:
     """Return the levels of a projection, or fit them to base descriptors (N, 128)."""
     if storage not in CODED:
@@ -49,29 +48,31 @@ def level_table(
         return levels.fit(project(fitted), CODED[storage]).numpy()
 
 
-def measure(query: Describe, reference: Describe, pairs: list[dict[str, list]]) -> list[float]:
+def ap(query: Describe, reference: Describe, pairs: list[dict[str, list]]) -> list[float]:
     """Return the AP in percent of each of `KINDS`, mean over maps."""
-
-    def ap(draws: list[tuple[torch.Tensor, torch.Tensor]]) -> float:
-        return np.mean([100 * nearest_neighbor_ap(query(a), reference(b)) for a, b in draws])
-
-    return [float(np.mean([ap(kinds[kind]) for kinds in pairs])) for kind in KINDS]
+    return [
+        float(np.mean([measure(query, kinds[kind], reference) for kinds in pairs]))
+        for kind in KINDS
+    ]
 
 
 def rows(
-    features: dict[str, torch.nn.Module], pairs: list[dict[str, list]], fitted: torch.Tensor | None
+    features: dict[str, torch.nn.Module],
+    files: dict[str, Path],
+    pairs: list[dict[str, list]],
+    fitted: torch.Tensor | None,
 ) -> Iterator[Row]:
-    """Measure features in all storages."""
-    for name, project in features.items():
+    """Measure features in all storages; the files are those of projections that do not ship."""
+    for name, project in progress(features.items(), "Measuring", "feature", len(features)):
         for storage in MEASURED:
-            table = level_table(name, storage, project, fitted)
+            table = level_table(files.get(name, name), storage, project, fitted)
 
             def coded(base: torch.Tensor, project=project, storage=storage, table=table):
                 return stored(project(base), storage, table)
 
             size = descriptor_bytes(getattr(project, "dim", DIM), storage)
-            both = measure(coded, coded, pairs)
-            floats = measure(project, coded, pairs) if storage != "float16" else both
+            both = ap(coded, coded, pairs)
+            floats = ap(project, coded, pairs) if storage != "float16" else both
             yield size, name, storage, floats, both
 
 
@@ -106,7 +107,7 @@ def families(values: list[tuple[int, str, float]]) -> dict[str, list[tuple[int, 
     """Group sizes and values of features by base descriptor and scheme."""
     found: dict[str, list[tuple[int, float]]] = {}
     for size, feature, value in values:
-        found.setdefault(feature.partition("@")[0].rstrip("0123456789"), []).append((size, value))
+        found.setdefault(family(feature), []).append((size, value))
     return found
 
 
@@ -126,6 +127,8 @@ def _main() -> None:
     add("--plot", type=Path, help="picture of the tables")
     args = parser.parse_args()
     cli.check_positive(args, "draws")
+    if not args.map and not args.outputs:
+        raise InputError("There is nothing to measure. Give --map or --outputs.")
     for descriptor in args.descriptor:
         cli.choose("descriptor", descriptor, [*DESCRIPTORS, COLMAP])
     panels = []
@@ -149,9 +152,8 @@ def _main() -> None:
                 or name == descriptor
                 or any(f"_{scheme}" in name for scheme in args.schemes)
             }
-            for row in rows(chosen, pairs, fitted):
-                measured.append(row)
-                print(*row, flush=True)
+            files = {file.name: file for file in args.projection}
+            measured += rows(chosen, files, pairs, fitted)
         print(f"| bytes | feature | storage | {' / '.join(KINDS)} | both sides stored |")
         print("| ---: | --- | --- | ---: | ---: |")
         for size, name, storage, *both in sorted(measured, key=lambda row: -row[0]):
@@ -160,9 +162,9 @@ def _main() -> None:
         mean = families([(size, name, np.mean(ap)) for size, name, _, ap, _ in measured])
         panels.append(partial(panel, points=mean, label="matching AP [%]"))
     if args.outputs:
+        found = inliers(args.outputs)
         print("| bytes | feature | storage | mean inliers, day | night |")
         print("| ---: | --- | --- | ---: | ---: |")
-        found = inliers(args.outputs)
         for size, name, storage, lists in found:
             cells = " | ".join(f"{value:,.0f}" for value in lists.values())
             print(f"| {size} | {name} | {storage} | {cells} |")

@@ -61,6 +61,9 @@ class Localizer:
         self.matcher = matchers.load(matcher).eval()
         self.gate = gate.of_matches(matcher, dimension(built.features))
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
+        coded = built.storage not in FLOATS and self.matcher.takes_codes
+        # a code is rounded much more than integers are, and they are faster
+        self.as_integers = coded and self.device == "cpu"
         self.extractor = extractors.load(built.conf["model"]).eval().to(self.device)
         self.vlad = aggregators.load(RETRIEVAL["model"]).eval()
         self.vlad.vocabulary = read_vocabulary(built.vocabulary)
@@ -70,11 +73,8 @@ class Localizer:
         self.descriptors, self.shown = {}, {}
         with open_h5(built.features) as file:
             for name in self.names:
-                stored = read_descriptors(file, name)
-                # a code is rounded much more than integers are, and they are faster
-                coded = not stored.is_float and self.matcher.takes_codes
-                descriptors = stored.restore(unbiased=coded)
-                if coded and self.device == "cpu":
+                descriptors = read_descriptors(file, name).restore(unbiased=coded)
+                if self.as_integers:
                     descriptors = to_integers(descriptors)
                 self.descriptors[name] = torch.from_numpy(descriptors).to(self.device)
                 shown = np.flatnonzero(self.reference.point_rows(name) >= 0)
@@ -146,11 +146,11 @@ class Localizer:
 
     def _match(self, descriptors: torch.Tensor, names: list[str]) -> dict[str, np.ndarray]:
         """Match descriptors (N, D) with those of map images that show a point."""
-        integers = torch.from_numpy(to_integers(descriptors.cpu().numpy()))
+        if self.as_integers:
+            descriptors = torch.from_numpy(to_integers(descriptors.numpy()))
 
         def match(name: str) -> np.ndarray:
             described, shown = self.descriptors[name], self.shown[name]
-            query = integers if described.dtype == integers.dtype else descriptors
-            return self.matcher.match_rows(query, described, shown).cpu().numpy()
+            return self.matcher.match_rows(descriptors, described, shown).cpu().numpy()
 
         return dict(zip(names, parallel.ordered("match", match, names), strict=True))

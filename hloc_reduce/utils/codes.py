@@ -13,10 +13,10 @@ CODED = {"uint4": 4, "uint2": 2, "uint1": 1}  # bits of a number
 STORAGES = (*FLOATS, "uint8", *CODED)
 QUANTIZED = {storage: f"descriptors_{storage}" for storage in STORAGES if storage not in FLOATS}
 STEPS = 255
-# integers that stand for 1: products of unit vectors are integers below 2**24, which a float32
-# represents exactly, and 99.9 % of the matches of real descriptors stay the same
-UNIT = 3000
-LEAST_NORM = 0.75  # of what codes stand for, on average: sets a limit to the products
+# The integer that stands for 1, and the least mean norm of what codes stand for. Products of
+# restored vectors are at most (UNIT / LEAST_NORM)**2 < 2**24, so a float32 represents them exactly;
+# 99.9 % of the matches of real descriptors that pass a ratio test stay the same.
+UNIT, LEAST_NORM = 3000, 0.75
 
 
 def descriptor_bytes(dim: int, storage: str) -> int:
