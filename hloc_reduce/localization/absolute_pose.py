@@ -133,7 +133,7 @@ def estimate(
         tried = sorted(tried, key=len, reverse=True)[:MAX_IMAGES]
         poses += [_estimate(matches, chosen) for chosen in tried]
     best = max(poses, key=_quality)
-    if 0 < best.num_inliers < number / (1 + RIVAL):  # then a rival may be among the others
+    if 0 < best.num_inliers < number / (1 + RIVAL):  # the others may agree with a rival
         poses.append(_estimate(matches, np.flatnonzero(~best.inliers)))
         best = max(poses, key=_quality)
     rivals = [pose for pose in poses if differ(best, pose, points3D)]
@@ -305,7 +305,7 @@ def _refusal(matches: _Matches, pose: Pose, rivals: list[Pose], gate: Gate) -> s
             f"{pose.agreement:.2f}, at least {least:g} is needed"
         )
     for rival in rivals:
-        if rival.num_inliers >= RIVAL * number and differ(pose, rival, matches.points3D):
+        if rival.confidence >= RIVAL * pose.confidence and differ(pose, rival, matches.points3D):
             return f"ambiguous: another pose has {rival.num_inliers} inliers, this one {number}"
     return None
 

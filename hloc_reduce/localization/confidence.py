@@ -22,7 +22,7 @@ REFINED = 2.0  # factor by which a focal length from EXIF data may change
 MAX_POSITION = 0.05  # standard deviation of the position, in median depths of the inliers
 MAX_ROTATION = 2.0  # standard deviation in degrees
 MIN_MATCHES = 6  # of an image whose matches may tell whether a pose is right
-RIVAL = 0.8  # a pose is ambiguous if another one has this share of its inliers
+RIVAL = 0.25  # a pose is ambiguous if another one has this share of its confidence
 
 # The least agreement of a pose, in general and for a DOUBTFUL confidence. Wrong poses at copies of
 # repeated structures have agreements up to the second one, and confidences in this range. Below it

@@ -56,7 +56,7 @@ def localize(
     best, info = max(solved, key=lambda both: _quality(both[1]))
     for other, its_info in solved:
         if info["reason"] is None is its_info["reason"] and other is not best:
-            rivals = other.num_inliers >= RIVAL * best.num_inliers
+            rivals = other.confidence >= RIVAL * best.confidence
             if rivals and absolute_pose.differ(best, other, info["points3D"]):
                 info["reason"] = (
                     f"ambiguous: a pose by other images has {other.num_inliers} inliers, this one "

@@ -250,12 +250,14 @@ def test_clusters_of_matches_of_few_points_are_refused(number, repeated):
         assert solve(keypoints, world, [np.arange(len(world))]).refusal is not None
 
 
-def test_a_rival_is_looked_for_where_half_of_the_matches_agree():
-    """Of two places that look the same the matches are divided between both."""
-    first, second = matches(51, 0), matches(49, 0, pose=pose_of(0, (50, 0, 8)), seed=1)
+@pytest.mark.parametrize("number", [51, 70])
+def test_a_rival_is_looked_for_where_many_matches_disagree(number):
+    """Of two places that look the same, one with fewer photos, the matches are divided."""
+    other = 100 - number
+    first, second = matches(number, 0), matches(other, 0, pose=pose_of(0, (50, 0, 8)), seed=1)
     keypoints, points = (np.concatenate(part) for part in zip(first, second, strict=True))
     found = solve(keypoints, points, [np.arange(0, 100, 2), np.arange(1, 100, 2)])
-    assert found.refusal == "ambiguous: another pose has 49 inliers, this one 51"
+    assert found.refusal == f"ambiguous: another pose has {other} inliers, this one {number}"
 
 
 def test_a_gate_of_ones_own_is_kept():
