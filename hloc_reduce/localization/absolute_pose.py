@@ -132,14 +132,12 @@ def estimate(
         tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
         tried = sorted(tried, key=len, reverse=True)[:MAX_IMAGES]
         poses += [_estimate(matches, chosen) for chosen in tried]
-    best = max(poses, key=_quality)
-    if 0 < best.num_inliers < number / (1 + RIVAL):  # the others may agree with a rival
-        poses.append(_estimate(matches, np.flatnonzero(~best.inliers)))
-        best = max(poses, key=_quality)
-    rivals = [pose for pose in poses if differ(best, pose, points3D)]
-    best, doubt = _calibrate(matches, best)
+    best, doubt = _calibrate(matches, max(poses, key=_quality))
     best = replace(best, agreement=agreement(best.inliers, images))
-    return replace(best, refusal=_refusal(matches, best, rivals, gate) or doubt)
+    others = np.flatnonzero(~best.inliers)
+    if len(others) >= RIVAL * best.num_inliers > 0:
+        poses.append(_estimate(matches, others))
+    return replace(best, refusal=_refusal(matches, best, poses, gate) or doubt)
 
 
 def _quality(pose: Pose) -> tuple[float, int]:
@@ -277,8 +275,8 @@ def _choose(
     )
 
 
-def _refusal(matches: _Matches, pose: Pose, rivals: list[Pose], gate: Gate) -> str | None:
-    """Return why a pose is not trusted, None if it is."""
+def _refusal(matches: _Matches, pose: Pose, others: list[Pose], gate: Gate) -> str | None:
+    """Return why a pose is not trusted in view of other poses, None if it is."""
     number = pose.num_inliers
     if number < gate.min_inliers:
         return f"too few inliers: {number}, at least {gate.min_inliers} are needed"
@@ -304,9 +302,9 @@ def _refusal(matches: _Matches, pose: Pose, rivals: list[Pose], gate: Gate) -> s
             "the matches of no image agree with the pose: agreement "
             f"{pose.agreement:.2f}, at least {least:g} is needed"
         )
-    for rival in rivals:
-        if rival.confidence >= RIVAL * pose.confidence and differ(pose, rival, matches.points3D):
-            return f"ambiguous: another pose has {rival.num_inliers} inliers, this one {number}"
+    for other in others:
+        if is_rival(pose, other, matches.points3D):
+            return f"ambiguous: another pose has {other.num_inliers} inliers, this one {number}"
     return None
 
 
@@ -346,6 +344,20 @@ def _is_swapped(camera: pycolmap.Camera) -> bool:
 def _off_centre(camera: pycolmap.Camera, x: float, y: float) -> float:
     """Return how far a point is from the centre, as a share of the size."""
     return float(np.abs(np.array([x / camera.width, y / camera.height]) - 0.5).max())
+
+
+def is_rival(pose: Pose, other: Pose, points3D: np.ndarray) -> bool:
+    """Return whether another pose, from other matches, makes a pose ambiguous.
+
+    Args:
+        pose: the best one.
+        other: from the same matches (M).
+        points3D: (M, 3) their points.
+    """
+    if other.confidence < RIVAL * pose.confidence:
+        return False
+    shared = (other.inliers & pose.inliers).sum()
+    return bool(2 * shared < other.num_inliers) and differ(pose, other, points3D)
 
 
 def differ(
