@@ -15,9 +15,18 @@ ROOT = Path(__file__).parents[1]
 STAGES = "stages"  # the modules at the top level of hloc_reduce
 # the lowest first
 ROOMS = (
-    *("utils", "runtime", "detectors", "descriptors", "projections", "extractors", "aggregators"),
-    *("matchers", "confs", "datasets", "localization", STAGES, "maps", "evaluation", "report"),
-    *("training", "demo", "hloc", "hloc_reduce", "pipelines", "confs (shown)"),
+    *("utils", "runtime", "detectors", "descriptors", "networks", "projections", "extractors"),
+    *("aggregators", "matchers", "confs", "datasets", "localization", STAGES, "maps"),
+    *(
+        "evaluation",
+        "report",
+        "training",
+        "demo",
+        "hloc",
+        "hloc_reduce",
+        "pipelines",
+        "confs (shown)",
+    ),
 )
 
 

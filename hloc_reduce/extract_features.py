@@ -12,6 +12,7 @@ import numpy as np
 from . import logger, projections
 from .confs import features as features_confs
 from .descriptors import DESCRIPTORS, check_weights
+from .networks import NETWORKS, fetch_weights
 from .runtime import parallel, processes
 from .runtime.executors import SERIAL, Executor, Results
 from .runtime.group_writer import FAILURE, Arrays, Group, GroupWriter, failures, fill
@@ -243,6 +244,9 @@ def provenance(conf: dict, as_half: bool = True) -> dict:
     descriptor = features_confs.descriptor_of(conf["model"])
     if descriptor in list(DESCRIPTORS):  # one from a YAML file may be unhashable
         check_weights(descriptor)
+    network = features_confs.network_of(conf["model"])
+    if network in list(NETWORKS):
+        fetch_weights(network)
     return made_by
 
 

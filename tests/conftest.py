@@ -16,8 +16,10 @@ import pycolmap
 import pytest
 from scipy.io import savemat
 
+from hloc_reduce import networks
+from hloc_reduce.confs import features
 from hloc_reduce.descriptors import weights
-from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils import cli, colmap, downloads
 from pipelines import batch
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -50,13 +52,21 @@ def herz_jesus() -> Path:
 
 
 @pytest.fixture
-def base_weights(monkeypatch) -> Callable[[str], None]:
-    """Skips a test for want of a base descriptor's weights, in the shared folder if it is there."""
+def base_weights(monkeypatch, tmp_path_factory) -> Callable[[str], None]:
+    """Skips a test for want of the weights of a base, in the shared folders if they are there."""
     if (SHARED / "torch_home").is_dir():
-        monkeypatch.setenv("TORCH_HOME", str(SHARED / "torch_home"))
+        home = tmp_path_factory.mktemp("torch_home")
+        checkpoints = home / "hub/checkpoints"
+        checkpoints.mkdir(parents=True)
+        for path in (SHARED / "torch_home/hub/checkpoints").iterdir():
+            (checkpoints / path.name).symlink_to(path)
+        for path in (SHARED / "edgepoint2").glob("*.pth"):
+            (checkpoints / f"edgepoint2_{path.name}").symlink_to(path)
+        monkeypatch.setenv("TORCH_HOME", str(home))
 
     def need(name: str) -> None:
-        path = weights(name)
+        network = networks.NETWORKS.get(features.network_of(features.confs[name]["model"]) or "")
+        path = downloads.cache() / network.file if network else weights(name)
         if path and not path.is_file():
             pytest.skip(f"the weights {path} are not on this machine")
 

@@ -1,4 +1,4 @@
-"""Local features: 128-D base descriptors, their projections, and features of users' YAML files.
+"""Local features: base descriptors, their projections, networks, and features of YAML files.
 
 `<descriptor>_<scheme><dim>` are the paper's; `<descriptor>_nested` is 64-D, and
 `<descriptor>_nested@<dim>` its first numbers. `colmap_sift` is COLMAP's SIFT.
@@ -12,6 +12,7 @@ import numpy as np
 from .. import projections
 from ..descriptors import COLMAP, DESCRIPTORS, DIM
 from ..detectors.dog import HLOC, KEYPOINTS
+from ..networks import ALIKED, EDGEPOINT2, NETWORKS
 from ..projections.released import FILES as RELEASED
 from ..utils.cli import InputError, Parser, choose
 from ..utils.codes import CODED, STORAGES
@@ -23,6 +24,20 @@ DIMS = (64, 32, 24, 16)
 SCHEMES = dict.fromkeys(DESCRIPTORS, ("pca", "us", "ss", "sv")) | {COLMAP: ("pca", "sv")}
 
 PREPROCESSING = {"grayscale": True, "resize_max": 1600}
+IN_COLOUR = {**PREPROCESSING, "grayscale": False}
+
+# the extractors of networks by the names of their features, such as edgepoint2_m32
+MODELS = (
+    {
+        f"edgepoint2_{name.lower()}": {"name": "edgepoint2", "model_name": name}
+        for name in EDGEPOINT2
+    }
+    | {"xfeat": {"name": "xfeat"}}
+    | {
+        name.removesuffix("-n16").replace("-", "_"): {"name": "aliked", "model_name": name}
+        for name in ALIKED
+    }
+)
 
 
 def base(descriptor: str) -> dict:
@@ -49,12 +64,26 @@ confs = {name: feature(name, base(name)) for name in SCHEMES} | {
     for descriptor in SCHEMES
     for name in names(descriptor)
 }
+confs |= {
+    name: {"output": f"feats-{name}", "model": model, "preprocessing": IN_COLOUR}
+    for name, model in MODELS.items()
+}
+
+
+def network_of(model: dict) -> str | None:
+    """Return the key of `networks.NETWORKS` whose features a model has or projects, if any."""
+    found = base_of(model)
+    name = found.get("model_name", found["name"])
+    return name if found["name"] in ("edgepoint2", "xfeat", "aliked") else None
 
 
 def dimension(name: str) -> int | None:
     """Return the dimension of the descriptors of a key of `confs`; None if only its model knows."""
     projection = confs[name]["model"].get("projection")
     if projection is None:
+        network = network_of(confs[name]["model"])
+        if network in NETWORKS:
+            return NETWORKS[network].dim
         return DIM if descriptor_of(confs[name]["model"]) else None
     digits = re.search(r"\d+$", projection)
     return int(digits[0]) if digits else DIMS[0]
@@ -74,6 +103,8 @@ def _weights(model: dict) -> str:
     """Say where the weights of a model come from."""
     projection = model.get("projection")
     if projection is None:
+        if network_of(model):
+            return "downloaded on first use"
         descriptor = DESCRIPTORS.get(descriptor_of(model) or "")
         if descriptor is None and model["name"] != "dog":
             return f"see extractors/{model['name']}.py"

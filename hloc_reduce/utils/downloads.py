@@ -19,13 +19,13 @@ def cache() -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 
-def fetch(path: Path, urls: Iterable[str], sha256: str, what: str, otherwise: str) -> Path:
+def fetch(path: Path, urls: Iterable[str], sha256: str | None, what: str, otherwise: str) -> Path:
     """Return a file; download it if it is missing.
 
     Args:
         path: where the file is kept.
         urls: tried one after the other.
-        sha256: checked in any case.
+        sha256: checked in any case; None accepts every file.
         what: names the file in messages, as in "The weights of tfeat".
         otherwise: what else the user can do, for messages.
 
@@ -33,7 +33,7 @@ def fetch(path: Path, urls: Iterable[str], sha256: str, what: str, otherwise: st
         InputError: when it cannot be downloaded, or its sha256 is another.
     """
     if path.is_file():
-        if file_sha256(path) != sha256:
+        if sha256 and file_sha256(path) != sha256:
             raise InputError(
                 f"{what}, {path}, are broken: their sha256 is not {sha256}. Delete it."
             )
@@ -46,7 +46,7 @@ def fetch(path: Path, urls: Iterable[str], sha256: str, what: str, otherwise: st
         except (OSError, HTTPException) as error:
             reasons[url] = getattr(error, "reason", error)
             continue
-        if hashlib.sha256(content).hexdigest() == sha256:
+        if sha256 in (None, hashlib.sha256(content).hexdigest()):
             with replacing(path) as temporary:
                 temporary.write_bytes(content)
             return path

@@ -1,0 +1,54 @@
+"""EdgePoint2's keypoints and descriptors."""
+
+from torch.nn.functional import grid_sample, interpolate, normalize
+
+from ..networks import EDGEPOINT2, NETWORKS
+from ..networks.edgepoint2 import EdgePoint2 as Network
+from ..networks.keypoints import strongest
+from ..networks.loading import load_weights
+from ..networks.noise import reduce_noise
+from ..utils.cli import choose
+from . import Extractor
+
+RADIUS = 2  # pixels between maxima of the scores
+MIN_SCORE = -5.0  # logit
+BORDER = 4  # pixels without keypoints
+
+
+class EdgePoint2(Extractor):
+    """The features of EdgePoint2 (github.com/HITCSC/EdgePoint2).
+
+    `model_name` is a size of the network, T to E, and the dimension of its descriptors: M32, for
+    example. Keypoints are the maxima of its score map, in whole pixels of the resized image, the
+    `max_keypoints` highest ones; -1 keeps all. With `denoise`, noisy images are blurred first.
+    """
+
+    default_conf = {"model_name": "M32", "max_keypoints": 4096, "denoise": True}
+
+    def _init(self, conf: dict) -> None:
+        name = choose("model_name", conf["model_name"], EDGEPOINT2)
+        self.dim = NETWORKS[name].dim
+        self.network = load_weights(Network(name[0], self.dim), name)
+
+    @property
+    def descriptor(self) -> str:
+        """The name of these descriptors in the metadata of projections."""
+        return f"edgepoint2_{self.conf['model_name'].lower()}"
+
+    def _forward(self, data: dict) -> dict:
+        image = reduce_noise(data["image"]) if self.conf["denoise"] else data["image"]
+        given = image.shape[:1:-1]
+        width, height = (max(1, side // Network.stride) * Network.stride for side in given)
+        if (width, height) != tuple(given):
+            image = interpolate(image, (height, width), mode="bilinear", align_corners=True)
+        dense, score_map = self.network(image)
+        limits = RADIUS, MIN_SCORE, BORDER, self.conf["max_keypoints"]
+        keypoints, scores = strongest(score_map[0, 0], *limits)
+        size = keypoints.new_tensor([width, height])
+        grid = (keypoints + 0.5) / size * 2 - 1
+        descriptors = grid_sample(dense, grid[None, None], align_corners=False)[0, :, 0]
+        return {
+            "keypoints": (keypoints * (keypoints.new_tensor(given) / size))[None],
+            "scores": scores[None],
+            "descriptors": normalize(descriptors, dim=0)[None],
+        }

@@ -1,0 +1,84 @@
+"""Load a network's weights, check them, and make it fast."""
+
+import pickle
+from collections.abc import Callable
+
+import torch
+from torch import nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from ..utils.cli import InputError
+from . import NETWORKS, fetch_weights
+
+CONSTANT = "hw_grid"  # a buffer of kornia's ALIKED that its weights lack
+TOLERANCE = 1e-3  # of what the weights compute
+
+Compute = Callable[[torch.Tensor], tuple[torch.Tensor, ...]]
+
+
+def load_weights(module: nn.Module, name: str, compute: Compute | None = None) -> nn.Module:
+    """Load the weights of a network of `NETWORKS`, fold its normalizations, and freeze it.
+
+    Args:
+        module: the network.
+        name: of the network.
+        compute: computes its maps from an image (1, 3, H, W); default: the module itself.
+
+    Returns:
+        The module.
+
+    Raises:
+        InputError: when the weights cannot be downloaded, are broken, or are another network's.
+    """
+    path, what = fetch_weights(name), f"The weights of {name}"
+    try:
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError):
+        raise InputError(f"{what}, {path}, are broken. Delete the file.") from None
+    try:
+        missing, unexpected = module.load_state_dict(weights, strict=False)
+    except (RuntimeError, TypeError, AttributeError):
+        missing, unexpected = [path.name], []
+    if unexpected or any(not key.endswith(CONSTANT) for key in missing):
+        raise InputError(f"{what}, {path}, are those of another network.")
+    fold(module.eval()).requires_grad_(False)
+    expected = NETWORKS[name].computes
+    found = fingerprint(compute or module)
+    if expected and any(
+        abs(a - b) > TOLERANCE * (1 + abs(b)) for a, b in zip(found, expected, strict=True)
+    ):
+        raise InputError(
+            f"{what}, {path}, are not the published ones: they compute {_rounded(found)} instead "
+            f"of {_rounded(expected)}. Delete the file."
+        )
+    return module
+
+
+def fingerprint(compute: Compute) -> tuple[float, ...]:
+    """Return the mean and the standard deviation of each map of a test image."""
+    x, y = torch.arange(96)[None] / 7, torch.arange(64)[:, None] / 5
+    image = 0.5 + 0.25 * (torch.sin(x + y) + torch.sin(2.3 * x - y * y / 4))
+    with torch.no_grad():
+        maps = compute(image.expand(1, 3, 64, 96))
+    return tuple(float(value) for part in maps for value in (part.mean(), part.std()))
+
+
+def _rounded(numbers: tuple[float, ...]) -> str:
+    return ", ".join(f"{number:.3f}" for number in numbers)
+
+
+def fold(module: nn.Module) -> nn.Module:
+    """Fold each batch normalization that follows a convolution into it.
+
+    Returns:
+        The module, which computes the same in fewer steps.
+    """
+    for child in module.children():
+        fold(child)
+    if isinstance(module, nn.Sequential):
+        for i in range(1, len(module)):
+            before, this = module[i - 1], module[i]
+            if isinstance(before, nn.Conv2d) and isinstance(this, nn.BatchNorm2d):
+                module[i - 1] = fuse_conv_bn_eval(before, this)
+                module[i] = nn.Identity()
+    return module

@@ -1,0 +1,221 @@
+"""Networks that find and describe keypoints: weights, keypoints, noise."""
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from hloc_reduce import extract_features, extractors, networks
+from hloc_reduce.confs import features
+from hloc_reduce.networks import EDGEPOINT2, NETWORKS, loading
+from hloc_reduce.networks.edgepoint2 import EdgePoint2
+from hloc_reduce.networks.keypoints import strongest
+from hloc_reduce.networks.noise import NOISY, reduce_noise, relative_noise
+from hloc_reduce.utils.cli import InputError
+
+COLOUR = {"grayscale": False}
+SMALL = ("edgepoint2_t32", "xfeat", "aliked_t16")
+
+
+@pytest.fixture
+def random_weights(tmp_path, monkeypatch):
+    """Replaces the weights of a network by random ones, which nothing checks."""
+    (tmp_path / "hub/checkpoints").mkdir(parents=True)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+
+    def make(name: str, module: nn.Module, changed: dict | None = None) -> Path:
+        network = replace(NETWORKS[name], sha256=None, computes=())
+        monkeypatch.setitem(networks.NETWORKS, name, network)
+        path = tmp_path / "hub/checkpoints" / network.file
+        torch.save(module.state_dict() | (changed or {}), path)
+        return path
+
+    return make
+
+
+def random_network(seed: int = 0) -> nn.Module:
+    """Return a T32 whose normalizations do something."""
+    torch.manual_seed(seed)
+    network = EdgePoint2("T", 32)
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.running_mean.uniform_(-0.1, 0.1)
+            module.running_var.uniform_(0.5, 2)
+            module.weight.data.uniform_(0.5, 2)
+            module.bias.data.uniform_(-0.1, 0.1)
+    return network
+
+
+def in_colour(grey: np.ndarray) -> np.ndarray:
+    return np.repeat(grey[:, :, None], 3, axis=2)
+
+
+def test_strongest_are_the_highest_strict_maxima():
+    scores = torch.zeros(40, 50)
+    scores[10, 20], scores[10, 23], scores[30, 40], scores[2, 25] = 3.0, 2.0, 5.0, 9.0
+    scores[20, 10:12] = 7.0  # a plateau
+    keypoints, found = strongest(scores, 2, 0.5, 4, -1)
+    assert keypoints.tolist() == [[40, 30], [20, 10], [23, 10]] and found.tolist() == [5, 3, 2]
+    keypoints, _ = strongest(scores, 3, 0.5, 4, -1)
+    assert keypoints.tolist() == [[40, 30], [20, 10]]
+    assert len(strongest(scores, 2, 0.5, 4, 1)[0]) == 1
+    assert len(strongest(scores, 2, 6.0, 4, -1)[0]) == 0
+    assert len(strongest(scores[:6, :6], 2, 0.5, 4, -1)[0]) == 0
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.02, 0.1])
+def test_noise_is_measured_in_units_of_the_contrast(textured, sigma):
+    clean = cv2.resize(textured, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC) / 255
+    noisy = clean + sigma * np.random.default_rng(0).standard_normal(clean.shape)
+    found = relative_noise(noisy.astype(np.float32))
+    assert found == pytest.approx(sigma / noisy.std(), rel=0.15, abs=0.02)
+    dark = relative_noise((0.2 * noisy + 0.1).astype(np.float32))
+    assert dark == pytest.approx(found, rel=0.05)
+
+
+def test_only_noisy_photos_are_blurred(textured):
+    clean = torch.from_numpy(textured.astype(np.float32) / 255)[None, None]
+    assert reduce_noise(clean) is clean
+    noise = torch.randn(1, 3, 240, 320, generator=torch.Generator().manual_seed(0))
+    noisy = (clean / 10 + 0.1 + 0.02 * noise).clamp(0, 1)
+    blurred = reduce_noise(noisy)
+    assert blurred.shape == noisy.shape and blurred.dtype == noisy.dtype
+    left = relative_noise(blurred[0].mean(dim=0).numpy())
+    assert left < NOISY / 2 < relative_noise(noisy[0].mean(dim=0).numpy())
+    for shape in ((1, 3, 64, 64), (1, 3, 20, 500), (1, 1, 1, 1)):
+        image = torch.full(shape, 0.5)
+        assert reduce_noise(image) is image
+
+
+def test_folded_networks_compute_the_same(random_weights):
+    network = random_network().eval()
+    random_weights("T32", network)
+    folded = loading.load_weights(EdgePoint2("T", 32), "T32")
+    assert not any(isinstance(module, nn.BatchNorm2d) for module in folded.modules())
+    image = torch.rand(1, 3, 64, 96)
+    with torch.no_grad():
+        for expected, found in zip(network(image), folded(image), strict=True):
+            torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(5, 3), (31, 33), (64, 64), (10, 1600), (100, 150)])
+def test_photos_of_any_size(random_weights, shape):
+    random_weights("T32", random_network())
+    model = extractors.load({"name": "edgepoint2", "model_name": "T32"}).eval()
+    height, width = shape
+    pixels = np.random.default_rng(0).integers(0, 255, (height, width, 3), np.uint8)
+    found = extractors.extract(model, pixels, COLOUR)
+    number = len(found["keypoints"])
+    assert found["descriptors"].shape == (32, number) and found["scores"].shape == (number,)
+    assert (found["keypoints"] > -1).all()
+    assert (found["keypoints"] <= [width, height]).all()
+    norms = np.linalg.norm(found["descriptors"], axis=0)
+    np.testing.assert_allclose(norms, 1, atol=1e-5)
+    grey = extractors.extract(model, np.ascontiguousarray(pixels[:, :, 0]), {"grayscale": True})
+    assert grey["descriptors"].shape[0] == 32
+
+
+def test_photos_of_one_colour_have_no_keypoints(random_weights):
+    random_weights("T32", random_network())
+    model = extractors.load({"name": "edgepoint2", "model_name": "T32"}).eval()
+    found = extractors.extract(model, np.full((640, 640, 3), 77, np.uint8), COLOUR)
+    # the padding of convolutions shows near the borders only
+    assert not (abs(found["keypoints"] - 319.5) < 100).all(axis=1).any()
+
+
+def test_weights_are_checked(random_weights, monkeypatch):
+    path = random_weights("T32", random_network())
+    content = path.read_bytes()
+    conf = {"name": "edgepoint2", "model_name": "T32"}
+    extractors.load(conf)
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="edgepoint2_T32.pth, are broken"):
+        extractors.load(conf)
+    torch.save(EdgePoint2("S", 32).state_dict(), path)
+    with pytest.raises(InputError, match="edgepoint2_T32.pth, are those of another network"):
+        extractors.load(conf)
+    torch.save([1, 2], path)
+    with pytest.raises(InputError, match="edgepoint2_T32.pth, are those of another network"):
+        extractors.load(conf)
+    monkeypatch.setitem(networks.NETWORKS, "T32", replace(NETWORKS["T32"], sha256="0" * 64))
+    with pytest.raises(InputError, match="The weights of T32, .*, are broken: their sha256"):
+        extract_features.provenance(features.confs["edgepoint2_t32"])
+
+
+def test_weights_that_compute_something_else_are_refused(random_weights, monkeypatch):
+    from kornia.feature import XFeat
+
+    expected = NETWORKS["xfeat"].computes
+    torch.manual_seed(0)
+    random_weights("xfeat", XFeat().net)
+    monkeypatch.setitem(
+        networks.NETWORKS, "xfeat", replace(networks.NETWORKS["xfeat"], computes=expected)
+    )
+    with pytest.raises(InputError, match="are not the published ones: they compute "):
+        extractors.load({"name": "xfeat"})
+
+
+def test_an_unknown_model_is_answered_by_all_that_are_valid():
+    with pytest.raises(InputError, match="There are: aliked-n16"):
+        extractors.load({"name": "aliked", "model_name": "aliked-n18"})
+    with pytest.raises(InputError, match="The nearest of 14: T48"):
+        extractors.load({"name": "edgepoint2", "model_name": "T64"})
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_features_of_networks(name, base_weights, textured):
+    base_weights(name)
+    model = extractors.load(features.confs[name]["model"]).eval()
+    assert model.descriptor == name and model.dim == features.dimension(name)
+    photo = in_colour(cv2.resize(textured, (640, 480), interpolation=cv2.INTER_CUBIC))
+    found = extractors.extract(model, photo, COLOUR)
+    assert 200 < len(found["keypoints"]) <= 4096
+    assert found["descriptors"].shape == (model.dim, len(found["keypoints"]))
+    np.testing.assert_allclose(np.linalg.norm(found["descriptors"], axis=0), 1, atol=1e-4)
+    again = extractors.extract(model, photo, COLOUR)
+    np.testing.assert_array_equal(found["keypoints"], again["keypoints"])
+    # the same photo moved by 32 pixels: the same keypoints, moved
+    moved = extractors.extract(model, np.ascontiguousarray(photo[32:, 32:]), COLOUR)
+    near = np.linalg.norm(
+        found["keypoints"][None] - 32 - moved["keypoints"][:300, None], axis=2
+    ).argmin(axis=1)
+    offset = found["keypoints"][near] - 32 - moved["keypoints"][:300]
+    close = np.linalg.norm(offset, axis=1) < 2
+    assert close.mean() > 0.6 and (abs(offset[close].mean(axis=0)) < 0.1).all()
+    cosine = (found["descriptors"].T[near] * moved["descriptors"].T[:300]).sum(axis=1)
+    assert np.median(cosine[close]) > 0.9
+
+
+@pytest.mark.parametrize("model_name", EDGEPOINT2)
+def test_edgepoint2_agrees_with_the_authors_code(model_name, base_weights, textured, monkeypatch):
+    """EDGEPOINT2 is the folder of a clone of github.com/HITCSC/EdgePoint2."""
+    base_weights(f"edgepoint2_{model_name.lower()}")
+    clone = os.environ.get("EDGEPOINT2")
+    if not clone:
+        pytest.skip("EDGEPOINT2 does not name a clone of github.com/HITCSC/EdgePoint2")
+    monkeypatch.chdir(clone)
+    monkeypatch.syspath_prepend(clone)
+    weights = networks.fetch_weights(model_name)
+    load = torch.load
+    monkeypatch.setattr(torch, "load", lambda file, _: load(weights, "cpu", weights_only=True))
+    from edgepoint2 import EdgePoint2Wrapper
+
+    photo = cv2.resize(textured, (500, 330), interpolation=cv2.INTER_CUBIC)
+    image = torch.from_numpy(in_colour(photo).transpose(2, 0, 1).astype(np.float32) / 255)[None]
+    expected = EdgePoint2Wrapper(model_name, None).eval()(image)[0]
+    monkeypatch.setattr(torch, "load", load)
+    conf = {"name": "edgepoint2", "model_name": model_name, "max_keypoints": -1}
+    found = extractors.load(conf).eval()({"image": image})
+    x, y = found["keypoints"][0].T.double()
+    order = torch.argsort(y * 1000 + x)  # the authors' without a limit
+    for key in ("keypoints", "scores"):
+        torch.testing.assert_close(found[key][0][order], expected[key], atol=1e-4, rtol=1e-5)
+    descriptors = found["descriptors"][0].T[order]
+    torch.testing.assert_close(descriptors, expected["descriptors"], atol=1e-4, rtol=0)
+    sys.modules.pop("edgepoint2")
