@@ -3,10 +3,10 @@
 Each map is tried with held-out photos of its place, with photos of all other places, and with
 blurred, mirrored, black and noisy versions of its own; all with their intrinsics and without, its
 own also with a wrong focal length. Cropped and squeezed versions of its own are tried without
-intrinsics. In a COLMAP model, every third photo is held out. Keypoints and maps come from
-colmap_sift_sv64, whatever descriptors are matched. Another --seed holds out other photos, builds
-other maps, and draws other photos of other places. Results go to trials.csv, and as a curve to
-false_accepts.svg; an interrupted run resumes with the next place.
+intrinsics. In a COLMAP model, every third photo is held out. Keypoints and maps are the same for
+all features, which have one base: those of colmap_sift_sv64, or of a network. Another --seed holds
+out other photos, builds other maps, and draws other photos of other places. Results go to
+trials.csv, and as a curve to false_accepts.svg; an interrupted run resumes with the next place.
 """
 
 import copy
@@ -37,6 +37,7 @@ from hloc_reduce.localize_sfm import RANSAC_THRESH
 from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import FLOATS, restore, store
 from hloc_reduce.utils.feature_files import (
     get_colmap_keypoints,
@@ -47,7 +48,7 @@ from hloc_reduce.utils.files import replacing, write_csv
 from hloc_reduce.utils.h5 import open_h5
 from hloc_reduce.utils.images import read_image
 
-BASE, MAP_FEATURE = "colmap_sift", "colmap_sift_sv64"
+MAP_FEATURES = {"colmap_sift": "colmap_sift_sv64"}  # of a base; default: the base itself
 EVERY = 3
 ALTERED = ("blurred", "mirrored", "black", "noise")
 BLUR = 6.0  # standard deviation in pixels
@@ -78,6 +79,7 @@ class Place:
         names: the images of the map.
         features: base descriptors of the images of the map and of the queries.
         metric: whether units are metres.
+        base: the name of the base feature.
         extent: norm of the standard deviations of the positions of the images.
     """
 
@@ -88,10 +90,13 @@ class Place:
     names: list[str]
     features: Path
     metric: bool
+    base: str
     extent: float
 
 
-def split(name: str, images: Path, model: Path, output: Path, seed: int) -> Place:
+def split(
+    name: str, images: Path, model: Path, output: Path, seed: int, base: str, matcher: str
+) -> Place:
     """Build a map of two thirds of the photos of a COLMAP model; the others are its queries."""
     reconstruction = colmap.read_model(model)
     photos = sorted(reconstruction.images.values(), key=lambda image: image.name)
@@ -105,46 +110,56 @@ def split(name: str, images: Path, model: Path, output: Path, seed: int) -> Plac
     reduced = output / "model"
     reduced.mkdir(parents=True, exist_ok=True)
     reconstruction.write_binary(reduced)
-    return _of_model(name, images, reduced, queries, output, metric=False)
+    return _of_model(name, images, reduced, queries, output, False, base, matcher)
 
 
-def of_dataset(root: Path, output: Path, _seed: int) -> Place:
+def of_dataset(root: Path, output: Path, _seed: int, base: str, matcher: str) -> Place:
     """Build the map of a data set in the layout of Aachen Day-Night or of InLoc."""
     if (root / "database/cutouts").is_dir():
-        return _of_scans(InLoc(root), output)
+        return _of_scans(InLoc(root), output, base)
     place = Aachen(root)
     listed = [query for part in place.query_lists().values() for query in part]
     truth = true_poses([name for name, _ in listed], place.ground_truth, True)
     queries = [(name, camera, truth[name]) for name, camera in listed]
-    return _of_model(root.name, place.images, place.reference_model, queries, output, metric=True)
+    model = place.reference_model
+    return _of_model(root.name, place.images, model, queries, output, True, base, matcher)
 
 
 def _of_model(
-    name: str, images: Path, model: Path, queries: list, output: Path, metric: bool
+    name: str,
+    images: Path,
+    model: Path,
+    queries: list,
+    output: Path,
+    metric: bool,
+    base: str,
+    matcher: str,
 ) -> Place:
-    built = maps.main(output / "map", images, model, MAP_FEATURE)
+    feature = MAP_FEATURES.get(base, base)
+    built = maps.main(output / "map", images, model, feature, matcher=matcher)
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)
-    features = _extract(images, output, [*names, *(query for query, _, _ in queries)])
+    features = _extract(images, output, [*names, *(query for query, _, _ in queries)], base)
     centres = [image.projection_center() for image in reference.images.values()]
     extent = float(np.linalg.norm(np.std(centres, axis=0)))
-    return Place(name, images, queries, reference, names, features, metric, extent)
+    return Place(name, images, queries, reference, names, features, metric, base, extent)
 
 
-def _of_scans(place: InLoc, output: Path) -> Place:
+def _of_scans(place: InLoc, output: Path, base: str) -> Place:
     names = place.map_names()
-    features = _extract(place.root, output, [*names, *place.query_names()])
+    features = _extract(place.root, output, [*names, *place.query_names()], base)
     truth = true_poses(place.query_names(), place.ground_truth, True)
     queries = [(name, camera, truth[name]) for name, camera in place.queries(features)]
     points = localize_inloc.lift_keypoints(place.root, features, names, output / "points3D.h5")
     poses = {name: scans.read_pose(place.root, name) for name in names}
     reference = ScanMap(h5py.File(points), h5py.File(features), poses)
     extent = float(np.linalg.norm(np.std([pose[:3, 3] for pose in poses.values()], axis=0)))
-    return Place(place.root.name, place.root, queries, reference, names, features, True, extent)
+    name = place.root.name
+    return Place(name, place.root, queries, reference, names, features, True, base, extent)
 
 
-def _extract(images: Path, output: Path, names: list[str]) -> Path:
-    conf = features_confs.confs[BASE]
+def _extract(images: Path, output: Path, names: list[str], base: str) -> Path:
+    conf = features_confs.confs[base]
     return extract_features.main(conf, images, output, image_list=sorted(set(names)))
 
 
@@ -184,7 +199,7 @@ def alter(
             altered.append((named, None if view in RESHAPED else camera, here))
     names = [name for name, _, _ in altered]
     extract_features.main(
-        features_confs.confs[BASE],
+        features_confs.confs[place.base],
         output / "altered",
         image_list=names,
         feature_path=output / "altered.h5",
@@ -214,6 +229,12 @@ class Described:
         return torch.from_numpy(
             restore(*store({"descriptors": described.T}, storage, self.levels), unbiased=True)
         )
+
+
+def base_name(feature: str) -> str:
+    """Return the name of the feature whose descriptors a feature projects, or its own."""
+    model = features_confs.base_of(features_confs.get(feature)[1]["model"])
+    return next(name for name, conf in features_confs.confs.items() if conf["model"] == model)
 
 
 def trials(
@@ -474,8 +495,8 @@ def _main() -> None:
     parser.add_argument(
         "--feature",
         nargs="+",
-        default=[MAP_FEATURE],
-        help=f"{BASE} or projections of it, NAME or NAME:STORAGE",
+        default=list(MAP_FEATURES.values()),
+        help="features of one base, NAME or NAME:STORAGE",
     )
     parser.add_argument(
         "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
@@ -495,10 +516,14 @@ def _main() -> None:
     parser.add_argument("--output", type=Path, default=Path("outputs/false_accepts"))
     args = parser.parse_args()
     torch.set_num_threads(1)
+    bases = {base_name(feature.partition(":")[0]) for feature in args.feature}
+    if len(bases) > 1:
+        raise InputError(f"The features have several bases: {', '.join(sorted(bases))}.")
+    options = args.seed, *bases, args.matcher
     output = args.output / f"seed{args.seed}"
     sources = [(root.name, of_dataset, (root,)) for root in args.dataset]
     sources += [(name, split, (name, *both)) for name, both in parse_maps(args.map).items()]
-    places = {name: make(*arguments, output / name, args.seed) for name, make, arguments in sources}
+    places = {name: make(*given, output / name, *options) for name, make, given in sources}
     rows = []
     for name, place in places.items():
         others = [other for other in places.values() if other is not place]

@@ -40,6 +40,9 @@ MODELS = (
 )
 
 
+BASES = (*SCHEMES, *MODELS)  # features whose descriptors are projected
+
+
 def base(descriptor: str) -> dict:
     """Return the model configuration of a base descriptor at DoG keypoints."""
     return {"name": "dog", "descriptor": descriptor, "keypoints": KEYPOINTS[0]}
@@ -181,12 +184,17 @@ def keypoints_of(model: dict) -> str | None:
 def levels(conf: dict) -> np.ndarray | None:
     """Return the levels (D, 2**bits) by which a feature is stored; None if they are not codes.
 
+    Those of a base are in a file of its name among the projections.
+
     Raises:
         InputError: when its storage needs levels that its projection does not have.
     """
     storage, projection = conf.get("storage"), conf["model"].get("projection")
     if storage not in CODED:
         return None
+    if projection is None:
+        shipped = (name for name in projections.names() if name in confs)
+        projection = next((name for name in shipped if confs[name]["model"] == conf["model"]), None)
     if projection is None:
         raise InputError(
             f"{conf['output'].removeprefix('feats-dog-')} has no projection, but --storage "

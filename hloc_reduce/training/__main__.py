@@ -13,7 +13,7 @@ import torch
 from .. import extractors, logger, projections
 from ..confs import features as features_confs
 from ..datasets import phototour as layout
-from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM, check_weights
+from ..descriptors import COLMAP, DESCRIPTORS, DIM, check_weights
 from ..evaluation import patch_verification as verification
 from ..projections import network
 from ..runtime.versions import versions
@@ -21,9 +21,9 @@ from ..utils import cli
 from ..utils.cli import InputError
 from ..utils.files import file_sha256
 from ..utils.paths import strings_as_paths
-from . import levels, nested, patch_tracks, pca, ss, sv, tracks, us
+from . import levels, nested, patch_tracks, pca, raw, ss, sv, tracks, us
 
-SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested}
+SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested, "raw": raw}
 RECIPE_NAMES = ("best", "paper", "tune")
 # hidden layers for descriptors that are not of patches; COLMAP's are computed so fast that larger
 # layers would take 5 % of the time
@@ -51,7 +51,7 @@ def main(
         sequences: folders of PhotoTour.
         descriptor: base descriptor; with `conf`, a name for its descriptors.
         scheme: a key of `SCHEMES`.
-        dims: numbers of output dimensions; ignored by "nested", which has its own.
+        dims: numbers of output dimensions; ignored by "nested", which has its own, and "raw".
         output: folder for `<descriptor>_<scheme><dim>.safetensors`.
         cache: folder for the tracks, which later trainings use again.
         recipe: "best", "paper" for the paper's losses, layers and hyper-parameters, or "tune" to
@@ -69,6 +69,9 @@ def main(
     names = {dim: f"{name}{dim}" for dim in dims}
     if trainer is nested:
         names = {nested.PREFIXES[0]: name}
+    if trainer is raw:
+        model = (conf or features_confs.confs[descriptor])["model"]
+        names = {extractors.load(model).dim: descriptor}
     trained = extractors.load(conf["model"]).descriptor if conf else descriptor
     settings = {dim: complete_recipe(scheme, recipe, trained, name) for dim, name in names.items()}
     files = {}
@@ -141,7 +144,7 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
         InputError: when the scheme has no such recipe, or no such projection ships.
     """
     trainer = SCHEMES[scheme]
-    if trainer is pca:
+    if trainer in (pca, raw):
         return {}
     base = DESCRIPTORS.get(descriptor)
     settings = {
@@ -171,7 +174,10 @@ def _parse() -> argparse.Namespace:
     add = parser.add_argument
     base = parser.add_mutually_exclusive_group()
     base.add_argument(
-        "--descriptor", nargs="+", default=["sift"], help=f"base descriptors: {', '.join(BASES)}"
+        "--descriptor",
+        nargs="+",
+        default=["sift"],
+        help=f"base descriptors: {', '.join(features_confs.BASES)}",
     )
     base.add_argument(
         "--base",
@@ -179,8 +185,13 @@ def _parse() -> argparse.Namespace:
         metavar="FILE",
         help="YAML file of a feature of any extractor, hloc's included, to project instead",
     )
-    add("--scheme", nargs="+", default=["sv"], help=f"schemes: {', '.join(SCHEMES)}")
-    add("--dim", type=int, nargs="+", default=[64], help="output dimensions; not for nested")
+    add(
+        "--scheme",
+        nargs="+",
+        default=["sv"],
+        help=f"schemes: {', '.join(SCHEMES)}; raw changes nothing and only fits levels for codes",
+    )
+    add("--dim", type=int, nargs="+", default=[64], help="output dimensions; not for nested, raw")
     tracks.add_map_option(parser, required=False)
     add(
         "--phototour",
@@ -217,11 +228,13 @@ def _check(args: argparse.Namespace, conf: dict | None) -> None:
             raise InputError("--base describes photos, not the patches of PhotoTour.")
         extractors.load(conf["model"])
     for descriptor in [] if conf else args.descriptor:
-        if of_patches and descriptor == COLMAP:
+        cli.choose("descriptor", descriptor, features_confs.BASES)
+        if of_patches and descriptor not in DESCRIPTORS:
             raise InputError(f"{descriptor} describes photos, not the patches of PhotoTour.")
-        cli.choose("descriptor", descriptor, DESCRIPTORS if of_patches else BASES)
         if descriptor in DESCRIPTORS:
             check_weights(descriptor)
+        elif descriptor != COLMAP:
+            extractors.load(features_confs.confs[descriptor]["model"])
     for scheme in args.scheme:
         cli.choose("scheme", scheme, SCHEMES)
     if "ss" in args.scheme:

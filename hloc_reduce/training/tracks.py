@@ -20,7 +20,7 @@ from .. import (
     triangulation,
 )
 from ..confs import features as features_confs
-from ..descriptors import BASES, COLMAP, DESCRIPTORS, DIM
+from ..descriptors import COLMAP, DESCRIPTORS, DIM
 from ..descriptors.model import Descriptor
 from ..extractors.dog import extract_patches
 from ..maps.map import Map, is_map
@@ -144,7 +144,7 @@ def main(
         InputError: for an unknown descriptor, or when the map cannot be read or gives no tracks.
     """
     if conf is None:
-        choose("descriptor", descriptor, BASES)
+        choose("descriptor", descriptor, features_confs.BASES)
     _check_source(images, model, output / "source.json")
     patches = conf is None and descriptor in DESCRIPTORS
     found_by = MATCHED if patches else descriptor
