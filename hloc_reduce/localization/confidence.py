@@ -28,9 +28,9 @@ RIVAL = 0.25  # a pose is ambiguous if another one has this share of its confide
 # repeated structures have agreements up to the second one, and confidences in this range. Below it
 # there are few matches, so that the agreement is less certain; above it, low agreements occurred
 # only in noisy scans.
-AGREEMENT = (0.17, 0.17)  # of matches without a ratio test
-AGREEMENT_RATIO = (0.76, 0.86)  # with a ratio test
-AGREEMENT_FEW, FEW = (0.55, 0.72), 32  # with a ratio test, and fewer than 32 dimensions
+AGREEMENT = (0.17, 0.17)  # of matches without a strict ratio test
+AGREEMENT_RATIO, STRICT = (0.76, 0.86), 0.8  # with a ratio test of up to 0.8
+AGREEMENT_FEW, FEW = (0.55, 0.72), 32  # the same for fewer than 32 dimensions
 DOUBTFUL = (50.0, 300.0)
 
 
@@ -233,7 +233,7 @@ class Gate:
         if self.min_agreement is not None:
             return self
         with_ratio = AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO
-        least = with_ratio if matcher.get("ratio_threshold") else AGREEMENT
+        least = with_ratio if (matcher.get("ratio_threshold") or 1) <= STRICT else AGREEMENT
         return replace(self, min_agreement=least)
 
     def least_agreement(self, confidence: float) -> float:
