@@ -2,7 +2,7 @@
 
 Builds the map once, from photos and a COLMAP model of them or from photos alone; later runs
 localize other photos in it. Without --query_images only the map is built. A new map has the feature
-colmap_sift_sv64 and the matcher NN-ratio unless you choose others.
+colmap_sift_sv64 and its matcher unless you choose others.
 """
 
 import hashlib
@@ -77,7 +77,7 @@ def open_map(
         model_or_map: COLMAP model of the photos, or an old map.
         feature: name of a feature, or its YAML file; default: colmap_sift_sv64.
         projection: projection file to use with the base descriptor of `feature`.
-        matcher: default: NN-ratio.
+        matcher: default: the feature's.
         num_covis: other images that each map image is matched with.
         overwrite: rebuild the map.
         storage: how descriptors are stored; default: float16.
@@ -104,7 +104,7 @@ def open_map(
             model_or_map,
             feature or features_confs.RECOMMENDED,
             projection,
-            matcher or "NN-ratio",
+            matcher,
             num_covis,
             overwrite,
             storage or STORAGES[0],

@@ -61,7 +61,9 @@ def add_feature_options(parser: cli.Parser) -> None:
     features_confs.add_storage_option(parser, of)
     features_confs.add_keypoints_option(parser)
     parser.add_argument(
-        "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
+        "--matcher",
+        help=f"one of {', '.join(matchers_confs.confs)} (default: the feature's, see "
+        "--list_features)",
     )
     parser.add_argument("--list_features", action="store_true", help="list the features and exit")
 

@@ -214,7 +214,7 @@ class DatasetRun(Run):
         feature: str = features_confs.RECOMMENDED,
         num_loc: int = 50,
         numbers: Mapping[str, int] | None = None,
-        matcher: str = "NN-ratio",
+        matcher: str | None = None,
         retrieval: str = "vlad",
         ground_truth: Path | None = None,
         overwrite: bool = False,
@@ -228,6 +228,7 @@ class DatasetRun(Run):
         gate: Gate = DEFAULT_GATE,
     ):
         feature, self._conf = features_confs.get(feature, projection, storage, keypoints)
+        matcher = matcher or features_confs.matcher_of(self._conf)
         self.place, self._retrieval, self.gate = place, retrieval, gate
         self._strict, self._accept_partial = strict, accept_partial
         self.numbers = {**(numbers or {}), "num_loc": num_loc}

@@ -40,6 +40,8 @@ MODELS = (
 )
 
 
+# the default matchers of extractors other than DoG (docs/results.md)
+MATCHERS = dict.fromkeys(("edgepoint2", "xfeat", "aliked"), "NN-mutual")
 BASES = (*SCHEMES, *MODELS)  # features whose descriptors are projected
 
 
@@ -73,6 +75,11 @@ confs |= {
 }
 
 
+def matcher_of(conf: dict) -> str:
+    """Return the matcher that suits a feature best, a key of `confs.matchers`."""
+    return MATCHERS.get(base_of(conf["model"])["name"], "NN-ratio")
+
+
 def network_of(model: dict) -> str | None:
     """Return the key of `networks.NETWORKS` whose features a model has or projects, if any."""
     found = base_of(model)
@@ -94,12 +101,12 @@ def dimension(name: str) -> int | None:
 
 def table() -> str:
     """Format the features with the size of their descriptors, as float16, and their weights."""
-    lines = [("feature", "numbers", "bytes", "weights")]
+    lines = [("feature", "numbers", "bytes", "matcher", "weights")]
     for name, conf in confs.items():
         dim = dimension(name)
         numbers = (str(dim), str(2 * dim)) if dim else ("", "")
-        lines.append((name, *numbers, _weights(conf["model"])))
-    return aligned(lines, left=4)
+        lines.append((name, *numbers, matcher_of(conf), _weights(conf["model"])))
+    return aligned(lines, left=5)
 
 
 def _weights(model: dict) -> str:

@@ -47,7 +47,7 @@ def main(
     model: Path | None = None,
     feature: str = features_confs.RECOMMENDED,
     projection: Path | None = None,
-    matcher: str = "NN-ratio",
+    matcher: str | None = None,
     num_covis: int = 20,
     overwrite: bool = False,
     storage: str = STORAGES[0],
@@ -64,7 +64,7 @@ def main(
             scale.
         feature: as in `confs.features.get`, like `projection`, `storage` and `keypoints`.
         projection: see `feature`.
-        matcher: a key of `confs.matchers`.
+        matcher: a key of `confs.matchers`; default: the feature's.
         num_covis: each image is paired with this number of the most covisible ones in the model.
             Without points in the model, or without a model, up to `MAX_EXHAUSTIVE` images are all
             paired with each other, and of more each with the most similar ones; without a model,
@@ -85,6 +85,7 @@ def main(
             kept, for a run with `accept_partial`.
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
+    matcher = matcher or features_confs.matcher_of(conf)
     reference = None if model is None else colmap.read_model(model)
     if reference is not None and not reference.images:
         raise InputError(f"The model {model} has no images.")

@@ -46,7 +46,7 @@ class Job:
     Args:
         dataset: data set folder.
         feature: name of a feature, or its YAML file.
-        matcher: name of a matcher.
+        matcher: name of a matcher; default: the feature's.
         storage: how descriptors are stored.
         keypoints: settings of the DoG detector.
         retrieval: "vlad", with the first feature of the data set, or a file.
@@ -59,7 +59,7 @@ class Job:
 
     dataset: Path
     feature: str = features_confs.RECOMMENDED
-    matcher: str = "NN-ratio"
+    matcher: str | None = None
     storage: str = STORAGES[0]
     keypoints: str = KEYPOINTS[0]
     retrieval: str = "vlad"
@@ -182,7 +182,8 @@ def _job(options: dict) -> Job:
     job = Job(**options | paths)
     _ = job.gate  # raises for bad values
     features_confs.get(job.feature, storage=job.storage, keypoints=job.keypoints)
-    cli.choose("matcher", job.matcher, matchers_confs.confs)
+    if job.matcher is not None:
+        cli.choose("matcher", job.matcher, matchers_confs.confs)
     return job
 
 

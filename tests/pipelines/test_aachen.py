@@ -140,7 +140,8 @@ def test_features_are_listed(capsys, run):
     cells = [[cell.strip() for cell in line.split("|")] for line in lines]
     rows = {name: values for name, *values in cells}
     assert list(rows)[:2] == ["feature", "sift"]
-    assert rows["sift_sv16"] == ["16", "32", "shipped"] and rows["sift_pca64"][:2] == ["64", "128"]
+    assert rows["sift_sv16"] == ["16", "32", "NN-ratio", "shipped"]
+    assert rows["edgepoint2_m48"] == ["48", "96", "NN-mutual", "downloaded on first use"]
 
 
 def test_herz_jesus(herz_jesus, tmp_path, run):
