@@ -48,7 +48,7 @@ def test_a_toy_extractor_is_listed(monkeypatch):
     monkeypatch.setitem(features_confs.confs, "corners", conf)
     rows = [line.split(" | ") for line in features_confs.table().splitlines()]
     listed = {name.strip(): [cell.strip() for cell in cells] for name, *cells in rows}
-    assert listed["corners"] == ["", "", "see extractors/corners.py"]
+    assert listed["corners"] == ["", "", "NN-ratio", "see extractors/corners.py"]
     assert listed["colmap_sift"][:2] == ["128", "256"]
     assert listed["sift_nested@24"][:2] == ["24", "48"] and listed["sift_nested"][0] == "64"
 

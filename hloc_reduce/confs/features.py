@@ -191,23 +191,31 @@ def keypoints_of(model: dict) -> str | None:
 def levels(conf: dict) -> np.ndarray | None:
     """Return the levels (D, 2**bits) by which a feature is stored; None if they are not codes.
 
-    Those of a base are in a file of its name among the projections.
-
     Raises:
-        InputError: when its storage needs levels that its projection does not have.
+        InputError: when its storage needs levels that there are none of.
     """
-    storage, projection = conf.get("storage"), conf["model"].get("projection")
+    storage, file = conf.get("storage"), level_file(conf)
     if storage not in CODED:
         return None
-    if projection is None:
-        shipped = (name for name in projections.names() if name in confs)
-        projection = next((name for name in shipped if confs[name]["model"] == conf["model"]), None)
-    if projection is None:
+    if file is None:
+        name = conf["output"].removeprefix("feats-").removeprefix("dog-")
         raise InputError(
-            f"{conf['output'].removeprefix('feats-dog-')} has no projection, but --storage "
-            f"{storage} needs one with levels: use a feature with a projection, or --storage uint8."
+            f"{name} has no projection, but --storage {storage} needs one with levels: use a "
+            "feature with a projection, or --storage uint8."
         )
-    return projections.levels(projection, storage)
+    return projections.levels(file, storage)
+
+
+def level_file(conf: dict) -> str | None:
+    """Return the projection that has the levels of a feature, if any.
+
+    The levels of a base without a projection ship as a projection of its name.
+    """
+    model = conf["model"]
+    if projection := model.get("projection"):
+        return projection
+    shipped = (name for name in projections.names() if name in confs)
+    return next((name for name in shipped if confs[name]["model"] == model), None)
 
 
 def of_patches(name: str) -> tuple[str, str | None]:

@@ -228,9 +228,9 @@ def _check(args: argparse.Namespace, conf: dict | None) -> None:
             raise InputError("--base describes photos, not the patches of PhotoTour.")
         extractors.load(conf["model"])
     for descriptor in [] if conf else args.descriptor:
-        cli.choose("descriptor", descriptor, features_confs.BASES)
-        if of_patches and descriptor not in DESCRIPTORS:
+        if of_patches and descriptor in features_confs.BASES and descriptor not in DESCRIPTORS:
             raise InputError(f"{descriptor} describes photos, not the patches of PhotoTour.")
+        cli.choose("descriptor", descriptor, DESCRIPTORS if of_patches else features_confs.BASES)
         if descriptor in DESCRIPTORS:
             check_weights(descriptor)
         elif descriptor != COLMAP:

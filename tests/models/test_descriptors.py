@@ -173,10 +173,8 @@ def of_file(read):
             PHOTOS,
         ),
         (of_file(lambda path, _: features.of_patches(path)), PATCHES),
-        (command_line("--map", "{0}/images:{0}"), PHOTOS),
         (command_line("--phototour", "{0}"), PATCHES),
         (command_line("--map", "{0}/images:{0}", "--validate", "{0}"), PATCHES),
-        (lambda path, _: tracks.main(path / "images", path, path / "out", "sfit"), PHOTOS),
     ],
 )
 def test_an_unknown_descriptor_is_answered_by_all_that_are_valid(act, valid, tmp_path, monkeypatch):
@@ -185,3 +183,16 @@ def test_an_unknown_descriptor_is_answered_by_all_that_are_valid(act, valid, tmp
     with pytest.raises(InputError, match="Unknown descriptor 'sfit'. There are: ") as error:
         act(tmp_path, monkeypatch)
     assert set(str(error.value).partition("There are: ")[2].rstrip(".").split(", ")) == valid
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        command_line("--map", "{0}/images:{0}"),
+        lambda path, _: tracks.main(path / "images", path, path / "out", "sfit"),
+    ],
+)
+def test_an_unknown_base_is_answered_by_the_nearest(act, tmp_path, monkeypatch):
+    (tmp_path / "images").mkdir()
+    with pytest.raises(InputError, match="Unknown descriptor 'sfit'. The nearest of 23: sift, "):
+        act(tmp_path, monkeypatch)

@@ -8,8 +8,9 @@ from command import refused
 
 from hloc_reduce import extract_features, match_features, projections, storage
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.projections import files as projection_files
 from hloc_reduce.projections import network
-from hloc_reduce.training import levels
+from hloc_reduce.training import levels, raw
 from hloc_reduce.training.tracks import Tracks
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.feature_files import dimension, get_descriptors
@@ -57,6 +58,22 @@ def test_prefixes_have_levels_of_their_own(tmp_path):
     part = projections.levels(f"{path}@24", "uint4")
     assert whole.shape == (64, 16) and part.shape == (24, 16)
     assert np.ptp(part) > np.ptp(whole[:24])  # fewer numbers of a unit vector are larger
+
+
+def test_descriptors_without_a_projection_have_levels_in_a_file_of_their_own(tmp_path, monkeypatch):
+    data = [make_tracks(dim=32)]
+    mlp, metadata = raw.train(data), {"descriptor": "edgepoint2_t32", "scheme": "raw"}
+    path = tmp_path / "edgepoint2_t32.safetensors"
+    network.save(mlp, metadata, path, levels.of_projection(mlp, metadata, data))
+    monkeypatch.setattr(projection_files, "WEIGHTS", tmp_path)
+    descriptors = torch.nn.functional.normalize(torch.randn(5, 32), dim=1)
+    torch.testing.assert_close(projections.load(path)(descriptors), descriptors)
+    _, conf = features_confs.get("edgepoint2_t32", storage="uint2")
+    assert conf["model"] == {"name": "edgepoint2", "model_name": "T32"}
+    np.testing.assert_array_equal(features_confs.levels(conf), projections.levels(path, "uint2"))
+    _, other = features_confs.get("edgepoint2_t48", storage="uint2")
+    with pytest.raises(InputError, match="edgepoint2_t48 has no projection, but --storage uint2"):
+        features_confs.levels(other)
 
 
 def test_features_are_stored_as_codes_and_queries_as_floats(projection, textured, tmp_path):
