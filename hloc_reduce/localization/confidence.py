@@ -31,7 +31,7 @@ RIVAL = 0.25  # a pose is ambiguous if another one has this share of its confide
 AGREEMENT = (0.17, 0.17)  # of matches without a strict ratio test
 AGREEMENT_RATIO, STRICT = (0.76, 0.86), 0.8  # with a ratio test of up to 0.8
 AGREEMENT_FEW, FEW = (0.55, 0.72), 32  # the same for fewer than 32 dimensions
-DOUBTFUL = (50.0, 300.0)
+DOUBTFUL = (50.0, 800.0)
 
 
 def confidence(
