@@ -1,5 +1,7 @@
 """ALIKED's keypoints and descriptors."""
 
+import torch
+
 from ..networks import ALIKED as MODELS
 from ..networks import NETWORKS
 from ..networks.loading import load_weights
@@ -24,7 +26,8 @@ class ALIKED(Extractor):
         self.dim = NETWORKS[name].dim
         # a threshold of 0 keeps the highest scores, whatever they are
         model = KorniaALIKED(name, conf["max_keypoints"], detection_threshold=0.0)
-        self.model = load_weights(model, name, model.extract_dense_map)
+        load_weights(model, name, model.extract_dense_map)
+        self.model = model.to(memory_format=torch.channels_last)  # nearly twice as fast on a CPU
 
     @property
     def descriptor(self) -> str:
@@ -33,7 +36,7 @@ class ALIKED(Extractor):
 
     def _forward(self, data: dict) -> dict:
         image = reduce_noise(data["image"]) if self.conf["denoise"] else data["image"]
-        (found,) = self.model(image)
+        (found,) = self.model(image.contiguous(memory_format=torch.channels_last))
         return {
             "keypoints": found.keypoints[None],
             "scores": found.keypoint_scores[None],

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import kornia
 import numpy as np
 import pytest
 import torch
@@ -190,6 +191,29 @@ def test_features_of_networks(name, base_weights, textured):
     assert close.mean() > 0.6 and (abs(offset[close].mean(axis=0)) < 0.1).all()
     cosine = (found["descriptors"].T[near] * moved["descriptors"].T[:300]).sum(axis=1)
     assert np.median(cosine[close]) > 0.9
+
+
+@pytest.mark.parametrize("name", ["xfeat", "aliked_t16"])
+def test_features_are_kornias(name, base_weights, textured):
+    base_weights(name)
+    photo = in_colour(cv2.resize(textured, (500, 330), interpolation=cv2.INTER_CUBIC))
+    image = torch.from_numpy(photo.transpose(2, 0, 1).astype(np.float32) / 255)[None]
+    found = extractors.load(features.confs[name]["model"]).eval()({"image": image})
+    if name == "xfeat":
+        expected = kornia.feature.XFeat.from_pretrained(4096).detectAndCompute(image)[0]
+        keypoints, scores = expected["keypoints"], expected["scores"]
+        descriptors = expected["descriptors"]
+        keypoints = keypoints + (torch.tensor([500 / 480, 330 / 320]) - 1) / 2  # pixel centres
+    else:
+        with torch.no_grad():
+            (expected,) = kornia.feature.ALIKED.from_pretrained("aliked-t16", 4096, 0.0)(image)
+        keypoints, scores = expected.keypoints, expected.keypoint_scores
+        descriptors = expected.descriptors
+    near = torch.cdist(keypoints, found["keypoints"][0]).argmin(dim=1)  # in any order
+    assert len(near) == found["keypoints"].shape[1] > 200
+    torch.testing.assert_close(found["keypoints"][0][near], keypoints, atol=1e-3, rtol=0)
+    torch.testing.assert_close(found["scores"][0][near], scores, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found["descriptors"][0].T[near], descriptors, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("model_name", EDGEPOINT2)
