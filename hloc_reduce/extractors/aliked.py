@@ -1,6 +1,7 @@
 """ALIKED's keypoints and descriptors."""
 
 import torch
+from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from ..networks import ALIKED as MODELS
 from ..networks import NETWORKS
@@ -27,7 +28,8 @@ class ALIKED(Extractor):
         # a threshold of 0 keeps the highest scores, whatever they are
         model = KorniaALIKED(name, conf["max_keypoints"], detection_threshold=0.0)
         load_weights(model, name, model.extract_dense_map)
-        self.model = model.to(memory_format=torch.channels_last)  # nearly twice as fast on a CPU
+        # nearly twice as fast on a CPU
+        self.model = convert_conv2d_weight_memory_format(model, torch.channels_last)
 
     @property
     def descriptor(self) -> str:
