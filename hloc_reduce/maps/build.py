@@ -3,7 +3,7 @@
 import shutil
 import uuid
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pycolmap
@@ -34,6 +34,7 @@ from ..utils.codes import STORAGES
 from ..utils.files import replacing
 from ..utils.images import list_images
 from ..utils.paths import strings_as_paths
+from . import contradictions
 from .map import FINGERPRINTS, FINISHED, FURTHER, MORE, PLACE, RETRIEVAL, SFM, Map, with_projection
 
 MAX_EXHAUSTIVE = 100  # photos without covisibility that are all paired with each other
@@ -162,7 +163,10 @@ def _files_of(model: Path | None) -> list[Path]:
 
 @dataclass
 class _Building:
-    """A map that is being built; `names` loses images that cannot be read."""
+    """A map that is being built; `names` loses images that cannot be read.
+
+    `matches` are its match files by the names of their feature files.
+    """
 
     folder: RunFolder
     image_dir: Path
@@ -172,6 +176,7 @@ class _Building:
     exhaustive: bool
     accept_partial: bool
     camera_mode: pycolmap.CameraMode
+    matches: dict[str, Path] = field(default_factory=dict)
 
     def build(
         self,
@@ -188,6 +193,8 @@ class _Building:
             folder, sfm = SFM, self._of_model(conf, model, reference)
         else:
             folder, conf, sfm = self._of_photos_alone(conf)
+        with self.folder.stage("judge_poses"):
+            contradicting = contradictions.warn(sfm, self.matches[conf["output"]])
         cameras = intrinsics.of_map(sfm, self.image_dir)
         summary = {
             "id": uuid.uuid4().hex,
@@ -201,6 +208,7 @@ class _Building:
             "sfm": folder,
             "images": len(self.names),
             "images_with_pose": sfm.num_reg_images(),
+            "images_contradicting_others": contradicting,
             "points3D": sfm.num_points3D(),
             "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
             "sizes": sorted(cameras.sizes),
@@ -318,8 +326,11 @@ class _Building:
         conf = matchers_confs.confs[self.matcher]
         with self.folder.stage("match_map"):
             if matches is not None:
-                return match_features.main(conf, pairs, features, matches=matches)
-            return match_features.main(conf, pairs, features.stem, self.folder.path)
+                matches = match_features.main(conf, pairs, features, matches=matches)
+            else:
+                matches = match_features.main(conf, pairs, features.stem, self.folder.path)
+        self.matches[features.stem] = matches
+        return matches
 
 
 def _drop_others(folder: RunFolder, built: Map) -> None:

@@ -1,0 +1,108 @@
+"""Find photos of a map whose poses contradict the other photos."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pycolmap
+
+from .. import logger
+from ..localization import absolute_pose
+from ..localization.confidence import DEFAULT_GATE
+from ..localization.references import SfmMap
+from ..runtime import parallel
+from ..utils import cli
+from ..utils.h5 import iterate_h5_names, open_h5
+from ..utils.match_files import get_matches, names_to_pair
+from ..utils.progress import progress
+
+OTHERS = 2  # photos that see a point by which another one is judged
+# a pose contradicts the others if they place the photo farther away
+FAR = 0.1  # of the median depth of its inliers
+TURNED = 5.0  # degrees
+
+
+def warn(sfm: pycolmap.Reconstruction, matches: Path) -> list[str]:
+    """Name the photos of a map whose poses contradict the other photos.
+
+    Each photo is localized, with the intrinsics of the map, by the points that at least two other
+    photos see. A photo contradicts them if that gives a trustworthy pose elsewhere. So do photos
+    that were given wrong poses or that the mapper placed wrongly, and both copies of a place that
+    is in the map twice.
+
+    Args:
+        sfm: the map.
+        matches: match file of its images.
+
+    Returns:
+        Their names.
+    """
+    reference, partners = SfmMap(sfm), _partners(sfm, matches)
+    points = [np.unique(reference.point_rows(name)) for name in reference.images]
+    seen = np.bincount(np.concatenate(points) + 1, minlength=len(reference.points) + 1)[1:]
+
+    def judge(name: str) -> str | None:
+        with open_h5(matches) as file:
+            return name if _contradicts(reference, name, partners[name], seen, file) else None
+
+    names = sorted(partners)
+    judged = parallel.ordered("judge", judge, names)
+    found = [name for name in progress(judged, "Judging poses", "image", len(names)) if name]
+    if found:
+        logger.warning(
+            "The map may be wrong: the other photos place %s elsewhere. Either these photos are "
+            "misplaced, or the place looks the same at two positions: check their poses, or build "
+            "the map without them.",
+            cli.some(found),
+        )
+    return found
+
+
+def _partners(sfm: pycolmap.Reconstruction, matches: Path) -> dict[str, list[str]]:
+    """Return for each image of a map those that it was matched with."""
+    names = {names_to_pair(image.name, "")[:-1]: image.name for image in sfm.images.values()}
+    partners: dict[str, list[str]] = {name: [] for name in names.values()}
+    with open_h5(matches) as file:
+        for pair in iterate_h5_names(file.id):
+            first, _, second = pair.partition("/")
+            if first in names and second in names:
+                partners[names[first]].append(names[second])
+                partners[names[second]].append(names[first])
+    return partners
+
+
+def _contradicts(
+    reference: SfmMap, name: str, others: Iterable[str], seen: np.ndarray, file: h5py.File
+) -> bool:
+    """Return whether the points of other images place an image elsewhere.
+
+    Args:
+        reference: the map.
+        name: of the image.
+        others: images that it was matched with.
+        seen: (P,) by how many images each point is seen.
+        file: match file.
+    """
+    image, own = reference.images[name], np.zeros(len(seen) + 1, int)
+    own[reference.point_rows(name)] = 1  # the last one is for keypoints without a point
+    pairs = []
+    for other in others:
+        found, _ = get_matches(file, name, other)
+        rows = reference.point_rows(other)[found[:, 1]]
+        shared = (rows >= 0) & (seen[rows] - own[rows] >= OTHERS)
+        pairs.append(np.stack([found[shared, 0], rows[shared]], axis=1))
+    if not sum(map(len, pairs)):
+        return False
+    different, which = np.unique(np.concatenate(pairs), axis=0, return_inverse=True)
+    images = np.split(which.reshape(-1), np.cumsum([len(part) for part in pairs])[:-1])
+    points2D = np.array([point.xy for point in image.points2D])[different[:, 0]]
+    points3D = reference.points[different[:, 1]]
+    config: dict = {"estimation": {"ransac": {"max_error": absolute_pose.MAX_ERROR}}}
+    pose = absolute_pose.estimate(points2D, points3D, images, image.camera, config, DEFAULT_GATE)
+    if pose.num_inliers < DEFAULT_GATE.min_inliers:
+        return False
+    if pose.confidence < DEFAULT_GATE.min_confidence:
+        return False
+    placed = absolute_pose.Pose(image.cam_from_world(), image.camera, pose.inliers)
+    return absolute_pose.differ(pose, placed, points3D, FAR, TURNED)
