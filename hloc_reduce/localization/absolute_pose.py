@@ -38,6 +38,7 @@ RIGHT = 1.1  # above it, the other intrinsics are right
 # multiples of MAX_POSITION and MAX_ROTATION
 TOLERANT = 1.2  # between poses with listed and other focal lengths: many lists are 5 % off
 CROPPED = 3.0, 2.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
+LISTED = 0.1, 50.0  # range of listed focal lengths, in longer sides
 # distances of the principal point from the centre, as shares of the size
 OFF_CENTRE, CENTRED = 0.15, 0.02
 
@@ -277,7 +278,9 @@ def _choose(
 
 def _refusal(matches: _Matches, pose: Pose, others: list[Pose], gate: Gate) -> str | None:
     """Return why a pose is not trusted in view of other poses, None if it is."""
-    number = pose.num_inliers
+    number, listed = pose.num_inliers, matches.camera.mean_focal_length()
+    if not LISTED[0] <= listed / max(matches.camera.width, matches.camera.height) <= LISTED[1]:
+        return f"no lens has its listed focal length of {listed:g} pixels: is it in millimetres?"
     if number < gate.min_inliers:
         return f"too few inliers: {number}, at least {gate.min_inliers} are needed"
     if pose.cam_from_world is None or pose.confidence < gate.min_confidence:
@@ -288,10 +291,8 @@ def _refusal(matches: _Matches, pose: Pose, others: list[Pose], gate: Gate) -> s
     focal_length = pose.camera.mean_focal_length()
     low, high = focal_lengths(matches.camera, matches.is_focal_length_guessed)
     if matches.is_focal_length_free and not low <= focal_length <= high:
-        return (
-            f"no plausible focal length: {focal_length:.0f} pixels, {low:.0f} to {high:.0f} were "
-            "expected"
-        )
+        found = f"{focal_length:.0f} pixels" if 0 < focal_length < 100 * high else "none"
+        return f"no plausible focal length: {found}, {low:.0f} to {high:.0f} were expected"
     if _is_swapped(matches.camera):
         return "the x and y of its listed principal point are swapped"
     if reason := _imprecision(matches, pose, pose.cam_from_world):

@@ -274,3 +274,11 @@ def test_the_size_of_a_photo_changes_nothing():
     )
     at_once = confidence(keypoints, points, TRUE, CAMERA, 12.0)
     assert abs(confidence(3 * keypoints, points, TRUE, large, 36.0) - at_once) < 0.5
+
+
+def test_a_focal_length_in_millimetres_is_named():
+    keypoints, points = matches(100, 0)
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1600, height=1200, params=[28, 800, 600])
+    found = solve(keypoints, points, camera=camera)
+    expected = "no lens has its listed focal length of 28 pixels: is it in millimetres?"
+    assert found.refusal == expected
