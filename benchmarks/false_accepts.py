@@ -94,9 +94,7 @@ class Place:
     extent: float
 
 
-def split(
-    name: str, images: Path, model: Path, output: Path, seed: int, base: str, matcher: str
-) -> Place:
+def split(name: str, images: Path, model: Path, output: Path, seed: int, base: str) -> Place:
     """Build a map of two thirds of the photos of a COLMAP model; the others are its queries."""
     reconstruction = colmap.read_model(model)
     photos = sorted(reconstruction.images.values(), key=lambda image: image.name)
@@ -110,10 +108,10 @@ def split(
     reduced = output / "model"
     reduced.mkdir(parents=True, exist_ok=True)
     reconstruction.write_binary(reduced)
-    return _of_model(name, images, reduced, queries, output, False, base, matcher)
+    return _of_model(name, images, reduced, queries, output, False, base)
 
 
-def of_dataset(root: Path, output: Path, _seed: int, base: str, matcher: str) -> Place:
+def of_dataset(root: Path, output: Path, _seed: int, base: str) -> Place:
     """Build the map of a data set in the layout of Aachen Day-Night or of InLoc."""
     if (root / "database/cutouts").is_dir():
         return _of_scans(InLoc(root), output, base)
@@ -122,7 +120,7 @@ def of_dataset(root: Path, output: Path, _seed: int, base: str, matcher: str) ->
     truth = true_poses([name for name, _ in listed], place.ground_truth, True)
     queries = [(name, camera, truth[name]) for name, camera in listed]
     model = place.reference_model
-    return _of_model(root.name, place.images, model, queries, output, True, base, matcher)
+    return _of_model(root.name, place.images, model, queries, output, True, base)
 
 
 def _of_model(
@@ -133,10 +131,8 @@ def _of_model(
     output: Path,
     metric: bool,
     base: str,
-    matcher: str,
 ) -> Place:
-    feature = MAP_FEATURES.get(base, base)
-    built = maps.main(output / "map", images, model, feature, matcher=matcher)
+    built = maps.main(output / "map", images, model, MAP_FEATURES.get(base, base))
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)
     features = _extract(images, output, [*names, *(query for query, _, _ in queries)], base)
@@ -499,7 +495,8 @@ def _main() -> None:
         help="features of one base, NAME or NAME:STORAGE",
     )
     parser.add_argument(
-        "--matcher", default="NN-ratio", help=f"one of {', '.join(matchers_confs.confs)}"
+        "--matcher",
+        help=f"one of {', '.join(matchers_confs.confs)} (default: the features')",
     )
     parser.add_argument("--trials", type=int, default=85, help="photos of other places, per map")
     parser.add_argument(
@@ -519,7 +516,9 @@ def _main() -> None:
     bases = {base_name(feature.partition(":")[0]) for feature in args.feature}
     if len(bases) > 1:
         raise InputError(f"The features have several bases: {', '.join(sorted(bases))}.")
-    options = args.seed, *bases, args.matcher
+    options = args.seed, *bases
+    conf = features_confs.get(args.feature[0].partition(":")[0])[1]
+    args.matcher = args.matcher or features_confs.matcher_of(conf)
     output = args.output / f"seed{args.seed}"
     sources = [(root.name, of_dataset, (root,)) for root in args.dataset]
     sources += [(name, split, (name, *both)) for name, both in parse_maps(args.map).items()]

@@ -240,9 +240,8 @@ def provenance(conf: dict, as_half: bool = True) -> dict:
         # the name only, as the file may be moved
         made_by["model"] = {**conf["model"], "projection": Path(projection).name}
         made_by["projection_sha256"] = projections.checksum(projection)
-    file = features_confs.level_file(conf)
-    if features_confs.levels(conf) is not None and file and file != projection:
-        made_by["levels_sha256"] = projections.checksum(file)
+    if features_confs.levels(conf) is not None and projection is None:
+        made_by["levels_sha256"] = projections.checksum(features_confs.level_file(conf) or "")
     descriptor = features_confs.descriptor_of(conf["model"])
     if descriptor in list(DESCRIPTORS):  # one from a YAML file may be unhashable
         check_weights(descriptor)

@@ -36,7 +36,7 @@ FEW = 100  # images: further attempts take little time, even for one missing ima
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
 SEEDS = (1, 2, 3)
 MORE = 1.5  # times as many images show that one camera took all
-SPREAD = 1.2  # ratio of focal lengths above which as many images and points show it, too
+SPREAD = 1.2  # ratio of focal lengths above which so many times as many points show it, too
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
 MANY = 3  # images of one camera estimate its focal length better than EXIF data do
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
@@ -76,7 +76,7 @@ def main(
     images, some with other initial pairs. With `camera_mode` AUTO, if at most two thirds of the
     images are in the model, or focal lengths differ by more than a factor of 1.2, and one camera
     may have taken all of them, the mapper runs with one shared camera. Its model is kept if it has
-    at least 1.5 times as many images, or as many images and points where focal lengths differ.
+    at least 1.5 times as many images, or 1.5 times as many points where focal lengths differ.
 
     Args:
         sfm_dir: folder of the new COLMAP model; a model made from the same inputs is read instead.
@@ -120,6 +120,7 @@ def main(
         "overlays": "dropped",
         "attempts": attempts,
         "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
+        "points": f"{MORE} times as many where focal lengths differ",
         "spread": SPREAD,
         "viewpoints": VIEWPOINTS,
         "once": once,
@@ -185,8 +186,8 @@ class _Mapper:
             shared = self.write_database(pycolmap.CameraMode.SINGLE)
             found, implausible = self.run(shared)
             images, more = _size(found)
-            as_good = spread > SPREAD and images >= registered and more >= points
-            if found and (images >= MORE * registered or as_good):
+            fits = spread > SPREAD and images >= registered and more >= MORE * points
+            if found and (images >= MORE * registered or fits):
                 models, dropped, database, alike = found, implausible, shared, False
         if not models:
             raise NoModelError(nothing(self.image_dir, dropped))

@@ -27,6 +27,7 @@ from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS
 from hloc_reduce.localization import intrinsics
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.maps import contradictions
 from hloc_reduce.maps.map import RETRIEVAL, Map
 from hloc_reduce.runtime import provenance, trace
 from hloc_reduce.runtime.group_writer import failures
@@ -117,6 +118,7 @@ def open_map(
     if any(model_or_map.glob("cameras.*")):
         raise InputError(f"{model_or_map} is a COLMAP model: give its photos, --map_images, too.")
     built = Map(model_or_map)
+    contradictions.warn(built.contradicting)
     if feature or projection:
         built.check_feature(feature or features_confs.RECOMMENDED, projection)
     given = {"storage": storage, "keypoints": keypoints, "matcher": matcher}

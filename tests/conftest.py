@@ -58,7 +58,7 @@ def base_weights(monkeypatch, tmp_path_factory) -> Callable[[str], None]:
         home = tmp_path_factory.mktemp("torch_home")
         checkpoints = home / "hub/checkpoints"
         checkpoints.mkdir(parents=True)
-        for path in (SHARED / "torch_home/hub/checkpoints").iterdir():
+        for path in (SHARED / "torch_home/hub/checkpoints").glob("*"):
             (checkpoints / path.name).symlink_to(path)
         for path in (SHARED / "edgepoint2").glob("*.pth"):
             (checkpoints / f"edgepoint2_{path.name}").symlink_to(path)

@@ -40,8 +40,8 @@ MODELS = (
 )
 
 
-# the default matchers of extractors other than DoG (docs/results.md)
-MATCHERS = dict.fromkeys(("edgepoint2", "xfeat", "aliked"), "NN-mutual")
+# the extractors of networks, and the networks that they run by default
+EXTRACTORS = {"edgepoint2": "M32", "xfeat": "xfeat", "aliked": "aliked-n16"}
 BASES = (*SCHEMES, *MODELS)  # features whose descriptors are projected
 
 
@@ -77,14 +77,15 @@ confs |= {
 
 def matcher_of(conf: dict) -> str:
     """Return the matcher that suits a feature best, a key of `confs.matchers`."""
-    return MATCHERS.get(base_of(conf["model"])["name"], "NN-ratio")
+    return "NN-mutual" if network_of(conf["model"]) else "NN-ratio"  # docs/results.md
 
 
 def network_of(model: dict) -> str | None:
     """Return the key of `networks.NETWORKS` whose features a model has or projects, if any."""
     found = base_of(model)
-    name = found.get("model_name", found["name"])
-    return name if found["name"] in ("edgepoint2", "xfeat", "aliked") else None
+    if str(found["name"]) not in EXTRACTORS:
+        return None
+    return str(found.get("model_name", EXTRACTORS[found["name"]]))
 
 
 def dimension(name: str) -> int | None:
@@ -161,7 +162,8 @@ def get(
     model = {"name": "reduced", "base": base, "projection": str(projection)}
     file, prefix = projections.split_prefix(projection)
     name = Path(file).stem + (prefix and f"@{prefix}")
-    return name, {**conf, "output": feature(name, model)["output"], "model": model}
+    output = f"feats-{name}" if network_of(base) else feature(name, model)["output"]
+    return name, {**conf, "output": output, "model": model}
 
 
 def with_keypoints(model: dict, keypoints: str) -> dict:
@@ -201,7 +203,8 @@ def levels(conf: dict) -> np.ndarray | None:
         name = conf["output"].removeprefix("feats-").removeprefix("dog-")
         raise InputError(
             f"{name} has no projection, but --storage {storage} needs one with levels: use a "
-            "feature with a projection, or --storage uint8."
+            "feature with a projection, --storage uint8, or train levels with --scheme raw of "
+            "hloc_reduce.training."
         )
     return projections.levels(file, storage)
 
@@ -285,7 +288,7 @@ def read(path: Path) -> dict:
     unknown |= given.keys() - {*PREPROCESSING, "resize_force"}
     if unknown:
         raise InputError(f"{path}: unknown keys {', '.join(map(str, sorted(unknown, key=str)))}.")
-    preprocessing = {**PREPROCESSING, **given}
+    preprocessing = {**(IN_COLOUR if network_of(model) else PREPROCESSING), **given}
     resize_max = preprocessing["resize_max"]
     if resize_max is not None and not (isinstance(resize_max, int) and resize_max > 0):
         raise InputError(f"{path}: resize_max is a number of pixels or null, not {resize_max!r}.")

@@ -3,6 +3,7 @@
 import torch
 
 from ..networks import NETWORKS
+from ..networks.keypoints import limit
 from ..networks.loading import load_weights
 from ..networks.noise import reduce_noise
 from . import Extractor
@@ -12,7 +13,7 @@ class XFeat(Extractor):
     """The sparse features of XFeat (Potje et al., CVPR 2024), by kornia.
 
     Keypoints are those with the `max_keypoints` highest scores, in whole pixels of the resized
-    image. With `denoise`, noisy images are blurred first.
+    image; -1 keeps all. With `denoise`, noisy images are blurred first.
     """
 
     default_conf = {"max_keypoints": 4096, "detection_threshold": 0.05, "denoise": True}
@@ -21,7 +22,7 @@ class XFeat(Extractor):
     def _init(self, conf: dict) -> None:
         from kornia.feature import XFeat as KorniaXFeat
 
-        self.model = KorniaXFeat(conf["max_keypoints"], conf["detection_threshold"])
+        self.model = KorniaXFeat(limit(conf["max_keypoints"]), conf["detection_threshold"])
         load_weights(self.model.net, "xfeat")
         self.model.eval()
 

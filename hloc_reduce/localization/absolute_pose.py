@@ -279,7 +279,8 @@ def _choose(
 def _refusal(matches: _Matches, pose: Pose, others: list[Pose], gate: Gate) -> str | None:
     """Return why a pose is not trusted in view of other poses, None if it is."""
     number, listed = pose.num_inliers, matches.camera.mean_focal_length()
-    if not LISTED[0] <= listed / max(matches.camera.width, matches.camera.height) <= LISTED[1]:
+    relative = listed / max(matches.camera.width, matches.camera.height)
+    if not (matches.is_focal_length_free or LISTED[0] <= relative <= LISTED[1]):
         return f"no lens has its listed focal length of {listed:g} pixels: is it in millimetres?"
     if number < gate.min_inliers:
         return f"too few inliers: {number}, at least {gate.min_inliers} are needed"

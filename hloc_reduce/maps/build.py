@@ -33,6 +33,7 @@ from ..utils.cli import InputError
 from ..utils.codes import STORAGES
 from ..utils.files import replacing
 from ..utils.images import list_images
+from ..utils.match_files import name_in_pair
 from ..utils.paths import strings_as_paths
 from . import contradictions
 from .map import FINGERPRINTS, FINISHED, FURTHER, MORE, PLACE, RETRIEVAL, SFM, Map, with_projection
@@ -91,6 +92,7 @@ def main(
     if reference is not None and not reference.images:
         raise InputError(f"The model {model} has no images.")
     names = _list(image_dir, reference, accept_partial)
+    _check_names(names)
     has_points = reference is not None and reference.num_points3D() > 0
     exhaustive = not has_points and len(names) <= MAX_EXHAUSTIVE
     made_by = extract_features.provenance(conf)
@@ -139,6 +141,7 @@ def main(
                 "again, choose other --outputs, or --overwrite."
             )
         _drop_others(folder, built)  # a killed run may have left some
+        contradictions.warn(built.contradicting)
         return built
 
 
@@ -153,6 +156,18 @@ def _list(
         return names
     names = sorted(image.name for image in reference.images.values())
     return list_images(image_dir, keep_present(image_dir, names, accept_partial))
+
+
+def _check_names(names: list[str]) -> None:
+    """Raise an InputError for two images that have one name in match files, as in hloc's."""
+    known: dict[str, str] = {}
+    for name in names:
+        other = known.setdefault(name_in_pair(name), name)
+        if other != name:
+            raise InputError(
+                f"{other} and {name} have the same name in match files, which replace / by -: "
+                "rename one of them."
+            )
 
 
 def _files_of(model: Path | None) -> list[Path]:
@@ -194,7 +209,8 @@ class _Building:
         else:
             folder, conf, sfm = self._of_photos_alone(conf)
         with self.folder.stage("judge_poses"):
-            contradicting = contradictions.warn(sfm, self.matches[conf["output"]])
+            contradicting = contradictions.find(sfm, self.matches[conf["output"]])
+        contradictions.warn(contradicting)
         cameras = intrinsics.of_map(sfm, self.image_dir)
         summary = {
             "id": uuid.uuid4().hex,

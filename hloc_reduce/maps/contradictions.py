@@ -10,11 +10,12 @@ import pycolmap
 from .. import logger
 from ..localization import absolute_pose
 from ..localization.confidence import DEFAULT_GATE
+from ..localization.projection import reprojection_errors
 from ..localization.references import SfmMap
 from ..runtime import parallel
 from ..utils import cli
 from ..utils.h5 import iterate_h5_names, open_h5
-from ..utils.match_files import get_matches, names_to_pair
+from ..utils.match_files import get_matches, name_in_pair
 from ..utils.progress import progress
 
 OTHERS = 2  # photos that see a point by which another one is judged
@@ -23,13 +24,14 @@ FAR = 0.1  # of the median depth of its inliers
 TURNED = 5.0  # degrees
 
 
-def warn(sfm: pycolmap.Reconstruction, matches: Path) -> list[str]:
-    """Name the photos of a map whose poses contradict the other photos.
+def find(sfm: pycolmap.Reconstruction, matches: Path) -> list[str]:
+    """Find the photos of a map whose poses contradict the other photos.
 
-    Each photo is localized, with the intrinsics of the map, by the points that at least two other
-    photos see. A photo contradicts them if that gives a trustworthy pose elsewhere. So do photos
-    that were given wrong poses or that the mapper placed wrongly, and both copies of a place that
-    is in the map twice.
+    A photo whose pose agrees with less than half of its matches with points that at least two
+    other photos see is localized by these, with the intrinsics of the map. It contradicts the
+    others if that gives a pose elsewhere, with the confidence of a localized query. So do photos
+    that were given wrong poses or that the mapper placed wrongly, and copies of a place that is in
+    the map twice.
 
     Args:
         sfm: the map.
@@ -48,20 +50,23 @@ def warn(sfm: pycolmap.Reconstruction, matches: Path) -> list[str]:
 
     names = sorted(partners)
     judged = parallel.ordered("judge", judge, names)
-    found = [name for name in progress(judged, "Judging poses", "image", len(names)) if name]
-    if found:
+    return [name for name in progress(judged, "Judging poses", "image", len(names)) if name]
+
+
+def warn(names: list[str]) -> None:
+    """Warn of photos whose poses contradict the others, if there are any."""
+    if names:
         logger.warning(
             "The map may be wrong: the other photos place %s elsewhere. Either these photos are "
             "misplaced, or the place looks the same at two positions: check their poses, or build "
-            "the map without them.",
-            cli.some(found),
+            "the map without them. map.json lists all of them.",
+            cli.some(names),
         )
-    return found
 
 
 def _partners(sfm: pycolmap.Reconstruction, matches: Path) -> dict[str, list[str]]:
     """Return for each image of a map those that it was matched with."""
-    names = {names_to_pair(image.name, "")[:-1]: image.name for image in sfm.images.values()}
+    names = {name_in_pair(image.name): image.name for image in sfm.images.values()}
     partners: dict[str, list[str]] = {name: [] for name in names.values()}
     with open_h5(matches) as file:
         for pair in iterate_h5_names(file.id):
@@ -98,6 +103,9 @@ def _contradicts(
     images = np.split(which.reshape(-1), np.cumsum([len(part) for part in pairs])[:-1])
     points2D = np.array([point.xy for point in image.points2D])[different[:, 0]]
     points3D = reference.points[different[:, 1]]
+    errors, _ = reprojection_errors(points2D, points3D, image.cam_from_world(), image.camera)
+    if 2 * (errors <= absolute_pose.MAX_ERROR).sum() >= len(errors):
+        return False
     config: dict = {"estimation": {"ransac": {"max_error": absolute_pose.MAX_ERROR}}}
     pose = absolute_pose.estimate(points2D, points3D, images, image.camera, config, DEFAULT_GATE)
     if pose.num_inliers < DEFAULT_GATE.min_inliers:

@@ -41,6 +41,7 @@ class Map:
         matcher: key of `confs.matchers`.
         images: folder of the photos.
         num_images: images with a pose.
+        contradicting: images whose poses contradict the others.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
         cameras: what the map tells about the intrinsics of other photos.
@@ -73,6 +74,7 @@ class Map:
         self.matcher = choose("matcher", content["matcher"], matchers_confs.confs)
         self.images = Path(content["image_dir"])
         self.num_images = int(content["images_with_pose"])
+        self.contradicting = list(content.get("images_contradicting_others", []))
         self.num_points3D = int(content["points3D"])
         self.camera_mode = content.get("camera_mode")
         known = content.get("cameras", {}).items()

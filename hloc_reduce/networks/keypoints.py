@@ -4,6 +4,11 @@ import torch
 from kornia.geometry.subpix import nms2d
 
 
+def limit(max_keypoints: int) -> int:
+    """Return a number of keypoints for kornia: one that no photo has for -1, which keeps all."""
+    return max_keypoints if max_keypoints >= 0 else 1 << 30
+
+
 def strongest(
     scores: torch.Tensor, radius: int, min_score: float, border: int, max_keypoints: int
 ) -> tuple[torch.Tensor, torch.Tensor]:

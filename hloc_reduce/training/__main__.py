@@ -69,11 +69,7 @@ def main(
     names = {dim: f"{name}{dim}" for dim in dims}
     if trainer is nested:
         names = {nested.PREFIXES[0]: name}
-    if trainer is raw:
-        model = (conf or features_confs.confs[descriptor])["model"]
-        names = {extractors.load(model).dim: descriptor}
     trained = extractors.load(conf["model"]).descriptor if conf else descriptor
-    settings = {dim: complete_recipe(scheme, recipe, trained, name) for dim, name in names.items()}
     files = {}
     for folder in map(Path, sequences):
         place = folder.resolve().name
@@ -90,6 +86,9 @@ def main(
         for (place, file), part in zip(files.items(), data, strict=True)
     }
     size = data[0].descriptors.shape[-1]
+    if trainer is raw:
+        names = {size: descriptor}
+    settings = {dim: complete_recipe(scheme, recipe, trained, name) for dim, name in names.items()}
     if max(names) > size:
         raise InputError(f"{descriptor} descriptors are {size}-D: --dim {max(names)} is too large.")
     paths = [output / f"{name}.safetensors" for name in names.values()]
@@ -249,9 +248,10 @@ def _check(args: argparse.Namespace, conf: dict | None) -> None:
     if args.validate:
         layout.read_pairs(args.validate)
         layout.read_points(args.validate)
-    for dim in args.dim:
-        if dim < 1 or (dim > DIM and conf is None):
-            raise InputError(f"--dim {dim}: choose 1 to {DIM}.")
+    most = min(features_confs.dimension(name) or DIM for name in args.descriptor) if not conf else 0
+    for dim in args.dim if set(args.scheme) - {"nested", "raw"} else []:
+        if dim < 1 or (conf is None and dim > most):
+            raise InputError(f"--dim {dim}: choose 1 to {most or 'the dimension of the base'}.")
 
 
 def _main() -> None:

@@ -10,6 +10,7 @@ from .cli import InputError
 from .files import file_sha256, replacing
 
 TIMEOUT = 5  # seconds to wait for a server
+TORCH_FILE = b"PK"  # torch.save writes zip files
 
 
 def cache() -> Path:
@@ -25,7 +26,7 @@ def fetch(path: Path, urls: Iterable[str], sha256: str | None, what: str, otherw
     Args:
         path: where the file is kept.
         urls: tried one after the other.
-        sha256: checked in any case; None accepts every file.
+        sha256: checked in any case; None accepts every file of torch's.
         what: names the file in messages, as in "The weights of tfeat".
         otherwise: what else the user can do, for messages.
 
@@ -46,11 +47,14 @@ def fetch(path: Path, urls: Iterable[str], sha256: str | None, what: str, otherw
         except (OSError, HTTPException) as error:
             reasons[url] = getattr(error, "reason", error)
             continue
-        if sha256 in (None, hashlib.sha256(content).hexdigest()):
+        if hashlib.sha256(content).hexdigest() == sha256 or (
+            sha256 is None and content.startswith(TORCH_FILE)
+        ):
             with replacing(path) as temporary:
                 temporary.write_bytes(content)
             return path
-        reasons[url] = f"the downloaded file does not have the sha256 {sha256}"
+        expected = f"does not have the sha256 {sha256}" if sha256 else "is not one of torch's"
+        reasons[url] = f"the downloaded file {expected}"
     tried = "; ".join(f"{url}: {reason}" for url, reason in reasons.items())
     raise InputError(
         f"{what} are missing and cannot be downloaded ({tried}): put them to {path}, {otherwise}."

@@ -18,9 +18,14 @@ def get_matcher(match_file: h5py.File) -> dict:
     return model if isinstance(model, dict) else {}
 
 
+def name_in_pair(name: str) -> str:
+    """Return how a match file names an image."""
+    return name.replace("/", "-")
+
+
 def names_to_pair(name0: str, name1: str, separator: str = "/") -> str:
     """Return the name of a pair's group in a match file."""
-    return separator.join((name0.replace("/", "-"), name1.replace("/", "-")))
+    return separator.join((name_in_pair(name0), name_in_pair(name1)))
 
 
 def find_pair(file: h5py.File, name0: str, name1: str) -> tuple[str | None, bool]:

@@ -13,7 +13,7 @@ The options are those of `pipelines.aachen` and `pipelines.inloc`.
 
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fnmatch import fnmatchcase
 from itertools import product
 from pathlib import Path
@@ -75,12 +75,17 @@ class Job:
         parts = [Path(self.feature).stem]
         for field in fields(self)[2:]:
             value = getattr(self, field.name)
-            if value != field.default and field.name != "ground_truth":
+            default = self._matcher() if field.name == "matcher" else field.default
+            if value not in (None, default) and field.name != "ground_truth":
                 named = field.name in NUMBERS or field.name == "keypoints"
                 prefix = field.name if named else ""
                 text = f"{value:g}" if field.name in NUMBERS else Path(value).stem
                 parts.append(prefix + text.removeprefix("pairs-query-"))
         return "+".join(parts)
+
+    def _matcher(self) -> str:
+        """Return the default matcher of the feature."""
+        return features_confs.matcher_of(features_confs.get(self.feature)[1])
 
     @property
     def numbers(self) -> dict[str, int]:
@@ -181,10 +186,9 @@ def _job(options: dict) -> Job:
     }
     job = Job(**options | paths)
     _ = job.gate  # raises for bad values
-    features_confs.get(job.feature, storage=job.storage, keypoints=job.keypoints)
-    if job.matcher is not None:
-        cli.choose("matcher", job.matcher, matchers_confs.confs)
-    return job
+    _, conf = features_confs.get(job.feature, storage=job.storage, keypoints=job.keypoints)
+    matcher = job.matcher or features_confs.matcher_of(conf)
+    return replace(job, matcher=cli.choose("matcher", matcher, matchers_confs.confs))
 
 
 def _matches(job: Job, excluded: dict) -> bool:

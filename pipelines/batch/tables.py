@@ -4,7 +4,6 @@ import csv
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from hloc_reduce.confs import features as features_confs
 from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.utils.files import replacing, write_csv
 from hloc_reduce.utils.tables import aligned, joined
@@ -75,7 +74,7 @@ def job_rows(shared: Shared, summaries: Mapping[Job, dict]) -> Iterator[dict]:
             "dataset": shared.dataset.name,
             "job": job.name,
             "feature": Path(job.feature).stem,
-            "matcher": job.matcher or features_confs.matcher_of(features_confs.get(job.feature)[1]),
+            "matcher": job.matcher,
             "storage": job.storage,
             "keypoints": job.keypoints,
             "retrieval": job.retrieval,

@@ -8,6 +8,7 @@ import pytest
 
 from hloc_reduce import maps
 from hloc_reduce.utils import colmap
+from hloc_reduce.utils.cli import InputError
 
 
 def shifted(pose: pycolmap.Rigid3d, distance: float) -> pycolmap.Rigid3d:
@@ -43,6 +44,26 @@ def test_misplaced_photos_are_named(plane, photos, tmp_path, caplog, misplaced):
     maps.main(tmp_path / "map", plane / "images", model)
     assert ("the other photos place 2.png elsewhere" in caplog.text) == bool(misplaced)
     assert ("The map may be wrong" in caplog.text) == bool(misplaced)
+
+
+def test_the_warning_is_repeated(plane, photos, tmp_path, caplog):
+    poses, camera = photos
+    model = write_model(tmp_path / "moved", poses | {"2.png": shifted(poses["2.png"], 0.8)}, camera)
+    for _ in range(2):
+        caplog.clear()
+        built = maps.main(tmp_path / "map", plane / "images", model)
+        assert built.contradicting == ["2.png"] and "place 2.png elsewhere" in caplog.text
+
+
+def test_names_that_match_files_confuse_are_refused(plane, photos, tmp_path):
+    poses, camera = photos
+    (plane / "images/a").mkdir()
+    for old, new in (("0.png", "a/0.png"), ("1.png", "a-0.png")):
+        (plane / "images" / old).rename(plane / "images" / new)
+        poses[new] = poses.pop(old)
+    model = write_model(tmp_path / "renamed", poses, camera)
+    with pytest.raises(InputError, match="a-0.png and a/0.png have the same name in match files"):
+        maps.main(tmp_path / "map", plane / "images", model)
 
 
 def test_copies_of_a_place_are_named(plane, photos, tmp_path, caplog):

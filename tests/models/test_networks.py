@@ -1,5 +1,6 @@
 """Networks that find and describe keypoints: weights, keypoints, noise."""
 
+import io
 import os
 import sys
 from dataclasses import replace
@@ -18,6 +19,7 @@ from hloc_reduce.networks import EDGEPOINT2, NETWORKS, loading
 from hloc_reduce.networks.edgepoint2 import EdgePoint2
 from hloc_reduce.networks.keypoints import strongest
 from hloc_reduce.networks.noise import NOISY, reduce_noise, relative_noise
+from hloc_reduce.utils import downloads
 from hloc_reduce.utils.cli import InputError
 
 COLOUR = {"grayscale": False}
@@ -160,6 +162,36 @@ def test_weights_that_compute_something_else_are_refused(random_weights, monkeyp
     )
     with pytest.raises(InputError, match="are not the published ones: they compute "):
         extractors.load({"name": "xfeat"})
+
+
+def test_a_page_in_place_of_weights_is_not_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(downloads, "urlopen", lambda url, timeout: io.BytesIO(b"<html>Log in"))
+    with pytest.raises(InputError, match="the downloaded file is not one of torch's"):
+        extractors.load({"name": "aliked", "model_name": "aliked-t16"})
+    assert not list(tmp_path.rglob("*.pth"))
+
+
+@pytest.mark.parametrize("name", ["xfeat", "aliked_t16", "edgepoint2_t32"])
+def test_all_keypoints_or_some(name, base_weights, textured):
+    base_weights(name)
+    numbers = []
+    for most in (50, 4096, -1):
+        model = extractors.load({**features.confs[name]["model"], "max_keypoints": most}).eval()
+        numbers.append(len(extractors.extract(model, in_colour(textured), COLOUR)["keypoints"]))
+    assert numbers[0] == 50 < numbers[1] <= numbers[2]
+
+
+def test_networks_of_a_file(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("model: {name: aliked, denoise: false}\n")
+    _, conf = features.get(str(path))
+    assert not conf["preprocessing"]["grayscale"]
+    assert features.network_of(conf["model"]) == "aliked-n16"
+    assert features.matcher_of(conf) == "NN-mutual"
+    path.write_text("model: {name: [1]}\n")
+    with pytest.raises(InputError, match="Unknown extractor"):
+        extractors.load(features.get(str(path))[1]["model"])
 
 
 def test_an_unknown_model_is_answered_by_all_that_are_valid():
