@@ -23,15 +23,17 @@ MAX_POSITION = 0.05  # standard deviation of the position, in median depths of t
 MAX_ROTATION = 2.0  # standard deviation in degrees
 MIN_MATCHES = 6  # of an image whose matches may tell whether a pose is right
 RIVAL = 0.25  # a pose is ambiguous if another one has this share of its confidence
+# or if one by other images, such as those of another floor, has this share of its inliers
+RIVAL_BY_OTHERS = 0.8
 
 # The least agreement of a pose, in general and for a DOUBTFUL confidence. Wrong poses at copies of
-# repeated structures have agreements up to the second one, and confidences in this range. Below it
-# there are few matches, so that the agreement is less certain; above it, low agreements occurred
-# only in noisy scans.
+# repeated structures, and of mirrored facades, have agreements up to the second one, and
+# confidences in this range. Below it there are few matches, so that the agreement is less certain;
+# above it, low agreements occurred only in noisy scans.
 AGREEMENT = (0.17, 0.17)  # of matches without a strict ratio test
 AGREEMENT_RATIO, STRICT = (0.76, 0.86), 0.8  # with a ratio test of up to 0.8
 AGREEMENT_FEW, FEW = (0.55, 0.72), 32  # the same for fewer than 32 dimensions
-DOUBTFUL = (50.0, 800.0)
+DOUBTFUL, DOUBTFUL_FEW = (50.0, 800.0), (50.0, 300.0)
 
 
 def confidence(
@@ -206,6 +208,7 @@ class Gate:
         min_inliers: the least number of RANSAC's inliers.
         min_agreement: the least `agreement`, in general and for a doubtful confidence; default: by
             the matches, see `of_matches`.
+        doubtful: the range of doubtful confidences.
 
     Raises:
         InputError: for a confidence that is not finite or a negative number of inliers.
@@ -214,6 +217,7 @@ class Gate:
     min_confidence: float = 8.0
     min_inliers: int = 8
     min_agreement: tuple[float, float] | None = None
+    doubtful: tuple[float, float] = DOUBTFUL
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
@@ -232,14 +236,16 @@ class Gate:
         """
         if self.min_agreement is not None:
             return self
-        with_ratio = AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO
-        least = with_ratio if (matcher.get("ratio_threshold") or 1) <= STRICT else AGREEMENT
-        return replace(self, min_agreement=least)
+        if (matcher.get("ratio_threshold") or 1) > STRICT:
+            return replace(self, min_agreement=AGREEMENT)
+        if dim < FEW:
+            return replace(self, min_agreement=AGREEMENT_FEW, doubtful=DOUBTFUL_FEW)
+        return replace(self, min_agreement=AGREEMENT_RATIO)
 
     def least_agreement(self, confidence: float) -> float:
         """Return the least agreement of a pose with a confidence."""
         general, doubtful = self.min_agreement or AGREEMENT
-        low, high = DOUBTFUL
+        low, high = self.doubtful
         return doubtful if low <= confidence < high else general
 
 

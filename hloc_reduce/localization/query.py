@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 
 from . import absolute_pose
-from .confidence import DEFAULT_GATE, RIVAL, Gate
+from .confidence import DEFAULT_GATE, RIVAL_BY_OTHERS, Gate
 from .references import Reference
 
 
@@ -56,7 +56,7 @@ def localize(
     best, info = max(solved, key=lambda both: _quality(both[1]))
     for other, its_info in solved:
         if info["reason"] is None is its_info["reason"] and other is not best:
-            rivals = other.confidence >= RIVAL * best.confidence
+            rivals = other.num_inliers >= RIVAL_BY_OTHERS * best.num_inliers
             if rivals and absolute_pose.differ(best, other, info["points3D"]):
                 info["reason"] = (
                     f"ambiguous: a pose by other images has {other.num_inliers} inliers, this one "
