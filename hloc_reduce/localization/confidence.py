@@ -27,13 +27,13 @@ RIVAL = 0.25  # a pose is ambiguous if another one has this share of its confide
 RIVAL_BY_OTHERS = 0.8
 
 # The least agreement of a pose, in general and for a DOUBTFUL confidence. Wrong poses at copies of
-# repeated structures, and of mirrored facades, have agreements up to the second one, and
-# confidences in this range. Below it there are few matches, so that the agreement is less certain;
-# above it, low agreements occurred only in noisy scans.
+# repeated structures have agreements up to the second one, and confidences in this range. Below it
+# there are few matches, so that the agreement is less certain; above it are mirrored facades, but
+# many more right poses in noisy scans.
 AGREEMENT = (0.17, 0.17)  # of matches without a strict ratio test
 AGREEMENT_RATIO, STRICT = (0.76, 0.86), 0.8  # with a ratio test of up to 0.8
 AGREEMENT_FEW, FEW = (0.55, 0.72), 32  # the same for fewer than 32 dimensions
-DOUBTFUL, DOUBTFUL_FEW = (50.0, 800.0), (50.0, 300.0)
+DOUBTFUL = (50.0, 300.0)
 
 
 def confidence(
@@ -208,7 +208,6 @@ class Gate:
         min_inliers: the least number of RANSAC's inliers.
         min_agreement: the least `agreement`, in general and for a doubtful confidence; default: by
             the matches, see `of_matches`.
-        doubtful: the range of doubtful confidences.
 
     Raises:
         InputError: for a confidence that is not finite or a negative number of inliers.
@@ -217,7 +216,6 @@ class Gate:
     min_confidence: float = 8.0
     min_inliers: int = 8
     min_agreement: tuple[float, float] | None = None
-    doubtful: tuple[float, float] = DOUBTFUL
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
@@ -238,14 +236,12 @@ class Gate:
             return self
         if (matcher.get("ratio_threshold") or 1) > STRICT:
             return replace(self, min_agreement=AGREEMENT)
-        if dim < FEW:
-            return replace(self, min_agreement=AGREEMENT_FEW, doubtful=DOUBTFUL_FEW)
-        return replace(self, min_agreement=AGREEMENT_RATIO)
+        return replace(self, min_agreement=AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO)
 
     def least_agreement(self, confidence: float) -> float:
         """Return the least agreement of a pose with a confidence."""
         general, doubtful = self.min_agreement or AGREEMENT
-        low, high = self.doubtful
+        low, high = DOUBTFUL
         return doubtful if low <= confidence < high else general
 
 

@@ -227,9 +227,9 @@ def test_a_pose_that_no_image_agrees_with_is_refused():
 
 
 def test_doubtful_poses_must_agree_with_more_matches():
-    """As those at another copy of a repeated pattern, of confidences of 50 to 800."""
+    """As those at another copy of a repeated pattern, of confidences of 50 to 300."""
     gate = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
-    assert gate.least_agreement(40) == gate.least_agreement(800) < gate.least_agreement(120)
+    assert gate.least_agreement(40) == gate.least_agreement(300) < gate.least_agreement(120)
     assert DEFAULT_GATE.least_agreement(120) == DEFAULT_GATE.least_agreement(40)
     keypoints, points = matches(60, 18)
     found = solve(keypoints, points, [np.arange(78)], gate=gate)
