@@ -14,6 +14,7 @@ from hloc_reduce import Localizer, maps
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.networks import noise
 from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.images import read_image
 from hloc_reduce.utils.progress import progress
 
@@ -54,6 +55,8 @@ def _main() -> None:
     place, noisy = Aachen(args.dataset), noise.NOISY
     lists = place.query_lists()
     queries = [query for name, part in lists.items() if args.list in name for query in part]
+    if not queries:
+        raise InputError(f"--list {args.list}: the lists are {', '.join(lists)}.")
     tried = [*args.blur, AUTOMATIC]
     print("| feature | noise | estimate | " + " | ".join(tried) + " |")
     print("| --- | ---: | ---: |" + " ---: |" * len(tried), flush=True)

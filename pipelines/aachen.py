@@ -94,6 +94,7 @@ def _main() -> None:
     default = "datasets/demo_town" if is_demo else "datasets/aachen_v1.1"
     dataset = given.pop("dataset") or Path(default)
     if is_demo:
+        features_confs.get(given["feature"], given["projection"])  # fails before the rendering
         demo.main(dataset)
     options.run_on_dataset(main, dataset, given)
 

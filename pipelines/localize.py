@@ -358,7 +358,7 @@ def _main() -> None:
     options.add_feature_options(parser)
     options.add_localization_options(parser, "none", 50)
     # None: what an old map was built with
-    parser.set_defaults(feature=None, matcher=None, storage=None, keypoints=None, camera_mode=None)
+    parser.set_defaults(feature=None, storage=None, keypoints=None, camera_mode=None)
     given = options.parse(parser)
     for name, names in (("storage", STORAGES), ("keypoints", KEYPOINTS)):
         if given[name] is not None:

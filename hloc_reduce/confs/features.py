@@ -196,9 +196,10 @@ def levels(conf: dict) -> np.ndarray | None:
     Raises:
         InputError: when its storage needs levels that there are none of.
     """
-    storage, file = conf.get("storage"), level_file(conf)
+    storage = conf.get("storage")
     if storage not in CODED:
         return None
+    file = level_file(conf)
     if file is None:
         name = conf["output"].removeprefix("feats-").removeprefix("dog-")
         raise InputError(

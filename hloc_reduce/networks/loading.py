@@ -68,7 +68,7 @@ def _rounded(numbers: tuple[float, ...]) -> str:
 
 
 def fold(module: nn.Module) -> nn.Module:
-    """Fold each batch normalization that follows a convolution into it.
+    """Fold batch normalizations into the convolutions that they follow in an `nn.Sequential`.
 
     Returns:
         The module, which computes the same in fewer steps.

@@ -5,10 +5,11 @@ import shutil
 
 import cv2
 import numpy as np
+import pytest
 import torch
 from command import outcome, results
 
-from hloc_reduce import projections
+from hloc_reduce import demo, projections
 from pipelines import aachen
 
 PIPELINE = aachen
@@ -126,3 +127,9 @@ def test_grey_photos_only_give_an_empty_map(aachen_layout, tmp_path, refused):
         cv2.imwrite(str(path), np.full((270, 360), 128, np.uint8))
     arguments = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--feature", "sift")
     assert "The map is empty" in refused(*arguments)
+
+
+def test_a_wrong_feature_is_found_before_the_demo_is_rendered(tmp_path, monkeypatch, refused):
+    monkeypatch.setattr(demo, "main", lambda dataset: pytest.fail("rendered"))
+    given = ("--demo", "--dataset", tmp_path / "town", "--feature", "edgepoint2_m33")
+    assert "Unknown feature 'edgepoint2_m33'" in refused(*given)
