@@ -3,7 +3,7 @@
 Two observations of each point of a map are drawn, in different images. All first descriptors are
 ranked by the distance to their nearest second descriptor; a match is correct if it is of the same
 point. The columns of the maps and their mean use the tracks as triangulated from mutual nearest
-neighbours of `sift` (or of `colmap_sift`, which has its own keypoints). "completed" adds the
+neighbours of `sift`, or of bases that have their own keypoints. "completed" adds the
 observations that matching missed and geometry found; "dark" also takes photometric variants
 (darkness, blur, noise) of the second photos. "photo pairs" matches one photo with another, as hloc
 does: the observations of the points that both see with all observations in the other photo.
@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from hloc_reduce import projections
-from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, DIM
+from hloc_reduce.confs import features as features_confs
 from hloc_reduce.evaluation.ranking import nearest_neighbor_ap
 from hloc_reduce.training import nested, tracks
 from hloc_reduce.training.sampling import matchable
@@ -32,12 +32,12 @@ from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 
 KINDS = ("matched", "completed", "dark", "photo pairs")
-Describe = Callable[[torch.Tensor], torch.Tensor]  # base descriptors (N, 128) to (N, D)
+Describe = Callable[[torch.Tensor], torch.Tensor]  # base descriptors (N, B) to (N, D)
 MIN_SHARED = 30  # points that a pair of photos must share
 
 
 def draw_pairs(data: tracks.Tracks, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Draw two observations of each point: base descriptors (N, 128) of both, and a dark second."""
+    """Draw two observations of each point: base descriptors (N, B) of both, and a dark second."""
     generator = np.random.default_rng(seed)
     kept, starts, lengths = matchable(data)
     first = generator.integers(lengths)
@@ -49,7 +49,7 @@ def draw_pairs(data: tracks.Tracks, seed: int) -> tuple[torch.Tensor, torch.Tens
 
 
 def photo_pairs(data: tracks.Tracks) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """List base descriptors (N, 128), (M, 128) of photo pairs, the first N of common points."""
+    """List base descriptors (N, B), (M, B) of photo pairs, the first N of common points."""
     photos = []
     for image in np.unique(data.image):
         seen = np.flatnonzero(data.image == image)
@@ -77,7 +77,9 @@ def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.M
     loaded = {name: projections.load(name) for name in names}
     loaded |= {file.name: projections.load(file) for file in files}
     order = sorted(loaded, key=lambda name: (family(name), -loaded[name].dim))
-    return {descriptor: torch.nn.Identity()} | {name: loaded[name] for name in order}
+    base = torch.nn.Identity()
+    base.dim = features_confs.dimension(descriptor)
+    return {descriptor: base} | {name: loaded[name] for name in order}
 
 
 def family(name: str) -> str:
@@ -119,7 +121,7 @@ def _main() -> None:
     args = parser.parse_args()
 
     for descriptor in args.descriptor:
-        cli.choose("descriptor", descriptor, [*DESCRIPTORS, COLMAP])
+        cli.choose("descriptor", descriptor, features_confs.BASES)
     for file in args.projection:
         if not file.name.lower().startswith(tuple(args.descriptor)):
             raise InputError(f"{file}: its name must begin with one of --descriptor.")
@@ -144,8 +146,7 @@ def _main() -> None:
             mean = {kind: np.mean(places) for kind, places in values.items()}
             cells = " | ".join(f"{value:.2f}" for value in (*values["matched"], *mean.values()))
             print(f"| {row} | {cells} |", flush=True)
-            dim = getattr(project, "dim", DIM)
-            means[family(row)][dim] = " / ".join(f"{mean[kind]:.1f}" for kind in KINDS)
+            means[family(row)][project.dim] = " / ".join(f"{mean[kind]:.1f}" for kind in KINDS)
         print()
     dims = sorted({dim for by_dim in means.values() for dim in by_dim}, reverse=True)
     print(f"| {' / '.join(KINDS)} | {' | '.join(map(str, dims))} |")

@@ -17,7 +17,7 @@ import torch
 from matching_ap import KINDS, Describe, draw_all, family, load_projections, measure
 
 from hloc_reduce import projections
-from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, DIM
+from hloc_reduce.confs import features as features_confs
 from hloc_reduce.evaluation import plots
 from hloc_reduce.training import levels, tracks
 from hloc_reduce.utils import cli
@@ -37,7 +37,7 @@ def stored(descriptors: torch.Tensor, storage: str, table: np.ndarray | None) ->
 def level_table(
     name: str | Path, storage: str, project: Describe, fitted: torch.Tensor | None
 ) -> np.ndarray | None:
-    """Return the levels of a projection, or fit them to base descriptors (N, 128)."""
+    """Return the levels of a projection, or fit them to base descriptors (N, B)."""
     if storage not in CODED:
         return None
     try:
@@ -70,7 +70,7 @@ def rows(
             def coded(base: torch.Tensor, project=project, storage=storage, table=table):
                 return stored(project(base), storage, table)
 
-            size = descriptor_bytes(getattr(project, "dim", DIM), storage)
+            size = descriptor_bytes(project.dim, storage)
             both = ap(coded, coded, pairs)
             floats = ap(project, coded, pairs) if storage != "float16" else both
             yield size, name, storage, floats, both
@@ -130,7 +130,7 @@ def _main() -> None:
     if not args.map and not args.outputs:
         raise InputError("There is nothing to measure. Give --map or --outputs.")
     for descriptor in args.descriptor:
-        cli.choose("descriptor", descriptor, [*DESCRIPTORS, COLMAP])
+        cli.choose("descriptor", descriptor, features_confs.BASES)
     panels = []
 
     def load(maps: list[str], descriptor: str) -> list[tracks.Tracks]:
