@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import projections
+from ..descriptors import BASES as AT_DOG
 from ..descriptors import COLMAP, DESCRIPTORS, DIM
 from ..detectors.dog import HLOC, KEYPOINTS
 from ..networks import ALIKED, EDGEPOINT2, NETWORKS
@@ -21,7 +22,13 @@ from ..utils.tables import aligned
 
 RECOMMENDED = "colmap_sift_sv64"  # the fastest, and the best measured (docs/performance.md)
 DIMS = (64, 32, 24, 16)
-SCHEMES = dict.fromkeys(DESCRIPTORS, ("pca", "us", "ss", "sv")) | {COLMAP: ("pca", "sv")}
+# the schemes and dimensions of the projections of each base descriptor; and who has a nested one
+PROJECTIONS: dict[str, tuple[tuple[str, ...], tuple[int, ...]]] = {
+    **dict.fromkeys(DESCRIPTORS, (("pca", "us", "ss", "sv"), DIMS)),
+    COLMAP: (("pca", "sv"), DIMS),
+    **dict.fromkeys(("xfeat", "edgepoint2_m64"), (("pca", "sv"), DIMS[1:])),
+}
+NESTED = (*DESCRIPTORS, "xfeat")
 
 PREPROCESSING = {"grayscale": True, "resize_max": 1600}
 IN_COLOUR = {**PREPROCESSING, "grayscale": False}
@@ -42,42 +49,40 @@ MODELS = (
 
 # the extractors of networks, and the networks that they run by default
 EXTRACTORS = {"edgepoint2": "M32", "xfeat": "xfeat", "aliked": "aliked-n16"}
-BASES = (*SCHEMES, *MODELS)  # features whose descriptors are projected
+BASES = (*AT_DOG, *MODELS)  # features whose descriptors are projected
 
 
 def base(descriptor: str) -> dict:
-    """Return the model configuration of a base descriptor at DoG keypoints."""
-    return {"name": "dog", "descriptor": descriptor, "keypoints": KEYPOINTS[0]}
+    """Return the model configuration of a base descriptor."""
+    at_dog = {"name": "dog", "descriptor": descriptor, "keypoints": KEYPOINTS[0]}
+    return MODELS.get(descriptor, at_dog)
 
 
 def feature(name: str, model: dict) -> dict:
     """Return the configuration of a feature."""
+    if network_of(model):
+        return {"output": f"feats-{name}", "model": model, "preprocessing": IN_COLOUR}
     return {"output": f"feats-dog-{name}", "model": model, "preprocessing": PREPROCESSING}
 
 
 def names(descriptor: str) -> list[str]:
     """List the projections of a base descriptor."""
-    reduced = [f"{descriptor}_{scheme}{dim}" for scheme in SCHEMES[descriptor] for dim in DIMS]
-    if descriptor == COLMAP:
-        return reduced
+    schemes, dims = PROJECTIONS[descriptor]
+    listed = [f"{descriptor}_{scheme}{dim}" for scheme in schemes for dim in dims]
+    if descriptor not in NESTED:
+        return listed
     nested = f"{descriptor}_nested"
-    return [*reduced, nested, *(f"{nested}@{dim}" for dim in DIMS[1:])]
-
-
-confs = {name: feature(name, base(name)) for name in SCHEMES} | {
-    name: feature(name, {"name": "reduced", "base": base(descriptor), "projection": name})
-    for descriptor in SCHEMES
-    for name in names(descriptor)
-}
-confs |= {
-    name: {"output": f"feats-{name}", "model": model, "preprocessing": IN_COLOUR}
-    for name, model in MODELS.items()
-}
+    return [*listed, nested, *(f"{nested}@{dim}" for dim in DIMS[1:])]
 
 
 def matcher_of(conf: dict) -> str:
     """Return the matcher that suits a feature best, a key of `confs.matchers`."""
     return "NN-mutual" if network_of(conf["model"]) else "NN-ratio"  # docs/results.md
+
+
+def base_of(model: dict) -> dict:
+    """Return the configuration of the extractor whose descriptors a model projects, or its own."""
+    return model.get("base", model)
 
 
 def network_of(model: dict) -> str | None:
@@ -86,6 +91,14 @@ def network_of(model: dict) -> str | None:
     if str(found["name"]) not in EXTRACTORS:
         return None
     return str(found.get("model_name", EXTRACTORS[found["name"]]))
+
+
+confs = {name: feature(name, base(name)) for name in AT_DOG} | {
+    name: feature(name, {"name": "reduced", "base": base(descriptor), "projection": name})
+    for descriptor in PROJECTIONS
+    for name in names(descriptor)
+}
+confs |= {name: feature(name, model) for name, model in MODELS.items()}
 
 
 def dimension(name: str) -> int | None:
@@ -162,8 +175,7 @@ def get(
     model = {"name": "reduced", "base": base, "projection": str(projection)}
     file, prefix = projections.split_prefix(projection)
     name = Path(file).stem + (prefix and f"@{prefix}")
-    output = f"feats-{name}" if network_of(base) else feature(name, model)["output"]
-    return name, {**conf, "output": output, "model": model}
+    return name, {**conf, "output": feature(name, model)["output"], "model": model}
 
 
 def with_keypoints(model: dict, keypoints: str) -> dict:
@@ -171,11 +183,6 @@ def with_keypoints(model: dict, keypoints: str) -> dict:
     if "base" in model:
         return {**model, "base": with_keypoints(model["base"], keypoints)}
     return {**model, "keypoints": keypoints} if model["name"] == "dog" else model
-
-
-def base_of(model: dict) -> dict:
-    """Return the configuration of the extractor whose descriptors a model projects, or its own."""
-    return model.get("base", model)
 
 
 def descriptor_of(model: dict) -> str | None:

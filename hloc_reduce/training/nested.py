@@ -5,5 +5,5 @@ from . import sv
 PREFIXES = (64, 32, 24, 16)
 # not in the paper: the losses of the prefixes are learned together
 RECIPES = {name: {**recipe, "prefixes": list(PREFIXES)} for name, recipe in sv.RECIPES.items()}
-DISTANCE_WEIGHTS = sv.DISTANCE_WEIGHTS
+DISTANCE_WEIGHTS, OF_NETWORKS = sv.DISTANCE_WEIGHTS, sv.OF_NETWORKS
 train = sv.train

@@ -46,6 +46,7 @@ RECIPES: dict[str, dict] = {
         "steps": 3000,
     },
 }
+OF_NETWORKS: dict = {}
 DISTANCE_WEIGHTS: dict[str, float] = {}
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from ..projections.network import MLP, read
+from . import pca
 from .loop import device, fit
 from .losses import distance_loss, triplet_loss
 from .sampling import PairSampler
@@ -38,6 +39,8 @@ RECIPES: dict[str, dict] = {
     },
 }
 RECIPES["tune"] = {**RECIPES["best"], "steps": 1000, "lr": 1e-3}
+# "best" for the descriptors of networks: one layer, which begins with the principal axes
+OF_NETWORKS = {"hidden": [], "steps": 1000, "batch_size": 2048, "lr": 1e-3, "maps_per_batch": 1}
 DISTANCE_WEIGHTS = {"hardnet": 3.0}  # beta
 
 
@@ -50,9 +53,10 @@ def train(
         maps: tracks of one or more maps.
         dim: number of output dimensions.
         recipe: an entry of `RECIPES` with `hidden`, the sizes of the hidden layers, and
-            `distance_weight`, the weight of the distance loss. Optional: `prefixes`, the lengths
-            of leading parts of a descriptor that are trained to match, too; `begin_with`, name or
-            path of a projection to begin with.
+            `distance_weight`, the weight of the distance loss. Without hidden layers, the only
+            layer begins with the principal axes. Optional: `prefixes`, the lengths of leading
+            parts of a descriptor that are trained to match, too; `begin_with`, name or path of a
+            projection to begin with.
         seed: of the initial weights and the batches.
         checkpoint: file to resume from; the caller deletes it.
         made_from: provenance of the training; a stale checkpoint is ignored.
@@ -67,6 +71,8 @@ def train(
     steps = recipe.get("steps") or recipe["epochs"] * -(-sampler.num_observations // size)
     if "begin_with" in recipe:
         mlp, _ = read(recipe["begin_with"])
+    elif not recipe["hidden"]:
+        mlp = pca.train(maps, dim, recipe, seed)
     else:
         mlp = MLP([maps[0].descriptors.shape[-1], *recipe["hidden"], dim])
     mlp.train().to(place)

@@ -35,6 +35,7 @@ RECIPES: dict[str, dict] = {
         "distance_weight": 1000.0,
     },
 }
+OF_NETWORKS: dict = {}
 DISTANCE_WEIGHTS = {"hardnet": 0.1}  # alpha, unless the recipe has one
 
 
