@@ -62,6 +62,9 @@ def end(interrupt: KeyboardInterrupt) -> NoReturn:
     if any(thread.is_alive() for thread in _calls):  # nothing else stops them
         sys.stdout.flush()
         os._exit(code)
+    # a KeyboardInterrupt that left code in a string, as dataclasses and torch execute, would make
+    # `python -m` end by SIGINT whatever its exit code; Python forgets it at the next such code
+    exec("")
     sys.exit(code)
 
 

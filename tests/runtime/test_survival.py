@@ -79,6 +79,20 @@ cli.run(main)
     assert said.endswith(f"{interrupts.INTERRUPTED}\n") and said.count("\n") == 1
 
 
+def test_an_interrupt_of_code_in_a_string_keeps_its_exit_code(tmp_path):
+    program = """
+import signal
+from hloc_reduce.utils import cli
+
+cli.run(lambda: exec("signal.raise_signal(signal.SIGTERM)", {"signal": signal}))
+"""
+    (tmp_path / "ended.py").write_text(program)
+    command = [sys.executable, "-m", "ended"]
+    found = ":".join([str(tmp_path), *sys.path])
+    run = subprocess.run(command, env={**os.environ, "PYTHONPATH": found}, cwd=tmp_path)
+    assert run.returncode == 143
+
+
 @pytest.mark.parametrize(
     "pipeline, workers, signals, number",
     [
