@@ -277,8 +277,9 @@ def run(
         matches = {}
         for other in place.names:
             rows_of = shown[other]
-            found, _ = mutual_nearest(described[other], query, ratio_threshold, rows_of)
-            matched = found >= 0
+            found, cosine = mutual_nearest(described[other], query, ratio_threshold, rows_of)
+            matched = torch.nonzero(found >= 0)[:, 0]
+            matched = matched[cosine[matched].argsort(descending=True)]
             matches[other] = torch.stack([found[matched], rows_of[matched]], 1).numpy()
         known = ("given", "off", "guess") if kind == "own" else ("given", "guess")
         for given in known if camera else ("guess",):

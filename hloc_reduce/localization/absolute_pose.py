@@ -26,7 +26,7 @@ from .resection import Resection
 SEED = 0
 MAX_ERROR = 12.0  # pixels, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
-MAX_IMAGES = 20  # tried by themselves, those with the most matches
+MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 ROUNDS = 3  # of estimation from the inliers among all matches
 # poses that differ by more are rivals
 SAME_ROTATION = 10.0  # degrees
@@ -113,14 +113,14 @@ def estimate(
 ) -> Pose:
     """Estimate an absolute pose and judge it.
 
-    If few of all matches agree with a pose, RANSAC may have missed the right one. So the matches
-    of each image are tried by themselves, too: those of an image that shows the same place agree
-    much more often. The pose with the highest confidence among all matches wins.
+    If few of all matches agree with a pose, RANSAC may have missed the right one. So the most
+    similar matches of each image are tried by themselves, too: those of an image that shows the
+    same place agree much more often. The pose with the highest confidence among all matches wins.
 
     Args:
         points2D: (M, 2) image points of all matches, COLMAP's pixels.
         points3D: (M, 3) their world points.
-        images: of each map image the indices of its matches.
+        images: of each map image the indices of its matches, the most similar first.
         camera: intrinsics.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement"; under
             "photo", whether it may be "cropped".
@@ -131,8 +131,7 @@ def estimate(
     poses = [_estimate(matches, np.arange(number))]
     if poses[0].num_inliers < CLEAR * number:
         tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
-        tried = sorted(tried, key=len, reverse=True)[:MAX_IMAGES]
-        poses += [_estimate(matches, chosen) for chosen in tried]
+        poses += [_estimate(matches, chosen[:MOST_SIMILAR]) for chosen in tried]
     best, doubt = _calibrate(matches, max(poses, key=_quality))
     best = replace(best, agreement=agreement(best.inliers, images))
     others = np.flatnonzero(~best.inliers)

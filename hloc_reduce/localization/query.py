@@ -25,7 +25,7 @@ def localize(
         keypoints: (N, 2) of the query, COLMAP's pixels.
         camera: intrinsics.
         matches: from map images, best first, to (M, 2) indices of the keypoints of the query and
-            of the image.
+            of the image, the most similar first.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
         gate: what a pose must have to be trusted.
 
@@ -84,7 +84,8 @@ def _correspondences(
     """Collect the different 2D-3D matches through some images, sorted.
 
     Returns:
-        The first part of the info of `localize`, and of each image the indices of its matches.
+        The first part of the info of `localize`, and of each image the indices of its matches, in
+        their order.
     """
     pairs, points = [np.zeros((0, 2), np.int64)], [np.zeros((0, 3))]
     for name in names:
@@ -96,7 +97,7 @@ def _correspondences(
     known = np.flatnonzero(pair[:, 1] >= 0)
     different, first, which = np.unique(pair[known], axis=0, return_index=True, return_inverse=True)
     which = which.reshape(-1)  # numpy 2.0 returns a column
-    images = [np.unique(which[image[known] == i]) for i in range(len(names))]
+    images = [_different(which[image[known] == i]) for i in range(len(names))]
     return {
         "num_matches": len(known),
         "num_without_point": len(pair) - len(known),
@@ -105,6 +106,11 @@ def _correspondences(
         "point3D_ids": different[:, 1],
         "points3D": np.concatenate(points)[known[first]],
     }, images
+
+
+def _different(numbers: np.ndarray) -> np.ndarray:
+    """Keep the first of equal numbers (N,)."""
+    return numbers[np.sort(np.unique(numbers, return_index=True)[1])]
 
 
 def merged(config: dict, refinement: dict) -> dict:

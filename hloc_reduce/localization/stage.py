@@ -18,7 +18,7 @@ from ..utils import cli
 from ..utils.cli import InputError
 from ..utils.feature_files import dimension, get_colmap_keypoints, get_image_size
 from ..utils.h5 import open_h5
-from ..utils.match_files import find_pair, get_matcher, get_matches
+from ..utils.match_files import find_pair, get_matcher, get_matches, most_similar_first
 from ..utils.parsers import parse_query_lists, write_poses
 from ..utils.progress import progress
 from .confidence import DEFAULT_GATE, Gate, add_gate_options
@@ -200,7 +200,7 @@ def _read(
     names: list[str],
     reference: Reference,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Read the keypoints of a query, and its matches with retrieved images."""
+    """Read the keypoints of a query, and its matches, the most similar first."""
     keypoints, _ = get_colmap_keypoints(feature_file, name)
     present = [other for other in names if other in reference]
     if len(present) < len(names):
@@ -211,7 +211,8 @@ def _read(
         return keypoints, {other: np.zeros((0, 2), np.int64) for other in present}
     sizes = {other: (len(keypoints), reference.num_keypoints(other)) for other in present}
     return keypoints, {
-        other: get_matches(match_file, name, other, both)[0] for other, both in sizes.items()
+        other: most_similar_first(*get_matches(match_file, name, other, both))
+        for other, both in sizes.items()
     }
 
 

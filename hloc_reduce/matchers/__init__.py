@@ -49,10 +49,11 @@ class Matcher(BaseModel):
             rows1: (K,) int64, ascending rows of descriptors1.
 
         Returns:
-            Matches (L, 2) int64, rows of descriptors0 and descriptors1.
+            Matches (L, 2) int64, rows of descriptors0 and descriptors1, the most similar first.
         """
-        ((matches0, _),) = self.match([(descriptors0, descriptors1)])
+        ((matches0, scores),) = self.match([(descriptors0, descriptors1)])
         rows0 = torch.nonzero(torch.isin(matches0, rows1))[:, 0]
+        rows0 = rows0[scores[rows0].argsort(descending=True, stable=True)]
         return torch.stack([rows0, matches0[rows0]], dim=1)
 
 

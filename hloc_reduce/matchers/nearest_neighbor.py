@@ -272,11 +272,12 @@ class NearestNeighbor(Matcher):
         """Match only some descriptors1, see `Matcher.match_rows`."""
         if not self.conf["do_mutual_check"]:
             return super().match_rows(descriptors0, descriptors1, rows1)
-        matches1, _ = mutual_nearest(
+        matches1, cosine = mutual_nearest(
             *(descriptors1, descriptors0, self.conf["ratio_threshold"], rows1),
             distance_threshold=self.conf["distance_threshold"],
         )
-        matched = matches1 >= 0
+        matched = torch.nonzero(matches1 >= 0)[:, 0]
+        matched = matched[cosine[matched].argsort(descending=True, stable=True)]
         return torch.stack([matches1[matched], rows1[matched]], dim=1)
 
     def _forward(self, data: dict) -> dict:

@@ -75,6 +75,11 @@ def get_matches(
     return matches, get_array(file, pair, "matching_scores0", matches0.shape)[matched]
 
 
+def most_similar_first(matches: np.ndarray, scores: np.ndarray | None) -> np.ndarray:
+    """Sort matches (M, 2) by their scores (M,), the highest first; without scores they stay."""
+    return matches if scores is None else matches[np.argsort(-scores, kind="stable")]
+
+
 def _check_matches(
     file: h5py.File, matches: np.ndarray, names: tuple[str, str], sizes: tuple[int, int]
 ) -> None:

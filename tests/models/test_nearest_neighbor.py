@@ -112,7 +112,7 @@ def test_integers_match_as_floats(sizes, ratio_threshold, options, arithmetic):
     torch.testing.assert_close(scores, expected_scores, atol=1e-3, rtol=0)
     rows1 = torch.arange(0, sizes[1], 2)
     found = matcher.match_rows(*rounded, rows1)
-    assert found.tolist() == matcher.match_rows(*pair, rows1).tolist()
+    assert sorted(found.tolist()) == sorted(matcher.match_rows(*pair, rows1).tolist())
 
 
 def test_codes_pass_the_ratio_test(arithmetic):
