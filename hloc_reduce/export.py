@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 OPSET = 18
 TOLERANCE = 1e-4  # between ONNX Runtime and torch
 PACKAGES = ("onnx", "onnxruntime", "onnxscript")
-NETWORKS = ("edgepoint2", "xfeat")  # the extractors that have `fixed`
 # images of these sides, in strides, make the graph and check it
 MADE_WITH, CHECKED_WITH = (3, 4), (8, 11)
 
@@ -99,12 +98,12 @@ def _projection(name: str, conf: dict) -> Graph:
     """Make the graph of a feature's projection."""
     import torch
 
-    if conf["model"].get("projection") is None:
+    projection = conf["model"].get("projection")
+    if projection is None:
         raise InputError(
-            f"{name} has no projection: choose one, such as {name}_sv64, or leave "
-            "out --projection_only."
+            f"{name} has no projection: --projection_only needs a feature that has one."
         )
-    project = projections.load(conf["model"]["projection"])
+    project = projections.load(projection)
     generator = torch.Generator().manual_seed(0)
     made_with, checked_with = (
         torch.nn.functional.normalize(
@@ -129,11 +128,11 @@ def _network(name: str, conf: dict) -> Graph:
 
     from . import extractors
 
-    base = features_confs.base_of(conf["model"])["name"]
-    if base not in NETWORKS:
+    if features_confs.network_of(conf["model"]) is None:
+        kind = features_confs.base_of(conf["model"])["name"]
         raise InputError(
-            f"{name} cannot be exported as a whole, because its extractor {base} is none of "
-            f"{', '.join(NETWORKS)}. --projection_only exports a projection alone."
+            f"{name} has the keypoints of {'DoG' if kind == 'dog' else kind}: only networks can be "
+            "exported as a whole. Export a projection alone with --projection_only."
         )
     extractor = extractors.load(conf["model"]).eval()
     settings, stride = extractor.base.conf, extractor.base.stride
@@ -182,6 +181,8 @@ def _image(height: int, width: int) -> "torch.Tensor":
 def _write(graph: Graph, path: Path) -> None:
     """Write an ONNX file."""
     import torch
+    from onnx_ir import Shape
+    from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 
     shape = next(iter(graph.shapes.values()))
     sides = {
@@ -194,15 +195,13 @@ def _write(graph: Graph, path: Path) -> None:
             graph.module, (graph.made_with,), dynamic_shapes=(sides,), strict=False
         )
         program = torch.onnx.export(traced, dynamo=True, opset_version=OPSET, verbose=False)
-    import onnx_ir
-
+    assert program is not None  # as without dynamo
     model = program.model
-    for value, (name, shape) in zip(
-        (*model.graph.inputs, *model.graph.outputs), graph.shapes.items(), strict=True
-    ):
-        value.name, value.shape = name, onnx_ir.Shape(shape)
+    ClearMetadataAndDocStringPass()(model)  # stack traces, with names of folders
+    values = (*model.graph.inputs, *model.graph.outputs)
+    for value, (name, shape) in zip(values, graph.shapes.items(), strict=True):
+        value.name, value.shape = name, Shape(shape)
     model.producer_name, model.producer_version = "hloc-reduce", __version__
-    model.metadata_props.clear()
     model.metadata_props.update(graph.metadata)
     program.save(path, external_data=False)
 
@@ -225,7 +224,7 @@ def _check(graph: Graph, path: Path) -> float:
             order = torch.cdist(graph.expected[0].double(), found[0].double()).argmin(dim=1)
             found = [x[order] for x in found]
         errors = ((a - b).abs() / (1 + b.abs()) for a, b in zip(found, graph.expected, strict=True))
-        difference = max(float(error.max()) for error in errors)
+        difference = max((float(error.max()) for error in errors if error.numel()), default=0.0)
     if not difference <= TOLERANCE:
         raise InputError(
             f"ONNX Runtime does not compute the features of torch ({difference:.0e} off instead of "

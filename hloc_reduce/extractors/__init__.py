@@ -62,7 +62,7 @@ class Extractor(BaseModel):
     def fixed(self, image: torch.Tensor) -> dict:
         """Return the features of an image in tensors of fixed length, for `hloc_reduce.export`.
 
-        Only extractors that can be written as ONNX have it.
+        The extractors of networks have it, so that they can be written as ONNX.
 
         Args:
             image: (1, 3, H, W) float32 RGB in [0, 1]; H and W are multiples of `stride`.

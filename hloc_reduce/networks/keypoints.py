@@ -58,7 +58,7 @@ def strongest_fixed(
 
     Returns:
         Keypoints (number, 2) float x, y, and their scores (number,), highest first. Rows without a
-        keypoint have the score -inf and any position.
+        keypoint have the score -inf, and any position at which a keypoint may be.
     """
     height, width = scores.shape
     edge = border - radius
@@ -68,10 +68,10 @@ def strongest_fixed(
     weighted = scores if weights is None else scores * weights
     found = torch.where(maxima, weighted[inner], -torch.inf).flatten()
     # small images have fewer pixels than rows
-    found, index = pad(found, (0, number), value=-torch.inf).topk(number)
-    columns = width - 2 * border
+    highest, index = pad(found, (0, number), value=-torch.inf).topk(number)
+    index, columns = index.clamp(max=found.shape[0] - 1), width - 2 * border
     y = index // columns
-    return torch.stack([index - y * columns, y], dim=1).to(scores.dtype) + border, found
+    return torch.stack([index - y * columns, y], dim=1).to(scores.dtype) + border, highest
 
 
 def _highest_around(scores: torch.Tensor, radius: int) -> torch.Tensor:
