@@ -96,9 +96,11 @@ class Graph(torch.nn.Module):
             descriptors (N, dim) of unit norm; float32.
         """
         features = self.extractor.reduce(self.extractor.base.fixed(image))
-        found = torch.nonzero(features["scores"][0] > -torch.inf)[:, 0]
-        descriptors = features["descriptors"][0].T
-        return features["keypoints"][0][found], features["scores"][0][found], descriptors[found]
+        scores = features["scores"][0]
+        rows = torch.nonzero(scores > -torch.inf)[:, 0]
+        values = features["keypoints"][0], scores, features["descriptors"][0].T
+        keypoints, scores, descriptors = (value.index_select(0, rows) for value in values)
+        return keypoints, scores, descriptors
 
 
 def load(conf: dict) -> Extractor:

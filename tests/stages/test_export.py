@@ -1,5 +1,6 @@
 """ONNX files: they compute what torch computes, for inputs of every size, and say what they are."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,9 @@ from hloc_reduce.confs import features
 from hloc_reduce.projections import network
 
 PIPELINE = export
+onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
+pytest.importorskip("onnxscript")
 
 
 def session(path: Path):
@@ -67,6 +70,12 @@ def test_a_network(name, run, base_weights, tmp_path):
     }
     assert loaded.get_modelmeta().producer_name == "hloc-reduce"
     assert str(Path(export.__file__).parent).encode() not in path.read_bytes()
+    # what docs/export.md says of TensorRT
+    graph = onnx.load(path).graph
+    constants = {value.name for value in graph.initializer}
+    (top,) = (node for node in graph.node if node.op_type == "TopK")
+    assert top.input[1] in constants
+    assert [node.op_type for node in graph.node].count("NonZero") == 1
 
 
 def test_a_network_with_options_and_a_projection(run, base_weights, tmp_path):
@@ -129,8 +138,6 @@ def test_a_file_that_computes_something_else_is_not_kept(refused, tmp_path, monk
     ],
 )
 def test_wrong_input(options, message, refused, tmp_path, monkeypatch, base_weights):
-    import re
-
     base_weights("xfeat")
     monkeypatch.chdir(tmp_path)
     if "--output" not in options:
