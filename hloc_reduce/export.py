@@ -22,7 +22,6 @@ from .utils.paths import strings_as_paths
 if TYPE_CHECKING:
     import torch
 
-
 OPSET = 18
 TOLERANCE = 1e-4  # between ONNX Runtime and torch
 PACKAGES = ("onnx", "onnxruntime", "onnxscript")
@@ -31,8 +30,8 @@ MADE_WITH, CHECKED_WITH = (3, 4), (8, 11)
 
 
 @dataclass(frozen=True)
-class Graph:
-    """What is written.
+class Content:
+    """What a file holds, and what it is checked with.
 
     Args:
         module: computes the outputs from the input.
@@ -80,12 +79,12 @@ def main(
             f"An export needs {', '.join(missing)}: pip install 'hloc-reduce[export]'."
         )
     name, conf = features_confs.get(feature, projection)
-    graph = (_projection if projection_only else _network)(name, conf)
-    graph.metadata.update(feature=name, hloc_reduce=__version__)
+    content = (_projection if projection_only else _network)(name, conf)
+    content.metadata.update(feature=name, hloc_reduce=__version__)
     with replacing(output) as temporary:
-        _write(graph, temporary)
-        difference = _check(graph, temporary)
-    number, dim = graph.expected[-1].shape
+        _write(content, temporary)
+        difference = _check(content, temporary)
+    number, dim = content.expected[-1].shape
     logger.info(
         "Wrote %s (%.1f MB). ONNX Runtime and torch agree on %d descriptors of %d numbers: at most "
         "%.0e apart.",
@@ -94,8 +93,8 @@ def main(
     return output
 
 
-def _projection(name: str, conf: dict) -> Graph:
-    """Make the graph of a feature's projection."""
+def _projection(name: str, conf: dict) -> Content:
+    """Return the content of a projection's file."""
     import torch
 
     projection = conf["model"].get("projection")
@@ -111,7 +110,7 @@ def _projection(name: str, conf: dict) -> Graph:
         )
         for number in (10, 1000)
     )
-    return Graph(
+    return Content(
         project,
         {"descriptors": ("N", project.sizes[0]), "reduced": ("N", project.dim)},
         1,
@@ -122,8 +121,8 @@ def _projection(name: str, conf: dict) -> Graph:
     )
 
 
-def _network(name: str, conf: dict) -> Graph:
-    """Make the graph of an extractor, with its projection if it has one."""
+def _network(name: str, conf: dict) -> Content:
+    """Return the content of a whole feature's file: an extractor, and its projection if any."""
     import torch
 
     from . import extractors
@@ -131,8 +130,9 @@ def _network(name: str, conf: dict) -> Graph:
     if features_confs.network_of(conf["model"]) is None:
         kind = features_confs.base_of(conf["model"])["name"]
         raise InputError(
-            f"{name} has the keypoints of {'DoG' if kind == 'dog' else kind}: only networks can be "
-            "exported as a whole. Export a projection alone with --projection_only."
+            f"{name} has the keypoints of {'DoG' if kind == 'dog' else kind}, but only features of "
+            f"{', '.join(features_confs.EXTRACTORS)} can be exported as a whole. Export a "
+            "projection alone with --projection_only."
         )
     extractor = extractors.load(conf["model"]).eval()
     settings, stride = extractor.base.conf, extractor.base.stride
@@ -145,7 +145,7 @@ def _network(name: str, conf: dict) -> Graph:
     image = _image(*(side * stride for side in CHECKED_WITH))
     with torch.no_grad():
         features = extractor({"image": image})
-    return Graph(
+    return Content(
         extractors.Graph(extractor),
         {
             "image": (1, 3, "height", "width"),
@@ -178,36 +178,36 @@ def _image(height: int, width: int) -> "torch.Tensor":
     return image.clamp(0, 1)
 
 
-def _write(graph: Graph, path: Path) -> None:
+def _write(content: Content, path: Path) -> None:
     """Write an ONNX file."""
     import torch
     from onnx_ir import Shape
     from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 
-    shape = next(iter(graph.shapes.values()))
+    shape = next(iter(content.shapes.values()))
     sides = {
-        axis: graph.stride * torch.export.Dim(f"{side}_in_strides")
+        axis: content.stride * torch.export.Dim(f"{side}_in_strides")
         for axis, side in enumerate(shape)
         if isinstance(side, str)
     }
     with _quiet(), torch.no_grad():
         traced = torch.export.export(
-            graph.module, (graph.made_with,), dynamic_shapes=(sides,), strict=False
+            content.module, (content.made_with,), dynamic_shapes=(sides,), strict=False
         )
         program = torch.onnx.export(traced, dynamo=True, opset_version=OPSET, verbose=False)
-    assert program is not None  # as without dynamo
+    assert program is not None  # it is only without dynamo
     model = program.model
     ClearMetadataAndDocStringPass()(model)  # stack traces, with names of folders
     values = (*model.graph.inputs, *model.graph.outputs)
-    for value, (name, shape) in zip(values, graph.shapes.items(), strict=True):
+    for value, (name, shape) in zip(values, content.shapes.items(), strict=True):
         value.name, value.shape = name, Shape(shape)
     model.producer_name, model.producer_version = "hloc-reduce", __version__
-    model.metadata_props.update(graph.metadata)
+    model.metadata_props.update(content.metadata)
     program.save(path, external_data=False)
 
 
-def _check(graph: Graph, path: Path) -> float:
-    """Return the greatest difference between ONNX Runtime and torch, relative for numbers above 1.
+def _check(content: Content, path: Path) -> float:
+    """Return the greatest difference between ONNX Runtime and torch; of scores, the relative one.
 
     Raises:
         InputError: when it is above `TOLERANCE`, or the keypoints are others.
@@ -216,19 +216,21 @@ def _check(graph: Graph, path: Path) -> float:
     import torch
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    name, *names = graph.shapes
-    found = [torch.from_numpy(x) for x in session.run(names, {name: graph.checked_with.numpy()})]
+    name, *names = content.shapes
+    found = [torch.from_numpy(x) for x in session.run(names, {name: content.checked_with.numpy()})]
     difference = float("inf")
-    if [x.shape for x in found] == [x.shape for x in graph.expected]:
+    if [x.shape for x in found] == [x.shape for x in content.expected]:
         if "keypoints" in names:  # those of equal scores are in any order
-            order = torch.cdist(graph.expected[0].double(), found[0].double()).argmin(dim=1)
+            order = torch.cdist(content.expected[0].double(), found[0].double()).argmin(dim=1)
             found = [x[order] for x in found]
-        errors = ((a - b).abs() / (1 + b.abs()) for a, b in zip(found, graph.expected, strict=True))
+        errors = [(a - b).abs() for a, b in zip(found, content.expected, strict=True)]
+        if "scores" in names:  # may be logits of any size
+            errors[1] /= 1 + content.expected[1].abs()
         difference = max((float(error.max()) for error in errors if error.numel()), default=0.0)
     if not difference <= TOLERANCE:
         raise InputError(
-            f"ONNX Runtime does not compute the features of torch ({difference:.0e} off instead of "
-            f"at most {TOLERANCE:.0e}), so that no file was written. Is it an old version?"
+            f"ONNX Runtime does not compute the features of torch: they differ by {difference:.0e} "
+            f"instead of at most {TOLERANCE:.0e}. No file was written. Try other versions of the two."
         )
     return difference
 

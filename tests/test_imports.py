@@ -9,17 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 checker = runpy.run_path(str(ROOT / "benchmarks/imports.py"))
-HEAVY = {
-    "torch",
-    "kornia",
-    "onnx",
-    "onnxruntime",
-    "scipy",
-    "sklearn",
-    "matplotlib",
-    "safetensors.torch",
-    "ray",
-}
+HEAVY = {"torch", "kornia", "scipy", "sklearn", "matplotlib", "safetensors.torch", "ray"}
 
 
 def test_imports_point_down():

@@ -92,8 +92,8 @@ class Graph(torch.nn.Module):
             image: see `Extractor.fixed`.
 
         Returns:
-            Keypoints (N, 2) x, y in pixels, centres at integers; scores (N,), highest first; and
-            descriptors (N, dim) of unit norm; float32.
+            Keypoints (N, 2) x, y in pixels, centres at integers; scores (N,); and descriptors
+            (N, dim) of unit norm; float32.
         """
         features = self.extractor.reduce(self.extractor.base.fixed(image))
         scores = features["scores"][0]

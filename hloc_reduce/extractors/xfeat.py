@@ -1,7 +1,7 @@
 """XFeat's keypoints and descriptors."""
 
 import torch
-from torch.nn.functional import grid_sample, normalize
+from torch.nn.functional import grid_sample, normalize, pixel_shuffle
 
 from ..networks import NETWORKS
 from ..networks.keypoints import limit, strongest_fixed
@@ -47,11 +47,11 @@ class XFeat(Extractor):
         """Return the features of an image in tensors of fixed length, see `Extractor.fixed`."""
         height, width = image.shape[2:]
         dense, logits, reliability = self.model.net(image)
-        x, y = torch.arange(width), torch.arange(height)
+        x, y = (torch.arange(side, device=image.device) for side in (width, height))
         pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
         weights = grid_sample(reliability, self._grid(pixels[None], image), align_corners=False)
         keypoints, scores = strongest_fixed(
-            self.model._get_kpts_heatmap(logits)[0, 0],
+            pixel_shuffle(logits.softmax(dim=1)[:, :-1], 8)[0, 0],
             *(RADIUS, self.conf["detection_threshold"], RADIUS, self.conf["max_keypoints"]),
             weights[0, 0],
         )
