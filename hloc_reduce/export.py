@@ -230,7 +230,7 @@ def _check(content: Content, path: Path) -> float:
     if not difference <= TOLERANCE:
         raise InputError(
             f"ONNX Runtime does not compute the features of torch: they differ by {difference:.0e} "
-            f"instead of at most {TOLERANCE:.0e}. No file was written. Try other versions of the two."
+            f"instead of at most {TOLERANCE:.0e}. No file was written. Try other versions."
         )
     return difference
 

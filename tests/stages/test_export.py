@@ -12,6 +12,7 @@ import hloc_reduce
 from hloc_reduce import export, extractors, projections
 from hloc_reduce.confs import features
 from hloc_reduce.projections import network
+from hloc_reduce.utils.cli import InputError
 
 PIPELINE = export
 onnx = pytest.importorskip("onnx")
@@ -95,6 +96,19 @@ def test_a_network_with_options_and_a_projection(run, base_weights, tmp_path):
     metadata = session(path).get_modelmeta().custom_metadata_map
     assert metadata["feature"] == "own" and metadata["dim"] == "16"
     assert metadata["max_keypoints"] == "100" and metadata["left_out"] == ""
+    content = export._network("own", conf)
+    keypoints, scores, descriptors = content.expected
+    order = torch.randperm(100)
+    expected = keypoints[order], scores[order], descriptors[order]
+    assert export._check(replace(content, expected=expected), path) < 1e-4
+    for expected in (
+        (keypoints + 2e-4, scores, descriptors),
+        (keypoints, scores.roll(1), descriptors),
+        (keypoints, scores, -descriptors),
+        (keypoints[1:], scores[1:], descriptors[1:]),
+    ):
+        with pytest.raises(InputError, match="does not compute the features of torch"):
+            export._check(replace(content, expected=expected), path)
 
 
 @pytest.mark.parametrize("name", ["sift_sv64", "sift_nested@24"])
