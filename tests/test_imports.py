@@ -57,10 +57,18 @@ COMMANDS = [
     "pipelines.aachen --dataset no/such/folder",
     "pipelines.localize --outputs o --map no/such/map --query_images no/such/folder",
     "pipelines.batch no/such/jobs.yaml",
+    "hloc_reduce.export --feature xfaet --output file.onnx",
     *(f"pipelines.{name} --help" for name in ("aachen", "inloc", "localize", "batch", "compare")),
     *(
         f"hloc_reduce.{name} --help"
-        for name in ("extract_features", "match_features", "localize_sfm", "report", "storage")
+        for name in (
+            "export",
+            "extract_features",
+            "match_features",
+            "localize_sfm",
+            "report",
+            "storage",
+        )
     ),
 ]
 

@@ -31,12 +31,14 @@ class Extractor(BaseModel):
         detect: detects the keypoints, if that can be done in another process (pickled), separately
             from describing them; `_forward` gets the result as `detected`.
         dim: dimension of the descriptors, as far as it is known.
+        stride: what the sides of an image are multiples of in `fixed`.
     """
 
     required_inputs = ("image",)
     detection_noise = 1.0
     detect: Detect | None = None
     dim = DIM
+    stride = 1
 
     @property
     def descriptor(self) -> str:
@@ -56,6 +58,49 @@ class Extractor(BaseModel):
     def reduce(self, features: dict) -> dict:
         """Return the features of this extractor, computed from those of `base`."""
         return features
+
+    def fixed(self, image: torch.Tensor) -> dict:
+        """Return the features of an image in tensors of fixed length, for `hloc_reduce.export`.
+
+        The extractors of networks have it, so that they can be written as ONNX.
+
+        Args:
+            image: (1, 3, H, W) float32 RGB in [0, 1]; H and W are multiples of `stride`.
+
+        Returns:
+            What `_forward` returns without its blur of noisy images, for exactly `max_keypoints`
+            keypoints. Missing ones have the score -inf.
+        """
+        raise NotImplementedError
+
+
+class Graph(torch.nn.Module):
+    """An extractor as a graph of tensors that ONNX can express.
+
+    Args:
+        extractor: one that has `fixed`, or a projection of its features.
+    """
+
+    def __init__(self, extractor: Extractor):
+        super().__init__()
+        self.extractor = extractor
+
+    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Compute the features of an image.
+
+        Args:
+            image: see `Extractor.fixed`.
+
+        Returns:
+            Keypoints (N, 2) x, y in pixels, centres at integers; scores (N,); and descriptors
+            (N, dim) of unit norm; float32.
+        """
+        features = self.extractor.reduce(self.extractor.base.fixed(image))
+        scores = features["scores"][0]
+        rows = torch.nonzero(scores > -torch.inf)[:, 0]
+        values = features["keypoints"][0], scores, features["descriptors"][0].T
+        keypoints, scores, descriptors = (value.index_select(0, rows) for value in values)
+        return keypoints, scores, descriptors
 
 
 def load(conf: dict) -> Extractor:

@@ -1,11 +1,12 @@
 """ALIKED's keypoints and descriptors."""
 
 import torch
+from torch.nn.functional import grid_sample
 from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from ..networks import ALIKED as MODELS
 from ..networks import NETWORKS
-from ..networks.keypoints import limit
+from ..networks.keypoints import limit, strongest_fixed
 from ..networks.loading import load_weights
 from ..networks.noise import reduce_noise
 from ..utils.cli import choose
@@ -19,6 +20,7 @@ class ALIKED(Extractor):
     keeps all. With `denoise`, noisy images are blurred first.
     """
 
+    stride = 32
     default_conf = {"model_name": "aliked-n16", "max_keypoints": 4096, "denoise": True}
 
     def _init(self, conf: dict) -> None:
@@ -44,4 +46,27 @@ class ALIKED(Extractor):
             "keypoints": found.keypoints[None],
             "scores": found.keypoint_scores[None],
             "descriptors": found.descriptors.T[None],
+        }
+
+    def fixed(self, image: torch.Tensor) -> dict:
+        """Return the features of an image in tensors of fixed length, see `Extractor.fixed`."""
+        height, width = image.shape[2:]
+        dense, score_map = self.model.extract_dense_map(image)
+        detector = self.model.dkd
+        radius, number = detector.radius, self.conf["max_keypoints"]
+        maxima, found = strongest_fixed(score_map[0, 0], radius, 0.0, radius, number)
+        # the mean position in the window around a maximum, weighted by the scores
+        steps = torch.arange(-radius, radius + 1, device=image.device)
+        columns, rows = (maxima.long()[:, :, None] + steps).unbind(dim=1)
+        window = score_map[0, 0][rows[:, :, None], columns[:, None]].flatten(1)
+        weights = (window / detector.temperature).softmax(dim=1)
+        keypoints = maxima + weights @ detector.get_buffer("hw_grid")
+        size = torch.tensor([width - 1, height - 1], dtype=image.dtype, device=image.device)
+        grid = keypoints / size * 2 - 1
+        scores = grid_sample(score_map, grid[None, None], align_corners=True)[0, 0, 0]
+        (descriptors,), _ = self.model.desc_head(dense, [grid])
+        return {
+            "keypoints": keypoints[None],
+            "scores": torch.where(found > -torch.inf, scores, found)[None],
+            "descriptors": descriptors.T[None],
         }

@@ -1,10 +1,13 @@
 """EdgePoint2's keypoints and descriptors."""
 
+from collections.abc import Callable
+
+import torch
 from torch.nn.functional import grid_sample, interpolate, normalize
 
 from ..networks import EDGEPOINT2, NETWORKS
 from ..networks.edgepoint2 import EdgePoint2 as Network
-from ..networks.keypoints import strongest
+from ..networks.keypoints import Keypoints, strongest, strongest_fixed
 from ..networks.loading import load_weights
 from ..networks.noise import reduce_noise
 from ..utils.cli import choose
@@ -23,6 +26,7 @@ class EdgePoint2(Extractor):
     `max_keypoints` highest ones; -1 keeps all. With `denoise`, noisy images are blurred first.
     """
 
+    stride = Network.stride
     default_conf = {"model_name": "M32", "max_keypoints": 4096, "denoise": True}
 
     def _init(self, conf: dict) -> None:
@@ -41,14 +45,24 @@ class EdgePoint2(Extractor):
         width, height = (max(1, side // Network.stride) * Network.stride for side in given)
         if (width, height) != tuple(given):
             image = interpolate(image, (height, width), mode="bilinear", align_corners=True)
+        found = self._compute(image, strongest)
+        ratio = found["keypoints"].new_tensor(given) / image.new_tensor([width, height])
+        return {**found, "keypoints": found["keypoints"] * ratio}
+
+    def fixed(self, image: torch.Tensor) -> dict:
+        """Return the features of an image in tensors of fixed length, see `Extractor.fixed`."""
+        return self._compute(image, strongest_fixed)
+
+    def _compute(self, image: torch.Tensor, select: Callable[..., Keypoints]) -> dict:
+        """Return the features of an image whose sides are multiples of `stride`."""
         dense, score_map = self.network(image)
         limits = RADIUS, MIN_SCORE, BORDER, self.conf["max_keypoints"]
-        keypoints, scores = strongest(score_map[0, 0], *limits)
-        size = keypoints.new_tensor([width, height])
+        keypoints, scores = select(score_map[0, 0], *limits)
+        size = torch.tensor(image.shape[:1:-1], dtype=image.dtype, device=image.device)
         grid = (keypoints + 0.5) / size * 2 - 1
         descriptors = grid_sample(dense, grid[None, None], align_corners=False)[0, :, 0]
         return {
-            "keypoints": (keypoints * (keypoints.new_tensor(given) / size))[None],
+            "keypoints": keypoints[None],
             "scores": scores[None],
             "descriptors": normalize(descriptors, dim=0)[None],
         }

@@ -2,6 +2,9 @@
 
 import torch
 from kornia.geometry.subpix import nms2d
+from torch.nn.functional import max_pool2d, pad
+
+Keypoints = tuple[torch.Tensor, torch.Tensor]  # x, y (N, 2), and their scores (N,)
 
 
 def limit(max_keypoints: int) -> int:
@@ -11,7 +14,7 @@ def limit(max_keypoints: int) -> int:
 
 def strongest(
     scores: torch.Tensor, radius: int, min_score: float, border: int, max_keypoints: int
-) -> tuple[torch.Tensor, torch.Tensor]:
+) -> Keypoints:
     """Find the highest maxima of a score map.
 
     Args:
@@ -33,3 +36,52 @@ def strongest(
     number = len(found) if max_keypoints < 0 else min(max_keypoints, len(found))
     found, order = found.topk(number)
     return torch.stack([x, y], dim=1)[order].to(scores.dtype), found
+
+
+def strongest_fixed(
+    scores: torch.Tensor,
+    radius: int,
+    min_score: float,
+    border: int,
+    number: int,
+    weights: torch.Tensor | None = None,
+) -> Keypoints:
+    """Find the keypoints of `strongest` in tensors of fixed length, which ONNX needs.
+
+    Args:
+        scores: (H, W) float.
+        radius: see `strongest`.
+        min_score: see `strongest`.
+        border: see `strongest`; at least `radius`.
+        number: of keypoints, at least 1.
+        weights: (H, W) float above 0, which the scores of maxima are multiplied by.
+
+    Returns:
+        Keypoints (number, 2) float x, y, and their scores (number,), highest first. Rows without a
+        keypoint have the score -inf, and any position at which a keypoint may be.
+    """
+    height, width = scores.shape
+    edge = border - radius
+    around = _highest_around(scores[edge : height - edge, edge : width - edge], radius)
+    inner = slice(border, height - border), slice(border, width - border)
+    maxima = (scores[inner] > around) & (scores[inner] > min_score)
+    weighted = scores if weights is None else scores * weights
+    found = torch.where(maxima, weighted[inner], -torch.inf).flatten()
+    # small images have fewer pixels than rows
+    highest, index = pad(found, (0, number), value=-torch.inf).topk(number)
+    index, columns = index.clamp(max=found.shape[0] - 1), width - 2 * border
+    y = index // columns
+    return torch.stack([index - y * columns, y], dim=1).to(scores.dtype) + border, highest
+
+
+def _highest_around(scores: torch.Tensor, radius: int) -> torch.Tensor:
+    """Return the highest score around each one (H - 2 radius, W - 2 radius), itself excluded."""
+    rows = max_pool2d(scores[None], (1, 2 * radius + 1), stride=1)
+    beside = scores[None, radius:-radius]
+    parts = (
+        max_pool2d(rows[:, : -radius - 1], (radius, 1), stride=1),
+        max_pool2d(rows[:, radius + 1 :], (radius, 1), stride=1),
+        max_pool2d(beside[:, :, : -radius - 1], (1, radius), stride=1),
+        max_pool2d(beside[:, :, radius + 1 :], (1, radius), stride=1),
+    )
+    return torch.stack(parts).amax(dim=0)[0]

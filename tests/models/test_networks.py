@@ -17,7 +17,7 @@ from hloc_reduce import extract_features, extractors, networks
 from hloc_reduce.confs import features
 from hloc_reduce.networks import EDGEPOINT2, NETWORKS, loading
 from hloc_reduce.networks.edgepoint2 import EdgePoint2
-from hloc_reduce.networks.keypoints import strongest
+from hloc_reduce.networks.keypoints import strongest, strongest_fixed
 from hloc_reduce.networks.noise import NOISY, reduce_noise, relative_noise
 from hloc_reduce.utils import downloads
 from hloc_reduce.utils.cli import InputError
@@ -70,6 +70,24 @@ def test_strongest_are_the_highest_strict_maxima():
     assert len(strongest(scores, 2, 0.5, 4, 1)[0]) == 1
     assert len(strongest(scores, 2, 6.0, 4, -1)[0]) == 0
     assert len(strongest(scores[:6, :6], 2, 0.5, 4, -1)[0]) == 0
+
+
+@pytest.mark.parametrize("number, radius, border", [(20, 2, 4), (4096, 2, 4), (4096, 3, 3)])
+def test_strongest_of_fixed_length(number, radius, border):
+    scores = torch.randn(40, 51, generator=torch.Generator().manual_seed(0)).round(decimals=1)
+    expected, their_scores = strongest(scores, radius, 0.5, border, -1)
+    keypoints, found = strongest_fixed(scores, radius, 0.5, border, number)
+    some = min(number, len(expected))
+    assert 20 < len(expected) < 200 and keypoints.shape == (number, 2)
+    torch.testing.assert_close(found[:some], their_scores[:some])
+    assert (found[some:] == -torch.inf).all()
+    assert (scores[keypoints[:some, 1].long(), keypoints[:some, 0].long()] == found[:some]).all()
+    assert set(map(tuple, keypoints[:some].tolist())) <= set(map(tuple, expected.tolist()))
+    # weights change the order, and which ones are kept, but not which ones exceed min_score
+    weights = 10 - scores
+    keypoints, weighted = strongest_fixed(scores, radius, 0.5, border, number, weights)
+    values = (their_scores * (10 - their_scores)).sort(descending=True).values
+    torch.testing.assert_close(weighted[:some], values[:some])
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.02, 0.1])
