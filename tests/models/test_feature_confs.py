@@ -117,7 +117,8 @@ def test_settings_of_dog_reach_the_base_of_a_projection():
 OF_PATCHES = [
     name
     for name in confs
-    if confs[name]["model"].get("projection") in projections.names() and "colmap" not in name
+    if confs[name]["model"].get("projection") in projections.names()
+    and features.descriptor_of(confs[name]["model"]) not in (None, features.COLMAP)
 ]
 
 
