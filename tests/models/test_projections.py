@@ -23,8 +23,9 @@ from hloc_reduce.utils.cli import InputError
 @pytest.mark.parametrize("name", projections.names())
 def test_shipped_projections_say_where_they_come_from(name):
     metadata = projections.load(name).metadata
-    dim = "" if metadata["scheme"] == "nested" else metadata["dim"]
-    assert f"{metadata['descriptor']}_{metadata['scheme']}{dim}" == name
+    scheme, dim = metadata["scheme"], metadata["dim"]
+    suffix = {"raw": "", "nested": "_nested"}.get(scheme, f"_{scheme}{dim}")
+    assert metadata["descriptor"] + suffix == name
     assert metadata["training_data"] and metadata["versions"] and "seed" in metadata
     assert metadata["recipe"]["name"] in ("best", "paper")
     assert metadata["input"] == "descriptors of unit L2 norm"
@@ -80,15 +81,16 @@ def test_saved_and_loaded(tmp_path):
     assert not any(parameter.requires_grad for parameter in loaded.parameters())
 
 
-def test_everything_ships_in_25_megabytes():
+def test_everything_ships_in_30_megabytes():
     expected = {
         name
-        for descriptor in ("sift", "mkd", "tfeat", "colmap_sift")
+        for descriptor in ("sift", "mkd", "tfeat", "colmap_sift", "xfeat", "edgepoint2_m64")
         for name in features.names(descriptor)
         if "@" not in name
     }
-    assert set(projections.names()) == expected and len(expected) == 59
-    assert sum(path.stat().st_size for path in WEIGHTS.iterdir()) < 25e6
+    expected |= {"xfeat", "edgepoint2_m32", "edgepoint2_m64"}  # levels
+    assert set(projections.names()) == expected and len(expected) == 75
+    assert sum(path.stat().st_size for path in WEIGHTS.iterdir()) < 30e6
 
 
 def test_what_does_not_ship_says_how_to_train_it():
