@@ -1,6 +1,7 @@
 """Losses of the schemes."""
 
 import torch
+from torch.nn.functional import cross_entropy
 
 DUPLICATE_DISTANCE = 0.008  # nearer descriptors count as the same patch, as in HardNet
 
@@ -23,6 +24,25 @@ def triplet_loss(anchors: torch.Tensor, positives: torch.Tensor, margin: float) 
     others = distances.masked_fill(same | (distances < DUPLICATE_DISTANCE), torch.inf)
     negative = torch.minimum(others.amin(dim=0), others.amin(dim=1))
     return (margin + positive - negative).clamp(min=0).mean()
+
+
+def contrastive_loss(
+    anchors: torch.Tensor, positives: torch.Tensor, temperature: float
+) -> torch.Tensor:
+    """Compute InfoNCE (van den Oord et al., 2018) in both directions, with all rows as negatives.
+
+    Args:
+        anchors: (N, D) of unit norm.
+        positives: (N, D) of unit norm, row i matching anchor i only.
+        temperature: by which cosines are divided; the lower, the more the nearest rows count.
+
+    Returns:
+        The mean cross entropy of finding positive i from anchor i, and the reverse, a scalar.
+    """
+    similarities = anchors @ positives.T / temperature
+    right = torch.arange(len(anchors), device=anchors.device)
+    there, back = (cross_entropy(rows, right) for rows in (similarities, similarities.T))
+    return (there + back) / 2
 
 
 def distance_loss(descriptors: torch.Tensor, embedded: torch.Tensor) -> torch.Tensor:

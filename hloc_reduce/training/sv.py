@@ -1,4 +1,4 @@
-"""Supervised reduction: triplet margin loss with the hardest negative in the batch (Sec. III-C)."""
+"""Supervised reduction: pull descriptors of the same point together (Sec. III-C)."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from torch import nn
 from ..projections.network import MLP, read
 from . import pca
 from .loop import device, fit
-from .losses import distance_loss, triplet_loss
+from .losses import contrastive_loss, distance_loss, triplet_loss
 from .sampling import PairSampler
 from .tracks import Tracks
 
@@ -40,7 +40,14 @@ RECIPES: dict[str, dict] = {
 }
 RECIPES["tune"] = {**RECIPES["best"], "steps": 1000, "lr": 1e-3}
 # "best" for the descriptors of networks: one layer, which begins with the principal axes
-OF_NETWORKS = {"hidden": [], "steps": 1000, "batch_size": 2048, "lr": 1e-3, "maps_per_batch": 1}
+OF_NETWORKS = {
+    "hidden": [],
+    "steps": 1000,
+    "batch_size": 2048,
+    "lr": 1e-3,
+    "maps_per_batch": 1,
+    "temperature": 0.04,
+}
 DISTANCE_WEIGHTS = {"hardnet": 3.0}  # beta
 
 
@@ -56,7 +63,8 @@ def train(
             `distance_weight`, the weight of the distance loss. Without hidden layers, the only
             layer begins with the principal axes. Optional: `prefixes`, the lengths of leading
             parts of a descriptor that are trained to match, too; `begin_with`, name or path of a
-            projection to begin with.
+            projection to begin with; `temperature`, of the contrastive loss, which replaces the
+            triplet loss.
         seed: of the initial weights and the batches.
         checkpoint: file to resume from; the caller deletes it.
         made_from: provenance of the training; a stale checkpoint is ignored.
@@ -83,7 +91,10 @@ def train(
         value = embedded.new_zeros(())
         for prefix in recipe.get("prefixes", [dim]):
             anchors, positives = nn.functional.normalize(embedded[:, :prefix], dim=1).chunk(2)
-            value = value + triplet_loss(anchors, positives, recipe["margin"])
+            if "temperature" in recipe:
+                value = value + contrastive_loss(anchors, positives, recipe["temperature"])
+            else:
+                value = value + triplet_loss(anchors, positives, recipe["margin"])
         if recipe["distance_weight"]:
             value = value + recipe["distance_weight"] * distance_loss(descriptors, embedded)
         return value
