@@ -1,26 +1,45 @@
 """Print a Markdown table of finished runs of any pipeline.
 
-What is no outputs folder of a finished run, such as a report beside the folders, is named and left
-out.
+With --centimetres, recall is at these position errors and 2 degrees instead of the limits of the
+data set. What is no outputs folder of a finished run, such as a report beside the folders, is named
+and left out.
 """
 
+import csv
 import json
 from pathlib import Path
 
 from hloc_reduce import logger
+from hloc_reduce.evaluation.poses import ERRORS, counted_errors, recall
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 
-HEADER = (
-    "| feature | bytes | list | localized | recall [%] | median error | mean inliers | points | s |"
-)
+COLUMNS = {
+    "feature": "---",
+    "bytes": "---:",
+    "list": "---",
+    "localized": "---:",
+    "recall [%]": "---:",
+    "median error": "---:",
+    "mean inliers": "---:",
+    "keypoints": "---:",
+    "points": "---:",
+    "extraction [s]": "---:",
+    "all [s]": "---:",
+}
+DEGREES = 2.0
 
 
-def rows(summary: dict) -> list[str]:
-    """Format a row for each query list of a summary."""
-    lines = []
+def rows(folder: Path, centimetres: list[float]) -> list[str]:
+    """Format a row for each query list of a finished run."""
+    summary, lines = json.loads((folder / "summary.json").read_text()), []
+    size, seconds = summary["bytes_per_keypoint"], summary["seconds"]
+    photos = summary["map_images"] + summary["queries"]
+    extraction = seconds.get("extract_features")
     for name, result in summary["lists"].items():
-        recall = " / ".join(f"{value:.1f}" for value in result.get("recall_percent", []))
+        percent = result.get("recall_percent", [])
+        if centimetres:
+            percent = _recall(folder / "queries.csv", name, centimetres)
         error = (
             f"{100 * result['median_position_error_m']:.2f} cm, "
             f"{result['median_rotation_error_deg']:.3f}°"
@@ -29,24 +48,36 @@ def rows(summary: dict) -> list[str]:
         )
         cells = (
             summary["feature"],
-            summary["bytes_per_keypoint"]["descriptor"],
+            size["descriptor"],
             name.split("_")[0],
             f"{result['localized']} of {result['queries']}",
-            recall,
+            " / ".join(f"{value:.1f}" for value in percent),
             error,
-            f"{result['mean_inliers']:.0f}",
+            f"{result['mean_inliers']:,.0f}",
+            f"{size['keypoints'] / photos:,.0f}",
             f"{summary['map_points3D']:,}" if "map_points3D" in summary else "",
-            f"{sum(summary['seconds'].values()):.0f}",
+            f"{extraction / photos:.2f}" if extraction else "",
+            f"{sum(seconds.values()):.0f}",
         )
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return lines
 
 
+def _recall(queries: Path, name: str, centimetres: list[float]) -> list[float]:
+    """Return recall in percent at position errors, of a list in queries.csv."""
+    with queries.open() as file:
+        listed = [row for row in csv.DictReader(file) if row["list"] == name]
+    known = [row | {key: float(row[key]) for key in ERRORS} for row in listed if row[ERRORS[0]]]
+    return recall(counted_errors(known), [(value / 100, DEGREES) for value in centimetres])
+
+
 def _main() -> None:
     parser = cli.Parser(__doc__, "outputs/demo_town/*")
-    parser.add_argument("outputs", type=Path, nargs="+", help="outputs folders of runs")
+    add = parser.add_argument
+    add("outputs", type=Path, nargs="+", help="outputs folders of runs")
+    add("--centimetres", type=float, nargs="+", default=[], help="position errors for recall")
     args = parser.parse_args()
-    lines = [HEADER, "| --- | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
+    lines = [f"| {' | '.join(cells)} |" for cells in (COLUMNS, COLUMNS.values())]
     finished = [folder for folder in args.outputs if (folder / "summary.json").is_file()]
     others = ", ".join(str(path) for path in args.outputs if path not in finished)
     if not finished:
@@ -54,7 +85,7 @@ def _main() -> None:
     if others:
         logger.warning("Left out, no finished runs: %s.", others)
     for folder in finished:
-        lines += rows(json.loads((folder / "summary.json").read_text()))
+        lines += rows(folder, args.centimetres)
     print("\n".join(lines))
 
 

@@ -13,9 +13,11 @@ from hloc_reduce.utils.cli import InputError
 ROOT = Path(__file__).parents[1]
 SUMMARY = {
     "feature": "sift",
-    "bytes_per_keypoint": {"descriptor": 256},
+    "bytes_per_keypoint": {"descriptor": 256, "keypoints": 6000},
+    "map_images": 3,
+    "queries": 3,
     "map_points3D": 3871,
-    "seconds": {"extract_features": 3.2, "match_features": 1.1},
+    "seconds": {"extract_features": 3.0, "match_features": 1.1},
     "lists": {"night_time": {"localized": 2, "queries": 3, "mean_inliers": 51.6}},
 }
 
@@ -33,10 +35,26 @@ def test_what_is_no_finished_run_is_left_out(tmp_path):
     shown = table(run, report)
     assert shown.returncode == 0 and f"Left out, no finished runs: {report}." in shown.stderr
     assert shown.stdout.splitlines()[2:] == [
-        "| sift | 256 | night | 2 of 3 |  |  | 52 | 3,871 | 4 |"
+        "| sift | 256 | night | 2 of 3 |  |  | 52 | 1,000 | 3,871 | 0.50 | 4 |"
     ]
     alone = table(report)
     assert alone.returncode == 2 and f"no summary.json in {report}" in alone.stderr
+
+
+def test_recall_in_centimetres_counts_localized_queries_only(tmp_path):
+    rows = [
+        ("a.jpg", "night_time", "localized", 0.004, 0.1),
+        ("b.jpg", "night_time", "localized", 0.03, 0.1),
+        ("c.jpg", "night_time", "localized", 0.001, 2.5),  # turned too far
+        ("d.jpg", "night_time", "fallback", 0.001, 0.1),
+        ("e.jpg", "day_time", "failed", "", ""),
+    ]
+    header = ("query", "list", "status", "position_error_m", "rotation_error_deg")
+    lines = [",".join(map(str, row)) for row in (header, *rows)]
+    (tmp_path / "queries.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "summary.json").write_text(json.dumps(SUMMARY))
+    shown = table(tmp_path, "--centimetres", "1", "5")
+    assert "| 25.0 / 50.0 |" in shown.stdout.splitlines()[2]
 
 
 def test_without_hloc_the_comparison_says_what_to_install(monkeypatch):
