@@ -1,4 +1,4 @@
-"""Blur noisy photos as much as helps a network."""
+"""Blur noisy photos as much as helps a network, and cut off their lamps."""
 
 import cv2
 import numpy as np
@@ -7,6 +7,7 @@ import torch
 BLOCK = 32  # pixels, the side of the blocks in which noise is measured
 SMOOTH = 0.1  # share of the blocks that are taken for smooth
 CLIPPED = 0.02, 0.98  # blocks of a mean beyond have lost their noise
+LAMPS = 2.5  # multiple of the median above which pixels are lamps
 # standard deviations of the noise, in that of the image, from which it is blurred; and of the blur
 # in pixels for a noise of 1 (docs/results.md)
 NOISY, BLUR = 0.08, 2.8
@@ -16,7 +17,8 @@ def relative_noise(image: np.ndarray) -> float:
     """Estimate the noise of an image in units of its contrast.
 
     Noise is what varies from pixel to pixel in the smoothest parts: the diagonal details of a Haar
-    transform, in which edges show least.
+    transform, in which edges show least. Lamps do not add to the contrast: networks normalize
+    images by their standard deviation, most of which a lamp in a dark photo would make up.
 
     Args:
         image: (H, W) float32 in [0, 1].
@@ -26,7 +28,7 @@ def relative_noise(image: np.ndarray) -> float:
         is too small, or of one colour.
     """
     height, width = (side // BLOCK * BLOCK for side in image.shape)
-    contrast = float(image.std())
+    contrast = float(image.clip(max=lamps(image)).std()) if image.size else 0.0
     if not (height and width and contrast):
         return 0.0
     pixels = image[:height, :width]
@@ -38,12 +40,24 @@ def relative_noise(image: np.ndarray) -> float:
     return float(np.quantile(measured, SMOOTH)) / contrast if measured.size else 0.0
 
 
+def lamps(image: np.ndarray) -> float:
+    """Return the value above which pixels (H, W) or (C, H, W) in [0, 1] are lamps."""
+    return min(1.0, LAMPS * float(np.median(image))) or 1.0
+
+
 def reduce_noise(image: torch.Tensor) -> torch.Tensor:
-    """Blur an image (1, C, H, W) float32 in [0, 1] if it is noisy; others are returned as given."""
+    """Blur an image and cut off its lamps if it is noisy.
+
+    Args:
+        image: (1, C, H, W) float32 in [0, 1].
+
+    Returns:
+        The same; the image as given if it is not noisy.
+    """
     channels = image[0].cpu().numpy()
     noise = relative_noise(channels.mean(axis=0))
     if noise < NOISY:
         return image
-    blur = BLUR * np.sqrt(noise)
-    blurred = [cv2.GaussianBlur(channel, (0, 0), blur) for channel in channels]
+    cut, blur = channels.clip(max=lamps(channels)), BLUR * np.sqrt(noise)
+    blurred = [cv2.GaussianBlur(channel, (0, 0), blur) for channel in cut]
     return torch.from_numpy(np.stack(blurred))[None].to(image.device)

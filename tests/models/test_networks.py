@@ -100,6 +100,17 @@ def test_noise_is_measured_in_units_of_the_contrast(textured, sigma):
     assert dark == pytest.approx(found, rel=0.05)
 
 
+def test_a_lamp_in_a_dark_photo_hides_neither_noise_nor_contrast(textured):
+    noise = np.random.default_rng(0).standard_normal(textured.shape)
+    photo = (textured / 2550 + 0.02 * noise).clip(0, 1).astype(np.float32)
+    found, lit = relative_noise(photo), photo.copy()
+    lit[20:50, 20:50] = 1
+    assert relative_noise(lit) == pytest.approx(found, rel=0.2)
+    plain, lamp = (reduce_noise(torch.from_numpy(image)[None, None]) for image in (photo, lit))
+    assert float(lamp.std()) == pytest.approx(float(plain.std()), rel=0.2)
+    assert lit.std() > 2 * photo.std()
+
+
 def test_only_noisy_photos_are_blurred(textured):
     clean = torch.from_numpy(textured.astype(np.float32) / 255)[None, None]
     assert reduce_noise(clean) is clean
