@@ -204,9 +204,9 @@ def _extract_image(
         logger.warning("Image %s has no keypoints.", name)
     groups = []
     for path, features in zip(paths, extracted, strict=True):
-        uncertainty = features.pop("uncertainty")
+        measured = {key: features.pop(key) for key in ("uncertainty", "blur")}
         arrays, attrs = stores[path](name, features)
-        attrs["keypoints"] = {"uncertainty": uncertainty}
+        attrs["keypoints"] = measured
         if failure is not None:
             attrs[""] = {FAILURE: failure}
         groups.append((path, (name, arrays, attrs)))

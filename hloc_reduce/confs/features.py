@@ -24,11 +24,11 @@ RECOMMENDED = "colmap_sift_sv64"  # the fastest, and the best measured (docs/per
 DIMS = (64, 32, 24, 16)
 # the schemes and dimensions of the projections of each base descriptor; and who has a nested one
 PROJECTIONS: dict[str, tuple[tuple[str, ...], tuple[int, ...]]] = {
-    **dict.fromkeys(DESCRIPTORS, (("pca", "us", "ss", "sv"), DIMS)),
+    **dict.fromkeys((*DESCRIPTORS, "aliked"), (("pca", "us", "ss", "sv"), DIMS)),
     COLMAP: (("pca", "sv"), DIMS),
     **dict.fromkeys(("xfeat", "edgepoint2_m64"), (("pca", "sv"), DIMS[1:])),
 }
-NESTED = (*DESCRIPTORS, "xfeat")
+NESTED = (*DESCRIPTORS, "xfeat", "aliked")
 
 PREPROCESSING = {"grayscale": True, "resize_max": 1600}
 IN_COLOUR = {**PREPROCESSING, "grayscale": False}

@@ -24,7 +24,8 @@ class Extractor(BaseModel):
 
     A subclass writes `_forward`: from `image` (1, C, H, W) float32 in [0, 1] to `keypoints`
     (1, N, 2) x, y in its pixels, centres at integers, `descriptors` (1, D, N) of unit norm, and
-    perhaps `scores`, `scales` (pixels) and `oris` (degrees), all (1, N).
+    perhaps `scores`, `scales` (pixels) and `oris` (degrees), all (1, N), and `blur` (1,), the
+    standard deviation in pixels of the blur by which it reduced the noise of the image.
 
     Attributes:
         detection_noise: standard deviation of the keypoints in pixels.
@@ -165,7 +166,8 @@ def extract(
     Returns:
         keypoints (N, 2) float32 (x, y) in pixels of the original image, centres at integers;
         descriptors (D, N); scores, scales (pixels), oris (degrees) (N,), if the model has them;
-        image_size (2,) width, height; and the uncertainty of the keypoints in pixels.
+        image_size (2,) width, height; the uncertainty of the keypoints, and the blur that reduced
+        the noise, both in pixels.
     """
     return extract_several([model], image, preprocessing, device)[0]
 
@@ -209,5 +211,6 @@ def extract_several(
             features["scales"] = features["scales"] * ratio.mean()
         features["image_size"] = size
         features["uncertainty"] = model.detection_noise * ratio.mean()
+        features["blur"] = features.get("blur", 0.0) * ratio.mean()
         extracted.append(features)
     return extracted

@@ -40,12 +40,13 @@ class ALIKED(Extractor):
         return self.conf["model_name"].removesuffix("-n16").replace("-", "_")
 
     def _forward(self, data: dict) -> dict:
-        image = reduce_noise(data["image"]) if self.conf["denoise"] else data["image"]
+        image, blur = reduce_noise(data["image"]) if self.conf["denoise"] else (data["image"], 0.0)
         (found,) = self.model(image.contiguous(memory_format=torch.channels_last))
         return {
             "keypoints": found.keypoints[None],
             "scores": found.keypoint_scores[None],
             "descriptors": found.descriptors.T[None],
+            "blur": torch.tensor([blur]),
         }
 
     def fixed(self, image: torch.Tensor) -> dict:

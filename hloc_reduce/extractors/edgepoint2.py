@@ -40,14 +40,14 @@ class EdgePoint2(Extractor):
         return f"edgepoint2_{self.conf['model_name'].lower()}"
 
     def _forward(self, data: dict) -> dict:
-        image = reduce_noise(data["image"]) if self.conf["denoise"] else data["image"]
+        image, blur = reduce_noise(data["image"]) if self.conf["denoise"] else (data["image"], 0.0)
         given = image.shape[:1:-1]
         width, height = (max(1, side // Network.stride) * Network.stride for side in given)
         if (width, height) != tuple(given):
             image = interpolate(image, (height, width), mode="bilinear", align_corners=True)
         found = self._compute(image, strongest)
         ratio = found["keypoints"].new_tensor(given) / image.new_tensor([width, height])
-        return {**found, "keypoints": found["keypoints"] * ratio}
+        return {**found, "keypoints": found["keypoints"] * ratio, "blur": torch.tensor([blur])}
 
     def fixed(self, image: torch.Tensor) -> dict:
         """Return the features of an image in tensors of fixed length, see `Extractor.fixed`."""

@@ -31,7 +31,7 @@ class XFeat(Extractor):
         self.model.eval()
 
     def _forward(self, data: dict) -> dict:
-        image = reduce_noise(data["image"]) if self.conf["denoise"] else data["image"]
+        image, blur = reduce_noise(data["image"]) if self.conf["denoise"] else (data["image"], 0.0)
         (found,) = self.model.detectAndCompute(image)
         size = torch.tensor(image.shape[:1:-1])
         resized = (size // 32 * 32).clamp(min=32)
@@ -41,6 +41,7 @@ class XFeat(Extractor):
             "keypoints": (found["keypoints"] + shift.to(image.device))[None],
             "scores": found["scores"][None],
             "descriptors": found["descriptors"].T[None],
+            "blur": torch.tensor([blur]),
         }
 
     def fixed(self, image: torch.Tensor) -> dict:

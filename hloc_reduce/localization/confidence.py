@@ -30,7 +30,8 @@ RIVAL_BY_OTHERS = 0.8
 # repeated structures have agreements up to the second one, and confidences in this range. Below it
 # there are few matches, so that the agreement is less certain; above it are mirrored facades, but
 # many more right poses in noisy scans.
-AGREEMENT = (0.17, 0.17)  # of matches without a strict ratio test
+AGREEMENT = (0.3, 0.3)  # of matches without a strict ratio test
+AGREEMENT_NOISY = (0.17, 0.17)  # the same for photos whose noise was reduced
 AGREEMENT_RATIO, STRICT = (0.76, 0.86), 0.8  # with a ratio test of up to 0.8
 AGREEMENT_FEW, FEW = (0.55, 0.72), 32  # the same for fewer than 32 dimensions
 DOUBTFUL = (50.0, 300.0)
@@ -237,6 +238,12 @@ class Gate:
         if (matcher.get("ratio_threshold") or 1) > STRICT:
             return replace(self, min_agreement=AGREEMENT)
         return replace(self, min_agreement=AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO)
+
+    def of_photo(self, blur: float) -> "Gate":
+        """Return the gate for a photo whose noise was reduced by a blur in pixels, 0 for none."""
+        if blur > 0 and self.min_agreement == AGREEMENT:
+            return replace(self, min_agreement=AGREEMENT_NOISY)
+        return self
 
     def least_agreement(self, confidence: float) -> float:
         """Return the least agreement of a pose with a confidence."""

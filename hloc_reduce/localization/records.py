@@ -11,7 +11,7 @@ from ..utils.files import naming, replacing
 from .intrinsics import from_list, to_list
 from .references import Reference
 
-RECORDS = 15  # the version of the content of records, and of the gate
+RECORDS = 16  # the version of the content of records, and of the gate
 NUMBERS = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
 
 

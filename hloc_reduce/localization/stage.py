@@ -16,7 +16,7 @@ from ..runtime.executors import SERIAL, Executor
 from ..runtime.group_writer import failure_of, failures
 from ..utils import cli
 from ..utils.cli import InputError
-from ..utils.feature_files import dimension, get_colmap_keypoints, get_image_size
+from ..utils.feature_files import dimension, get_blur, get_colmap_keypoints, get_image_size
 from ..utils.h5 import open_h5
 from ..utils.match_files import find_pair, get_matcher, get_matches, most_similar_first
 from ..utils.parsers import parse_query_lists, write_poses
@@ -177,16 +177,20 @@ def _localize_all(
     reference = load_reference()
 
     def solve(task: tuple) -> tuple[str, dict]:
-        name, camera, keypoints, found = task
+        name, camera, blur, keypoints, found = task
         used = {other: pairs for other, pairs in found.items() if len(pairs) >= skip_matches}
         options = config(name, camera)
-        cam_from_world, info = localize(reference, keypoints, camera, used, options, gate)
+        its_gate = gate.of_photo(blur)
+        cam_from_world, info = localize(reference, keypoints, camera, used, options, its_gate)
         info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
         return name, to_record(reference, list(found), cam_from_world, info)
 
     with open_h5(features) as feature_file, open_h5(matches) as match_file:
         tasks = (
-            (name, camera, *_read(feature_file, match_file, name, retrieved, reference))
+            (
+                *(name, camera, get_blur(feature_file, name)),
+                *_read(feature_file, match_file, name, retrieved, reference),
+            )
             for name, camera, retrieved in queries
         )
         with closing(parallel.ordered("localize", solve, tasks)) as solved:

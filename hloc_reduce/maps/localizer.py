@@ -126,8 +126,9 @@ class Localizer:
         lap("matching")
         config = {"estimation": {"ransac": {"max_error": self.ransac_thresh}}}
         keypoints = to_colmap(features["keypoints"])
+        gate = self.gate.of_photo(float(features["blur"]))
         cam_from_world, info = query.localize(
-            self.reference, keypoints, camera, matches, merged(config, refinement), self.gate
+            self.reference, keypoints, camera, matches, merged(config, refinement), gate
         )
         lap("pose")
         info |= {

@@ -45,19 +45,19 @@ def lamps(image: np.ndarray) -> float:
     return min(1.0, LAMPS * float(np.median(image))) or 1.0
 
 
-def reduce_noise(image: torch.Tensor) -> torch.Tensor:
+def reduce_noise(image: torch.Tensor) -> tuple[torch.Tensor, float]:
     """Blur an image and cut off its lamps if it is noisy.
 
     Args:
         image: (1, C, H, W) float32 in [0, 1].
 
     Returns:
-        The same; the image as given if it is not noisy.
+        The image, as given if it is not noisy, and the standard deviation of the blur in pixels.
     """
     channels = image[0].cpu().numpy()
     noise = relative_noise(channels.mean(axis=0))
     if noise < NOISY:
-        return image
+        return image, 0.0
     cut, blur = channels.clip(max=lamps(channels)), BLUR * np.sqrt(noise)
     blurred = [cv2.GaussianBlur(channel, (0, 0), blur) for channel in cut]
-    return torch.from_numpy(np.stack(blurred))[None].to(image.device)
+    return torch.from_numpy(np.stack(blurred))[None].to(image.device), float(blur)

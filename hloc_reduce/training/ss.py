@@ -46,7 +46,7 @@ RECIPES: dict[str, dict] = {
         "steps": 3000,
     },
 }
-OF_NETWORKS: dict = {}
+OF_NETWORKS = sv.OF_NETWORKS
 DISTANCE_WEIGHTS: dict[str, float] = {}
 
 

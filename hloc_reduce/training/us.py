@@ -35,7 +35,7 @@ RECIPES: dict[str, dict] = {
         "distance_weight": 1000.0,
     },
 }
-OF_NETWORKS: dict = {}
+OF_NETWORKS = {"hidden": [], "steps": 1000}  # "best" for the descriptors of networks
 DISTANCE_WEIGHTS = {"hardnet": 0.1}  # alpha, unless the recipe has one
 
 

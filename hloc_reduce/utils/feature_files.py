@@ -26,6 +26,13 @@ def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
     return keypoints, uncertainty
 
 
+def get_blur(file: h5py.File, name: str) -> float:
+    """Read the blur in pixels that reduced the noise of an image; files of hloc have none."""
+    with reading(file.filename):
+        blur = get_dataset(file, name, "keypoints").attrs.get("blur", 0.0)
+    return float(blur) if isinstance(blur, int | float | np.number) else 0.0
+
+
 def get_image_size(file: h5py.File, name: str) -> tuple[int, int]:
     """Read the width and height of an image in an open feature file."""
     width, height = map(int, get_array(file, name, "image_size", (2,))[:2])

@@ -178,7 +178,7 @@ def test_one_image_at_a_time_finds_what_is_rare_among_all():
     """Of 4,000 matches 40 are right, nearly all of them in one of the images."""
     keypoints, points = matches(40, 4000)
     order = np.r_[np.arange(40), 40 + np.arange(4000)]
-    images = [order[:140], *np.array_split(order[140:], 30)]
+    images = [order[:100], *np.array_split(order[100:], 30)]
     alone = solve(keypoints, points)
     found = solve(keypoints, points, images)
     assert alone.refusal is not None
@@ -224,6 +224,16 @@ def test_a_pose_that_no_image_agrees_with_is_refused():
     assert agreement(few, [np.arange(5)]) < 0.25  # five of an image tell nothing
     assert agreement(few, []) == agreement(few, [np.arange(5)])
     assert agreement(np.zeros(0, bool), []) == 0
+
+
+def test_in_noisy_photos_fewer_matches_must_agree():
+    gate = DEFAULT_GATE.of_matches({}, 64)
+    assert gate.of_photo(2.0).min_agreement < gate.of_photo(0.0).min_agreement
+    for other in (
+        DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64),
+        Gate(min_agreement=(0, 0)),
+    ):
+        assert other.of_photo(2.0) == other
 
 
 def test_doubtful_poses_must_agree_with_more_matches():

@@ -106,23 +106,24 @@ def test_a_lamp_in_a_dark_photo_hides_neither_noise_nor_contrast(textured):
     found, lit = relative_noise(photo), photo.copy()
     lit[20:50, 20:50] = 1
     assert relative_noise(lit) == pytest.approx(found, rel=0.2)
-    plain, lamp = (reduce_noise(torch.from_numpy(image)[None, None]) for image in (photo, lit))
+    plain, lamp = (reduce_noise(torch.from_numpy(image)[None, None])[0] for image in (photo, lit))
     assert float(lamp.std()) == pytest.approx(float(plain.std()), rel=0.2)
     assert lit.std() > 2 * photo.std()
 
 
 def test_only_noisy_photos_are_blurred(textured):
     clean = torch.from_numpy(textured.astype(np.float32) / 255)[None, None]
-    assert reduce_noise(clean) is clean
+    assert reduce_noise(clean) == (clean, 0)
     noise = torch.randn(1, 3, 240, 320, generator=torch.Generator().manual_seed(0))
     noisy = (clean / 10 + 0.1 + 0.02 * noise).clamp(0, 1)
-    blurred = reduce_noise(noisy)
+    blurred, blur = reduce_noise(noisy)
+    assert 0.5 < blur < 3
     assert blurred.shape == noisy.shape and blurred.dtype == noisy.dtype
     left = relative_noise(blurred[0].mean(dim=0).numpy())
     assert left < NOISY / 2 < relative_noise(noisy[0].mean(dim=0).numpy())
     for shape in ((1, 3, 64, 64), (1, 3, 20, 500), (1, 1, 1, 1)):
         image = torch.full(shape, 0.5)
-        assert reduce_noise(image) is image
+        assert reduce_noise(image)[0] is image
 
 
 def test_folded_networks_compute_the_same(random_weights):

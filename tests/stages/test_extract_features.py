@@ -17,6 +17,7 @@ from hloc_reduce.runtime import parallel
 from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import get_blur
 
 
 def test_all_cores_extract_the_same(tmp_path, textured):
@@ -37,7 +38,11 @@ def test_all_cores_extract_the_same(tmp_path, textured):
             assert len(alone) == len(together) == len(images)
             for image in images:
                 for key, array in alone[image.name].items():
-                    np.testing.assert_array_equal(array[()], together[image.name][key][()])
+                    other = together[image.name][key][()]
+                    if key == "descriptors":  # products of some CPUs depend on the threads
+                        np.testing.assert_allclose(array[()], other, rtol=2e-3, atol=1e-5)
+                    else:
+                        np.testing.assert_array_equal(array[()], other)
     images[3].write_bytes(b"no image")
     torch.set_num_threads(2)
     with pytest.raises(InputError, match="Cannot read image .*3.png"):
@@ -91,6 +96,22 @@ def test_extraction_in_original_pixels(tmp_path, textured):
     assert large["image_size"].tolist() == [640, 480] and large["uncertainty"] == 2
     np.testing.assert_allclose(large["keypoints"], small["keypoints"] * 2 + 0.5, atol=1e-3)
     np.testing.assert_allclose(large["scales"], small["scales"] * 2, rtol=1e-5)
+
+
+def test_the_blur_of_a_noisy_photo_is_stored_in_its_pixels(tmp_path, textured, monkeypatch):
+    class Blurring(DoG):
+        def _forward(self, data):
+            return super()._forward(data) | {"blur": torch.tensor([1.5])}
+
+    monkeypatch.setattr(extractors, "load", Blurring)
+    cv2.imwrite(str(tmp_path / "a.png"), textured)
+    conf = {
+        "output": "feats",
+        "model": {"name": "dog"},
+        "preprocessing": {"grayscale": True, "resize_max": 160},
+    }
+    with h5py.File(extract_features.main(conf, tmp_path, tmp_path)) as file:
+        assert get_blur(file, "a.png") == 3.0 and "blur" not in file["a.png"]
 
 
 def test_a_killed_detector_is_said(tmp_path, textured, monkeypatch):

@@ -13,7 +13,7 @@ from small_map import MATCHER
 from hloc_reduce import localize_sfm, match_features
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import query, stage
-from hloc_reduce.localization.confidence import AGREEMENT, AGREEMENT_RATIO
+from hloc_reduce.localization.confidence import AGREEMENT, AGREEMENT_NOISY, AGREEMENT_RATIO
 from hloc_reduce.localization.records import log_file, pose_of, read_records
 from hloc_reduce.localization.references import SfmMap
 from hloc_reduce.utils import cli, colmap
@@ -224,6 +224,22 @@ def test_the_gate_knows_the_matcher_by_its_file(built, conf, agreement, monkeypa
     monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[-1]) or localize(*a))
     assert built.localize()["query/6.jpg"]["localized"]
     assert {gate.min_agreement for gate in gates} == {agreement}
+
+
+@pytest.mark.parametrize(
+    ("blur", "agreement"), [(2.0, AGREEMENT_NOISY), (0.0, AGREEMENT), ("much", AGREEMENT)]
+)
+def test_the_gate_knows_noisy_photos_by_their_features(built, blur, agreement, monkeypatch):
+    conf = match_features.confs["NN-mutual"]
+    match_features.main(
+        conf, built.loc_pairs, built.features, matches=built.loc_matches, overwrite=True
+    )
+    with h5py.File(built.features, "r+") as file:
+        file["query/6.jpg/keypoints"].attrs["blur"] = blur
+    gates, localize = [], query.localize
+    monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[-1]) or localize(*a))
+    assert built.localize()["query/6.jpg"]["localized"]
+    assert gates[0].min_agreement == agreement
 
 
 def test_the_gate_skips_images_without_descriptors(built, monkeypatch):

@@ -19,6 +19,6 @@ class Reduced(BaseModel):
         return self.model.detection_noise
 
     def _forward(self, data: dict) -> dict:
-        features = self.model(data)
+        features = {key: value for key, value in self.model(data).items() if key != "blur"}
         # hloc would store float32 as float16, which has no fractions of pixels above 1024
         return {**features, "keypoints": features["keypoints"].double()}
