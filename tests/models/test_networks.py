@@ -305,3 +305,38 @@ def test_edgepoint2_agrees_with_the_authors_code(model_name, base_weights, textu
     descriptors = found["descriptors"][0].T[order]
     torch.testing.assert_close(descriptors, expected["descriptors"], atol=1e-4, rtol=0)
     sys.modules.pop("edgepoint2")
+
+
+def test_dedode_with_random_weights(tmp_path, textured, monkeypatch):
+    from kornia.feature import DeDoDe
+
+    def pretrained(detector, weights, amp_dtype):
+        assert (detector, weights) == ("L-C4-v2", "B-upright")
+        torch.manual_seed(0)
+        return DeDoDe(descriptor_model="B", amp_dtype=amp_dtype)
+
+    monkeypatch.setattr(DeDoDe, "from_pretrained", pretrained)
+    cv2.imwrite(str(tmp_path / "a.png"), textured[:75, :110])
+    (tmp_path / "dedode.yaml").write_text(
+        "model: {name: dedode, max_keypoints: 40}\npreprocessing: {grayscale: false}\n"
+    )
+    name, conf = features.get(str(tmp_path / "dedode.yaml"))
+    assert name == "dedode"
+    found = extractors.extract(
+        extractors.load(conf["model"]).eval(), tmp_path / "a.png", conf["preprocessing"]
+    )
+    x, y = found["keypoints"].T
+    assert len(x) == 40 and min(x.min(), y.min()) >= 0 and x.max() <= 109 and y.max() <= 74
+    np.testing.assert_allclose(x, x.round(), atol=1e-4)  # whole pixels, centres at integers
+    np.testing.assert_allclose(np.linalg.norm(found["descriptors"], axis=0), 1, rtol=1e-4)
+
+
+def test_weights_of_dedode_that_cannot_be_loaded_are_named(monkeypatch):
+    from kornia.feature import DeDoDe
+
+    def fails(*_, **__):
+        raise OSError("no network")
+
+    monkeypatch.setattr(DeDoDe, "from_pretrained", fails)
+    with pytest.raises(InputError, match="L-C4-v2 and B-upright of DeDoDe cannot be loaded"):
+        extractors.load({"name": "dedode"})
