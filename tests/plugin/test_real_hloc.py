@@ -20,6 +20,8 @@ from torch.nn.functional import normalize
 import hloc_reduce
 from hloc_reduce import extractors, localize_sfm, match_features, triangulation
 from hloc_reduce import hloc as plugin
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs.features import matcher_of
 from hloc_reduce.confs.matchers import confs as matchers
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
@@ -59,7 +61,8 @@ def modules(*of_hloc):
 def localized(stages, dataset, outputs, feature):
     """Run a chain of stages; return the pose errors of the queries (metres, degrees) by name."""
     images, model = dataset / "images_upright", dataset / "3D-models/aachen_v_1_1"
-    conf, matcher = stages["extract_features"].confs[feature], matchers["NN-ratio"]
+    conf = stages["extract_features"].confs[feature]
+    matcher = matchers[matcher_of(features_confs.confs.get(feature, conf))]
     sfm_pairs, loc_pairs = outputs / "pairs-db.txt", outputs / "pairs-query.txt"
     local = stages["extract_features"].main(conf, images, outputs)
     stages["pairs_from_covisibility"].main(model, sfm_pairs, 3)
@@ -131,6 +134,14 @@ def test_any_chain_of_stages_localizes(registered, aachen_layout, tmp_path, chai
     if chain == HLOCS_SIFT:
         with h5py.File(tmp_path / "outputs/feats-sift.h5") as file:
             assert file["db/1.png/keypoints"].dtype == np.float16
+    for name in ("day/a.png", "night/a.png"):
+        assert found[name][0] < 0.02 and found[name][1] < 0.5
+
+
+@pytest.mark.parametrize("feature", ["edgepoint2_m32", "xfeat_sv32"])
+def test_networks_in_hloc(registered, base_weights, aachen_layout, tmp_path, feature):
+    base_weights(feature.removesuffix("_sv32"))
+    found = localized(modules(*CHAINS["hloc's"]), aachen_layout, tmp_path / "outputs", feature)
     for name in ("day/a.png", "night/a.png"):
         assert found[name][0] < 0.02 and found[name][1] < 0.5
 
