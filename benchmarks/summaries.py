@@ -1,8 +1,9 @@
-"""Print a Markdown table of finished runs of any pipeline.
+"""Print a Markdown table of finished runs of any pipeline, with a row for each query list.
 
 With --centimetres, recall is at these position errors and 2 degrees instead of the limits of the
-data set. What is no outputs folder of a finished run, such as a report beside the folders, is named
-and left out.
+data set. With --places, a row is a run's folder name, and a column a query list of a data set: mean
+inliers, and how many queries are localized where some are not. What is no outputs folder of a
+finished run, such as a report beside the folders, is named and left out.
 """
 
 import csv
@@ -56,10 +57,38 @@ def rows(folder: Path, centimetres: list[float]) -> list[str]:
             f"{result['mean_inliers']:,.0f}",
             f"{size['keypoints'] / photos:,.0f}",
             f"{summary['map_points3D']:,}" if "map_points3D" in summary else "",
-            f"{extraction / photos:.2f}" if extraction else "",
+            # other runs of a batch may have extracted the features
+            f"{extraction / photos:.2f}" if extraction and extraction > 0.1 * photos else "",
             f"{sum(seconds.values()):.0f}",
         )
         lines.append(f"| {' | '.join(map(str, cells))} |")
+    return lines
+
+
+def by_list(folders: list[Path], centimetres: list[float]) -> list[str]:
+    """Format a table with a row for each query list of each run."""
+    lines = [f"| {' | '.join(cells)} |" for cells in (COLUMNS, COLUMNS.values())]
+    return [*lines, *(row for folder in folders for row in rows(folder, centimetres))]
+
+
+def by_place(folders: list[Path]) -> list[str]:
+    """Format a table with a row for each folder name and a column for each query list."""
+    cells: dict[tuple[int, str], dict[str, str]] = {}
+    for folder in folders:
+        summary = json.loads((folder / "summary.json").read_text())
+        row = cells.setdefault((-summary["bytes_per_keypoint"]["descriptor"], folder.name), {})
+        for name, result in summary["lists"].items():
+            missed = result["localized"] < result["queries"]
+            count = f" ({result['localized']} of {result['queries']})" if missed else ""
+            place = f"{Path(summary['dataset']).name}, {name.split('_')[0]}"
+            row[place] = f"{result['mean_inliers']:,.0f}{count}"
+    places = list(dict.fromkeys(place for row in cells.values() for place in row))
+    lines = [
+        f"| bytes | feature | {' | '.join(places)} |",
+        "| ---: | --- |" + " ---: |" * len(places),
+    ]
+    for (size, feature), row in sorted(cells.items()):
+        lines.append(f"| {-size} | {feature} | {' | '.join(row.get(p, '') for p in places)} |")
     return lines
 
 
@@ -76,16 +105,15 @@ def _main() -> None:
     add = parser.add_argument
     add("outputs", type=Path, nargs="+", help="outputs folders of runs")
     add("--centimetres", type=float, nargs="+", default=[], help="position errors for recall")
+    add("--places", action="store_true", help="a row for each feature, a column for each list")
     args = parser.parse_args()
-    lines = [f"| {' | '.join(cells)} |" for cells in (COLUMNS, COLUMNS.values())]
     finished = [folder for folder in args.outputs if (folder / "summary.json").is_file()]
     others = ", ".join(str(path) for path in args.outputs if path not in finished)
     if not finished:
         raise InputError(f"There is no summary.json in {others}: has the run finished?")
     if others:
         logger.warning("Left out, no finished runs: %s.", others)
-    for folder in finished:
-        lines += rows(folder, args.centimetres)
+    lines = by_place(finished) if args.places else by_list(finished, args.centimetres)
     print("\n".join(lines))
 
 

@@ -57,6 +57,19 @@ def test_recall_in_centimetres_counts_localized_queries_only(tmp_path):
     assert "| 25.0 / 50.0 |" in shown.stdout.splitlines()[2]
 
 
+def test_places_are_columns(tmp_path):
+    for place, feature in (("town", "sift"), ("mill", "sift"), ("town", "sift+uint8")):
+        (tmp_path / place / feature).mkdir(parents=True)
+        summary = SUMMARY | {"dataset": f"datasets/{place}"}
+        (tmp_path / place / feature / "summary.json").write_text(json.dumps(summary))
+    shown = table(*sorted(tmp_path.glob("*/*")), "--places").stdout.splitlines()
+    assert shown[0] == "| bytes | feature | mill, night | town, night |"
+    assert shown[2:] == [
+        "| 256 | sift | 52 (2 of 3) | 52 (2 of 3) |",
+        "| 256 | sift+uint8 |  | 52 (2 of 3) |",
+    ]
+
+
 def test_without_hloc_the_comparison_says_what_to_install(monkeypatch):
     monkeypatch.setattr("hloc_reduce.utils.hloc.is_installed", lambda: False)
     stages_of = runpy.run_path(str(ROOT / "benchmarks/against_hloc.py"))["stages_of"]
