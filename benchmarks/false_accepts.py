@@ -40,6 +40,7 @@ from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import FLOATS, restore, store
 from hloc_reduce.utils.feature_files import (
+    get_blur,
     get_colmap_keypoints,
     get_descriptors,
     get_image_size,
@@ -272,7 +273,7 @@ def run(
     for source, name, camera, truth, path, kind in tried:
         with open_h5(path) as file:
             query = describe(file, name, is_query=True)
-            keypoints, _ = get_colmap_keypoints(file, name)
+            keypoints, blur = get_colmap_keypoints(file, name)[0], get_blur(file, name)
             size = get_image_size(file, name)
         matches = {}
         for other in place.names:
@@ -284,7 +285,11 @@ def run(
         known = ("given", "off", "guess") if kind == "own" else ("given", "guess")
         for given in known if camera else ("guess",):
             row = localize(
-                place, keypoints, intrinsics_of(camera, size, given, sizes), matches, gate
+                place,
+                keypoints,
+                intrinsics_of(camera, size, given, sizes),
+                matches,
+                gate.of_photo(blur),
             )
             cam_from_world = row.pop("cam_from_world")
             row |= outcome(place, row, cam_from_world, truth)
