@@ -3,7 +3,7 @@
 Darkens the queries of a data set in Aachen's layout, adds noise, and localizes them with their
 intrinsics in a map of its photos, after no blur, after given ones, and after the automatic one.
 Noise and its estimate are in units of the contrast. Prints mean inliers; queries that are not
-localized have none.
+localized have none. With any blur lamps are cut off, too.
 """
 
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from hloc_reduce import Localizer, maps
 from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.localization.confidence import AGREEMENT_NOISY, Gate
 from hloc_reduce.networks import noise
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
@@ -62,7 +63,7 @@ def _main() -> None:
     print("| --- | ---: | ---: |" + " ---: |" * len(tried), flush=True)
     for feature in args.feature:
         built = maps.main(args.output / feature, place.images, place.reference_model, feature)
-        localizer = Localizer(built.folder)
+        localizer = Localizer(built.folder, gate=Gate(min_agreement=AGREEMENT_NOISY))
         for amount in args.noise:
             generator, estimates = np.random.default_rng(0), []
             inliers: dict[str, list[int]] = {blur: [] for blur in tried}

@@ -35,7 +35,8 @@ def rows(folder: Path, centimetres: list[float]) -> list[str]:
     """Format a row for each query list of a finished run."""
     summary, lines = json.loads((folder / "summary.json").read_text()), []
     size, seconds = summary["bytes_per_keypoint"], summary["seconds"]
-    photos = summary["map_images"] + summary["queries"]
+    # a map of one's own was extracted before
+    photos = summary["queries"] + ("map" not in summary) * summary["map_images"]
     extraction = seconds.get("extract_features")
     for name, result in summary["lists"].items():
         percent = result.get("recall_percent", [])
@@ -55,7 +56,7 @@ def rows(folder: Path, centimetres: list[float]) -> list[str]:
             " / ".join(f"{value:.1f}" for value in percent),
             error,
             f"{result['mean_inliers']:,.0f}",
-            f"{size['keypoints'] / photos:,.0f}",
+            f"{size['keypoints'] / size['images']:,.0f}",
             f"{summary['map_points3D']:,}" if "map_points3D" in summary else "",
             # other runs of a batch may have extracted the features
             f"{extraction / photos:.2f}" if extraction and extraction > 0.1 * photos else "",
@@ -80,7 +81,8 @@ def by_place(folders: list[Path]) -> list[str]:
         for name, result in summary["lists"].items():
             missed = result["localized"] < result["queries"]
             count = f" ({result['localized']} of {result['queries']})" if missed else ""
-            place = f"{Path(summary['dataset']).name}, {name.split('_')[0]}"
+            place = Path(summary.get("dataset") or summary["map"]).name
+            place = f"{place}, {name.split('_')[0]}"
             row[place] = f"{result['mean_inliers']:,.0f}{count}"
     places = list(dict.fromkeys(place for row in cells.values() for place in row))
     lines = [
@@ -104,8 +106,13 @@ def _main() -> None:
     parser = cli.Parser(__doc__, "outputs/demo_town/*")
     add = parser.add_argument
     add("outputs", type=Path, nargs="+", help="outputs folders of runs")
-    add("--centimetres", type=float, nargs="+", default=[], help="position errors for recall")
-    add("--places", action="store_true", help="a row for each feature, a column for each list")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument(
+        "--centimetres", type=float, nargs="+", default=[], help="position errors for recall"
+    )
+    how.add_argument(
+        "--places", action="store_true", help="a row for each feature, a column for each list"
+    )
     args = parser.parse_args()
     finished = [folder for folder in args.outputs if (folder / "summary.json").is_file()]
     others = ", ".join(str(path) for path in args.outputs if path not in finished)

@@ -137,14 +137,18 @@ def _network(name: str, conf: dict) -> Content:
     extractor = extractors.load(conf["model"]).eval()
     settings, stride = extractor.base.conf, extractor.base.stride
     number, longest = settings["max_keypoints"], conf["preprocessing"]["resize_max"]
+    if conf["preprocessing"]["grayscale"]:
+        raise InputError(f"{name} takes gray images, but exported files take RGB: grayscale: false")
     if number < 1:
         raise InputError(f"{name}: ONNX needs max_keypoints of at least 1, not {number}.")
     left_out = [f"resizing to at most {longest} pixels"] if longest else []
-    left_out += ["blur of noisy images"] if settings["denoise"] else []
+    left_out += ["blur of noisy images, whose lamps are cut off"] if settings["denoise"] else []
     settings["denoise"] = False
     image = _image(*(side * stride for side in CHECKED_WITH))
     with torch.no_grad():
         features = extractor({"image": image})
+    if not features["scores"].numel():
+        raise InputError(f"{name} finds no keypoints to check the file with: lower its threshold.")
     return Content(
         extractors.Graph(extractor),
         {
@@ -230,7 +234,8 @@ def _check(content: Content, path: Path) -> float:
     if not difference <= TOLERANCE:
         raise InputError(
             f"ONNX Runtime does not compute the features of torch: they differ by {difference:.0e} "
-            f"instead of at most {TOLERANCE:.0e}. No file was written. Try other versions."
+            f"instead of at most {TOLERANCE:.0e}. No file was written. Try the versions of onnx, "
+            "onnxruntime, onnxscript and torch in constraints.txt."
         )
     return difference
 

@@ -12,7 +12,7 @@ import numpy as np
 from . import logger, projections
 from .confs import features as features_confs
 from .descriptors import DESCRIPTORS, check_weights
-from .networks import NETWORKS, fetch_weights
+from .networks import NETWORKS, NOISE_REDUCTION, fetch_weights
 from .runtime import parallel, processes
 from .runtime.executors import SERIAL, Executor, Results
 from .runtime.group_writer import FAILURE, Arrays, Group, GroupWriter, failures, fill
@@ -248,6 +248,7 @@ def provenance(conf: dict, as_half: bool = True) -> dict:
     network = features_confs.network_of(conf["model"])
     if network in list(NETWORKS):
         fetch_weights(network)
+        made_by["noise_reduction"] = NOISE_REDUCTION
     return made_by
 
 

@@ -13,7 +13,7 @@ from hloc_reduce.utils.cli import InputError
 ROOT = Path(__file__).parents[1]
 SUMMARY = {
     "feature": "sift",
-    "bytes_per_keypoint": {"descriptor": 256, "keypoints": 6000},
+    "bytes_per_keypoint": {"descriptor": 256, "keypoints": 6000, "images": 6},
     "map_images": 3,
     "queries": 3,
     "map_points3D": 3871,

@@ -82,7 +82,7 @@ def bytes_per_keypoint(features: Path) -> dict:
 
     Returns:
         `descriptor`, bytes of one of a map image; `storage`, how it is stored; `feature_file`,
-        bytes of the file for each keypoint; and `keypoints`, of all images.
+        bytes of the file for each keypoint; `keypoints`, of all images; and `images`.
     """
     names = list_h5_names(features)
     with open_h5(features) as file:
@@ -99,6 +99,7 @@ def bytes_per_keypoint(features: Path) -> dict:
         "storage": storage,
         "feature_file": round(features.stat().st_size / total, 1) if total else 0.0,
         "keypoints": total,
+        "images": len(names),
     }
 
 

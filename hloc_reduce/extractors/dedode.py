@@ -11,7 +11,7 @@ class DeDoDe(Extractor):
     """The features of DeDoDe (Edstedt et al., 3DV 2024), by kornia, which downloads the weights.
 
     `detector` and `weights` name the weights of the detector and of the descriptor, see
-    `kornia.feature.DeDoDe.from_pretrained`. Keypoints are the `max_keypoints` likeliest ones.
+    `kornia.feature.DeDoDe.from_pretrained`. Keypoints are the `max_keypoints` likeliest pixels.
     """
 
     default_conf = {"detector": "L-C4-v2", "weights": "B-upright", "max_keypoints": 4096}
@@ -20,6 +20,8 @@ class DeDoDe(Extractor):
     def _init(self, conf: dict) -> None:
         from kornia.feature import DeDoDe as KorniaDeDoDe
 
+        if conf["max_keypoints"] < 1:
+            raise InputError(f"max_keypoints of DeDoDe is {conf['max_keypoints']}: at least 1.")
         names = conf["detector"], conf["weights"]
         try:
             self.model = KorniaDeDoDe.from_pretrained(*names, amp_dtype=torch.float32)
@@ -34,9 +36,9 @@ class DeDoDe(Extractor):
         return f"dedode.{self.conf['weights']}"
 
     def _forward(self, data: dict) -> dict:
-        height, width = data["image"].shape[2:]
-        number = min(self.conf["max_keypoints"], height * width)
-        keypoints, scores, descriptors = self.model(data["image"], n=number)
+        image = data["image"].expand(-1, 3, -1, -1)  # of gray photos, too
+        number = min(self.conf["max_keypoints"], image[0, 0].numel())
+        keypoints, scores, descriptors = self.model(image, n=number)
         # whole pixels; kornia counts from the corner of the first one
         return {
             "keypoints": (keypoints - 0.5).round(),

@@ -209,6 +209,7 @@ class Gate:
         min_inliers: the least number of RANSAC's inliers.
         min_agreement: the least `agreement`, in general and for a doubtful confidence; default: by
             the matches, see `of_matches`.
+        min_agreement_noisy: the same for photos whose noise was reduced.
 
     Raises:
         InputError: for a confidence that is not finite or a negative number of inliers.
@@ -217,6 +218,7 @@ class Gate:
     min_confidence: float = 8.0
     min_inliers: int = 8
     min_agreement: tuple[float, float] | None = None
+    min_agreement_noisy: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
@@ -236,14 +238,13 @@ class Gate:
         if self.min_agreement is not None:
             return self
         if (matcher.get("ratio_threshold") or 1) > STRICT:
-            return replace(self, min_agreement=AGREEMENT)
+            return replace(self, min_agreement=AGREEMENT, min_agreement_noisy=AGREEMENT_NOISY)
         return replace(self, min_agreement=AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO)
 
     def of_photo(self, blur: float) -> "Gate":
         """Return the gate for a photo whose noise was reduced by a blur in pixels, 0 for none."""
-        if blur > 0 and self.min_agreement == AGREEMENT:
-            return replace(self, min_agreement=AGREEMENT_NOISY)
-        return self
+        noisy = self.min_agreement_noisy
+        return replace(self, min_agreement=noisy) if blur > 0 and noisy else self
 
     def least_agreement(self, confidence: float) -> float:
         """Return the least agreement of a pose with a confidence."""

@@ -25,6 +25,8 @@ class Network:
     computes: tuple[float, ...] = ()
 
 
+NOISE_REDUCTION = 2  # the version of `noise.reduce_noise`, part of the provenance of features
+
 EDGEPOINT2 = {
     "T32": "c88b76d2b05cb19de7314a108042d05688424d9a9a3abed97c778078e676cfdc",
     "T48": "6871142455b685674704046b8a0a4aa26248eacd86d4b7cc30b790b9eeda7779",

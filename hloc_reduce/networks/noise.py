@@ -7,7 +7,8 @@ import torch
 BLOCK = 32  # pixels, the side of the blocks in which noise is measured
 SMOOTH = 0.1  # share of the blocks that are taken for smooth
 CLIPPED = 0.02, 0.98  # blocks of a mean beyond have lost their noise
-LAMPS = 2.5  # multiple of the median above which pixels are lamps
+# lamps are brighter than this multiple of the median, and this share of the pixels at most
+LAMPS, LAMPS_SHARE = 2.5, 0.02
 # standard deviations of the noise, in that of the image, from which it is blurred; and of the blur
 # in pixels for a noise of 1 (docs/results.md)
 NOISY, BLUR = 0.08, 2.8
@@ -42,7 +43,8 @@ def relative_noise(image: np.ndarray) -> float:
 
 def lamps(image: np.ndarray) -> float:
     """Return the value above which pixels (H, W) or (C, H, W) in [0, 1] are lamps."""
-    return min(1.0, LAMPS * float(np.median(image))) or 1.0
+    median, brightest = np.quantile(image, [0.5, 1 - LAMPS_SHARE])
+    return float(max(LAMPS * median, brightest))
 
 
 def reduce_noise(image: torch.Tensor) -> tuple[torch.Tensor, float]:

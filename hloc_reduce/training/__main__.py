@@ -151,7 +151,7 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
         "distance_weight": trainer.DISTANCE_WEIGHTS.get(descriptor, 0.0),
         **trainer.RECIPES[cli.choose(f"recipe of {scheme}", recipe, trainer.RECIPES)],
     }
-    if recipe == "best" and descriptor in features_confs.MODELS:
+    if recipe in ("best", "tune") and descriptor in features_confs.MODELS:
         settings |= trainer.OF_NETWORKS
     if recipe == "tune":
         settings |= {"begin_with": name, "begin_with_sha256": projections.checksum(name)}

@@ -231,7 +231,7 @@ def test_in_noisy_photos_fewer_matches_must_agree():
     assert gate.of_photo(2.0).min_agreement < gate.of_photo(0.0).min_agreement
     for other in (
         DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64),
-        Gate(min_agreement=(0, 0)),
+        Gate(min_agreement=gate.min_agreement),
     ):
         assert other.of_photo(2.0) == other
 

@@ -111,6 +111,16 @@ def test_a_lamp_in_a_dark_photo_hides_neither_noise_nor_contrast(textured):
     assert lit.std() > 2 * photo.std()
 
 
+@pytest.mark.parametrize("sky", [0, 3, 8])
+def test_a_dark_sky_makes_no_photo_noisy(textured, sky):
+    """Half of the photo and more is nearly black, and all that is lit is above the median."""
+    photo = np.full((600, 320), sky / 255, np.float32)
+    photo[360:] = 0.7 * textured / 255
+    photo += np.random.default_rng(0).normal(0, 1 / 255, photo.shape)
+    image = torch.from_numpy(photo.clip(0, 1).astype(np.float32))[None, None]
+    assert reduce_noise(image) == (image, 0)
+
+
 def test_only_noisy_photos_are_blurred(textured):
     clean = torch.from_numpy(textured.astype(np.float32) / 255)[None, None]
     assert reduce_noise(clean) == (clean, 0)

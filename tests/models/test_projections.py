@@ -81,7 +81,7 @@ def test_saved_and_loaded(tmp_path):
     assert not any(parameter.requires_grad for parameter in loaded.parameters())
 
 
-def test_everything_ships_in_30_megabytes():
+def test_everything_ships_in_25_megabytes():
     expected = {
         name
         for descriptor in ("sift", "mkd", "tfeat", "colmap_sift", "xfeat", "edgepoint2_m64")
@@ -90,7 +90,7 @@ def test_everything_ships_in_30_megabytes():
     }
     expected |= {"xfeat", "edgepoint2_m32", "edgepoint2_m64"}  # levels
     assert set(projections.names()) == expected and len(expected) == 75
-    assert sum(path.stat().st_size for path in WEIGHTS.iterdir()) < 30e6
+    assert sum(path.stat().st_size for path in WEIGHTS.iterdir()) < 25e6
 
 
 def test_what_does_not_ship_says_how_to_train_it():
