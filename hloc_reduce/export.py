@@ -142,7 +142,7 @@ def _network(name: str, conf: dict) -> Content:
     if number < 1:
         raise InputError(f"{name}: ONNX needs max_keypoints of at least 1, not {number}.")
     left_out = [f"resizing to at most {longest} pixels"] if longest else []
-    left_out += ["blur of noisy images, whose lamps are cut off"] if settings["denoise"] else []
+    left_out += ["noise reduction"] if settings["denoise"] else []
     settings["denoise"] = False
     image = _image(*(side * stride for side in CHECKED_WITH))
     with torch.no_grad():

@@ -17,7 +17,7 @@ class ALIKED(Extractor):
     """The features of ALIKED (Zhao et al., IEEE TIM 2023), by kornia.
 
     `model_name` is one of hloc's. Keypoints are those with the `max_keypoints` highest scores; -1
-    keeps all. With `denoise`, noisy images are blurred first.
+    keeps all. With `denoise`, the noise of noisy images is reduced first.
     """
 
     stride = 32

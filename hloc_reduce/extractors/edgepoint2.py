@@ -23,7 +23,7 @@ class EdgePoint2(Extractor):
 
     `model_name` is a size of the network, T to E, and the dimension of its descriptors: M32, for
     example. Keypoints are the maxima of its score map, in whole pixels of the resized image, the
-    `max_keypoints` highest ones; -1 keeps all. With `denoise`, noisy images are blurred first.
+    `max_keypoints` highest ones; -1 keeps all. With `denoise`, noise is reduced first.
     """
 
     stride = Network.stride

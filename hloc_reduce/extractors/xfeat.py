@@ -16,7 +16,7 @@ class XFeat(Extractor):
     """The sparse features of XFeat (Potje et al., CVPR 2024), by kornia.
 
     Keypoints are those with the `max_keypoints` highest scores, in whole pixels of the resized
-    image; -1 keeps all. With `denoise`, noisy images are blurred first.
+    image; -1 keeps all. With `denoise`, the noise of noisy images is reduced first.
     """
 
     default_conf = {"max_keypoints": 4096, "detection_threshold": 0.05, "denoise": True}

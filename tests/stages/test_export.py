@@ -67,7 +67,7 @@ def test_a_network(name, run, base_weights, tmp_path):
         "hloc_reduce": hloc_reduce.__version__,
         "stride": "32",
         "max_keypoints": "4096",
-        "left_out": "resizing to at most 1600 pixels, blur of noisy images, whose lamps are cut off",
+        "left_out": "resizing to at most 1600 pixels, noise reduction",
     }
     assert loaded.get_modelmeta().producer_name == "hloc-reduce"
     assert str(Path(export.__file__).parent).encode() not in path.read_bytes()
