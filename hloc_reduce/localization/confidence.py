@@ -26,15 +26,17 @@ RIVAL = 0.25  # a pose is ambiguous if another one has this share of its confide
 # or if one by other images, such as those of another floor, has this share of its inliers
 RIVAL_BY_OTHERS = 0.8
 
-# The least agreement of a pose, in general and for a DOUBTFUL confidence. Wrong poses at copies of
-# repeated structures have agreements up to the second one, and confidences in this range. Below it
-# there are few matches, so that the agreement is less certain; above it are mirrored facades, but
-# many more right poses in noisy scans.
-AGREEMENT = (0.3, 0.3)  # of matches without a strict ratio test
-AGREEMENT_NOISY = (0.17, 0.17)  # the same for photos whose noise was reduced
-AGREEMENT_RATIO, STRICT = (0.76, 0.86), 0.8  # with a ratio test of up to 0.8
-AGREEMENT_FEW, FEW = (0.55, 0.72), 32  # the same for fewer than 32 dimensions
-DOUBTFUL = (50.0, 300.0)
+# The least agreement of a pose, from a confidence on. With a ratio test, wrong poses at copies of
+# repeated structures have confidences of 50 to 300. Below, there are few matches, so that the
+# agreement is less certain; above, there are mirrored facades, but many more right poses in noisy
+# scans. Without, mirrored facades have confidences above 1,200, and right poses agree more there.
+Steps = tuple[tuple[float, float], ...]
+AGREEMENT: Steps = ((0, 0.3), (1200, 0.56))  # of matches without a strict ratio test
+AGREEMENT_NOISY: Steps = ((0, 0.17),)  # the same for photos whose noise was reduced
+STRICT = 0.8  # the largest ratio of a strict test
+AGREEMENT_RATIO: Steps = ((0, 0.76), (50, 0.86), (300, 0.76))  # with a strict ratio test
+FEW = 32  # dimensions
+AGREEMENT_FEW: Steps = ((0, 0.55), (50, 0.72), (300, 0.55))  # the same for fewer dimensions
 
 
 def confidence(
@@ -207,8 +209,8 @@ class Gate:
     Args:
         min_confidence: the least `confidence`.
         min_inliers: the least number of RANSAC's inliers.
-        min_agreement: the least `agreement`, in general and for a doubtful confidence; default: by
-            the matches, see `of_matches`.
+        min_agreement: pairs, in ascending order, of a confidence and the least `agreement` of poses
+            with at least this confidence; default: by the matches, see `of_matches`.
         min_agreement_noisy: the same for photos whose noise was reduced.
 
     Raises:
@@ -217,8 +219,8 @@ class Gate:
 
     min_confidence: float = 8.0
     min_inliers: int = 8
-    min_agreement: tuple[float, float] | None = None
-    min_agreement_noisy: tuple[float, float] | None = None
+    min_agreement: Steps | None = None
+    min_agreement_noisy: Steps | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
@@ -248,9 +250,8 @@ class Gate:
 
     def least_agreement(self, confidence: float) -> float:
         """Return the least agreement of a pose with a confidence."""
-        general, doubtful = self.min_agreement or AGREEMENT
-        low, high = DOUBTFUL
-        return doubtful if low <= confidence < high else general
+        steps = self.min_agreement or AGREEMENT
+        return next((least for start, least in reversed(steps) if confidence >= start), 0.0)
 
 
 DEFAULT_GATE = Gate()

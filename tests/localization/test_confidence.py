@@ -240,7 +240,9 @@ def test_doubtful_poses_must_agree_with_more_matches():
     """As those at another copy of a repeated pattern, of confidences of 50 to 300."""
     gate = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
     assert gate.least_agreement(40) == gate.least_agreement(300) < gate.least_agreement(120)
-    assert DEFAULT_GATE.least_agreement(120) == DEFAULT_GATE.least_agreement(40)
+    mutual = DEFAULT_GATE.of_matches({}, 64)
+    assert mutual.least_agreement(40) == mutual.least_agreement(1199) < mutual.least_agreement(1200)
+    assert mutual.of_photo(2.0).least_agreement(40) == mutual.of_photo(2.0).least_agreement(5000)
     keypoints, points = matches(60, 18)
     found = solve(keypoints, points, [np.arange(78)], gate=gate)
     assert 50 < found.confidence < 300 and 0.7 < found.agreement < 0.86
@@ -273,7 +275,7 @@ def test_a_rival_is_looked_for_where_many_matches_disagree(number):
 
 
 def test_a_gate_of_ones_own_is_kept():
-    own = Gate(min_agreement=(0.3, 0.4))
+    own = Gate(min_agreement=((0, 0.3), (50, 0.4)))
     assert own.of_matches({"ratio_threshold": 0.8}, 64) == own
 
 
