@@ -98,7 +98,7 @@ def panel(axis, points: dict[str, list[tuple[int, float]]], label: str) -> None:
         axis.plot(sizes, [best[s] for s in sizes], marker="o", color=colour, label=name)
     axis.set(xscale="log", xlabel="bytes of a descriptor", ylabel=label)
     axis.set_ylim(0, 1.08 * axis.get_ylim()[1])
-    ticks = [8, 16, 32, 64, 128, 256]
+    ticks = [2, 4, 8, 16, 32, 64, 128, 256]
     axis.set_xticks(ticks, [str(tick) for tick in ticks])
     axis.minorticks_off()
 
