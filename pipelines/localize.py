@@ -10,6 +10,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
@@ -159,17 +160,8 @@ def main(
     Raises:
         InputError: when something is missing or wrong.
     """
-    given = parse_query_lists(queries) if queries else None
-    if given is None:
-        names = list_images(query_images)
-        lists = {query_images.resolve().name: names}
-        inferred = _infer(query_images, names, built.cameras, strict)
-        sources = {name: source for name, (_, source) in inferred.items()}
-    else:
-        lists = {stem: [name for name, _ in part] for stem, part in given.items()}
-        names = [name for part in lists.values() for name in part]
-        sources = dict.fromkeys(names, "list")
-        check_queries(query_images, names, strict)
+    wanted = _find_queries(query_images, queries, built, strict)
+    names = wanted.names
     map_names = built.names()  # a broken model is found before photos are read
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
@@ -184,16 +176,8 @@ def main(
     folder = RunFolder(outputs, conf, overwrite, inputs, stale=bool(photos.changed))
     with Run(folder, built.feature, built.matcher) as run:
         photos.write()
-        listed: Path | list[tuple[str, pycolmap.Camera | None]]
-        if queries:
-            listed = queries
-        else:
-            intrinsics.write_queries(inferred, outputs / LISTED)
-            listed = [(name, inferred[name][0] if name in inferred else None) for name in names]
-        for source, said in SOURCES.items():
-            if some := [name for name in names if sources.get(name) == source]:
-                logger.info("Intrinsics of %d queries are %s: %s", len(some), said, cli.some(some))
-
+        listed = queries or wanted.write(outputs / LISTED)
+        wanted.log()
         with run.stage("extract_features"):
             features = extract_features.main(
                 *(built.conf, query_images, outputs),
@@ -210,11 +194,7 @@ def main(
         with run.stage("localization"):
             records = localize_sfm.main(
                 *(built.sfm, listed, loc_pairs, features, matches, poses),
-                refinements={
-                    name: intrinsics.REFINEMENTS[source]
-                    for name, source in sources.items()
-                    if source != "list"
-                },
+                refinements=wanted.refinements,
                 full_names=True,
                 gate=gate,
             )
@@ -224,9 +204,9 @@ def main(
             "num_loc": num_loc,
             "map_images": built.num_images,
             "map_points3D": built.num_points3D,
-            "intrinsics": Counter(sources.values()),
+            "intrinsics": Counter(wanted.sources.values()),
         }
-        limits = dict.fromkeys(lists, DAY_THRESHOLDS)
+        limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
         files = {
             "query_images": query_images,
             "map_images": built.images,
@@ -236,7 +216,58 @@ def main(
             "matches": matches,
             "ground_truth": ground_truth,
         }
-        return run.finish(summary, lists, records, truth, limits, features, poses, files)
+        return run.finish(summary, wanted.lists, records, truth, limits, features, poses, files)
+
+
+@dataclass(frozen=True)
+class _Queries:
+    """The queries of a run.
+
+    Args:
+        lists: the names of the queries of each list.
+        sources: where the intrinsics of a query are from, "list" or as from `intrinsics.infer`.
+        inferred: intrinsics that are not listed, with their sources; none of unreadable photos.
+    """
+
+    lists: dict[str, list[str]]
+    sources: dict[str, str]
+    inferred: dict[str, tuple[pycolmap.Camera, str]]
+
+    @property
+    def names(self) -> list[str]:
+        """The names of all queries."""
+        return [name for part in self.lists.values() for name in part]
+
+    @property
+    def refinements(self) -> dict[str, dict]:
+        """Which inferred intrinsics are refined with the pose."""
+        return {name: intrinsics.REFINEMENTS[source] for name, (_, source) in self.inferred.items()}
+
+    def write(self, path: Path) -> list[tuple[str, pycolmap.Camera | None]]:
+        """Write the inferred intrinsics and return those of all queries, None if not known."""
+        intrinsics.write_queries(self.inferred, path)
+        cameras = {name: camera for name, (camera, _) in self.inferred.items()}
+        return [(name, cameras.get(name)) for name in self.names]
+
+    def log(self) -> None:
+        """Log where inferred intrinsics are from."""
+        for source, said in SOURCES.items():
+            if some := [name for name in self.names if self.sources.get(name) == source]:
+                logger.info("Intrinsics of %d queries are %s: %s", len(some), said, cli.some(some))
+
+
+def _find_queries(query_images: Path, queries: Path | None, built: Map, strict: bool) -> _Queries:
+    """Read the queries of lists, or of a folder with inferred intrinsics."""
+    if queries:
+        given = parse_query_lists(queries)
+        lists = {stem: [name for name, _ in part] for stem, part in given.items()}
+        names = [name for part in lists.values() for name in part]
+        check_queries(query_images, names, strict)
+        return _Queries(lists, dict.fromkeys(names, "list"), {})
+    names = list_images(query_images)
+    inferred = _infer(query_images, names, built.cameras, strict)
+    sources = {name: source for name, (_, source) in inferred.items()}
+    return _Queries({query_images.resolve().name: names}, sources, inferred)
 
 
 class _Photos:
