@@ -2,8 +2,9 @@
 
 With --centimetres, recall is at these position errors and 2 degrees instead of the limits of the
 data set. With --places, a row is a run's folder name, and a column a query list of a data set: mean
-inliers, and how many queries are localized where some are not. What is no outputs folder of a
-finished run, such as a report beside the folders, is named and left out.
+inliers, and how many queries are localized where some are not. Runs of a batch share features, so
+only one of them has seconds of extraction. What is no outputs folder of a finished run, such as a
+report beside the folders, is named and left out.
 """
 
 import csv
@@ -35,7 +36,7 @@ def rows(folder: Path, centimetres: list[float]) -> list[str]:
     """Format a row for each query list of a finished run."""
     summary, lines = json.loads((folder / "summary.json").read_text()), []
     size, seconds = summary["bytes_per_keypoint"], summary["seconds"]
-    # a map of one's own was extracted before
+    # pipelines.localize extracts the queries only: its map has features
     photos = summary["queries"] + ("map" not in summary) * summary["map_images"]
     extraction = seconds.get("extract_features")
     for name, result in summary["lists"].items():
@@ -58,8 +59,7 @@ def rows(folder: Path, centimetres: list[float]) -> list[str]:
             f"{result['mean_inliers']:,.0f}",
             f"{size['keypoints'] / size['images']:,.0f}",
             f"{summary['map_points3D']:,}" if "map_points3D" in summary else "",
-            # other runs of a batch may have extracted the features
-            f"{extraction / photos:.2f}" if extraction and extraction > 0.1 * photos else "",
+            "" if extraction is None else f"{extraction / photos:.2f}",
             f"{sum(seconds.values()):.0f}",
         )
         lines.append(f"| {' | '.join(map(str, cells))} |")

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ..descriptors import DIM
+from ..networks.noise import reduce_noise
 from ..utils.base_model import BaseModel, dynamic_load
 from ..utils.hloc import is_installed
 from ..utils.images import convert, read_image
@@ -63,15 +64,30 @@ class Extractor(BaseModel):
     def fixed(self, image: torch.Tensor) -> dict:
         """Return the features of an image in tensors of fixed length, for `hloc_reduce.export`.
 
-        The extractors of networks have it, so that they can be written as ONNX.
+        `NetworkExtractor`s have it, so that they can be written as ONNX.
 
         Args:
             image: (1, 3, H, W) float32 RGB in [0, 1]; H and W are multiples of `stride`.
 
         Returns:
-            What `_forward` returns without its blur of noisy images, for exactly `max_keypoints`
-            keypoints. Missing ones have the score -inf.
+            What `_forward` returns without noise reduction, for exactly `max_keypoints` keypoints.
+            Missing ones have the score -inf.
         """
+        raise NotImplementedError
+
+
+class NetworkExtractor(Extractor):
+    """An extractor that reduces the noise of noisy images if its option `denoise` is set.
+
+    A subclass writes `_extract`, in place of `_forward`, and `fixed`.
+    """
+
+    def _forward(self, data: dict) -> dict:
+        image, blur = reduce_noise(data["image"]) if self.conf["denoise"] else (data["image"], 0.0)
+        return {**self._extract(image), "blur": torch.tensor([blur])}
+
+    def _extract(self, image: torch.Tensor) -> dict:
+        """Return the features of an image (1, C, H, W), as `_forward` returns them."""
         raise NotImplementedError
 
 

@@ -8,12 +8,11 @@ from ..networks import ALIKED as MODELS
 from ..networks import NETWORKS
 from ..networks.keypoints import limit, strongest_fixed
 from ..networks.loading import load_weights
-from ..networks.noise import reduce_noise
 from ..utils.cli import choose
-from . import Extractor
+from . import NetworkExtractor
 
 
-class ALIKED(Extractor):
+class ALIKED(NetworkExtractor):
     """The features of ALIKED (Zhao et al., IEEE TIM 2023), by kornia.
 
     `model_name` is one of hloc's. Keypoints are those with the `max_keypoints` highest scores; -1
@@ -39,14 +38,12 @@ class ALIKED(Extractor):
         """The name of these descriptors in the metadata of projections."""
         return self.conf["model_name"].removesuffix("-n16").replace("-", "_")
 
-    def _forward(self, data: dict) -> dict:
-        image, blur = reduce_noise(data["image"]) if self.conf["denoise"] else (data["image"], 0.0)
+    def _extract(self, image: torch.Tensor) -> dict:
         (found,) = self.model(image.contiguous(memory_format=torch.channels_last))
         return {
             "keypoints": found.keypoints[None],
             "scores": found.keypoint_scores[None],
             "descriptors": found.descriptors.T[None],
-            "blur": torch.tensor([blur]),
         }
 
     def fixed(self, image: torch.Tensor) -> dict:

@@ -9,16 +9,15 @@ from ..networks import EDGEPOINT2, NETWORKS
 from ..networks.edgepoint2 import EdgePoint2 as Network
 from ..networks.keypoints import Keypoints, strongest, strongest_fixed
 from ..networks.loading import load_weights
-from ..networks.noise import reduce_noise
 from ..utils.cli import choose
-from . import Extractor
+from . import NetworkExtractor
 
 RADIUS = 2  # pixels between maxima of the scores
 MIN_SCORE = -5.0  # logit
 BORDER = 4  # pixels without keypoints
 
 
-class EdgePoint2(Extractor):
+class EdgePoint2(NetworkExtractor):
     """The features of EdgePoint2 (github.com/HITCSC/EdgePoint2).
 
     `model_name` is a size of the network, T to E, and the dimension of its descriptors: M32, for
@@ -39,15 +38,14 @@ class EdgePoint2(Extractor):
         """The name of these descriptors in the metadata of projections."""
         return f"edgepoint2_{self.conf['model_name'].lower()}"
 
-    def _forward(self, data: dict) -> dict:
-        image, blur = reduce_noise(data["image"]) if self.conf["denoise"] else (data["image"], 0.0)
+    def _extract(self, image: torch.Tensor) -> dict:
         given = image.shape[:1:-1]
         width, height = (max(1, side // Network.stride) * Network.stride for side in given)
         if (width, height) != tuple(given):
             image = interpolate(image, (height, width), mode="bilinear", align_corners=True)
         found = self._compute(image, strongest)
         ratio = found["keypoints"].new_tensor(given) / image.new_tensor([width, height])
-        return {**found, "keypoints": found["keypoints"] * ratio, "blur": torch.tensor([blur])}
+        return {**found, "keypoints": found["keypoints"] * ratio}
 
     def fixed(self, image: torch.Tensor) -> dict:
         """Return the features of an image in tensors of fixed length, see `Extractor.fixed`."""

@@ -6,13 +6,12 @@ from torch.nn.functional import grid_sample, normalize, pixel_shuffle
 from ..networks import NETWORKS
 from ..networks.keypoints import limit, strongest_fixed
 from ..networks.loading import load_weights
-from ..networks.noise import reduce_noise
-from . import Extractor
+from . import NetworkExtractor
 
 RADIUS = 2  # pixels between maxima of the scores
 
 
-class XFeat(Extractor):
+class XFeat(NetworkExtractor):
     """The sparse features of XFeat (Potje et al., CVPR 2024), by kornia.
 
     Keypoints are those with the `max_keypoints` highest scores, in whole pixels of the resized
@@ -30,8 +29,7 @@ class XFeat(Extractor):
         load_weights(self.model.net, "xfeat")
         self.model.eval()
 
-    def _forward(self, data: dict) -> dict:
-        image, blur = reduce_noise(data["image"]) if self.conf["denoise"] else (data["image"], 0.0)
+    def _extract(self, image: torch.Tensor) -> dict:
         (found,) = self.model.detectAndCompute(image)
         size = torch.tensor(image.shape[:1:-1])
         resized = (size // 32 * 32).clamp(min=32)
@@ -41,7 +39,6 @@ class XFeat(Extractor):
             "keypoints": (found["keypoints"] + shift.to(image.device))[None],
             "scores": found["scores"][None],
             "descriptors": found["descriptors"].T[None],
-            "blur": torch.tensor([blur]),
         }
 
     def fixed(self, image: torch.Tensor) -> dict:

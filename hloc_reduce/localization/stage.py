@@ -177,10 +177,9 @@ def _localize_all(
     reference = load_reference()
 
     def solve(task: tuple) -> tuple[str, dict]:
-        name, camera, blur, keypoints, found = task
+        name, camera, its_gate, keypoints, found = task
         used = {other: pairs for other, pairs in found.items() if len(pairs) >= skip_matches}
         options = config(name, camera)
-        its_gate = gate.of_photo(blur)
         cam_from_world, info = localize(reference, keypoints, camera, used, options, its_gate)
         info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
         return name, to_record(reference, list(found), cam_from_world, info)
@@ -188,7 +187,7 @@ def _localize_all(
     with open_h5(features) as feature_file, open_h5(matches) as match_file:
         tasks = (
             (
-                *(name, camera, get_blur(feature_file, name)),
+                *(name, camera, gate.of_photo(get_blur(feature_file, name))),
                 *_read(feature_file, match_file, name, retrieved, reference),
             )
             for name, camera, retrieved in queries
