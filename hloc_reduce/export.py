@@ -138,7 +138,9 @@ def _network(name: str, conf: dict) -> Content:
     settings, stride = extractor.base.conf, extractor.base.stride
     number, longest = settings["max_keypoints"], conf["preprocessing"]["resize_max"]
     if conf["preprocessing"]["grayscale"]:
-        raise InputError(f"{name} takes gray images, but exported files take RGB: grayscale: false")
+        raise InputError(
+            f"{name} takes gray images, but exported files take RGB. Write grayscale: false."
+        )
     if number < 1:
         raise InputError(f"{name}: ONNX needs max_keypoints of at least 1, not {number}.")
     left_out = [f"resizing to at most {longest} pixels"] if longest else []

@@ -339,6 +339,15 @@ def test_dedode_with_random_weights(tmp_path, textured, monkeypatch):
     assert len(x) == 40 and min(x.min(), y.min()) >= 0 and x.max() <= 109 and y.max() <= 74
     np.testing.assert_allclose(x, x.round(), atol=1e-4)  # whole pixels, centres at integers
     np.testing.assert_allclose(np.linalg.norm(found["descriptors"], axis=0), 1, rtol=1e-4)
+    gray = extractors.extract(
+        extractors.load(conf["model"]).eval(), tmp_path / "a.png", {"grayscale": True}
+    )  # textured is gray
+    np.testing.assert_allclose(gray["keypoints"], found["keypoints"])
+
+
+def test_dedode_needs_a_number_of_keypoints():
+    with pytest.raises(InputError, match="max_keypoints of DeDoDe is -1: at least 1"):
+        extractors.load({"name": "dedode", "max_keypoints": -1})
 
 
 def test_weights_of_dedode_that_cannot_be_loaded_are_named(monkeypatch):

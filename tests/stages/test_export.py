@@ -163,12 +163,21 @@ def test_wrong_input(options, message, refused, tmp_path, monkeypatch, base_weig
     assert not list(tmp_path.iterdir())
 
 
-def test_all_keypoints_cannot_be_kept(refused, tmp_path, base_weights):
-    base_weights("edgepoint2_t32")
-    path = tmp_path / "all.yaml"
-    path.write_text("model: {name: edgepoint2, model_name: T32, max_keypoints: -1}\n")
-    message = refused("--feature", path, "--output", tmp_path / "all.onnx")
-    assert "all: ONNX needs max_keypoints of at least 1, not -1" in message
+@pytest.mark.parametrize(
+    "option, preprocessing, message",
+    [
+        ("max_keypoints: -1", "", "mine: ONNX needs max_keypoints of at least 1, not -1"),
+        ("max_keypoints: 9", "preprocessing: {grayscale: true}", "mine takes gray images.*RGB"),
+        ("detection_threshold: 0.9999", "", "mine finds no keypoints to check the file with"),
+    ],
+)
+def test_what_a_file_cannot_express_is_refused(
+    option, preprocessing, message, refused, tmp_path, base_weights
+):
+    base_weights("xfeat")
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"model: {{name: xfeat, {option}}}\n{preprocessing}\n")
+    assert re.search(message, refused("--feature", path, "--output", tmp_path / "mine.onnx"))
 
 
 def test_missing_weights(refused, tmp_path, monkeypatch):
