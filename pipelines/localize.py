@@ -6,27 +6,20 @@ colmap_sift_sv64 and its matcher unless you choose others.
 """
 
 import hashlib
-import os
 import re
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
-
-import pycolmap
 
 from hloc_reduce import (
     aggregate_features,
     extract_features,
     localize_sfm,
-    logger,
     maps,
     pairs_from_retrieval,
 )
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS
-from hloc_reduce.localization import intrinsics
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.maps import contradictions
 from hloc_reduce.maps.map import RETRIEVAL, Map
@@ -36,21 +29,15 @@ from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES
-from hloc_reduce.utils.images import list_images
-from hloc_reduce.utils.parsers import parse_query_lists, write_pairs
+from hloc_reduce.utils.parsers import write_pairs
 from hloc_reduce.utils.paths import strings_as_paths
 
 from . import options
-from .run import Run, check_queries, readable
+from .queries import Photos, Queries
+from .run import Run, readable
 
 MADE_FROM = "made_from.json"  # the map and the photos of the queries
 LISTED = "queries_with_intrinsics.txt"  # written for a folder of queries
-SOURCES = {
-    "map": "those of the map's camera, according to their EXIF data",
-    "EXIF": "from EXIF data and refined with the pose",
-    "guess": "guessed and refined with the pose",
-    "unknown": "guessed and refined with the pose, of sizes that no map photo has: perhaps cropped",
-}
 NOT_IN_NAMES = r"[^\w.-]+"  # characters of a glob
 
 
@@ -160,12 +147,12 @@ def main(
     Raises:
         InputError: when something is missing or wrong.
     """
-    wanted = _find_queries(query_images, queries, built, strict)
+    wanted = Queries.find(query_images, queries, built, strict)
     names = wanted.names
     map_names = built.names()  # a broken model is found before photos are read
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
-    photos = _Photos(outputs / MADE_FROM, built, query_images, names)
+    photos = Photos(outputs / MADE_FROM, built, query_images, names)
     conf = {
         "map": built.place,
         "query_images": str(query_images.resolve()),
@@ -217,106 +204,6 @@ def main(
             "ground_truth": ground_truth,
         }
         return run.finish(summary, wanted.lists, records, truth, limits, features, poses, files)
-
-
-@dataclass(frozen=True)
-class _Queries:
-    """The queries of a run.
-
-    Args:
-        lists: the names of the queries of each list.
-        sources: where the intrinsics of a query are from, "list" or as from `intrinsics.infer`.
-        inferred: intrinsics that are not listed, with their sources; none of unreadable photos.
-    """
-
-    lists: dict[str, list[str]]
-    sources: dict[str, str]
-    inferred: dict[str, tuple[pycolmap.Camera, str]]
-
-    @property
-    def names(self) -> list[str]:
-        """The names of all queries."""
-        return [name for part in self.lists.values() for name in part]
-
-    @property
-    def refinements(self) -> dict[str, dict]:
-        """Which inferred intrinsics are refined with the pose."""
-        return {name: intrinsics.REFINEMENTS[source] for name, (_, source) in self.inferred.items()}
-
-    def write(self, path: Path) -> list[tuple[str, pycolmap.Camera | None]]:
-        """Write the inferred intrinsics and return those of all queries, None if not known."""
-        intrinsics.write_queries(self.inferred, path)
-        cameras = {name: camera for name, (camera, _) in self.inferred.items()}
-        return [(name, cameras.get(name)) for name in self.names]
-
-    def log(self) -> None:
-        """Log where inferred intrinsics are from."""
-        for source, said in SOURCES.items():
-            if some := [name for name in self.names if self.sources.get(name) == source]:
-                logger.info("Intrinsics of %d queries are %s: %s", len(some), said, cli.some(some))
-
-
-def _find_queries(query_images: Path, queries: Path | None, built: Map, strict: bool) -> _Queries:
-    """Read the queries of lists, or of a folder with inferred intrinsics."""
-    if queries:
-        given = parse_query_lists(queries)
-        lists = {stem: [name for name, _ in part] for stem, part in given.items()}
-        names = [name for part in lists.values() for name in part]
-        check_queries(query_images, names, strict)
-        return _Queries(lists, dict.fromkeys(names, "list"), {})
-    names = list_images(query_images)
-    inferred = _infer(query_images, names, built.cameras, strict)
-    sources = {name: source for name, (_, source) in inferred.items()}
-    return _Queries({query_images.resolve().name: names}, sources, inferred)
-
-
-class _Photos:
-    """The provenance of results: the map and the photos of the queries.
-
-    Results are stale if a photo that they were made from has changed, or the map was rebuilt.
-    """
-
-    def __init__(self, path: Path, built: Map, query_images: Path, names: list[str]):
-        self._path = path
-        before = provenance.read(path)
-        known = before.get("queries", {})
-        files = {name: query_images / name for name in names}
-        found = {
-            name: file
-            for name, file in files.items()
-            if file.is_file() and os.access(file, os.R_OK)
-        }
-        self._map, self._photos = built.id, provenance.fingerprints(found, known)
-        self.changed = provenance.changed(known, self._photos)
-        if before and before.get("map") != built.id:
-            self.changed.append(f"the map {built.folder}")
-        if self.changed:
-            logger.info("Results are stale, as these changed: %s.", ", ".join(self.changed))
-        else:  # photos that are not in this list may be in the next
-            self._photos = {**known, **self._photos}
-
-    def write(self) -> None:
-        provenance.write(self._path, {"map": self._map, "queries": self._photos})
-
-    def forget(self, unreadable: Iterable[str]) -> None:
-        """Leave out unreadable photos: once readable, they do not make the other results stale."""
-        for name in unreadable:
-            self._photos.pop(name, None)
-        self.write()
-
-
-def _infer(
-    query_images: Path, names: list[str], of_map: intrinsics.MapCameras, strict: bool
-) -> dict[str, tuple[pycolmap.Camera, str]]:
-    """Infer the intrinsics of photos; skip unreadable ones unless `strict`."""
-    cameras = {}
-    for name in names:
-        try:
-            cameras[name] = intrinsics.infer(query_images / name, of_map)
-        except InputError:
-            if strict:
-                raise
-    return cameras
 
 
 def _retrieve(

@@ -1,0 +1,144 @@
+"""The queries of pipelines.localize: their names and intrinsics, and whether photos changed."""
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import pycolmap
+
+from hloc_reduce import logger
+from hloc_reduce.localization import intrinsics
+from hloc_reduce.maps.map import Map
+from hloc_reduce.runtime import provenance
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.images import list_images
+from hloc_reduce.utils.parsers import parse_query_lists
+
+from .run import check_queries
+
+SOURCES = {
+    "map": "those of the map's camera, according to their EXIF data",
+    "EXIF": "from EXIF data and refined with the pose",
+    "guess": "guessed and refined with the pose",
+    "unknown": "guessed and refined with the pose, of sizes that no map photo has: perhaps cropped",
+}
+
+
+@dataclass(frozen=True)
+class Queries:
+    """The queries of a run.
+
+    Args:
+        lists: the names of the queries of each list.
+        inferred: intrinsics with their sources, as from `intrinsics.infer`, but none of unreadable
+            photos; None if the lists have intrinsics.
+    """
+
+    lists: dict[str, list[str]]
+    inferred: dict[str, tuple[pycolmap.Camera, str]] | None = None
+
+    @classmethod
+    def find(cls, query_images: Path, queries: Path | None, built: Map, strict: bool) -> Self:
+        """Read the queries of lists, or of a folder, whose intrinsics are inferred.
+
+        Args:
+            query_images: folder of the photos.
+            queries: query list with intrinsics, or a glob of several; None for the whole folder.
+            built: the map.
+            strict: stop at an unreadable photo.
+
+        Raises:
+            InputError: when a list is wrong, a photo is missing, or, if `strict`, unreadable.
+        """
+        if queries:
+            given = parse_query_lists(queries)
+            listed = cls({stem: [name for name, _ in part] for stem, part in given.items()})
+            check_queries(query_images, listed.names, strict)
+            return listed
+        names = list_images(query_images)
+        inferred = _infer(query_images, names, built.cameras, strict)
+        return cls({query_images.resolve().name: names}, inferred)
+
+    @property
+    def names(self) -> list[str]:
+        """The names of all queries."""
+        return [name for part in self.lists.values() for name in part]
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """Where the intrinsics of the queries are from."""
+        if self.inferred is None:
+            return dict.fromkeys(self.names, "list")
+        return {name: source for name, (_, source) in self.inferred.items()}
+
+    @property
+    def refinements(self) -> dict[str, dict]:
+        """Which inferred intrinsics are refined with the pose."""
+        inferred = (self.inferred or {}).items()
+        return {name: intrinsics.REFINEMENTS[source] for name, (_, source) in inferred}
+
+    def write(self, path: Path) -> list[tuple[str, pycolmap.Camera | None]]:
+        """Write the inferred intrinsics and return those of all queries, None if not known."""
+        inferred = self.inferred or {}
+        intrinsics.write_queries(inferred, path)
+        return [(name, inferred[name][0] if name in inferred else None) for name in self.names]
+
+    def log(self) -> None:
+        """Log where inferred intrinsics are from."""
+        sources = self.sources
+        for source, said in SOURCES.items():
+            if some := [name for name in sources if sources[name] == source]:
+                logger.info("Intrinsics of %d queries are %s: %s", len(some), said, cli.some(some))
+
+
+class Photos:
+    """The provenance of results: the map and the photos of the queries.
+
+    Results are stale if a photo that they were made from has changed, or the map was rebuilt.
+    """
+
+    def __init__(self, path: Path, built: Map, query_images: Path, names: list[str]):
+        self._path = path
+        before = provenance.read(path)
+        known = before.get("queries", {})
+        files = {name: query_images / name for name in names}
+        found = {
+            name: file
+            for name, file in files.items()
+            if file.is_file() and os.access(file, os.R_OK)
+        }
+        self._map, self._photos = built.id, provenance.fingerprints(found, known)
+        self.changed = provenance.changed(known, self._photos)
+        if before and before.get("map") != built.id:
+            self.changed.append(f"the map {built.folder}")
+        if self.changed:
+            logger.info("Results are stale, as these changed: %s.", ", ".join(self.changed))
+        else:  # photos that are not in this list may be in the next
+            self._photos = {**known, **self._photos}
+
+    def write(self) -> None:
+        """Write the provenance."""
+        provenance.write(self._path, {"map": self._map, "queries": self._photos})
+
+    def forget(self, unreadable: Iterable[str]) -> None:
+        """Leave out unreadable photos: once readable, they do not make the other results stale."""
+        for name in unreadable:
+            self._photos.pop(name, None)
+        self.write()
+
+
+def _infer(
+    query_images: Path, names: list[str], of_map: intrinsics.MapCameras, strict: bool
+) -> dict[str, tuple[pycolmap.Camera, str]]:
+    """Infer the intrinsics of photos; skip unreadable ones unless `strict`."""
+    cameras = {}
+    for name in names:
+        try:
+            cameras[name] = intrinsics.infer(query_images / name, of_map)
+        except InputError:
+            if strict:
+                raise
+    return cameras
