@@ -39,6 +39,7 @@ def rows(folder: Path, centimetres: list[float]) -> list[str]:
     # pipelines.localize extracts the queries only: its map has features
     photos = summary["queries"] + ("map" not in summary) * summary["map_images"]
     extraction = seconds.get("extract_features")
+    images = size.get("images")  # older summaries have none
     for name, result in summary["lists"].items():
         percent = result.get("recall_percent", [])
         if centimetres:
@@ -57,7 +58,7 @@ def rows(folder: Path, centimetres: list[float]) -> list[str]:
             " / ".join(f"{value:.1f}" for value in percent),
             error,
             f"{result['mean_inliers']:,.0f}",
-            f"{size['keypoints'] / size['images']:,.0f}",
+            f"{size['keypoints'] / images:,.0f}" if images else "",
             f"{summary['map_points3D']:,}" if "map_points3D" in summary else "",
             "" if extraction is None else f"{extraction / photos:.2f}",
             f"{sum(seconds.values()):.0f}",

@@ -37,6 +37,9 @@ def test_what_is_no_finished_run_is_left_out(tmp_path):
     assert shown.stdout.splitlines()[2:] == [
         "| sift | 256 | night | 2 of 3 |  |  | 52 | 1,000 | 3,871 | 0.50 | 4 |"
     ]
+    old = {**SUMMARY, "bytes_per_keypoint": {"descriptor": 256, "keypoints": 6000}}
+    (run / "summary.json").write_text(json.dumps(old))
+    assert "| 52 |  | 3,871 |" in table(run).stdout
     alone = table(report)
     assert alone.returncode == 2 and f"no summary.json in {report}" in alone.stderr
 
