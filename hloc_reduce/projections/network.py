@@ -51,9 +51,11 @@ class Projection(nn.Module):
         self.linears = nn.ModuleList(map(nn.Linear, mlp.sizes[:-1], mlp.sizes[1:]))
         scale, shift = torch.ones(mlp.sizes[0]), torch.zeros(mlp.sizes[0])
         for folded, linear, norm in zip(self.linears, mlp.linears, [*mlp.norms, None], strict=True):
-            # fold the normalization before the layer, x * scale + shift, into weight and bias
-            weight, bias = (part.detach() for part in linear.parameters())
-            folded.weight.data, folded.bias.data = weight * scale, bias + weight @ shift
+            # fold the normalization before the layer, x * scale + shift, into weight and bias; in
+            # float64, so that their rounding does not depend on the number of threads
+            weight, bias = (part.detach().double() for part in linear.parameters())
+            folded.weight.data = (weight * scale).float()
+            folded.bias.data = (bias + (weight * shift).sum(dim=1)).float()
             if norm is not None:
                 scale = norm.weight.detach() / (norm.running_var + norm.eps).sqrt()
                 shift = norm.bias.detach() - norm.running_mean * scale
