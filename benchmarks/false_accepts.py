@@ -29,7 +29,7 @@ from hloc_reduce.datasets import scans, true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.localization import intrinsics, query
+from hloc_reduce.localization import intrinsics, mirrored, query
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.localization.query import merged
 from hloc_reduce.localization.references import Reference, ScanMap, SfmMap
@@ -270,11 +270,12 @@ def run(
         ids, _ = place.reference.lift(name, np.arange(len(descriptors)))
         shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
     gate = DEFAULT_GATE.of_matches(model, described[place.names[0]].shape[1])
-    for source, name, camera, truth, path, kind in tried:
+
+    def match(path: Path, name: str) -> tuple[np.ndarray, dict, Gate]:
         with open_h5(path) as file:
             query = describe(file, name, is_query=True)
-            keypoints, blur = get_colmap_keypoints(file, name)[0], get_blur(file, name)
-            size = get_image_size(file, name)
+            keypoints = get_colmap_keypoints(file, name)[0]
+            its_gate = gate.of_photo(get_blur(file, name))
         matches = {}
         for other in place.names:
             rows_of = shown[other]
@@ -282,20 +283,35 @@ def run(
             matched = torch.nonzero(found >= 0)[:, 0]
             matched = matched[cosine[matched].argsort(descending=True)]
             matches[other] = torch.stack([found[matched], rows_of[matched]], 1).numpy()
+        return keypoints, matches, its_gate
+
+    for source, name, camera, truth, path, kind in tried:
+        images = source.images if path == source.features else output / "altered"
+        with open_h5(path) as file:
+            size = get_image_size(file, name)
+        matched, flipped = match(path, name), None
         known = ("given", "off", "guess") if kind == "own" else ("given", "guess")
         for given in known if camera else ("guess",):
-            row = localize(
-                place,
-                keypoints,
-                intrinsics_of(camera, size, given, sizes),
-                matches,
-                gate.of_photo(blur),
-            )
+            its_camera, refinement = intrinsics_of(camera, size, given, sizes)
+            row = localize(place, matched, its_camera, refinement)
+            if mirrored.is_doubtful(not row["refusal"], row["agreement"]):
+                flipped = flipped or match(*mirror(images, output, name, place.base))
+                other_row = localize(place, flipped, mirrored.mirror(its_camera), refinement)
+                values = row["confidence"], other_row["confidence"]
+                row["refusal"] = mirrored.refusal(*values) or ""
             cam_from_world = row.pop("cam_from_world")
             row |= outcome(place, row, cam_from_world, truth)
             first = {"feature": feature, "map": place.name, "place": source.name}
             rows.append(first | {"photo": name, "kind": kind, "intrinsics": given} | row)
     return rows
+
+
+def mirror(images: Path, output: Path, name: str, base: str) -> tuple[Path, str]:
+    """Extract the features of the mirror image of a photo; return their file and its name."""
+    conf = copy.deepcopy(features_confs.confs[base])
+    conf["preprocessing"]["mirrored"] = True
+    path = output / f"mirrored-{images.parent.name}-{images.name}.h5"
+    return extract_features.main(conf, images, image_list=[name], feature_path=path), name
 
 
 def intrinsics_of(
@@ -327,13 +343,12 @@ def intrinsics_of(
 
 def localize(
     place: Place,
-    keypoints: np.ndarray,
-    camera: tuple[pycolmap.Camera, dict],
-    matches: dict,
-    gate: Gate,
+    matched: tuple[np.ndarray, dict, Gate],
+    camera: pycolmap.Camera,
+    refinement: dict,
 ) -> dict:
-    """Localize a query, given its intrinsics and the configuration that refines them."""
-    camera, refinement = camera
+    """Localize a query, given its keypoints, matches and gate; its intrinsics may be refined."""
+    keypoints, matches, gate = matched
     config = merged({"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}, refinement)
     cam_from_world, info = query.localize(place.reference, keypoints, camera, matches, config, gate)
     depths = [np.nan]

@@ -9,6 +9,7 @@ import pycolmap
 from .localization import stage
 from .localization.confidence import DEFAULT_GATE, Gate
 from .localization.intrinsics import to_lists
+from .localization.mirrored import MirrorImages
 from .localization.query import merged
 from .localization.references import SfmMap
 from .runtime import provenance
@@ -38,6 +39,7 @@ def main(
     full_names: bool = False,
     executor: Executor = SERIAL,
     gate: Gate = DEFAULT_GATE,
+    mirror_images: MirrorImages | None = None,
 ) -> dict[str, dict]:
     """Localize queries in a COLMAP model.
 
@@ -61,6 +63,7 @@ def main(
         full_names: write whole names instead of `basename`.
         executor: does the work; a map in memory is localized in by this process.
         gate: what a pose must have for the query to be called localized.
+        mirror_images: extracts and matches mirror images of queries, see `localization.stage.main`.
 
     Returns:
         A record for each query, as `localization.stage.main` returns it and keeps it in
@@ -104,6 +107,7 @@ def main(
             name_parts=None if full_names else 2 if prepend_camera_name else 1,
             executor=executor,
             gate=gate,
+            mirror_images=mirror_images,
         )
     finally:
         _load.cache_clear()  # a map may be large

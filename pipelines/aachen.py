@@ -65,6 +65,7 @@ def main(
                 *(sfm, place.queries, loc_pairs, features, loc_matches, poses),
                 executor=run.executor,
                 gate=run.gate,
+                mirror_images=run.mirror_images_of_dataset(),
             )
         limits = {name: thresholds(name) for name in lists}
         map_points3D = reconstruction.num_points3D()

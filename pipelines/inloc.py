@@ -60,6 +60,7 @@ def main(
                 executor=run.executor,
                 points=points,
                 gate=run.gate,
+                mirror_images=run.mirror_images_of_dataset(),
             )
         source = "list" if place.query_list.is_file() else "iphone7"
         limits = dict.fromkeys(lists, INLOC_THRESHOLDS)

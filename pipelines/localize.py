@@ -184,6 +184,9 @@ def main(
                 refinements=wanted.refinements,
                 full_names=True,
                 gate=gate,
+                mirror_images=run.mirror_images(
+                    built.conf, query_images, loc_pairs, features, built.features
+                ),
             )
         summary = {
             "retrieval": "vlad",

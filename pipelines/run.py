@@ -29,6 +29,7 @@ from hloc_reduce.evaluation.summaries import (
     write_summary,
 )
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.localization.mirrored import MirrorImages
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.runtime.group_writer import failures
@@ -83,17 +84,50 @@ class Run:
             features: feature file.
             features_ref: feature file of the second images; default: `features`.
         """
+        with self.stage(stage):
+            return self._match(pairs, features, features_ref)
+
+    def _match(self, pairs: Path, features: Path, features_ref: Path | None) -> Path:
         conf = matchers_confs.confs[self.matcher]
         matches = self.folder.path / f"{features.stem}_{conf['output']}_{pairs.stem}.h5"
-        with self.stage(stage):
-            if next(parse_pairs(pairs), None) is not None:  # else no query could be read
-                match_features.main(
-                    *(conf, pairs, features),
-                    matches=matches,
-                    features_ref=features_ref,
-                    executor=self.executor,
-                )
+        if next(parse_pairs(pairs), None) is not None:  # else no query could be read
+            match_features.main(
+                *(conf, pairs, features),
+                matches=matches,
+                features_ref=features_ref,
+                executor=self.executor,
+            )
         return matches
+
+    def mirror_images(
+        self, conf: dict, image_dir: Path, pairs: Path, features: Path, map_features: Path
+    ) -> MirrorImages:
+        """Return what extracts and matches mirror images of queries, for a localization stage.
+
+        Args:
+            conf: configuration of the feature.
+            image_dir: folder of the queries.
+            pairs: pairs of all queries and map images.
+            features: feature file of all queries.
+            map_features: feature file of the map images.
+        """
+
+        def main(names: list[str]) -> tuple[Path, Path]:
+            listed = self.folder.path / f"{pairs.stem}-mirrored.txt"
+            retrieved = parse_retrieval(pairs)
+            write_pairs([(name, other) for name in names for other in retrieved[name]], listed)
+            mirrored = extract_features.main(
+                {**conf, "preprocessing": {**conf["preprocessing"], "mirrored": True}},
+                image_dir,
+                feature_path=self.folder.path / f"{features.stem}-mirrored.h5",
+                image_list=names,
+                executor=self.executor,
+                strict=False,
+                queries=names,
+            )
+            return mirrored, self._match(listed, mirrored, map_features)
+
+        return main
 
     def finish(
         self,
@@ -288,6 +322,11 @@ class DatasetRun(Run):
             self.is_partial |= len(kept) < len(self.map_names)
             self.map_names = kept
         return self.features
+
+    def mirror_images_of_dataset(self) -> MirrorImages:
+        """Return what extracts and matches mirror images of queries, for a localization stage."""
+        images = self.place.images
+        return self.mirror_images(self._conf, images, self._pairs, self.features, self.features)
 
     def retrieve(self) -> Path:
         """Write the pairs of the readable queries and map images."""

@@ -146,7 +146,13 @@ PLANE = {"Plane": {"day": (2, "query/day/"), "night": (1, "query/night/")}}
 
 
 @pytest.fixture
-def plane(tmp_path):
+def symmetric() -> float:
+    """The height of the part of the plane whose right half mirrors the left one, of its height."""
+    return 0.0
+
+
+@pytest.fixture
+def plane(tmp_path, symmetric):
     """Photos of the plane z = 0 and a COLMAP model of their poses with covisibility."""
     generator = np.random.default_rng(0)
     texture = np.zeros((600, 600))
@@ -154,6 +160,8 @@ def plane(tmp_path):
         noise = cv2.GaussianBlur(generator.standard_normal(texture.shape), (0, 0), sigma)
         texture += noise / noise.std()
     texture = (128 + 30 * texture).clip(0, 255).astype(np.uint8)
+    top = round(symmetric * 600)
+    texture[:top, 300:] = texture[:top, 299::-1]
 
     reference = pycolmap.Reconstruction()
     camera = pycolmap.Camera(

@@ -143,7 +143,8 @@ def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Ten
 
     Args:
         image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-        preprocessing: `grayscale`, `resize_max`, `resize_force` of a feature's configuration.
+        preprocessing: `grayscale`, `resize_max`, `resize_force` of a feature's configuration; and
+            `mirrored`, whether to swap left and right.
 
     Returns:
         The image (1, C, H, W) float32 in [0, 1], and its original (width, height).
@@ -155,6 +156,8 @@ def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Ten
     pixels = (
         convert(image, grayscale) if isinstance(image, np.ndarray) else read_image(image, grayscale)
     )
+    if preprocessing.get("mirrored"):
+        pixels = pixels[:, ::-1]
     pixels = pixels.astype(np.float32)
     size = np.array(pixels.shape[1::-1])
     resize_max = preprocessing.get("resize_max")

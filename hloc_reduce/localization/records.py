@@ -8,10 +8,11 @@ import pycolmap
 
 from ..utils.cli import InputError
 from ..utils.files import naming, replacing
+from . import mirrored
 from .intrinsics import from_list, to_list
 from .references import Reference
 
-RECORDS = 16  # the version of the content of records, and of the gate
+RECORDS = 17  # the version of the content of records, and of the gate
 NUMBERS = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
 
 
@@ -66,23 +67,46 @@ def to_record(
     localized = info["reason"] is None
     if not localized:
         cam_from_world = reference.fallback(names) or cam_from_world
-    qvec = tvec = None
-    if cam_from_world is not None:
-        x, y, z, w = cam_from_world.rotation.quat
-        qvec = [float(value) for value in (w, x, y, z)]
-        tvec = [float(value) for value in cam_from_world.translation]
     return {
         "localized": localized,
         "reason": info["reason"],
         "confidence": info["confidence"],
         "agreement": info["agreement"],
-        "qvec": qvec,
-        "tvec": tvec,
+        **_written(cam_from_world),
         "camera": info["camera"] and to_list(info["camera"]),
         "max_error": info["max_error"],
         **{key: info[key] for key in NUMBERS},
         "db": info["db"] if localized else next(iter(names), None),
+        "mirror_image": None,
     }
+
+
+def _written(cam_from_world: pycolmap.Rigid3d | None) -> dict:
+    """Return the written pose of a record."""
+    if cam_from_world is None:
+        return {"qvec": None, "tvec": None}
+    x, y, z, w = cam_from_world.rotation.quat
+    return {
+        "qvec": [float(value) for value in (w, x, y, z)],
+        "tvec": [float(value) for value in cam_from_world.translation],
+    }
+
+
+def with_mirror_image(record: dict, other: dict, reference: Reference, names: list[str]) -> dict:
+    """Return the record of a localized query after its mirror image was localized, too.
+
+    Args:
+        record: of the query.
+        other: of its mirror image.
+        reference: the map.
+        names: the retrieved images, best first.
+    """
+    record = {**record, "mirror_image": other["confidence"]}
+    if not (reason := mirrored.refusal(record["confidence"], other["confidence"])):
+        return record
+    fallback = reference.fallback(names) or pose_of(record)
+    first = next(iter(names), None)
+    return record | _written(fallback) | {"localized": False, "reason": reason, "db": first}
 
 
 def refused(

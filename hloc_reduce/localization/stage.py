@@ -22,8 +22,17 @@ from ..utils.match_files import find_pair, get_matcher, get_matches, most_simila
 from ..utils.parsers import parse_query_lists, write_poses
 from ..utils.progress import progress
 from .confidence import DEFAULT_GATE, Gate, add_gate_options
+from .mirrored import MirrorImages, is_doubtful, mirror
 from .query import localize
-from .records import RECORDS, Log, log_file, pose_of, refused, to_record
+from .records import (
+    RECORDS,
+    Log,
+    log_file,
+    pose_of,
+    refused,
+    to_record,
+    with_mirror_image,
+)
 from .references import Reference
 
 CHUNK = 8  # queries
@@ -44,6 +53,7 @@ def main(
     name_parts: int | None = 1,
     executor: Executor = SERIAL,
     gate: Gate = DEFAULT_GATE,
+    mirror_images: MirrorImages | None = None,
 ) -> dict[str, dict]:
     """Localize queries by the files of their features and matches.
 
@@ -66,15 +76,21 @@ def main(
         executor: does the work; `load_reference` and `config` are pickled for other processes.
         gate: what a pose must have for the query to be called localized; its agreement, if not
             given, is that for the matcher and the dimension in the files.
+        mirror_images: extracts and matches mirror images of queries, whose own poses are refused
+            if those of the mirror images are likelier; default: no query is tested.
 
     Returns:
         A record for each query: `localized`; `reason`, why it is not localized, None if it is;
         `confidence` and `agreement`; the written pose as `qvec` (w, x, y, z) and `tvec`, the
         fallback if the query is not localized, None if there is none; `camera`, the model, width,
         height and parameters in a list, None if not known; `max_error`, RANSAC's inlier threshold
-        in pixels, None for pycolmap's default; and the numbers and `db` of `localize`.
+        in pixels, None for pycolmap's default; `mirror_image`, the confidence of its mirror image,
+        None if that was not tried; and the numbers and `db` of `localize`.
     """
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
+    if mirror_images:
+        header["mirror_images"] = True
+    localize = partial(_localized, load_reference, config, skip_matches, gate, executor)
     with Log(log_file(results), header, overwrite) as log:
         todo = [(name, camera) for name, camera in queries if name not in log.records]
         for name, record in _refuse(load_reference, features, todo, retrieved):
@@ -85,15 +101,19 @@ def main(
             if name not in log.records
         ]
         if tasks:
-            with open_h5(matches) as match_file:
-                _check_some_matched(match_file, [name for name, _ in queries], retrieved)
-                gate = gate.of_matches(get_matcher(match_file), dimension(features))
-            work = partial(
-                _localize_all, load_reference, features, matches, config, skip_matches, gate
-            )
-            with closing(executor.map(work, tasks, CHUNK)) as found:
-                for name, record in progress(found, "Localizing", "query", len(tasks)):
-                    log.add(name, record)
+            _check_some_matched(matches, [name for name, _ in queries], retrieved)
+            for name, record in localize(features, matches, tasks, "Localizing"):
+                log.add(name, record)
+        tasks = [
+            (name, mirror(camera), retrieved.get(name, []))
+            for name, camera in queries
+            if camera and _may_be_mirrored(log.records[name])
+        ]
+        if mirror_images and tasks:
+            files, reference = mirror_images([name for name, _, _ in tasks]), load_reference()
+            for name, record in localize(*files, tasks, "Trying mirror images"):
+                names = [other for other in retrieved.get(name, []) if other in reference]
+                log.add(name, with_mirror_image(log.records[name], record, reference, names))
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose_of(record) for name, record in records.items()}
     submitted = {name: known for name, known in poses.items() if known is not None}
@@ -153,15 +173,40 @@ def _reason(feature_file: h5py.File, name: str, camera: pycolmap.Camera | None) 
 
 
 def _check_some_matched(
-    match_file: h5py.File, names: list[str], retrieved: Mapping[str, list[str]]
+    matches: Path, names: list[str], retrieved: Mapping[str, list[str]]
 ) -> None:
     """Refuse a match file that has not a single pair."""
     pairs = [(name, other) for name in names for other in retrieved.get(name, [])]
-    if pairs and not any(find_pair(match_file, *pair)[0] for pair in pairs):
-        raise InputError(
-            f"The pair {pairs[0][0]}, {pairs[0][1]} is not in the match file "
-            f"{match_file.filename}, and no other of the queries is."
-        )
+    with open_h5(matches) as file:
+        if pairs and not any(find_pair(file, *pair)[0] for pair in pairs):
+            raise InputError(
+                f"The pair {pairs[0][0]}, {pairs[0][1]} is not in the match file {matches}, and no "
+                "other of the queries is."
+            )
+
+
+def _may_be_mirrored(record: dict) -> bool:
+    """Tell whether the mirror image of a query is yet to be tried."""
+    return record["mirror_image"] is None and is_doubtful(record["localized"], record["agreement"])
+
+
+def _localized(
+    load_reference: Callable[[], Reference],
+    config: Callable[[str, pycolmap.Camera], dict],
+    skip_matches: int,
+    gate: Gate,
+    executor: Executor,
+    features: Path,
+    matches: Path,
+    tasks: list[tuple[str, pycolmap.Camera | None, list[str]]],
+    said: str,
+) -> Iterator[tuple[str, dict]]:
+    """Yield the names and the records of queries, with a progress bar."""
+    with open_h5(matches) as file:
+        gate = gate.of_matches(get_matcher(file), dimension(features))
+    work = partial(_localize_all, load_reference, features, matches, config, skip_matches, gate)
+    with closing(executor.map(work, tasks, CHUNK)) as found:
+        yield from progress(found, said, "query", len(tasks))
 
 
 def _localize_all(
@@ -171,7 +216,7 @@ def _localize_all(
     config: Callable[[str, pycolmap.Camera], dict],
     skip_matches: int,
     gate: Gate,
-    queries: Iterable[tuple[str, pycolmap.Camera, list[str]]],
+    queries: Iterable[tuple[str, pycolmap.Camera | None, list[str]]],
 ) -> Generator[tuple[str, dict], None, None]:
     """Yield the names and the records of queries with their intrinsics and retrieved images."""
     reference = load_reference()

@@ -10,7 +10,7 @@ import torch
 from .. import aggregators, extractors, matchers
 from ..aggregators.vlad import read_vocabulary
 from ..confs import matchers as matchers_confs
-from ..localization import intrinsics, query
+from ..localization import intrinsics, mirrored, query
 from ..localization.confidence import DEFAULT_GATE, Gate
 from ..localization.query import merged
 from ..localization.references import SfmMap
@@ -110,34 +110,57 @@ class Localizer:
         if camera is None:
             camera, source = intrinsics.infer(image, self.cameras)
             refinement = intrinsics.REFINEMENTS[source]
-        features = extractors.extract(self.extractor, image, self.preprocessing, self.device)
+        features = self._extract(image)
         width, height = map(int, features["image_size"])
         if (camera.width, camera.height) != (width, height):
             raise InputError(
                 f"The camera has {camera.width}x{camera.height} pixels, the photo has "
                 f"{width}x{height}."
             )
-        rounded = features["descriptors"].T.astype(self.dtype)
-        descriptors = torch.from_numpy(rounded.astype(np.float32, order="C"))
         lap("extraction")
-        retrieved = self._retrieve(descriptors)
+        retrieved = self._retrieve(features["descriptors"])
         lap("retrieval")
-        matches = self._match(descriptors.to(self.device), retrieved)
+        matches = self._match(features["descriptors"], retrieved)
         lap("matching")
-        config = {"estimation": {"ransac": {"max_error": self.ransac_thresh}}}
-        keypoints = to_colmap(features["keypoints"])
-        gate = self.gate.of_photo(float(features["blur"]))
-        cam_from_world, info = query.localize(
-            self.reference, keypoints, camera, matches, merged(config, refinement), gate
-        )
+        cam_from_world, info = self._estimate(features, matches, camera, refinement)
         lap("pose")
+        if mirrored.is_doubtful(info["reason"] is None, info["agreement"]):
+            flipped = self._extract(image, mirrored=True)
+            matches = self._match(flipped["descriptors"], retrieved)
+            _, other = self._estimate(flipped, matches, mirrored.mirror(camera), refinement)
+            info["reason"] = mirrored.refusal(info["confidence"], other["confidence"])
+            lap("mirror_image")
         info |= {
-            "points2D": keypoints[info["keypoints"]],
+            "points2D": features["keypoints"][info["keypoints"]],
             "retrieved": retrieved,
             "intrinsics": source,
             "seconds": seconds,
         }
         return cam_from_world if info["reason"] is None else None, info
+
+    def _extract(self, image: Path | np.ndarray, mirrored: bool = False) -> dict:
+        """Extract features as a feature file has them: keypoints (N, 2), descriptors (N, D)."""
+        preprocessing = {**self.preprocessing, "mirrored": mirrored}
+        features: dict = extractors.extract(self.extractor, image, preprocessing, self.device)
+        rounded = features["descriptors"].T.astype(self.dtype)
+        descriptors = torch.from_numpy(rounded.astype(np.float32, order="C"))
+        keypoints = to_colmap(features["keypoints"])
+        return {**features, "descriptors": descriptors, "keypoints": keypoints}
+
+    def _estimate(
+        self,
+        features: dict,
+        matches: dict[str, np.ndarray],
+        camera: pycolmap.Camera,
+        refinement: dict,
+    ) -> tuple[pycolmap.Rigid3d | None, dict]:
+        """Estimate the pose of a photo from its matches, see `localization.query.localize`."""
+        config = {"estimation": {"ransac": {"max_error": self.ransac_thresh}}}
+        return query.localize(
+            *(self.reference, features["keypoints"], camera, matches),
+            merged(config, refinement),
+            self.gate.of_photo(float(features["blur"])),
+        )
 
     def _retrieve(self, descriptors: torch.Tensor) -> list[str]:
         """Return the names of the map images most similar to local descriptors (N, D)."""
@@ -147,6 +170,7 @@ class Localizer:
 
     def _match(self, descriptors: torch.Tensor, names: list[str]) -> dict[str, np.ndarray]:
         """Match descriptors (N, D) with those of map images that show a point."""
+        descriptors = descriptors.to(self.device)
         if self.as_integers:
             descriptors = torch.from_numpy(to_integers(descriptors.numpy()))
 

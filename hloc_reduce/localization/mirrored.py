@@ -1,0 +1,45 @@
+"""Tell mirrored photos, which may have a wrong pose on a symmetric facade, from others.
+
+The mirror image of a symmetric facade looks much like the facade itself, so that many matches agree
+with a wrong pose. But fewer do than with the pose of the photo as it was taken. So a query is
+mirrored and localized again; if that pose is likelier, the query was mirrored before. Right poses
+with which most matches agree need no such test.
+"""
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+
+import pycolmap
+
+DOUBTFUL = 0.9  # agreement: wrong poses of mirrored photos had at most 0.83
+
+# from names of queries to files of the features and of the matches of their mirror images
+MirrorImages = Callable[[list[str]], tuple[Path, Path]]
+
+
+def is_doubtful(localized: bool, agreement: float) -> bool:
+    """Tell whether the mirror image of a query is to be tried."""
+    return localized and agreement < DOUBTFUL
+
+
+def mirror(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """Return the intrinsics of a mirrored photo."""
+    mirrored = copy.deepcopy(camera)
+    mirrored.principal_point_x = camera.width - camera.principal_point_x
+    return mirrored
+
+
+def refusal(confidence: float, of_mirror_image: float) -> str | None:
+    """Return why a pose is not trusted in view of that of the mirror image, None if it is.
+
+    Args:
+        confidence: of the pose.
+        of_mirror_image: the confidence of the pose of the mirror image.
+    """
+    if of_mirror_image <= confidence:
+        return None
+    return (
+        f"it is mirrored: the confidence is {confidence:.1f}, that of its mirror image "
+        f"{of_mirror_image:.1f}"
+    )

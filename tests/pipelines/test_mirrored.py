@@ -1,0 +1,81 @@
+"""Mirrored photos of a symmetric place, which have many inliers at a wrong pose."""
+
+import cv2
+import pytest
+from command import outcome, run
+
+from hloc_reduce import Localizer
+from hloc_reduce.localization import mirrored
+from hloc_reduce.localization.records import log_file, read_records
+from pipelines import aachen, inloc, localize
+
+MATCHER = "--matcher", "NN-mutual"  # a ratio test would refuse most wrong matches here
+
+
+@pytest.fixture
+def symmetric() -> float:
+    """Most of the plane mirrors itself."""
+    return 0.7
+
+
+def mirror(path, of):
+    """Write the mirror image of a photo."""
+    cv2.imwrite(str(path), cv2.imread(str(of))[:, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100])
+
+
+def mirror_images(outputs):
+    """Return the confidences of the mirror images that were tried."""
+    summary, _ = outcome(outputs)
+    records = read_records(log_file(outputs / summary["poses"]))
+    return {name: record["mirror_image"] for name, record in records.items()}
+
+
+def test_photos_of_ones_own(place, tmp_path, monkeypatch):
+    """The mirrored photo is refused by the pipeline and in memory, and would not be otherwise."""
+    build, images, outputs = place
+    new = tmp_path / "new"
+    new.mkdir()
+    photo = images / "query/day/a.png"
+    mirror(new / "mirrored.png", photo)
+    (new / "right.png").write_bytes(photo.read_bytes())
+    run(monkeypatch, localize, *build, *MATCHER, "--query_images", new)
+    _, rows = outcome(outputs / "queries-new")
+    assert rows["right.png"]["status"] == "localized"
+    assert rows["mirrored.png"]["status"] == "fallback"
+    assert rows["mirrored.png"]["reason"].startswith("it is mirrored: the confidence is ")
+    tried = mirror_images(outputs / "queries-new")
+    assert tried["right.png"] is None  # most matches agree
+
+    localizer = Localizer(outputs / "map")
+    pose, info = localizer.localize(new / "mirrored.png")
+    assert pose is None and info["reason"] == rows["mirrored.png"]["reason"]
+    # again, with nothing but the records
+    run(monkeypatch, localize, *build, *MATCHER, "--query_images", new)
+    assert outcome(outputs / "queries-new")[1] == rows
+
+    monkeypatch.setattr(mirrored, "DOUBTFUL", 0.0)
+    pose, info = localizer.localize(new / "mirrored.png")
+    assert pose is not None and info["num_inliers"] > 50
+    monkeypatch.setattr(mirrored, "DOUBTFUL", 1.0)
+    pose, info = localizer.localize(new / "right.png")
+    assert pose is not None and "mirror_image" in info["seconds"]
+
+
+def test_aachen(aachen_layout, tmp_path, monkeypatch):
+    """The query by day is mirrored; the one by night is not."""
+    photo = aachen_layout / "images_upright/query/day/a.png"
+    mirror(photo, photo)
+    run(monkeypatch, aachen, "--dataset", aachen_layout, "--outputs", tmp_path / "out", *MATCHER)
+    _, rows = outcome(tmp_path / "out")
+    assert rows["query/day/a.png"]["reason"].startswith("it is mirrored")
+    assert rows["query/night/a.png"]["status"] == "localized"
+
+
+def test_inloc(inloc_layout, tmp_path, monkeypatch):
+    """One of two photos is mirrored."""
+    photos = inloc_layout / "query/iphone7"
+    mirror(photos / "b.JPG", photos / "a.JPG")
+    run(monkeypatch, inloc, "--dataset", inloc_layout, "--outputs", tmp_path / "out", *MATCHER)
+    _, rows = outcome(tmp_path / "out")
+    assert rows["query/iphone7/b.JPG"]["reason"].startswith("it is mirrored")
+    assert rows["query/iphone7/a.JPG"]["status"] == "localized"
