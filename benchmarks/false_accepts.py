@@ -294,7 +294,7 @@ def run(
         for given in known if camera else ("guess",):
             its_camera, refinement = intrinsics_of(camera, size, given, sizes)
             row = localize(place, matched, its_camera, refinement)
-            if mirrored.is_doubtful(not row["refusal"], row["agreement"]):
+            if mirrored.is_doubtful(not row["refusal"], row["agreement"], row["confidence"]):
                 flipped = flipped or match(*mirror(images, output, name, place.base))
                 other_row = localize(place, flipped, mirrored.mirror(its_camera), refinement)
                 values = row["confidence"], other_row["confidence"]

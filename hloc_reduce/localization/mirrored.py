@@ -3,7 +3,7 @@
 The mirror image of a symmetric facade looks much like the facade itself, so that many matches agree
 with a wrong pose. But fewer do than with the pose of the photo as it was taken. So a query is
 mirrored and localized again; if that pose is likelier, the query was mirrored before. Right poses
-with which most matches agree need no such test.
+of high confidence, with which most matches agree, need no such test.
 """
 
 import copy
@@ -12,15 +12,17 @@ from pathlib import Path
 
 import pycolmap
 
-DOUBTFUL = 0.9  # agreement: wrong poses of mirrored photos had at most 0.83
+# agreement and confidence below which poses are doubtful; those of mirrored photos had an agreement
+# of at most 0.85 or a confidence of at most 125 (docs/results.md)
+DOUBTFUL = 0.9, 250.0
 
 # from names of queries to files of the features and of the matches of their mirror images
 MirrorImages = Callable[[list[str]], tuple[Path, Path]]
 
 
-def is_doubtful(localized: bool, agreement: float) -> bool:
+def is_doubtful(localized: bool, agreement: float, confidence: float) -> bool:
     """Tell whether the mirror image of a query is to be tried."""
-    return localized and agreement < DOUBTFUL
+    return localized and (agreement < DOUBTFUL[0] or confidence < DOUBTFUL[1])
 
 
 def mirror(camera: pycolmap.Camera) -> pycolmap.Camera:

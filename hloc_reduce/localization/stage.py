@@ -187,7 +187,8 @@ def _check_some_matched(
 
 def _may_be_mirrored(record: dict) -> bool:
     """Tell whether the mirror image of a query is yet to be tried."""
-    return record["mirror_image"] is None and is_doubtful(record["localized"], record["agreement"])
+    known = (record[key] for key in ("localized", "agreement", "confidence"))
+    return record["mirror_image"] is None and is_doubtful(*known)
 
 
 def _localized(

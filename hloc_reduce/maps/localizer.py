@@ -124,7 +124,7 @@ class Localizer:
         lap("matching")
         cam_from_world, info = self._estimate(features, matches, camera, refinement)
         lap("pose")
-        if mirrored.is_doubtful(info["reason"] is None, info["agreement"]):
+        if mirrored.is_doubtful(info["reason"] is None, info["agreement"], info["confidence"]):
             flipped = self._extract(image, mirrored=True)
             matches = self._match(flipped["descriptors"], retrieved)
             _, other = self._estimate(flipped, matches, mirrored.mirror(camera), refinement)

@@ -53,10 +53,10 @@ def test_photos_of_ones_own(place, tmp_path, monkeypatch):
     run(monkeypatch, localize, *build, *MATCHER, "--query_images", new)
     assert outcome(outputs / "queries-new")[1] == rows
 
-    monkeypatch.setattr(mirrored, "DOUBTFUL", 0.0)
+    monkeypatch.setattr(mirrored, "DOUBTFUL", (0.0, 0.0))
     pose, info = localizer.localize(new / "mirrored.png")
     assert pose is not None and info["num_inliers"] > 50
-    monkeypatch.setattr(mirrored, "DOUBTFUL", 1.0)
+    monkeypatch.setattr(mirrored, "DOUBTFUL", (1.0, 0.0))
     pose, info = localizer.localize(new / "right.png")
     assert pose is not None and "mirror_image" in info["seconds"]
 
