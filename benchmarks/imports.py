@@ -17,16 +17,8 @@ STAGES = "stages"  # the modules at the top level of hloc_reduce
 ROOMS = (
     *("utils", "runtime", "detectors", "descriptors", "networks", "projections", "extractors"),
     *("aggregators", "matchers", "confs", "datasets", "localization", STAGES, "maps"),
-    *(
-        "evaluation",
-        "report",
-        "training",
-        "demo",
-        "hloc",
-        "hloc_reduce",
-        "pipelines",
-        "confs (shown)",
-    ),
+    *("compact", "evaluation", "report", "demo", "training", "hloc", "hloc_reduce", "pipelines"),
+    "confs (shown)",
 )
 
 

@@ -63,7 +63,8 @@ def open_map(
     Args:
         outputs: a new map goes into its folder `map`.
         map_images: folder of the map's photos; None to open an old map.
-        model_or_map: COLMAP model of the photos, or an old map.
+        model_or_map: COLMAP model of the photos, or an old map, or a file of
+            `hloc_reduce.compact`, which is unpacked into the folder `map`.
         feature: name of a feature, or its YAML file; default: colmap_sift_sv64.
         projection: projection file to use with the base descriptor of `feature`.
         matcher: default: the feature's.
@@ -82,7 +83,9 @@ def open_map(
         raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
     mode = colmap.camera_mode(camera_mode or "auto")
     if map_images is not None:
-        if model_or_map is not None and maps.is_map(model_or_map):
+        if model_or_map is not None and (
+            maps.is_map(model_or_map) or maps.is_compact(model_or_map)
+        ):
             raise InputError(
                 f"--map {model_or_map} is a map that was built: leave out --map_images to localize "
                 "in it, or give the COLMAP model that it was built from."
@@ -105,7 +108,10 @@ def open_map(
         raise InputError("Give --map_images, the folder of the photos to build a map of.")
     if any(model_or_map.glob("cameras.*")):
         raise InputError(f"{model_or_map} is a COLMAP model: give its photos, --map_images, too.")
-    built = Map(model_or_map)
+    if maps.is_compact(model_or_map):
+        built = maps.unpack(model_or_map, outputs / "map", overwrite)
+    else:
+        built = Map(model_or_map)
     contradictions.warn(built.contradicting)
     if feature or projection:
         built.check_feature(feature or features_confs.RECOMMENDED, projection)
@@ -254,7 +260,8 @@ def _main() -> None:
         "--map",
         type=Path,
         metavar="MODEL|MAP",
-        help="COLMAP model of the photos in --map_images, or a map that was built before",
+        help="COLMAP model of the photos in --map_images, or a map that was built before, a folder "
+        "or a file of hloc_reduce.compact",
     )
     parser.add_argument(
         "--map_images", type=Path, help="photos of the map; without --map they are reconstructed"

@@ -1,6 +1,8 @@
 """Maps to localize in: built from photos, opened, and kept in memory."""
 
 from .build import main
+from .compact import is_compact
 from .map import Map, is_map
+from .unpack import main as unpack
 
-__all__ = ["Map", "is_map", "main"]
+__all__ = ["Map", "is_compact", "is_map", "main", "unpack"]

@@ -8,21 +8,17 @@ import pycolmap
 import torch
 
 from .. import aggregators, extractors, matchers
-from ..aggregators.vlad import read_vocabulary
-from ..confs import matchers as matchers_confs
 from ..localization import intrinsics, mirrored, query
 from ..localization.confidence import DEFAULT_GATE, Gate
 from ..localization.query import merged
-from ..localization.references import SfmMap
 from ..localize_sfm import RANSAC_THRESH
-from ..pairs_from_retrieval import rank, read_global
+from ..pairs_from_retrieval import rank
 from ..runtime import parallel
-from ..utils import colmap
 from ..utils.cli import InputError
 from ..utils.codes import FLOATS, to_integers
-from ..utils.feature_files import dimension, read_descriptors, to_colmap
-from ..utils.h5 import open_h5
-from .map import RETRIEVAL, Map
+from ..utils.feature_files import to_colmap
+from .contents import read
+from .map import RETRIEVAL
 
 
 class Localizer:
@@ -31,13 +27,14 @@ class Localizer:
     Photos are matched only with keypoints of map images that show a point: the others cannot help.
 
     Args:
-        map_dir: the folder of a map from `maps.main` or `pipelines.localize`.
+        map_dir: the folder of a map from `maps.main` or `pipelines.localize`, or a file from
+            `hloc_reduce.compact`.
         num_loc: the number of most similar map images that a photo is matched with.
         ransac_thresh: RANSAC inlier threshold in pixels.
         gate: what a pose must have to be trusted.
 
     Raises:
-        InputError: if the folder is not a map.
+        InputError: if it is not a map.
 
     Example:
         >>> localizer = Localizer("outputs/map")  # doctest: +SKIP
@@ -51,34 +48,32 @@ class Localizer:
         ransac_thresh: float = RANSAC_THRESH,
         gate: Gate = DEFAULT_GATE,
     ):
-        built = Map(Path(map_dir))
+        contents = read(Path(map_dir))
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
-        self.preprocessing = built.conf["preprocessing"]
-        self.cameras = built.cameras
+        self.preprocessing, self.cameras = contents.preprocessing, contents.cameras
         # queries stay floats, rounded as in a feature file
-        self.dtype = built.storage if built.storage in FLOATS else FLOATS[0]
-        matcher: dict = matchers_confs.confs[built.matcher]["model"]
-        self.matcher = matchers.load(matcher).eval()
-        self.gate = gate.of_matches(matcher, dimension(built.features))
+        self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
+        self.matcher = matchers.load(contents.matcher).eval()
+        self.gate = gate.of_matches(contents.matcher, contents.dim)
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
-        coded = built.storage not in FLOATS and self.matcher.takes_codes
+        coded = contents.storage not in FLOATS and self.matcher.takes_codes
         # a code is rounded much more than integers are, and they are faster
         self.as_integers = coded and self.device == "cpu"
-        self.extractor = extractors.load(built.conf["model"]).eval().to(self.device)
+        self.extractor = contents.extractor.eval().to(self.device)
         self.vlad = aggregators.load(RETRIEVAL["model"]).eval()
-        self.vlad.vocabulary = read_vocabulary(built.vocabulary)
-        self.reference = SfmMap(colmap.read_model(built.sfm))
-        self.names = sorted(self.reference.images)
-        self.global_descriptors = read_global(built.descriptors, self.names)
-        self.descriptors, self.shown = {}, {}
-        with open_h5(built.features) as file:
-            for name in self.names:
-                descriptors = read_descriptors(file, name).restore(unbiased=coded)
-                if self.as_integers:
-                    descriptors = to_integers(descriptors)
-                self.descriptors[name] = torch.from_numpy(descriptors).to(self.device)
-                shown = np.flatnonzero(self.reference.point_rows(name) >= 0)
-                self.shown[name] = torch.from_numpy(shown).to(self.device)
+        self.vlad.vocabulary = contents.vocabulary
+        self.reference, self.names = contents.reference, contents.names
+        self.global_descriptors = contents.global_descriptors
+        moved = {id(part): self._to_device(part) for part in contents.descriptors.values()}
+        self.descriptors = {name: moved[id(part)] for name, part in contents.descriptors.items()}
+        self.shown = {
+            name: torch.from_numpy(rows).to(self.device) for name, rows in contents.shown.items()
+        }
+
+    def _to_device(self, descriptors: np.ndarray) -> torch.Tensor:
+        """Return descriptors (N, D) as they are matched."""
+        matched = to_integers(descriptors) if self.as_integers else descriptors
+        return torch.from_numpy(matched).to(self.device)
 
     def localize(
         self, image: Path | str | np.ndarray, camera: pycolmap.Camera | None = None
@@ -170,12 +165,10 @@ class Localizer:
 
     def _match(self, descriptors: torch.Tensor, names: list[str]) -> dict[str, np.ndarray]:
         """Match descriptors (N, D) with those of map images that show a point."""
-        descriptors = descriptors.to(self.device)
-        if self.as_integers:
-            descriptors = torch.from_numpy(to_integers(descriptors.numpy()))
+        query = self._to_device(descriptors.numpy())
 
         def match(name: str) -> np.ndarray:
             described, shown = self.descriptors[name], self.shown[name]
-            return self.matcher.match_rows(descriptors, described, shown).cpu().numpy()
+            return self.matcher.match_rows(query, described, shown).cpu().numpy()
 
         return dict(zip(names, parallel.ordered("match", match, names), strict=True))

@@ -135,8 +135,13 @@ class Map:
             InputError: if it is another one, or has the same name but another projection.
         """
         name, conf = features_confs.get(feature, projection, self.storage, self.keypoints)
-        made_by = extract_features.provenance(conf)
-        if json.loads((self.folder / "conf.json").read_text())["feature"] != made_by:
+        made_by = json.loads((self.folder / "conf.json").read_text()).get("feature")
+        known = (
+            name == self.feature
+            if made_by is None
+            else made_by == extract_features.provenance(conf)
+        )
+        if not known:
             other = "" if name != self.feature else f", but not of the {name} that it is now"
             raise InputError(
                 f"The map {self.folder} is of --feature {self.feature}{other}. "

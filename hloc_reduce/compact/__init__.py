@@ -1,0 +1,178 @@
+"""Write a map into one small file that localization needs nothing else beside.
+
+Keeps one descriptor for each 3D point, which images see it, and what retrieval needs: no photos, no
+keypoints. Localize in it with pipelines.localize --map FILE, or with Localizer(FILE).
+"""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from .. import logger
+from ..aggregate_features import vocabulary_of
+from ..confs import features as features_confs
+from ..confs import matchers as matchers_confs
+from ..localization import intrinsics
+from ..maps import compact, points
+from ..maps.map import RETRIEVAL, Map
+from ..pairs_from_retrieval import read_global
+from ..utils import cli, colmap
+from ..utils.cli import InputError
+from ..utils.codes import STORAGES
+from ..utils.files import replacing
+from ..utils.paths import strings_as_paths
+
+MEGABYTE = 1_000_000
+TRIES = 6  # sizes that are tried to come close to a limit
+CLOSE = 0.99  # share of the limit that is close enough
+# descriptors of points are means, so that fewer matches need a strict ratio test
+MATCHERS = {"NN-ratio": "NN-ratio90"}
+FEW = 32  # numbers that are stored as uint4; more as uint2
+
+
+@strings_as_paths
+def main(
+    output: Path,
+    map: Path | None = None,
+    sfm: Path | None = None,
+    features: Path | None = None,
+    global_descriptors: Path | None = None,
+    feature: str | None = None,
+    matcher: str | None = None,
+    storage: str | None = None,
+    max_mb: float | None = None,
+) -> dict[str, int]:
+    """Write a compact map.
+
+    Args:
+        output: the file, .hlm.
+        map: folder of a map of `pipelines.localize`; or else give the following four.
+        sfm: COLMAP model.
+        features: feature file of its images.
+        global_descriptors: h5 file of their global descriptors, with the vocabulary beside it, from
+            `aggregate_features`; default: the one beside `features`.
+        feature: name of the feature, or its YAML file.
+        matcher: a key of `confs.matchers`; default: the map's, or the feature's, but NN-ratio90
+            instead of NN-ratio.
+        storage: of the points' descriptors; default: that of the map if it has codes, else uint4
+            for up to 32 numbers, uint2 for more, and float16 for features without levels.
+        max_mb: the size of the file in 1,000,000 bytes; points that images need least are left out.
+
+    Returns:
+        The bytes of each part of the file.
+
+    Raises:
+        InputError: when something is missing or wrong, or the limit is below what the file needs
+            without points.
+    """
+    if output.suffix != compact.SUFFIX:
+        raise InputError(f"--output {output}: it must end in {compact.SUFFIX}.")
+    if max_mb is not None and not max_mb > 0:
+        raise InputError(f"--max_mb {max_mb}: it must be above 0.")
+    if map is not None:
+        built = Map(map)
+        name, conf, usual = built.feature, built.conf, built.matcher
+        sfm, features, descriptors = built.sfm, built.features, built.descriptors
+        vocabulary, cameras = built.vocabulary, built.cameras
+        model = colmap.read_model(sfm)
+    else:
+        if sfm is None or features is None or feature is None:
+            raise InputError("Give --map, or --sfm, --features and --feature.")
+        name, conf = features_confs.get(feature)
+        beside = features.parent / f"{RETRIEVAL['output']}_{features.stem}.h5"
+        descriptors = global_descriptors or beside
+        vocabulary = vocabulary_of(descriptors)
+        model = colmap.read_model(sfm)
+        sizes = {(camera.width, camera.height) for camera in model.cameras.values()}
+        cameras, usual = intrinsics.MapCameras({}, sizes), features_confs.matcher_of(conf)
+    matcher = matcher or MATCHERS.get(usual, usual)
+    cli.choose("matcher", matcher, matchers_confs.confs)
+    conf = {**conf, "storage": _storage(conf, storage)}
+    everything = points.collect(model, features)
+    dim, levels = everything.descriptors.shape[1], features_confs.levels(conf)
+    if levels is not None and len(levels) != dim:
+        raise InputError(
+            f"{features} has {dim} numbers a descriptor, but {name} has {len(levels)}."
+        )
+    rows = read_global(descriptors, everything.names)
+    encode = partial(_encode, everything, model, rows, vocabulary, name, conf, matcher, cameras)
+    if max_mb is None:
+        number = len(everything)
+        content, parts = encode(number)
+    else:
+        number, content, parts = _fit(encode, len(everything), max_mb)
+    with replacing(output) as temporary:
+        temporary.write_bytes(content)
+    logger.info(
+        "%s has %s of %s points and %s bytes: %s.",
+        *(output, f"{number:,}", f"{len(everything):,}", f"{len(content):,}"),
+        ", ".join(f"{part} {size:,}" for part, size in parts.items()),
+    )
+    return parts
+
+
+def _storage(conf: dict, storage: str | None) -> str:
+    """Return the storage of a map's points."""
+    if storage is not None:
+        cli.choose("storage", storage, STORAGES)
+        features_confs.levels({**conf, "storage": storage})
+        return storage
+    if "storage" in conf:
+        return conf["storage"]
+    if features_confs.level_file(conf) is None:
+        return STORAGES[0]
+    try:
+        dim = features_confs.levels({**conf, "storage": "uint4"})
+        return "uint4" if dim is not None and len(dim) <= FEW else "uint2"
+    except InputError:  # a projection without levels
+        return STORAGES[0]
+
+
+def _encode(
+    everything: points.Points,
+    model: pycolmap.Reconstruction,
+    rows: np.ndarray,
+    vocabulary: Path,
+    name: str,
+    conf: dict,
+    matcher: str,
+    cameras: intrinsics.MapCameras,
+    number: int,
+) -> tuple[bytes, dict[str, int]]:
+    """Encode the points that images need most."""
+    chosen = everything.only(points.select(everything, number))
+    return compact.encode(chosen, model, rows, vocabulary, name, conf, matcher, cameras)
+
+
+def _fit(
+    encode: Callable[[int], tuple[bytes, dict[str, int]]], number: int, max_mb: float
+) -> tuple[int, bytes, dict[str, int]]:
+    """Encode about as many points as fit into a limit.
+
+    Returns:
+        Their number, the content and the bytes of each part.
+    """
+    limit, best = max_mb * MEGABYTE, (0, b"", dict[str, int]())
+    low, high, tried = 0, number + 1, number  # the first number fits, the second one does not
+    for _ in range(TRIES):
+        content, parts = encode(tried)
+        size = len(content)
+        if size <= limit:
+            low, best = tried, (tried, content, parts)
+            if tried == number or size >= CLOSE * limit:
+                break
+        else:
+            high = tried
+        fixed = size - sum(parts[part] for part in ("coordinates", "descriptors", "visible"))
+        guess = int(tried * (limit - fixed) / (size - fixed))
+        if high - low < 2:
+            break
+        tried = min(max(guess, low + 1), high - 1)
+    if not low:
+        raise InputError(
+            f"--max_mb {max_mb:g} is too small: without points {fixed:,} bytes are needed."
+        )
+    return best

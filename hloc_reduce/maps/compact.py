@@ -1,0 +1,322 @@
+"""Compact maps: one file with all that localization needs. docs/map-format.md describes it."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from .. import projections
+from ..confs import features as features_confs
+from ..confs import matchers as matchers_confs
+from ..localization import intrinsics
+from ..utils.cli import InputError, choose
+from ..utils.codes import CODED, QUANTIZED, STORAGES, restore, store
+from ..utils.files import file_sha256, replacing
+from . import points as points_of_map
+from .points import Points
+
+VERSION = 1
+SUFFIX = ".hlm"
+SIGNS = 1024  # bits of an image's retrieval descriptor
+
+
+def hadamard(rows: np.ndarray, number: int) -> np.ndarray:
+    """Return the Walsh-Hadamard transform of rows, which is its own inverse but for a factor.
+
+    Args:
+        rows: (N, G) float32.
+        number: the least length of the transform, which is a power of two.
+
+    Returns:
+        (N, H) float32, where H is the next power of two from `number` on.
+    """
+    size = 1 << max(number - 1, 0).bit_length()
+    values = np.zeros((len(rows), size), np.float32)
+    values[:, : rows.shape[1]] = rows
+    half = 1
+    while half < size:
+        parts = values.reshape(len(rows), -1, 2, half)
+        values = np.stack([parts[:, :, 0] + parts[:, :, 1], parts[:, :, 0] - parts[:, :, 1]], 2)
+        half *= 2
+    return values.reshape(len(rows), size)
+
+
+def encode(
+    points: Points,
+    sfm: pycolmap.Reconstruction,
+    global_descriptors: np.ndarray,
+    vocabulary: Path,
+    feature: str,
+    conf: dict,
+    matcher: str,
+    cameras: intrinsics.MapCameras,
+) -> tuple[bytes, dict[str, int]]:
+    """Return the content of a compact map, the same for the same arguments.
+
+    Args:
+        points: that it has.
+        sfm: the model that they are from.
+        global_descriptors: (I, G) of its images.
+        vocabulary: of these.
+        feature: name of the feature.
+        conf: its configuration, whose storage is that of the points' descriptors.
+        matcher: a key of `confs.matchers`.
+        cameras: what the map tells about the intrinsics of other photos.
+
+    Returns:
+        The content, and the number of bytes of each part.
+    """
+    from safetensors.numpy import save
+
+    from ..aggregators.vlad import VOCABULARY, read_vocabulary
+
+    storage = conf.get("storage", STORAGES[0])
+    points = points.sorted()
+    images = {image.name: image for image in sfm.images.values()}
+    shown = [images[name] for name in points.names]
+    ids = sorted({image.camera_id for image in shown})
+    packed, least, step, bits = points_of_map.quantize(
+        points.xyz, points_of_map.precision(points, sfm)
+    )
+    visible, kind = points_of_map.pack_visible(points.visible, len(points))
+    levels = features_confs.levels(conf)
+    stored, attrs = store({"descriptors": points.descriptors.T}, storage, levels)
+    key = QUANTIZED.get(storage, "descriptors")
+    size = global_descriptors.shape[1]
+    signs = hadamard(global_descriptors, size)[:, :SIGNS] > 0
+    poses = [image.cam_from_world() for image in shown]
+    tensors: dict[str, np.ndarray] = {
+        "names": np.frombuffer("\n".join(points.names).encode(), np.uint8),
+        "rotations": np.array([pose.rotation.quat for pose in poses], np.float32),
+        "translations": np.array([pose.translation for pose in poses]),
+        "camera_of_image": np.array([ids.index(image.camera_id) for image in shown], np.uint32),
+        "coordinates": packed,
+        "descriptors": stored[key],
+        "num_visible": np.array([len(part) for part in points.visible], np.uint32),
+        "visible": visible,
+        "retrieval": np.packbits(signs, axis=1, bitorder="little"),
+    }
+    if levels is not None:
+        tensors["levels"] = attrs[key]["levels"]
+    if file_sha256(vocabulary) != file_sha256(VOCABULARY):
+        tensors["vocabulary"] = read_vocabulary(vocabulary).numpy().astype(np.float16)
+    metadata = {
+        "version": VERSION,
+        "feature": feature,
+        "conf": {key: conf[key] for key in ("model", "preprocessing")},
+        "storage": storage,
+        "scale": [float(value) for value in attrs.get(key, {}).values()] if levels is None else [],
+        "matcher": matcher,
+        "points": len(points),
+        "least": least.tolist(),
+        "step": step,
+        "bits": bits,
+        "visible": kind,
+        "signs": signs.shape[1],
+        "cameras": [intrinsics.to_list(sfm.cameras[i]) for i in ids],
+        "known": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
+        "sizes": sorted(cameras.sizes),
+        "models": sorted(cameras.models),
+    }
+    if projection := conf["model"].get("projection"):
+        file, prefix = projections.find(projection), projections.split_prefix(projection)[1]
+        metadata["projection_sha256"] = file_sha256(file)
+        name = file.stem + (prefix and f"@{prefix}")
+        shipped = file.stem in projections.names() and projections.checksum(file.stem)
+        if shipped != metadata["projection_sha256"]:
+            tensors["projection"] = np.frombuffer(file.read_bytes(), np.uint8)
+        metadata["conf"]["model"] = {**conf["model"], "projection": name}
+    content = save(tensors, {"map": json.dumps(metadata, sort_keys=True)})
+    parts = {name: tensor.nbytes for name, tensor in tensors.items()}
+    return content, parts | {"header": len(content) - sum(parts.values())}
+
+
+class CompactMap:
+    """A compact map, as a `localization.references.Reference`: its images show points.
+
+    Args:
+        path: the file.
+
+    Attributes:
+        feature: name of the feature.
+        conf: its configuration.
+        storage: of the points' descriptors.
+        matcher: a key of `confs.matchers`.
+        cameras: what the map tells about the intrinsics of other photos.
+        camera_number, camera_of: the number of each image's camera, and its intrinsics.
+        names: the images, sorted.
+        points: (P, 3) float64, coordinates.
+        visible: of each image the points that it shows (M,).
+        vocabulary: (W, D) float32 tensor, of the global descriptors.
+        global_descriptors: (I, G) float32 of unit norm.
+        projection: content of the file of the projection, None without one.
+
+    Raises:
+        InputError: when the file is missing, broken or of another version.
+    """
+
+    def __init__(self, path: Path):
+        from safetensors import SafetensorError, safe_open
+
+        self.path = path
+        try:
+            with safe_open(path, "np") as file:
+                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+                metadata = json.loads((file.metadata() or {})["map"])
+            if metadata["version"] != VERSION:
+                raise InputError(
+                    f"{path} is a compact map of version {metadata['version']}, not {VERSION}."
+                )
+            self._read(metadata, tensors)
+        except FileNotFoundError:
+            raise InputError(f"There is no map {path}.") from None
+        except InputError:
+            raise
+        except (
+            *(OSError, SafetensorError, KeyError, ValueError, TypeError, IndexError),
+            *(RecursionError, OverflowError, AttributeError),
+        ) as error:
+            said = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+            raise InputError(f"{path} is not a compact map, or broken ({said}).") from None
+
+    def _read(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
+        names = _array(tensors, "names", np.uint8, (None,)).tobytes().decode().split("\n")
+        self.names, number = names, int(metadata["points"])
+        if len(set(names)) != len(names) or not all(names):
+            raise ValueError("images without a name, or with the same")
+        count = len(names)
+        self._rotations = _array(tensors, "rotations", np.float32, (count, 4))
+        self._translations = _array(tensors, "translations", np.float64, (count, 3))
+        cameras = [intrinsics.from_list(values) for values in metadata["cameras"]]
+        if not all(camera.verify_params() for camera in cameras):
+            raise ValueError("cameras of other numbers of parameters")
+        used = _array(tensors, "camera_of_image", np.uint32, (count,))
+        self.camera_number = dict(zip(names, used.tolist(), strict=True))
+        self.camera_of = {name: cameras[i] for name, i in self.camera_number.items()}
+        bits, step = int(metadata["bits"]), float(metadata["step"])
+        least = np.array(metadata["least"], np.float64)
+        coordinates = _array(tensors, "coordinates", np.uint8, (-(-number * 3 * bits // 8),))
+        if not (0 < bits <= points_of_map.MAX_BITS and number > 0 and least.shape == (3,)):
+            raise ValueError(f"{number} points of {bits} bits")
+        self.points = points_of_map.restore(coordinates, number, least, step, bits)
+        counts = _array(tensors, "num_visible", np.uint32, (count,)).astype(np.int64)
+        packed = _array(tensors, "visible", np.uint8, (None,))
+        visible = points_of_map.unpack_visible(packed, metadata["visible"], counts, number)
+        self.visible = dict(zip(names, visible, strict=True))
+        self.storage = choose("storage", metadata["storage"], STORAGES)
+        self._stored = {QUANTIZED.get(self.storage, "descriptors"): tensors["descriptors"]}
+        self._attrs = dict(zip(("scale", "offset"), metadata["scale"], strict=False))
+        if self.storage in CODED:
+            self._attrs["levels"] = tensors["levels"]
+        if tensors["descriptors"].shape[1:] != (number,):
+            raise ValueError(f"descriptors of shape {tensors['descriptors'].shape}")
+        ((key, stored),) = self._stored.items()
+        restore({key: stored[:, :1]}, {key: self._attrs})  # raises errors of shapes and levels
+        size = int(metadata["signs"])
+        rows = _array(tensors, "retrieval", np.uint8, (count, -(-size // 8)))
+        signs = 2 * np.unpackbits(rows, axis=1, count=size, bitorder="little") - np.float32(1)
+        self._read_feature(metadata, tensors)
+        number = self.vocabulary.numel()
+        self.global_descriptors = hadamard(signs, number)[:, :number] / np.sqrt(signs.size or 1)
+        finite = (self._rotations, self._translations, self.points, np.array(step))
+        if not all(np.isfinite(values).all() for values in finite):
+            raise ValueError("numbers that are not finite")
+
+    def _read_feature(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
+        import torch
+
+        from ..aggregators.vlad import read_vocabulary
+
+        self.feature, conf = str(metadata["feature"]), metadata["conf"]
+        self.conf = {"output": f"feats-{Path(self.feature).name}", **conf}
+        self.conf["storage"] = self.storage
+        self.matcher = choose("matcher", metadata["matcher"], matchers_confs.confs)
+        sizes = {(int(width), int(height)) for width, height in metadata["sizes"]}
+        known = {name: intrinsics.from_list(v) for name, v in metadata["known"].items()}
+        self.cameras = intrinsics.MapCameras(known, sizes, {str(m) for m in metadata["models"]})
+        if "vocabulary" in tensors:
+            self.vocabulary = torch.from_numpy(tensors["vocabulary"].astype(np.float32))
+        else:
+            self.vocabulary = read_vocabulary()
+        self.projection: bytes | None = None
+        projection = conf["model"].get("projection")
+        if projection is None:
+            return
+        if "projection" in tensors:
+            self.projection = tensors["projection"].tobytes()
+            return
+        if projections.checksum(projection) != metadata["projection_sha256"]:
+            raise InputError(f"{self.path} needs another {projection} than the one that ships.")
+        self.projection = projections.find(projection).read_bytes()
+
+    def write_projection(self, folder: Path) -> dict:
+        """Write the projection into a folder; return the configuration of the feature with it."""
+        if self.projection is None:
+            return self.conf
+        file = folder / f"{Path(self.feature).name.partition('@')[0]}.safetensors"
+        with replacing(file) as temporary:
+            temporary.write_bytes(self.projection)
+        prefix = projections.split_prefix(self.conf["model"]["projection"])[1]
+        projection = f"{file}{prefix and f'@{prefix}'}"
+        return {**self.conf, "model": {**self.conf["model"], "projection": projection}}
+
+    @property
+    def dim(self) -> int:
+        """The dimension of the descriptors."""
+        stored = next(iter(self._stored.values()))
+        return len(self._attrs.get("levels", stored))
+
+    def stored(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
+        """Return the descriptors of the points that an image shows, as a feature file has them."""
+        ((key, everything),) = self._stored.items()
+        return {key: everything[:, self.visible[name]]}, {key: dict(self._attrs)}
+
+    def descriptors(self, unbiased: bool = False) -> np.ndarray:
+        """Return the descriptors of the points (P, D) float32, see `codes.restore`."""
+        key = next(iter(self._stored))
+        return restore(self._stored, {key: self._attrs}, unbiased)
+
+    def pose(self, name: str) -> pycolmap.Rigid3d:
+        """Return the pose of an image, camera from world."""
+        i = self.names.index(name)
+        rotation = pycolmap.Rotation3d(self._rotations[i].astype(np.float64))
+        return pycolmap.Rigid3d(rotation, self._translations[i])
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.visible
+
+    def num_keypoints(self, name: str) -> int:
+        """Return the number of points, which are the keypoints of every image."""
+        return len(self.points)
+
+    def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ids and the coordinates of points, which are the keypoints of every image."""
+        return keypoints.astype(np.int64), self.points[keypoints]
+
+    def clusters(self, names: list[str]) -> list[list[str]]:
+        """Return the images in one cluster."""
+        return [names]
+
+    def fallback(self, names: list[str]) -> pycolmap.Rigid3d:
+        """Return the pose of the first of some images, or without them of the first of all."""
+        return self.pose(names[0] if names else self.names[0])
+
+
+def _array(
+    tensors: Mapping[str, np.ndarray], name: str, dtype: type, shape: tuple[int | None, ...]
+) -> np.ndarray:
+    """Return a tensor; raise a ValueError if it has another type or shape."""
+    found = tensors[name]
+    fits = len(found.shape) == len(shape) and all(
+        size in (None, side) for side, size in zip(found.shape, shape, strict=True)
+    )
+    if found.dtype != dtype or not fits:
+        raise ValueError(f"{name} of {found.dtype} {found.shape}")
+    return found
+
+
+def is_compact(path: Path) -> bool:
+    """Tell whether a path is that of a compact map."""
+    return path.suffix == SUFFIX

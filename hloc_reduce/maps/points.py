@@ -1,0 +1,267 @@
+"""The points of a map as a compact file keeps them: a descriptor each, coordinates in few bits."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from ..utils.cli import InputError
+from ..utils.colmap import point3D_ids
+from ..utils.feature_files import dimension, get_descriptors
+from ..utils.h5 import open_h5
+from ..utils.progress import progress
+
+ERROR = 0.1  # of coordinates, as a share of the mean reprojection error
+NEAREST = 0.02  # quantile of the depths at which it holds
+MAX_BITS = 32
+GRID = 8  # cells along each side of an image that selected points are spread over
+CHUNK = 2**16  # points that are packed at once, a multiple of 8
+ROUNDS = 64  # in which points are selected, some at once
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of a map.
+
+    Args:
+        xyz: (P, 3) float64.
+        descriptors: (P, D) float32 of unit norm, the mean of those of a point's keypoints.
+        names: the images.
+        visible: of each image the points that it shows (M,), ascending.
+        cells: of each image the cell of a grid, from 0 on, that these are seen in (M,).
+    """
+
+    xyz: np.ndarray
+    descriptors: np.ndarray
+    names: list[str]
+    visible: list[np.ndarray]
+    cells: list[np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def only(self, chosen: np.ndarray) -> "Points":
+        """Return chosen points (K,), renumbered in this order."""
+        number = np.full(len(self), -1)
+        number[chosen] = np.arange(len(chosen))
+        visible, cells = [], []
+        for points, its_cells in zip(self.visible, self.cells, strict=True):
+            kept = number[points] >= 0
+            order = np.argsort(number[points][kept])
+            visible.append(number[points][kept][order])
+            cells.append(its_cells[kept][order])
+        parts = self.xyz[chosen], self.descriptors[chosen]
+        return Points(*parts, self.names, visible, cells)
+
+    def sorted(self) -> "Points":
+        """Return the points in the order of the images that show them, the first ones first."""
+        first = np.full((3, len(self)), len(self.names))
+        for i in reversed(range(len(self.names))):
+            points = self.visible[i]
+            first[1:, points] = first[:-1, points]
+            first[0, points] = i
+        return self.only(np.lexsort(first[::-1]))
+
+
+def collect(sfm: pycolmap.Reconstruction, features: Path) -> Points:
+    """Collect the points of a map.
+
+    Args:
+        sfm: the map.
+        features: feature file of its images.
+
+    Raises:
+        InputError: when an image has other features, or the map has no points.
+    """
+    ids = np.array(sorted(sfm.point3D_ids()), np.int64)
+    images = {image.name: image for image in sfm.images.values()}
+    names = sorted(images)
+    visible, cells, sums = [], [], np.zeros((len(ids), dimension(features)), np.float32)
+    for name in progress(names, "Collecting points", "image"):
+        image = images[name]
+        observed = point3D_ids(image)
+        keypoints = np.flatnonzero(observed >= 0)
+        rows, first = np.unique(np.searchsorted(ids, observed[keypoints]), return_index=True)
+        keypoints = keypoints[first]
+        with open_h5(features) as file:
+            described = get_descriptors(file, name)
+        if len(described) != image.num_points2D() or described.shape[1] != sums.shape[1]:
+            raise InputError(
+                f"{features} has {len(described)} descriptors of {described.shape[1]} numbers for "
+                f"{name}: {image.num_points2D()} of {sums.shape[1]} are expected."
+            )
+        sums[rows] += described[keypoints]
+        camera = sfm.cameras[image.camera_id]
+        points2D = image.points2D
+        xy = np.array([points2D[i].xy for i in keypoints]).reshape(-1, 2)
+        column, row = (xy * GRID / [camera.width, camera.height]).clip(0, GRID - 1).astype(int).T
+        visible.append(rows)
+        cells.append(row * GRID + column)
+    if not len(ids):
+        raise InputError("The map has no points.")
+    norms = np.linalg.norm(sums, axis=1, keepdims=True)
+    xyz = np.array([sfm.points3D[i].xyz for i in ids])
+    points = Points(xyz, sums / np.maximum(norms, 1e-12), names, visible, cells)
+    return points.only(np.flatnonzero(norms[:, 0] > 0))
+
+
+def select(points: Points, number: int) -> np.ndarray:
+    """Select points that images need most, greedily.
+
+    A point is worth the more, the more images show it, and the fewer selected points lie in its
+    cell of each of them: each image keeps points in all its parts (weighted K-cover).
+
+    Args:
+        points: all points.
+        number: of selected ones.
+
+    Returns:
+        Their indices (number,), ascending.
+    """
+    if number >= len(points):
+        return np.arange(len(points))
+    point = np.concatenate(points.visible)
+    image = np.repeat(np.arange(len(points.names)), [len(part) for part in points.visible])
+    cell = image * GRID * GRID + np.concatenate(points.cells)
+    count = np.zeros(len(points.names) * GRID * GRID)
+    chosen = np.zeros(len(points), bool)
+    for left in range(ROUNDS, 0, -1):
+        gain = np.bincount(point, 1 / (1 + count[cell]), minlength=len(points))
+        gain[chosen] = -1
+        more = -(-(number - int(chosen.sum())) // left)
+        best = np.argsort(-gain, kind="stable")[:more]
+        new = np.zeros(len(points), bool)
+        new[best] = True
+        chosen |= new
+        count += np.bincount(cell[new[point]], minlength=len(count))
+    return np.flatnonzero(chosen)
+
+
+def precision(points: Points, sfm: pycolmap.Reconstruction) -> float:
+    """Return the step of coordinates whose error is hardly seen in the images.
+
+    At nearly all points it projects to less than `ERROR` of the mean reprojection error.
+    """
+    pixels = max(sfm.compute_mean_reprojection_error(), 0.1) * ERROR
+    images = {image.name: image for image in sfm.images.values()}
+    depths = [np.zeros(0)]
+    for name, rows in zip(points.names, points.visible, strict=True):
+        image = images[name]
+        local = image.cam_from_world() * points.xyz[rows]
+        focal_length = sfm.cameras[image.camera_id].mean_focal_length()
+        depths.append(local[:, 2] / focal_length)  # of a pixel
+    found = np.concatenate(depths)
+    per_pixel = float(np.quantile(found[found > 0], NEAREST)) if (found > 0).any() else 1.0
+    return 2 * pixels * per_pixel / np.sqrt(3)  # the error is up to half a step in each axis
+
+
+def quantize(xyz: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, float, int]:
+    """Pack coordinates into as few bits as a step needs.
+
+    Args:
+        xyz: (P, 3).
+        step: of the coordinates; larger if the extent needs more than `MAX_BITS` bits.
+
+    Returns:
+        Bytes (N,) uint8; the least coordinates (3,); the step; and the bits of a coordinate.
+    """
+    least = xyz.min(axis=0)
+    extent = float((xyz - least).max())
+    step = max(step, extent / (2**MAX_BITS - 1), np.finfo(np.float64).tiny)
+    whole = np.rint((xyz - least) / step).astype(np.uint64)
+    bits = max(1, int(whole.max()).bit_length())
+    packed = []
+    for start in range(0, len(whole), CHUNK):
+        part = whole[start : start + CHUNK].reshape(-1, 1)
+        flags = (part >> np.arange(bits, dtype=np.uint64) & np.uint64(1)).astype(np.uint8)
+        packed.append(np.packbits(flags, bitorder="little"))
+    return np.concatenate(packed), least, step, bits
+
+
+def restore(
+    packed: np.ndarray, number: int, least: np.ndarray, step: float, bits: int
+) -> np.ndarray:
+    """Return the coordinates (number, 3) float64 of `quantize`."""
+    xyz, weights = np.empty((number, 3)), 2.0 ** np.arange(bits)
+    for start in range(0, number, CHUNK):
+        part = xyz[start : start + CHUNK]
+        begin = start * 3 * bits // 8
+        flags = np.unpackbits(packed[begin:], count=3 * bits * len(part), bitorder="little")
+        part[:] = least + step * (flags.reshape(-1, bits) @ weights).reshape(-1, 3)
+    return xyz
+
+
+def pack_visible(visible: list[np.ndarray], number: int) -> tuple[np.ndarray, str]:
+    """Pack the points that each image shows in as few bytes as one of two ways needs.
+
+    Args:
+        visible: of each image the indices of its points, ascending.
+        number: of points.
+
+    Returns:
+        Bytes (N,) uint8, and "bitmaps", one bit a point, rounded up to bytes, for each image; or
+        "deltas", the differences between the indices of an image, from -1 on, in base 128 with the
+        low digits first and the high bit set in all bytes of a difference but the last.
+    """
+    deltas = np.concatenate([np.diff(points, prepend=-1) for points in visible])
+    digits = [deltas >> 7 * i for i in range(5)]
+    lengths = np.ones(len(deltas), np.int64) + np.sum([part > 0 for part in digits[1:]], axis=0)
+    if len(visible) * -(-number // 8) <= lengths.sum():
+        flags = np.zeros((len(visible), number), np.uint8)
+        for row, points in zip(flags, visible, strict=True):
+            row[points] = 1
+        return np.packbits(flags, axis=1, bitorder="little").reshape(-1), "bitmaps"
+    starts = np.cumsum(lengths) - lengths
+    packed = np.zeros(lengths.sum(), np.uint8)
+    for i, part in enumerate(digits):
+        has = lengths > i
+        more = (lengths[has] > i + 1).astype(np.uint8) << 7
+        packed[starts[has] + i] = (part[has] & 127).astype(np.uint8) | more
+    return packed, "deltas"
+
+
+def unpack_visible(
+    packed: np.ndarray, kind: str, counts: np.ndarray, number: int
+) -> list[np.ndarray]:
+    """Return the points that each image shows.
+
+    Args:
+        packed: from `pack_visible`.
+        kind: "bitmaps" or "deltas".
+        counts: of each image the number of its points.
+        number: of points.
+
+    Raises:
+        ValueError: when they contradict each other.
+    """
+    if kind == "bitmaps":
+        width = -(-number // 8)
+        if len(packed) != len(counts) * width:
+            raise ValueError(f"{len(packed)} bytes of {len(counts)} bitmaps of {width} bytes")
+        rows = packed.reshape(len(counts), width)
+        visible = [
+            np.flatnonzero(np.unpackbits(row, count=number, bitorder="little")) for row in rows
+        ]
+        if [len(points) for points in visible] != counts.tolist():
+            raise ValueError("bitmaps of other numbers of points")
+        return visible
+    if kind != "deltas":
+        raise ValueError(f"visible points as {kind!r}")
+    last = np.flatnonzero(packed < 128)
+    total = int(counts.sum())
+    if len(last) != total or (total and last[-1] != len(packed) - 1):
+        raise ValueError(f"{len(last)} differences, not {total}")
+    starts = np.concatenate([[0], last[:-1] + 1]) if total else last
+    lengths = last - starts + 1
+    if total and lengths.max() > 5:
+        raise ValueError("a difference of more than 5 bytes")
+    deltas = np.zeros(total, np.int64)
+    for i in range(5):
+        has = lengths > i
+        deltas[has] |= (packed[starts[has] + i].astype(np.int64) & 127) << 7 * i
+    ends = np.cumsum(counts)
+    visible = [np.cumsum(part) - 1 for part in np.split(deltas, ends[:-1])]
+    if total and (deltas.min() < 1 or max(p[-1] for p in visible if len(p)) >= number):
+        raise ValueError("visible points that do not exist")
+    return visible

@@ -1,0 +1,121 @@
+"""Unpack a compact map into the folder of a map, in which pipelines localize as in any other."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from ..confs import features as features_confs
+from ..localization import intrinsics
+from ..localization.projection import reprojection_errors
+from ..runtime import provenance
+from ..runtime.group_writer import GroupWriter
+from ..runtime.outputs import RunFolder
+from ..utils import colmap
+from ..utils.files import announce, file_sha256, replacing
+from ..utils.paths import strings_as_paths
+from ..utils.progress import progress
+from .compact import CompactMap
+from .map import FINISHED, PLACE, RETRIEVAL, SFM, Map, with_projection
+
+
+@strings_as_paths
+def main(path: Path, map_dir: Path, overwrite: bool = False) -> Map:
+    """Unpack a compact map, unless it is unpacked already.
+
+    The keypoints of an image are the projections of the points that it shows.
+
+    Args:
+        path: file of `hloc_reduce.compact`.
+        map_dir: the folder of the map.
+        overwrite: replace another map in it.
+
+    Raises:
+        InputError: when the file is broken, or the folder has another map.
+    """
+    compact = CompactMap(path)
+    digest = file_sha256(path)
+    with RunFolder(map_dir, {"compact": digest}, overwrite, inputs=[path]) as folder:
+        if not (map_dir / FINISHED).exists():
+            with folder.stage("unpack"):
+                _write(compact, map_dir, digest)
+    return Map(map_dir)
+
+
+def _write(compact: CompactMap, folder: Path, digest: str) -> None:
+    """Write the files of a map."""
+    from safetensors.torch import save
+
+    conf = compact.write_projection(folder)
+    model = pycolmap.Reconstruction()
+    features = folder / f"{conf['output']}.h5"
+    header = {"compact": digest}
+    with GroupWriter(features, header, overwrite=True) as writer:
+        for i, name in enumerate(progress(compact.names, "Unpacking", "image")):
+            keypoints = _add_image(model, compact, i)
+            arrays, attrs = compact.stored(name)
+            camera = compact.camera_of[name]
+            arrays |= {
+                "keypoints": (keypoints - 0.5).astype(np.float32),  # hloc's pixels
+                "image_size": np.array([camera.width, camera.height]),
+            }
+            writer.add(name, arrays, attrs)
+    _add_points(model, compact)
+    announce(folder / SFM)
+    (folder / SFM).mkdir(exist_ok=True)
+    model.write(folder / SFM)
+    descriptors = folder / f"{RETRIEVAL['output']}_{features.stem}.h5"
+    with GroupWriter(descriptors, header, overwrite=True) as writer:
+        for name, row in zip(compact.names, compact.global_descriptors, strict=True):
+            writer.add(name, {"global_descriptor": row})
+    with replacing(descriptors.with_suffix(".vocabulary.safetensors")) as temporary:
+        temporary.write_bytes(save({"vocabulary": compact.vocabulary}))
+    with replacing(folder / PLACE) as temporary:
+        temporary.write_text(digest)
+    cameras = compact.cameras
+    content = {
+        "id": digest,
+        "feature": compact.feature,
+        "matcher": compact.matcher,
+        "image_dir": str(folder / "images"),  # there are none
+        "conf": with_projection(conf, lambda path: Path(path).name),
+        "keypoints": features_confs.keypoints_of(conf["model"]) or "adaptive",
+        "sfm": SFM,
+        "images_with_pose": len(compact.names),
+        "points3D": len(compact.points),
+        "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
+        "sizes": sorted(cameras.sizes),
+        "camera_models": sorted(cameras.models),
+    }
+    provenance.write(folder / FINISHED, content)
+
+
+def _add_image(model: pycolmap.Reconstruction, compact: CompactMap, number: int) -> np.ndarray:
+    """Add an image; return the projections of its points (M, 2), COLMAP's pixels."""
+    name = compact.names[number]
+    points = compact.points[compact.visible[name]]
+    camera, pose = compact.camera_of[name], compact.pose(name)
+    _, projected = reprojection_errors(np.zeros((len(points), 2)), points, pose, camera)
+    projected = np.nan_to_num(projected, posinf=0.0, neginf=0.0)
+    camera.camera_id = compact.camera_number[name] + 1
+    image = pycolmap.Image(
+        name=name, keypoints=projected, camera_id=camera.camera_id, image_id=number + 1
+    )
+    colmap.add_image(model, camera, image, pose)
+    return projected
+
+
+def _add_points(model: pycolmap.Reconstruction, compact: CompactMap) -> None:
+    """Add the points with their tracks."""
+    image = np.repeat(
+        np.arange(len(compact.names)), [len(compact.visible[name]) for name in compact.names]
+    )
+    keypoint = np.concatenate([np.arange(len(compact.visible[name])) for name in compact.names])
+    point = np.concatenate([compact.visible[name] for name in compact.names])
+    order = np.argsort(point, kind="stable")
+    ends = np.cumsum(np.bincount(point, minlength=len(compact.points)))
+    for number, rows in enumerate(np.split(order, ends[:-1])):
+        track = pycolmap.Track(
+            [pycolmap.TrackElement(int(image[row]) + 1, int(keypoint[row])) for row in rows]
+        )
+        model.add_point3D(compact.points[number], track)

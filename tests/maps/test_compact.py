@@ -1,0 +1,257 @@
+"""Compact maps: one file to localize in."""
+
+import numpy as np
+import pycolmap
+import pytest
+from command import outcome
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from safetensors.numpy import load_file, save_file
+
+from hloc_reduce import Localizer, compact, maps
+from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.maps import points
+from hloc_reduce.maps.compact import CompactMap, hadamard
+from hloc_reduce.utils import parsers
+from hloc_reduce.utils.cli import InputError
+from pipelines import localize
+
+PIPELINE = localize
+
+
+@pytest.fixture
+def built(place, run):
+    """The map of the plane, and its photos."""
+    build, images, outputs = place
+    run(*build, "--feature", "colmap_sift_sv32")
+    return outputs / "map", images
+
+
+@given(
+    arrays.arrays(
+        np.float64, st.tuples(st.integers(1, 40), st.just(3)), elements=st.floats(-1e6, 1e6)
+    ),
+    st.floats(1e-6, 10),
+)
+@settings(deadline=None)
+def test_coordinates_are_within_half_a_step(xyz, step):
+    packed, least, used, bits = points.quantize(xyz, step)
+    restored = points.restore(packed, len(xyz), least, used, bits)
+    assert np.abs(restored - xyz).max() <= 0.5001 * used + 1e-9 * np.abs(xyz).max()
+    assert len(packed) == -(-len(xyz) * 3 * bits // 8)
+    assert used == step or np.ptp(xyz, axis=0).max() / step > 2**31
+
+
+def test_coordinates_of_many_points_are_packed_in_parts(monkeypatch):
+    xyz = np.random.default_rng(0).uniform(-5, 90, (100, 3))
+    whole = points.quantize(xyz, 0.01)
+    monkeypatch.setattr(points, "CHUNK", 16)
+    parts = points.quantize(xyz, 0.01)
+    assert np.array_equal(whole[0], parts[0])
+    assert np.array_equal(
+        points.restore(*parts[:1], 100, *parts[1:]), points.restore(*whole[:1], 100, *whole[1:])
+    )
+
+
+@given(st.lists(st.sets(st.integers(0, 40_000), max_size=30), min_size=1, max_size=5))
+@settings(deadline=None)
+def test_visible_points_survive(chosen):
+    for number in (40_001, max([i for part in chosen for i in part], default=0) + 1):
+        visible = [np.array(sorted(part), np.int64) for part in chosen]
+        packed, kind = points.pack_visible(visible, number)
+        counts = np.array([len(part) for part in visible])
+        found = points.unpack_visible(packed, kind, counts, number)
+        assert [part.tolist() for part in found] == [part.tolist() for part in visible]
+
+
+def test_the_shorter_way_is_taken():
+    dense, sparse = [np.arange(0, 800, 2)], [np.array([5, 70_000])]
+    assert points.pack_visible(dense, 800)[1] == "bitmaps"
+    packed, kind = points.pack_visible(sparse, 70_001)
+    assert kind == "deltas" and packed.tolist() == [
+        6,
+        0x80 | (69_995 & 127),
+        0x80 | (69_995 >> 7 & 127),
+        69_995 >> 14,
+    ]
+
+
+def test_hadamard_is_its_own_inverse():
+    rows = np.random.default_rng(0).standard_normal((3, 12)).astype(np.float32)
+    there = hadamard(rows, 12)
+    assert there.shape == (3, 16)
+    np.testing.assert_allclose(there @ there.T, 16 * rows @ rows.T, rtol=1e-4)
+    np.testing.assert_allclose(hadamard(there, 12)[:, :12] / 16, rows, atol=1e-5)
+
+
+def test_selected_points_are_spread():
+    """Of 90 points in one cell and 10 in others, the 10 are all taken; and the often seen ones."""
+    xyz, descriptors = np.zeros((100, 3)), np.ones((100, 4), np.float32)
+    cells = np.array([0] * 90 + list(range(1, 11)))
+    everything = points.Points(xyz, descriptors, ["a"], [np.arange(100)], [cells])
+    assert set(range(90, 100)) <= set(points.select(everything, 20).tolist())
+    two = points.Points(
+        xyz, descriptors, ["a", "b"], [np.arange(100), np.arange(5, 9)], [cells, cells[:4]]
+    )
+    assert set(range(5, 9)) <= set(points.select(two, 20).tolist())
+    assert points.select(two, 100).tolist() == list(range(100))
+
+
+def test_a_file_localizes_as_its_map(built, tmp_path, run):
+    """In memory and through the pipeline, which unpacks it; the same bytes every time."""
+    folder, images = built
+    file = tmp_path / "place.hlm"
+    parts = compact.main(file, folder)
+    content = file.read_bytes()
+    assert sum(parts.values()) == len(content)
+    assert content != b"" and compact.main(file, folder) == parts and file.read_bytes() == content
+    photo = images / "query/day/a.png"
+    expected, info = Localizer(folder).localize(photo)
+    pose, found = Localizer(file).localize(photo)
+    assert max(pose_error(pose, expected)) < 0.02
+    assert found["num_inliers"] > 0.7 * info["num_inliers"] and found["reason"] is None
+
+    outputs = tmp_path / "of_file"
+    new = ("--map", file, "--query_images", images / "query/day", "--outputs", outputs)
+    run(*new)
+    summary, rows = outcome(outputs / "queries-day")
+    assert rows["a.png"]["status"] == "localized" and rows["grey.png"]["status"] == "fallback"
+    poses = parsers.parse_poses(outputs / "queries-day" / summary["poses"])
+    assert max(pose_error(poses["a.png"], pose)) < 1e-3
+    assert int(rows["a.png"]["num_inliers"]) == found["num_inliers"]
+    unpacked = maps.Map(outputs / "map")
+    assert unpacked.feature == "colmap_sift_sv32" and unpacked.storage == "uint4"
+    model = pycolmap.Reconstruction(unpacked.sfm)
+    assert model.compute_mean_reprojection_error() < 0.01
+    again = (outputs / "map/map.json").stat().st_mtime_ns
+    run(*new)
+    assert (outputs / "map/map.json").stat().st_mtime_ns == again
+
+
+def test_a_limit_of_the_size(built, tmp_path):
+    folder, images = built
+    whole, half = tmp_path / "whole.hlm", tmp_path / "half.hlm"
+    compact.main(whole, folder)
+    limit = 0.6 * whole.stat().st_size
+    compact.main(half, folder, max_mb=limit / 1e6)
+    assert 0.9 * limit < half.stat().st_size <= limit
+    pose, _ = Localizer(half).localize(images / "query/day/a.png")
+    expected, _ = Localizer(whole).localize(images / "query/day/a.png")
+    assert max(pose_error(pose, expected)) < 0.2
+    with pytest.raises(InputError, match="too small"):
+        compact.main(tmp_path / "none.hlm", folder, max_mb=1e-4)
+    assert not (tmp_path / "none.hlm").exists()
+
+
+def test_files_of_stages(built, tmp_path):
+    """A model and a feature file, as hloc's pipelines leave them, make the same map."""
+    folder, images = built
+    known = maps.Map(folder)
+    parts = compact.main(
+        tmp_path / "a.hlm", sfm=known.sfm, features=known.features, feature="colmap_sift_sv32"
+    )
+    expected = compact.main(tmp_path / "b.hlm", folder)
+    assert {**parts, "header": 0} == {**expected, "header": 0}
+    with pytest.raises(InputError, match="Give --map, or"):
+        compact.main(tmp_path / "a.hlm", sfm=known.sfm)
+    with pytest.raises(InputError, match="has 32 numbers a descriptor, but colmap_sift_sv64 has 64"):
+        other = maps.Map(folder).features
+        compact.main(tmp_path / "a.hlm", sfm=known.sfm, features=other, feature="colmap_sift_sv64")
+
+
+@pytest.fixture
+def file(built, tmp_path):
+    path = tmp_path / "place.hlm"
+    compact.main(path, built[0])
+    return path
+
+
+def test_truncated_anywhere(file):
+    content = file.read_bytes()
+    for size in (0, 7, 8, 100, len(content) // 2, len(content) - 1):
+        file.write_bytes(content[:size])
+        with pytest.raises(InputError, match="is not a compact map, or broken") as error:
+            CompactMap(file)
+        assert str(error.value).count("\n") == 0
+    file.unlink()
+    with pytest.raises(InputError, match="There is no map"):
+        CompactMap(file)
+
+
+def change(file, name, value=None, **metadata):
+    """Write a file with a changed tensor, or metadata."""
+    import json
+
+    from safetensors import safe_open
+
+    tensors = load_file(file)
+    with safe_open(file, "np") as opened:
+        known = json.loads(opened.metadata()["map"])
+    if name:
+        tensors[name] = value(tensors[name].copy())
+    save_file(tensors, file, {"map": json.dumps(known | metadata)})
+
+
+def nan(array):
+    array[0] = np.nan
+    return array
+
+
+@pytest.mark.parametrize(
+    "name, value, metadata",
+    [
+        ("translations", nan, {}),
+        ("rotations", lambda a: a[:-1], {}),
+        ("coordinates", lambda a: a[:-5], {}),
+        ("descriptors", lambda a: a[:, :-1], {}),
+        ("descriptors", lambda a: a[:-1], {}),
+        ("levels", lambda a: -a, {}),
+        ("visible", lambda a: a[:-1], {}),
+        ("visible", lambda a: np.full_like(a, 255), {}),
+        ("num_visible", lambda a: a + 2**31, {}),
+        ("camera_of_image", lambda a: a + 9, {}),
+        ("retrieval", lambda a: a[:, :1], {}),
+        ("names", lambda a: a[:3], {}),
+        (None, None, {"points": 10**12}),
+        (None, None, {"points": -1}),
+        (None, None, {"points": "many"}),
+        (None, None, {"bits": 10**6}),
+        (None, None, {"bits": 0}),
+        (None, None, {"step": "wide"}),
+        (None, None, {"least": [0, 0]}),
+        (None, None, {"signs": 10**10}),
+        (None, None, {"visible": "deltas"}),
+        (None, None, {"visible": 7}),
+        (None, None, {"storage": "uint3"}),
+        (None, None, {"matcher": "none"}),
+        (None, None, {"cameras": [["PINHOLE", 1, 1, 1]]}),
+        (None, None, {"conf": {}}),
+        (None, None, {"conf": None}),
+        (None, None, {"version": 99}),
+        (None, None, {"projection_sha256": "0"}),
+    ],
+)
+def test_hostile_files(file, name, value, metadata):
+    change(file, name, value, **metadata)
+    with pytest.raises(InputError) as error:
+        CompactMap(file)
+    assert str(error.value).count("\n") < 2
+
+
+def test_bad_arguments(built, tmp_path, refused, place):
+    folder, images = built
+    for output, options, message in (
+        (tmp_path / "a.zip", {}, "must end in .hlm"),
+        (tmp_path / "a.hlm", {"max_mb": -1.0}, "must be above 0"),
+        (tmp_path / "a.hlm", {"storage": "uint3"}, "Unknown storage"),
+        (tmp_path / "a.hlm", {"matcher": "best"}, "Unknown matcher"),
+    ):
+        with pytest.raises(InputError, match=message):
+            compact.main(output, folder, **options)
+    file = tmp_path / "a.hlm"
+    compact.main(file, folder)
+    new = ("--map", file, "--query_images", images / "query/day", "--outputs", tmp_path / "of_file")
+    assert "--feature colmap_sift_sv32" in refused(*new, "--feature", "sift_sv64")
+    assert "built with --storage uint4" in refused(*new, "--storage", "uint8")
+    assert "leave out --map_images" in refused(*new, "--map_images", images)
