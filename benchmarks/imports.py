@@ -17,7 +17,17 @@ STAGES = "stages"  # the modules at the top level of hloc_reduce
 ROOMS = (
     *("utils", "runtime", "detectors", "descriptors", "networks", "projections", "extractors"),
     *("aggregators", "matchers", "confs", "datasets", "localization", STAGES, "maps"),
-    *("compact", "evaluation", "report", "demo", "training", "hloc", "hloc_reduce", "pipelines"),
+    *(
+        "compact",
+        "serve",
+        "evaluation",
+        "report",
+        "demo",
+        "training",
+        "hloc",
+        "hloc_reduce",
+        "pipelines",
+    ),
     "confs (shown)",
 )
 

@@ -1,0 +1,35 @@
+"""Command line of `hloc_reduce.serve`."""
+
+from pathlib import Path
+
+from .. import logger
+from ..utils import cli
+from ..utils.cli import InputError
+from . import MAX_MB, QUEUE, __doc__, make_app
+
+
+def _main() -> None:
+    parser = cli.Parser(__doc__, "--map place.hlm --port 8000")
+    add = parser.add_argument
+    add("--map", type=Path, required=True, help="map folder, or file of hloc_reduce.compact")
+    add("--host", default="127.0.0.1", help="address to listen on; 0.0.0.0 for all networks")
+    add("--port", type=int, default=8000, help="port to listen on")
+    add("--num_loc", type=int, default=50, help="retrieved map images per photo")
+    add("--max_mb", type=float, default=MAX_MB, help="largest photo in 1,000,000 bytes")
+    add("--queue", type=int, default=QUEUE, help="requests that may wait; others get status 503")
+    args = parser.parse_args()
+    cli.check_positive(args, "num_loc", "queue", "port")
+    try:
+        import uvicorn
+    except ImportError:
+        raise InputError("The service needs: pip install 'hloc-reduce[serve]'.") from None
+    from ..maps.localizer import Localizer
+
+    localizer = Localizer(args.map, args.num_loc)
+    logger.info("Serving %s at http://%s:%d.", args.map, args.host, args.port)
+    app = make_app(localizer, args.max_mb, args.queue)
+    uvicorn.run(app, host=args.host, port=args.port, log_level="warning", timeout_keep_alive=30)
+
+
+if __name__ == "__main__":
+    cli.run(_main)

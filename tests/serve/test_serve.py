@@ -1,0 +1,157 @@
+"""The HTTP service, with a real client."""
+
+import json
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
+from urllib.error import HTTPError
+from urllib.parse import quote
+from urllib.request import Request, urlopen
+
+import numpy as np
+import pytest
+import uvicorn
+from PIL import Image
+
+from hloc_reduce import Localizer, compact, serve
+from hloc_reduce.serve.__main__ import _main
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
+from pipelines import localize
+
+PIPELINE = localize
+
+
+@pytest.fixture
+def start():
+    """Starts the service in a thread; returns its address."""
+    servers = []
+
+    def start(localizer, **options):
+        app = serve.make_app(localizer, **options)
+        server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error"))
+        thread = threading.Thread(target=server.run, daemon=True)
+        thread.start()
+        while not server.started:
+            time.sleep(0.01)
+        servers.append((server, thread))
+        (port,) = {s.getsockname()[1] for part in server.servers for s in part.sockets}
+        return f"http://127.0.0.1:{port}"
+
+    yield start
+    for server, thread in servers:
+        server.should_exit = True
+        thread.join()
+
+
+def ask(url, body=None):
+    """Return the status and the content of an answer."""
+    try:
+        with urlopen(Request(url, body), timeout=60) as answer:
+            return answer.status, json.loads(answer.read())
+    except HTTPError as error:
+        content = error.read()
+        return error.code, json.loads(content) if content.startswith(b"{") else content
+
+
+CAMERA = "?camera=" + quote("SIMPLE_PINHOLE 360 270 375 180 135")
+
+
+def test_a_photo_gets_its_pose(place, run, tmp_path, start):
+    """As from the Localizer, eight at a time; photos of nothing get a reason."""
+    build, images, outputs = place
+    run(*build)
+    file = tmp_path / "place.hlm"
+    compact.main(file, outputs / "map")
+    localizer = Localizer(file)
+    url = start(localizer)
+    photo = (images / "query/day/a.png").read_bytes()
+    _, camera = next(q for q in _queries(images) if q[0].endswith("a.png"))
+    pose, info = localizer.localize(images / "query/day/a.png", camera)
+    status, found = ask(url + "/localize" + CAMERA + "&inliers=1", photo)
+    assert status == 200 and found["localized"] and found["intrinsics"] == "given"
+    assert found["tvec"] == pytest.approx(pose.translation.tolist())
+    assert found["num_inliers"] == info["num_inliers"] == len(found["points2D"])
+    assert len(found["points3D"]) == info["num_inliers"] and found["retrieved"]
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(lambda _: ask(url + "/localize", photo), range(24)))
+    assert {status for status, _ in answers} == {200}
+    assert len({tuple(found["tvec"]) for _, found in answers}) == 1
+    assert "points2D" not in answers[0][1]
+    grey = (images / "query/day/grey.png").read_bytes()
+    status, found = ask(url + "/localize", grey)
+    assert status == 200 and not found["localized"] and found["reason"] == "no keypoints"
+    assert "tvec" not in found
+    assert ask(url + "/health")[1] == {"images": 4, "served": 26, "waiting": 0}
+    bad = quote("SIMPLE_PINHOLE 10 10 9 5 5")
+    status, found = ask(f"{url}/localize?camera={bad}", photo)
+    assert status == 400 and found["error"].startswith("The camera has 10x10 pixels, the photo has")
+
+
+def _queries(images):
+    from hloc_reduce.utils.parsers import parse_query_lists
+
+    lists = images.parent / "queries/*_time_queries_with_intrinsics.txt"
+    return [query for part in parse_query_lists(lists).values() for query in part]
+
+
+class Blocked:
+    """A localizer that waits to be released."""
+
+    names = ("a",)
+
+    def __init__(self):
+        self.released = threading.Event()
+
+    def localize(self, path, camera):
+        self.released.wait(30)
+        raise InputError(f"Cannot read image {path}: it is truncated.")
+
+
+def png(size, mode="L"):
+    buffer = BytesIO()
+    Image.new(mode, size).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def test_garbage_is_refused(start):
+    localizer = Blocked()
+    localizer.released.set()
+    url = start(localizer, max_mb=0.1)
+    photo = png((8, 8))
+    noise = np.random.default_rng(0).bytes(1000)
+    for body in (b"", noise, photo[:20], b"GIF89a" + noise):
+        assert ask(url + "/localize", body) == (400, {"error": "the body is not a photo"})
+    assert ask(url + "/localize", photo) == (400, {"error": "Cannot read image: it is truncated."})
+    assert ask(url + "/localize", bytes(100_001))[0] == 413
+    status, found = ask(url + "/localize", png((12_000, 9_000), "1"))
+    assert status == 413 and "100,000,000 pixels" in found["error"]
+    for camera in ("", "x", "PINHOLE", "PINHOLE 1 1 1", "PINHOLE 9 9 nan 1 1 1", "NONE 1 1 1 1 1"):
+        status, found = ask(f"{url}/localize?camera={quote(camera)}", photo)
+        assert status == 400 and "MODEL WIDTH HEIGHT PARAMS" in found["error"], camera
+    assert ask(url + "/localize")[0] == 405 and ask(url + "/map")[0] == 404
+    assert ask(url + "/health")[1]["waiting"] == 0
+
+
+def test_a_full_queue_is_refused(start):
+    localizer = Blocked()
+    url = start(localizer, queue=2)
+    photo = png((8, 8))
+    with ThreadPoolExecutor(2) as pool:
+        accepted = [pool.submit(ask, url + "/localize", photo) for _ in range(2)]
+        while ask(url + "/health")[1]["waiting"] < 2:
+            time.sleep(0.01)
+        status, found = ask(url + "/localize", photo)
+        assert status == 503 and "2 requests are waiting" in found["error"]
+        localizer.released.set()
+        assert [answer.result()[0] for answer in accepted] == [400, 400]
+    assert ask(url + "/localize", photo)[0] == 400
+
+
+def test_a_missing_map(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(sys, "argv", ["serve", "--map", str(tmp_path / "place.hlm")])
+    with pytest.raises(SystemExit) as exit:
+        cli.run(_main)
+    assert exit.value.code == 2 and "There is no map" in caplog.text
