@@ -296,7 +296,8 @@ def run(
             row = localize(place, matched, its_camera, refinement)
             if mirrored.is_doubtful(not row["refusal"], row["agreement"], row["confidence"]):
                 flipped = flipped or match(*mirror(images, output, name, place.base))
-                other_row = localize(place, flipped, mirrored.mirror(its_camera), refinement)
+                its_camera = mirrored.mirror(its_camera)
+                other_row = localize(place, flipped, its_camera, refinement, thorough=False)
                 values = row["confidence"], other_row["confidence"]
                 row["refusal"] = mirrored.refusal(*values) or ""
             cam_from_world = row.pop("cam_from_world")
@@ -346,11 +347,13 @@ def localize(
     matched: tuple[np.ndarray, dict, Gate],
     camera: pycolmap.Camera,
     refinement: dict,
+    thorough: bool = True,
 ) -> dict:
     """Localize a query, given its keypoints, matches and gate; its intrinsics may be refined."""
     keypoints, matches, gate = matched
     config = merged({"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}, refinement)
-    cam_from_world, info = query.localize(place.reference, keypoints, camera, matches, config, gate)
+    options = config, gate, thorough
+    cam_from_world, info = query.localize(place.reference, keypoints, camera, matches, *options)
     depths = [np.nan]
     if cam_from_world is not None and info["inliers"].any():
         points = info["points3D"][info["inliers"]]

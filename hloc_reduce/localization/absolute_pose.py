@@ -110,6 +110,7 @@ def estimate(
     camera: pycolmap.Camera,
     config: dict,
     gate: Gate,
+    thorough: bool = True,
 ) -> Pose:
     """Estimate an absolute pose and judge it.
 
@@ -125,11 +126,12 @@ def estimate(
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement"; under
             "photo", whether it may be "cropped".
         gate: what a pose must have to be trusted.
+        thorough: try the matches of single images, too.
     """
     matches = _Matches(points2D, points3D, camera, config)
     number = len(matches)
     poses = [_estimate(matches, np.arange(number))]
-    if poses[0].num_inliers < CLEAR * number:
+    if thorough and poses[0].num_inliers < CLEAR * number:
         tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
         poses += [_estimate(matches, chosen[:MOST_SIMILAR]) for chosen in tried]
     best, doubt = _calibrate(matches, max(poses, key=_quality))

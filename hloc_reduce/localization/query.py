@@ -17,6 +17,7 @@ def localize(
     matches: Mapping[str, np.ndarray],
     config: dict,
     gate: Gate = DEFAULT_GATE,
+    thorough: bool = True,
 ) -> tuple[pycolmap.Rigid3d | None, dict]:
     """Localize a query.
 
@@ -28,6 +29,7 @@ def localize(
             of the image, the most similar first.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
         gate: what a pose must have to be trusted.
+        thorough: where few matches agree with a pose, try those of single images, too.
 
     Returns:
         The pose (camera from world) or None, and info on the cluster of map images with the best
@@ -42,7 +44,7 @@ def localize(
     for names in reference.clusters(list(matches)) if matches else [[]]:
         info, images = _correspondences(reference, names, matches)
         points = keypoints[info["keypoints"]], info["points3D"]
-        found = absolute_pose.estimate(*points, images, camera, config, gate)
+        found = absolute_pose.estimate(*points, images, camera, config, gate, thorough)
         info |= {
             "reason": _reason(len(keypoints), names, info) or found.refusal,
             "confidence": round(max(0.0, found.confidence), 2),

@@ -102,7 +102,7 @@ def main(
         ]
         if tasks:
             _check_some_matched(matches, [name for name, _ in queries], retrieved)
-            for name, record in localize(features, matches, tasks, "Localizing"):
+            for name, record in localize(features, matches, tasks, True):
                 log.add(name, record)
         tasks = [
             (name, mirror(camera), retrieved.get(name, []))
@@ -111,7 +111,7 @@ def main(
         ]
         if mirror_images and tasks:
             files, reference = mirror_images([name for name, _, _ in tasks]), load_reference()
-            for name, record in localize(*files, tasks, "Trying mirror images"):
+            for name, record in localize(*files, tasks, False):
                 names = [other for other in retrieved.get(name, []) if other in reference]
                 log.add(name, with_mirror_image(log.records[name], record, reference, names))
     records = {name: log.records[name] for name, _ in queries}
@@ -200,12 +200,14 @@ def _localized(
     features: Path,
     matches: Path,
     tasks: list[tuple[str, pycolmap.Camera | None, list[str]]],
-    said: str,
+    thorough: bool,
 ) -> Iterator[tuple[str, dict]]:
-    """Yield the names and the records of queries, with a progress bar."""
+    """Yield the names and the records of queries, or, if not `thorough`, of mirror images."""
     with open_h5(matches) as file:
         gate = gate.of_matches(get_matcher(file), dimension(features))
-    work = partial(_localize_all, load_reference, features, matches, config, skip_matches, gate)
+    files = features, matches
+    work = partial(_localize_all, load_reference, *files, config, skip_matches, gate, thorough)
+    said = "Localizing" if thorough else "Trying mirror images"
     with closing(executor.map(work, tasks, CHUNK)) as found:
         yield from progress(found, said, "query", len(tasks))
 
@@ -217,6 +219,7 @@ def _localize_all(
     config: Callable[[str, pycolmap.Camera], dict],
     skip_matches: int,
     gate: Gate,
+    thorough: bool,
     queries: Iterable[tuple[str, pycolmap.Camera | None, list[str]]],
 ) -> Generator[tuple[str, dict], None, None]:
     """Yield the names and the records of queries with their intrinsics and retrieved images."""
@@ -226,7 +229,8 @@ def _localize_all(
         name, camera, its_gate, keypoints, found = task
         used = {other: pairs for other, pairs in found.items() if len(pairs) >= skip_matches}
         options = config(name, camera)
-        cam_from_world, info = localize(reference, keypoints, camera, used, options, its_gate)
+        query = keypoints, camera, used, options, its_gate
+        cam_from_world, info = localize(reference, *query, thorough)
         info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
         return name, to_record(reference, list(found), cam_from_world, info)
 

@@ -122,7 +122,8 @@ class Localizer:
         if mirrored.is_doubtful(info["reason"] is None, info["agreement"], info["confidence"]):
             flipped = self._extract(image, mirrored=True)
             matches = self._match(flipped["descriptors"], retrieved)
-            _, other = self._estimate(flipped, matches, mirrored.mirror(camera), refinement)
+            camera = mirrored.mirror(camera)
+            _, other = self._estimate(flipped, matches, camera, refinement, thorough=False)
             info["reason"] = mirrored.refusal(info["confidence"], other["confidence"])
             lap("mirror_image")
         info |= {
@@ -148,6 +149,7 @@ class Localizer:
         matches: dict[str, np.ndarray],
         camera: pycolmap.Camera,
         refinement: dict,
+        thorough: bool = True,
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Estimate the pose of a photo from its matches, see `localization.query.localize`."""
         config = {"estimation": {"ransac": {"max_error": self.ransac_thresh}}}
@@ -155,6 +157,7 @@ class Localizer:
             *(self.reference, features["keypoints"], camera, matches),
             merged(config, refinement),
             self.gate.of_photo(float(features["blur"])),
+            thorough,
         )
 
     def _retrieve(self, descriptors: torch.Tensor) -> list[str]:

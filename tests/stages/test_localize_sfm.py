@@ -221,7 +221,7 @@ def test_the_gate_knows_the_matcher_by_its_file(built, conf, agreement, monkeypa
             conf, built.loc_pairs, built.features, matches=built.loc_matches, overwrite=True
         )
     gates, localize = [], query.localize
-    monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[-1]) or localize(*a))
+    monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[5]) or localize(*a))
     assert built.localize()["query/6.jpg"]["localized"]
     assert {gate.min_agreement for gate in gates} == {agreement}
 
@@ -237,7 +237,7 @@ def test_the_gate_knows_noisy_photos_by_their_features(built, blur, agreement, m
     with h5py.File(built.features, "r+") as file:
         file["query/6.jpg/keypoints"].attrs["blur"] = blur
     gates, localize = [], query.localize
-    monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[-1]) or localize(*a))
+    monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[5]) or localize(*a))
     assert built.localize()["query/6.jpg"]["localized"]
     assert gates[0].min_agreement == agreement
 
