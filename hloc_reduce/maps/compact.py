@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -229,9 +230,13 @@ class CompactMap:
 
         from ..aggregators.vlad import read_vocabulary
 
-        self.feature, conf = str(metadata["feature"]), metadata["conf"]
-        self.conf = {"output": f"feats-{Path(self.feature).name}", **conf}
-        self.conf["storage"] = self.storage
+        self.feature, conf = Path(metadata["feature"]).name, metadata["conf"]
+        self.conf: dict[str, Any] = {
+            "output": f"feats-{self.feature}",
+            "model": dict(conf["model"]),
+            "preprocessing": dict(conf["preprocessing"]),
+            "storage": self.storage,
+        }
         self.matcher = choose("matcher", metadata["matcher"], matchers_confs.confs)
         sizes = {(int(width), int(height)) for width, height in metadata["sizes"]}
         known = {name: intrinsics.from_list(v) for name, v in metadata["known"].items()}
@@ -255,7 +260,7 @@ class CompactMap:
         """Write the projection into a folder; return the configuration of the feature with it."""
         if self.projection is None:
             return self.conf
-        file = folder / f"{Path(self.feature).name.partition('@')[0]}.safetensors"
+        file = folder / f"{self.feature.partition('@')[0]}.safetensors"
         with replacing(file) as temporary:
             temporary.write_bytes(self.projection)
         prefix = projections.split_prefix(self.conf["model"]["projection"])[1]

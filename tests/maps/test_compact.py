@@ -155,7 +155,9 @@ def test_files_of_stages(built, tmp_path):
     assert {**parts, "header": 0} == {**expected, "header": 0}
     with pytest.raises(InputError, match="Give --map, or"):
         compact.main(tmp_path / "a.hlm", sfm=known.sfm)
-    with pytest.raises(InputError, match="has 32 numbers a descriptor, but colmap_sift_sv64 has 64"):
+    with pytest.raises(
+        InputError, match="has 32 numbers a descriptor, but colmap_sift_sv64 has 64"
+    ):
         other = maps.Map(folder).features
         compact.main(tmp_path / "a.hlm", sfm=known.sfm, features=other, feature="colmap_sift_sv64")
 
@@ -237,6 +239,15 @@ def test_hostile_files(file, name, value, metadata):
     with pytest.raises(InputError) as error:
         CompactMap(file)
     assert str(error.value).count("\n") < 2
+
+
+def test_a_file_writes_nothing_elsewhere(file, tmp_path):
+    """Whatever it says of names of files."""
+    change(file, None, conf={**CompactMap(file).conf, "output": "../../evil"}, feature="../evil")
+    built = maps.unpack(file, tmp_path / "a/b/map")
+    assert {path.name for path in (tmp_path / "a").iterdir()} == {"b"}
+    assert {path.name for path in (tmp_path / "a/b").iterdir()} == {"map"}
+    assert built.features.name == "feats-evil.h5" and not list(tmp_path.glob("*evil*"))
 
 
 def test_bad_arguments(built, tmp_path, refused, place):
