@@ -153,6 +153,8 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
     }
     if recipe in ("best", "tune") and descriptor in features_confs.MODELS:
         settings |= trainer.OF_NETWORKS
+        if trainer is sv and recipe == "best" and descriptor in sv.PCA_SHARES:
+            settings["pca_share"] = sv.PCA_SHARES[descriptor]
     if recipe == "tune":
         settings |= {"begin_with": name, "begin_with_sha256": projections.checksum(name)}
     return settings

@@ -49,6 +49,7 @@ OF_NETWORKS = {
     "temperature": 0.04,
 }
 DISTANCE_WEIGHTS = {"hardnet": 3.0}  # beta
+PCA_SHARES = {"xfeat": 0.6}  # of the principal axes in the trained layer (docs/training.md)
 
 
 def train(
@@ -64,7 +65,7 @@ def train(
             layer begins with the principal axes. Optional: `prefixes`, the lengths of leading
             parts of a descriptor that are trained to match, too; `begin_with`, name or path of a
             projection to begin with; `temperature`, of the contrastive loss, which replaces the
-            triplet loss.
+            triplet loss; `pca_share`, between 0 and 1, of the principal axes in the trained layer.
         seed: of the initial weights and the batches.
         checkpoint: file to resume from; the caller deletes it.
         made_from: provenance of the training; a stale checkpoint is ignored.
@@ -100,4 +101,24 @@ def train(
         return value
 
     fit(mlp, loss, steps, recipe, checkpoint, made_from)
-    return mlp.eval().cpu()
+    mlp.eval().cpu()
+    if "pca_share" in recipe:
+        return between(mlp, pca.train(maps, dim, recipe, seed), recipe["pca_share"])
+    return mlp
+
+
+def between(trained: MLP, axes: MLP, share: float) -> MLP:
+    """Return the layer between two, each scaled to the same norm.
+
+    Args:
+        trained: a network of one layer.
+        axes: another one of the same sizes.
+        share: of `axes`.
+    """
+    mlp = MLP(trained.sizes)
+    for parameter in mlp.parameters():
+        parameter.data.zero_()
+    for one, part in ((trained, 1 - share), (axes, share)):
+        for into, value in zip(mlp.parameters(), one.parameters(), strict=True):
+            into.data += part * value.detach() / float(next(one.parameters()).norm())
+    return mlp.eval()

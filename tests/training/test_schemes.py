@@ -18,6 +18,21 @@ def test_supervised_learns_what_tells_points_apart(tmp_path):
     assert held_out_precision(mlp) > held_out_precision() + 0.1
 
 
+def test_a_layer_between_the_trained_one_and_the_axes(tmp_path):
+    """Of equal norms, one share of each; only for the base that gains by it."""
+    recipe = {**RECIPE, "hidden": [], "steps": 20, "temperature": 0.04}
+    data = [noisy_tracks()]
+    trained = sv.train(data, 8, recipe, 0, tmp_path / "c")
+    mixed = sv.train(data, 8, {**recipe, "pca_share": 0.6}, 0, tmp_path / "d")
+    axes = pca.train(data, 8, {}, 0)
+    a, b = (mlp.linears[0].weight / mlp.linears[0].weight.norm() for mlp in (trained, axes))
+    torch.testing.assert_close(mixed.linears[0].weight, 0.4 * a + 0.6 * b)
+    for name, share in (("xfeat", 0.6), ("edgepoint2_m64", None), ("sift", None)):
+        found = training.complete_recipe("sv", "best", name, f"{name}_sv32").get("pca_share")
+        assert found == share
+    assert "pca_share" not in training.complete_recipe("nested", "best", "xfeat", "xfeat_nested")
+
+
 def test_paper_recipe_is_the_papers(tmp_path, monkeypatch):
     """Sec. III-D: two hidden layers, 10 epochs of batches of 1,024, Adam from 0.001 to 0."""
     numbers, rates = [], []
