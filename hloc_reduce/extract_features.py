@@ -20,6 +20,7 @@ from .runtime.trace import span
 from .utils import cli
 from .utils.cli import InputError
 from .utils.codes import FLOATS, STORAGES, store
+from .utils.files import file_sha256
 from .utils.images import UnreadableImage, list_images
 from .utils.parsers import image_names
 from .utils.paths import strings_as_paths
@@ -247,7 +248,10 @@ def provenance(conf: dict, as_half: bool = True) -> dict:
         check_weights(descriptor)
     network = features_confs.network_of(conf["model"])
     if network in list(NETWORKS):
-        fetch_weights(network)
+        given = features_confs.base_of(conf["model"]).get("weights")
+        weights = fetch_weights(network, given)
+        if given or not NETWORKS[network].urls:  # which may be trained anew
+            made_by["weights_sha256"] = file_sha256(weights)
         made_by["noise_reduction"] = NOISE_REDUCTION
     return made_by
 

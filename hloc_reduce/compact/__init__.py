@@ -26,9 +26,9 @@ from ..utils.files import replacing
 from ..utils.paths import strings_as_paths
 
 MEGABYTE = 1_000_000
-TRIES = 6  # sizes that are tried to come close to a limit
-CLOSE = 0.99  # share of the limit that is close enough
-# descriptors of points are means, so that fewer matches need a strict ratio test
+TRIES = 12  # sizes that are tried to come close to a limit
+AIM, CLOSE = 0.99, 0.97  # shares of the limit that are aimed at, and are close enough
+# descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
 FEW = 32  # numbers that are stored as uint4; more as uint2
 
@@ -72,6 +72,9 @@ def main(
         raise InputError(f"--output {output}: it must end in {compact.SUFFIX}.")
     if max_mb is not None and not max_mb > 0:
         raise InputError(f"--max_mb {max_mb}: it must be above 0.")
+    stages = sfm, features, global_descriptors, feature
+    if map is not None and any(part is not None for part in stages):
+        raise InputError("Give --map, or --sfm, --features and --feature, not both.")
     if map is not None:
         built = Map(map)
         name, conf, usual = built.feature, built.conf, built.matcher
@@ -93,10 +96,10 @@ def main(
     conf = {**conf, "storage": _storage(conf, storage)}
     everything = points.collect(model, features)
     dim, levels = everything.descriptors.shape[1], features_confs.levels(conf)
-    if levels is not None and len(levels) != dim:
-        raise InputError(
-            f"{features} has {dim} numbers a descriptor, but {name} has {len(levels)}."
-        )
+    known = features_confs.dimension(name) if name in features_confs.confs else None
+    expected = known if levels is None else len(levels)
+    if expected not in (None, dim):
+        raise InputError(f"{features} has {dim} numbers a descriptor, but {name} has {expected}.")
     rows = read_global(descriptors, everything.names)
     encode = partial(_encode, everything, model, rows, vocabulary, name, conf, matcher, cameras)
     if max_mb is None:
@@ -160,19 +163,20 @@ def _fit(
     for _ in range(TRIES):
         content, parts = encode(tried)
         size = len(content)
+        fixed = size - sum(parts[part] for part in ("coordinates", "descriptors", "visible"))
         if size <= limit:
             low, best = tried, (tried, content, parts)
             if tried == number or size >= CLOSE * limit:
                 break
         else:
             high = tried
-        fixed = size - sum(parts[part] for part in ("coordinates", "descriptors", "visible"))
-        guess = int(tried * (limit - fixed) / (size - fixed))
-        if high - low < 2:
+        if high - low < 2 or limit <= fixed:
             break
-        tried = min(max(guess, low + 1), high - 1)
+        # points that many images show come first, so that fewer take more than their share
+        guess = int(AIM * tried * (limit - fixed) / (size - fixed))
+        tried = guess if low < guess < high else (low + high) // 2
     if not low:
         raise InputError(
-            f"--max_mb {max_mb:g} is too small: without points {fixed:,} bytes are needed."
+            f"--max_mb {max_mb:g} is too small: a point and {fixed:,} bytes are needed."
         )
     return best

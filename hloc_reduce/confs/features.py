@@ -13,7 +13,7 @@ from .. import projections
 from ..descriptors import BASES as AT_DOG
 from ..descriptors import COLMAP, DESCRIPTORS, DIM
 from ..detectors.dog import HLOC, KEYPOINTS
-from ..networks import ALIKED, EDGEPOINT2, NETWORKS
+from ..networks import ALIKED, EDGEPOINT2, MINI, NETWORKS
 from ..projections.released import FILES as RELEASED
 from ..utils.cli import InputError, Parser, choose
 from ..utils.codes import CODED, STORAGES
@@ -35,7 +35,8 @@ IN_COLOUR = {**PREPROCESSING, "grayscale": False}
 
 # the extractors of networks by the names of their features, such as edgepoint2_m32
 MODELS = (
-    {
+    {name: {"name": "mini", "model_name": name} for name in MINI}
+    | {
         f"edgepoint2_{name.lower()}": {"name": "edgepoint2", "model_name": name}
         for name in EDGEPOINT2
     }
@@ -48,7 +49,7 @@ MODELS = (
 
 
 # the extractors of networks, and the networks that they run by default
-EXTRACTORS = {"edgepoint2": "M32", "xfeat": "xfeat", "aliked": "aliked-n16"}
+EXTRACTORS = {"mini": "mini32", "edgepoint2": "M32", "xfeat": "xfeat", "aliked": "aliked-n16"}
 BASES = (*AT_DOG, *MODELS)  # features whose descriptors are projected
 
 
@@ -127,8 +128,9 @@ def _weights(model: dict) -> str:
     """Say where the weights of a model come from."""
     projection = model.get("projection")
     if projection is None:
-        if network_of(model):
-            return "downloaded on first use"
+        if network := network_of(model):
+            is_downloaded = network not in NETWORKS or NETWORKS[network].urls
+            return "downloaded on first use" if is_downloaded else "shipped"
         descriptor = DESCRIPTORS.get(descriptor_of(model) or "")
         if descriptor is None and model["name"] != "dog":
             return f"see extractors/{model['name']}.py"
@@ -183,6 +185,13 @@ def with_keypoints(model: dict, keypoints: str) -> dict:
     if "base" in model:
         return {**model, "base": with_keypoints(model["base"], keypoints)}
     return {**model, "keypoints": keypoints} if model["name"] == "dog" else model
+
+
+def _with_weights(model: dict, weights: str) -> dict:
+    """Return the configuration of a model with other weights of its network."""
+    if "base" in model:
+        return {**model, "base": _with_weights(model["base"], weights)}
+    return {**model, "weights": weights}
 
 
 def descriptor_of(model: dict) -> str | None:
@@ -273,7 +282,23 @@ def read(path: Path) -> dict:
     Raises:
         InputError: when the file is not a feature's configuration.
     """
-    content = read_yaml(path)
+    conf = check(read_yaml(path), path)
+    return {"output": f"feats-{path.stem}", **conf}
+
+
+def check(content: object, path: Path) -> dict:
+    """Check the configuration of a feature in a file, and complete it.
+
+    Args:
+        content: with `model`, and perhaps `preprocessing` and an `output`, which is ignored.
+        path: the file, for messages.
+
+    Returns:
+        Its `model` and `preprocessing`.
+
+    Raises:
+        InputError: when it is not a feature's configuration.
+    """
     content = content if isinstance(content, dict) else {}
     model = content.get("model")
     base = model.get("base", model) if isinstance(model, dict) else None
@@ -288,6 +313,10 @@ def read(path: Path) -> dict:
         model = with_keypoints(model, KEYPOINTS[0])
     if projection and Path(projections.split_prefix(projection)[0]).suffix:
         model = {**model, "projection": str(Path(projection).absolute())}  # for other machines
+    if (weights := base.get("weights")) is not None:
+        if not isinstance(weights, str):
+            raise InputError(f"{path}: weights is a file, not {weights!r}.")
+        model = _with_weights(model, str(Path(weights).absolute()))
     given = content.get("preprocessing") or {}
     if not isinstance(given, dict):
         raise InputError(f"{path}: preprocessing cannot be {given!r}.")
@@ -300,4 +329,4 @@ def read(path: Path) -> dict:
     resize_max = preprocessing["resize_max"]
     if resize_max is not None and not (isinstance(resize_max, int) and resize_max > 0):
         raise InputError(f"{path}: resize_max is a number of pixels or null, not {resize_max!r}.")
-    return {"output": f"feats-{path.stem}", "model": model, "preprocessing": preprocessing}
+    return {"model": model, "preprocessing": preprocessing}

@@ -10,11 +10,13 @@ import copy
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 # agreement and confidence below which poses are doubtful; those of mirrored photos had an agreement
 # of at most 0.85 or a confidence of at most 125 (docs/results.md)
 DOUBTFUL = 0.9, 250.0
+SIDED = ("p2", "sx1", "sx2")  # parameters
 
 # from names of queries to files of the features and of the matches of their mirror images
 MirrorImages = Callable[[list[str]], tuple[Path, Path]]
@@ -29,6 +31,9 @@ def mirror(camera: pycolmap.Camera) -> pycolmap.Camera:
     """Return the intrinsics of a mirrored photo."""
     mirrored = copy.deepcopy(camera)
     mirrored.principal_point_x = camera.width - camera.principal_point_x
+    # these distortions move both sides of the image to the same one
+    sided = [name.strip() in SIDED for name in camera.params_info.split(",")]
+    mirrored.params = (np.where(sided, -1, 1) * mirrored.params).tolist()
     return mirrored
 
 

@@ -1,8 +1,9 @@
 """Compact maps: one file with all that localization needs. docs/map-format.md describes it."""
 
 import json
+import re
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,18 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..localization import intrinsics
 from ..utils.cli import InputError, choose
-from ..utils.codes import CODED, QUANTIZED, STORAGES, restore, store
+from ..utils.codes import CODED, FLOATS, QUANTIZED, STORAGES, check_levels, restore, store
 from ..utils.files import file_sha256, replacing
+from ..utils.parsers import check_names, parse_camera
 from . import points as points_of_map
 from .points import Points
 
 VERSION = 1
 SUFFIX = ".hlm"
 SIGNS = 1024  # bits of an image's retrieval descriptor
+# what a file may ask for
+MAX_DIM, MAX_GLOBAL, MAX_SIDE, LEAST_OCTAVE = 512, 2**14, 4096, -1
+PROJECTION = re.compile(r"[\w+-]+(@\d+)?")  # a name, and a prefix of a nested one
 
 
 def hadamard(rows: np.ndarray, number: int) -> np.ndarray:
@@ -74,6 +79,7 @@ def encode(
     from ..aggregators.vlad import VOCABULARY, read_vocabulary
 
     storage = conf.get("storage", STORAGES[0])
+    _check_model(conf["model"], feature)
     points = points.sorted()
     images = {image.name: image for image in sfm.images.values()}
     shown = [images[name] for name in points.names]
@@ -125,6 +131,7 @@ def encode(
         file, prefix = projections.find(projection), projections.split_prefix(projection)[1]
         metadata["projection_sha256"] = file_sha256(file)
         name = file.stem + (prefix and f"@{prefix}")
+        metadata["projection_suffix"] = file.suffix
         shipped = file.stem in projections.names() and projections.checksum(file.stem)
         if shipped != metadata["projection_sha256"]:
             tensors["projection"] = np.frombuffer(file.read_bytes(), np.uint8)
@@ -152,6 +159,7 @@ class CompactMap:
         visible: of each image the points that it shows (M,).
         vocabulary: (W, D) float32 tensor, of the global descriptors.
         global_descriptors: (I, G) float32 of unit norm.
+        dim: dimension of the descriptors.
         projection: content of the file of the projection, None without one.
 
     Raises:
@@ -177,22 +185,21 @@ class CompactMap:
             raise
         except (
             *(OSError, SafetensorError, KeyError, ValueError, TypeError, IndexError),
-            *(RecursionError, OverflowError, AttributeError),
+            *(RecursionError, OverflowError, AttributeError, RuntimeError),
         ) as error:
             said = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
             raise InputError(f"{path} is not a compact map, or broken ({said}).") from None
 
     def _read(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
         names = _array(tensors, "names", np.uint8, (None,)).tobytes().decode().split("\n")
-        self.names, number = names, int(metadata["points"])
-        if len(set(names)) != len(names) or not all(names):
-            raise ValueError("images without a name, or with the same")
+        self.names, number = check_names(names, self.path), int(metadata["points"])
+        folders = {str(folder) for name in names for folder in PurePath(name).parents}
+        if len(set(names)) != len(names) or folders & set(names):
+            raise ValueError("images of the same name, or an image in another one")
         count = len(names)
         self._rotations = _array(tensors, "rotations", np.float32, (count, 4))
         self._translations = _array(tensors, "translations", np.float64, (count, 3))
-        cameras = [intrinsics.from_list(values) for values in metadata["cameras"]]
-        if not all(camera.verify_params() for camera in cameras):
-            raise ValueError("cameras of other numbers of parameters")
+        cameras = [_camera(values) for values in metadata["cameras"]]
         used = _array(tensors, "camera_of_image", np.uint32, (count,))
         self.camera_number = dict(zip(names, used.tolist(), strict=True))
         self.camera_of = {name: cameras[i] for name, i in self.camera_number.items()}
@@ -206,49 +213,63 @@ class CompactMap:
         packed = _array(tensors, "visible", np.uint8, (None,))
         visible = points_of_map.unpack_visible(packed, metadata["visible"], counts, number)
         self.visible = dict(zip(names, visible, strict=True))
-        self.storage = choose("storage", metadata["storage"], STORAGES)
-        self._stored = {QUANTIZED.get(self.storage, "descriptors"): tensors["descriptors"]}
-        self._attrs = dict(zip(("scale", "offset"), metadata["scale"], strict=False))
-        if self.storage in CODED:
-            self._attrs["levels"] = tensors["levels"]
-        if tensors["descriptors"].shape[1:] != (number,):
-            raise ValueError(f"descriptors of shape {tensors['descriptors'].shape}")
-        ((key, stored),) = self._stored.items()
-        restore({key: stored[:, :1]}, {key: self._attrs})  # raises errors of shapes and levels
-        size = int(metadata["signs"])
-        rows = _array(tensors, "retrieval", np.uint8, (count, -(-size // 8)))
-        signs = 2 * np.unpackbits(rows, axis=1, count=size, bitorder="little") - np.float32(1)
-        self._read_feature(metadata, tensors)
-        number = self.vocabulary.numel()
-        self.global_descriptors = hadamard(signs, number)[:, :number] / np.sqrt(signs.size or 1)
-        finite = (self._rotations, self._translations, self.points, np.array(step))
+        self._read_descriptors(metadata, tensors)
+        self._read_feature(metadata)
+        self._read_projection(metadata, tensors)
+        self._read_retrieval(metadata, tensors)
+        finite = (self._translations, self.points, np.array(step), 1 / self._norms())
         if not all(np.isfinite(values).all() for values in finite):
             raise ValueError("numbers that are not finite")
 
-    def _read_feature(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
-        import torch
+    def _norms(self) -> np.ndarray:
+        """Return the norms of the quaternions (I,); those of zero as infinite."""
+        norms = np.linalg.norm(self._rotations.astype(np.float64), axis=1)
+        return np.where(norms > 0, norms, np.nan)
 
-        from ..aggregators.vlad import read_vocabulary
+    def _read_descriptors(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
+        self.storage = choose("storage", metadata["storage"], STORAGES)
+        kind = np.dtype(self.storage) if self.storage in FLOATS else np.uint8
+        found = _array(tensors, "descriptors", kind, (None, len(self.points)))
+        self._key = QUANTIZED.get(self.storage, "descriptors")
+        self._attrs: dict[str, Any] = {}
+        self._descriptors = found
+        if self.storage in CODED:
+            self._attrs["levels"] = check_levels(tensors["levels"], self.storage, len(found))
+        elif self.storage not in FLOATS:
+            scale, offset = map(float, metadata["scale"])
+            self._attrs |= {"scale": scale, "offset": offset}
+        self.dim = len(self._attrs.get("levels", found))
+        numbers = found if self.storage in FLOATS else np.array(metadata["scale"], float)
+        if not (0 < self.dim <= MAX_DIM and np.isfinite(numbers).all()):
+            raise ValueError(f"descriptors of {self.dim} numbers, or not finite")
 
-        self.feature, conf = Path(metadata["feature"]).name, metadata["conf"]
+    def _read_feature(self, metadata: dict) -> None:
+        self.feature = PurePath(metadata["feature"]).name
+        check_names([self.feature], self.path)
+        conf = features_confs.check(metadata["conf"], self.path)
+        _check_model(conf["model"], self.feature)
+        if not 0 < (conf["preprocessing"]["resize_max"] or MAX_SIDE) <= MAX_SIDE:
+            raise ValueError(f"photos of more than {MAX_SIDE} pixels")
         self.conf: dict[str, Any] = {
             "output": f"feats-{self.feature}",
-            "model": dict(conf["model"]),
-            "preprocessing": dict(conf["preprocessing"]),
+            **conf,
             "storage": self.storage,
         }
         self.matcher = choose("matcher", metadata["matcher"], matchers_confs.confs)
         sizes = {(int(width), int(height)) for width, height in metadata["sizes"]}
-        known = {name: intrinsics.from_list(v) for name, v in metadata["known"].items()}
+        known = {str(name): _camera(values) for name, values in metadata["known"].items()}
         self.cameras = intrinsics.MapCameras(known, sizes, {str(m) for m in metadata["models"]})
-        if "vocabulary" in tensors:
-            self.vocabulary = torch.from_numpy(tensors["vocabulary"].astype(np.float32))
-        else:
-            self.vocabulary = read_vocabulary()
+
+    def _read_projection(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
         self.projection: bytes | None = None
-        projection = conf["model"].get("projection")
+        projection = self.conf["model"].get("projection")
         if projection is None:
             return
+        if not PROJECTION.fullmatch(projection):
+            raise ValueError(f"the projection {projection!r}")
+        self._suffix = metadata["projection_suffix"]
+        if self._suffix not in (".safetensors", ".pth"):
+            raise ValueError(f"a projection of type {self._suffix!r}")
         if "projection" in tensors:
             self.projection = tensors["projection"].tobytes()
             return
@@ -256,32 +277,44 @@ class CompactMap:
             raise InputError(f"{self.path} needs another {projection} than the one that ships.")
         self.projection = projections.find(projection).read_bytes()
 
+    def _read_retrieval(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
+        import torch
+
+        from ..aggregators.vlad import read_vocabulary
+
+        self.vocabulary = read_vocabulary()
+        if "vocabulary" in tensors:
+            found = _array(tensors, "vocabulary", np.float16, (None, self.dim))
+            self.vocabulary = torch.from_numpy(found.astype(np.float32))
+        number, size = self.vocabulary.numel(), int(metadata["signs"])
+        whole = 1 << max(number - 1, 0).bit_length()
+        if self.vocabulary.shape[1] != self.dim or not 0 < number <= MAX_GLOBAL:
+            raise ValueError(f"a vocabulary of shape {tuple(self.vocabulary.shape)}")
+        if size != min(SIGNS, whole) or not self.vocabulary.isfinite().all():
+            raise ValueError(f"{size} signs of global descriptors of {number} numbers")
+        rows = _array(tensors, "retrieval", np.uint8, (len(self.names), -(-size // 8)))
+        signs = 2 * np.unpackbits(rows, axis=1, count=size, bitorder="little") - np.float32(1)
+        # the transform multiplies norms by sqrt(whole)
+        self.global_descriptors = hadamard(signs, number)[:, :number] / np.sqrt(size * whole)
+
     def write_projection(self, folder: Path) -> dict:
         """Write the projection into a folder; return the configuration of the feature with it."""
         if self.projection is None:
             return self.conf
-        file = folder / f"{self.feature.partition('@')[0]}.safetensors"
+        name, prefix = projections.split_prefix(self.conf["model"]["projection"])
+        file = folder / f"{name}{self._suffix}"
         with replacing(file) as temporary:
             temporary.write_bytes(self.projection)
-        prefix = projections.split_prefix(self.conf["model"]["projection"])[1]
         projection = f"{file}{prefix and f'@{prefix}'}"
         return {**self.conf, "model": {**self.conf["model"], "projection": projection}}
 
-    @property
-    def dim(self) -> int:
-        """The dimension of the descriptors."""
-        stored = next(iter(self._stored.values()))
-        return len(self._attrs.get("levels", stored))
-
     def stored(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
         """Return the descriptors of the points that an image shows, as a feature file has them."""
-        ((key, everything),) = self._stored.items()
-        return {key: everything[:, self.visible[name]]}, {key: dict(self._attrs)}
+        return {self._key: self._descriptors[:, self.visible[name]]}, {self._key: self._attrs}
 
-    def descriptors(self, unbiased: bool = False) -> np.ndarray:
-        """Return the descriptors of the points (P, D) float32, see `codes.restore`."""
-        key = next(iter(self._stored))
-        return restore(self._stored, {key: self._attrs}, unbiased)
+    def descriptors(self, name: str, unbiased: bool = False) -> np.ndarray:
+        """Return the descriptors of the points that an image shows (M, D), see `codes.restore`."""
+        return restore(*self.stored(name), unbiased)
 
     def pose(self, name: str) -> pycolmap.Rigid3d:
         """Return the pose of an image, camera from world."""
@@ -293,12 +326,13 @@ class CompactMap:
         return name in self.visible
 
     def num_keypoints(self, name: str) -> int:
-        """Return the number of points, which are the keypoints of every image."""
-        return len(self.points)
+        """Return the number of points that an image shows: these are its keypoints."""
+        return len(self.visible[name])
 
     def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ids and the coordinates of points, which are the keypoints of every image."""
-        return keypoints.astype(np.int64), self.points[keypoints]
+        """Return the ids and the coordinates of points that an image shows."""
+        rows = self.visible[name][keypoints]
+        return rows, self.points[rows]
 
     def clusters(self, names: list[str]) -> list[list[str]]:
         """Return the images in one cluster."""
@@ -309,8 +343,33 @@ class CompactMap:
         return self.pose(names[0] if names else self.names[0])
 
 
+def _check_model(model: dict, feature: str) -> None:
+    """Refuse a feature whose extractor or weights a file cannot be trusted with, or does not have.
+
+    Raises:
+        InputError: for hloc's extractors and for weights in a file.
+    """
+    base = features_confs.base_of(model)
+    for name in {str(model["name"]), str(base["name"])}:
+        if name not in ("dog", "reduced", *features_confs.EXTRACTORS):
+            raise InputError(f"Compact maps cannot have {feature}: its extractor is {name}.")
+    if base.get("weights") is not None:
+        raise InputError(f"Compact maps cannot have {feature}: its weights are in a file.")
+    octave = (base.get("options") or {}).get("first_octave", 0)
+    if not octave >= LEAST_OCTAVE:
+        raise InputError(f"Compact maps cannot have {feature}: its first_octave is {octave}.")
+
+
+def _camera(values: list) -> pycolmap.Camera:
+    """Return the intrinsics in a list; raise a ValueError if they are wrong."""
+    return parse_camera([str(value) for value in values])
+
+
 def _array(
-    tensors: Mapping[str, np.ndarray], name: str, dtype: type, shape: tuple[int | None, ...]
+    tensors: Mapping[str, np.ndarray],
+    name: str,
+    dtype: type | np.dtype,
+    shape: tuple[int | None, ...],
 ) -> np.ndarray:
     """Return a tensor; raise a ValueError if it has another type or shape."""
     found = tensors[name]

@@ -1,6 +1,8 @@
 """What a map holds in memory to localize one photo at a time, whether a folder or one file."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -37,8 +39,9 @@ class Contents:
         reference: its points.
         names: its images.
         global_descriptors: (I, G) float32 of the images.
-        descriptors: of each image (N, D) float32; several images may share them.
-        shown: of each image the rows of `descriptors` that show a point (M,).
+        describe: returns the descriptors (N, D) float32 of an image.
+        shown: of each image the rows of these that show a point (M,).
+        on_demand: do not keep the descriptors of images in memory.
     """
 
     extractor: Extractor
@@ -51,8 +54,9 @@ class Contents:
     reference: Reference
     names: list[str]
     global_descriptors: np.ndarray
-    descriptors: dict[str, np.ndarray]
+    describe: Callable[[str], np.ndarray]
     shown: dict[str, np.ndarray]
+    on_demand: bool = False
 
 
 def read(path: Path) -> Contents:
@@ -71,9 +75,11 @@ def _of_folder(path: Path) -> Contents:
     built = Map(path)
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)
-    with open_h5(built.features) as file:
-        coded = built.storage not in FLOATS
-        descriptors = {n: read_descriptors(file, n).restore(unbiased=coded) for n in names}
+
+    def describe(name: str) -> np.ndarray:
+        with open_h5(built.features) as file:
+            return read_descriptors(file, name).restore(unbiased=built.storage not in FLOATS)
+
     return Contents(
         extractor=extractors.load(built.conf["model"]),
         preprocessing=built.conf["preprocessing"],
@@ -85,7 +91,7 @@ def _of_folder(path: Path) -> Contents:
         reference=reference,
         names=names,
         global_descriptors=read_global(built.descriptors, names),
-        descriptors=descriptors,
+        describe=describe,
         shown={name: np.flatnonzero(reference.point_rows(name) >= 0) for name in names},
     )
 
@@ -94,7 +100,6 @@ def _of_file(path: Path) -> Contents:
     compact = CompactMap(path)
     with TemporaryDirectory() as folder:
         extractor = extractors.load(compact.write_projection(Path(folder))["model"])
-    descriptors = compact.descriptors(unbiased=compact.storage not in FLOATS)
     return Contents(
         extractor=extractor,
         preprocessing=compact.conf["preprocessing"],
@@ -106,6 +111,7 @@ def _of_file(path: Path) -> Contents:
         reference=compact,
         names=compact.names,
         global_descriptors=compact.global_descriptors,
-        descriptors=dict.fromkeys(compact.names, descriptors),
-        shown=compact.visible,
+        describe=partial(compact.descriptors, unbiased=compact.storage not in FLOATS),
+        shown={name: np.arange(len(rows)) for name, rows in compact.visible.items()},
+        on_demand=True,
     )

@@ -64,8 +64,9 @@ class Localizer:
         self.vlad.vocabulary = contents.vocabulary
         self.reference, self.names = contents.reference, contents.names
         self.global_descriptors = contents.global_descriptors
-        moved = {id(part): self._to_device(part) for part in contents.descriptors.values()}
-        self.descriptors = {name: moved[id(part)] for name, part in contents.descriptors.items()}
+        self.describe = lambda name: self._to_device(contents.describe(name))
+        if not contents.on_demand:
+            self.describe = {name: self.describe(name) for name in self.names}.__getitem__
         self.shown = {
             name: torch.from_numpy(rows).to(self.device) for name, rows in contents.shown.items()
         }
@@ -171,7 +172,7 @@ class Localizer:
         query = self._to_device(descriptors.numpy())
 
         def match(name: str) -> np.ndarray:
-            described, shown = self.descriptors[name], self.shown[name]
+            described, shown = self.describe(name), self.shown[name]
             return self.matcher.match_rows(query, described, shown).cpu().numpy()
 
         return dict(zip(names, parallel.ordered("match", match, names), strict=True))

@@ -10,13 +10,16 @@ from ..localization import intrinsics
 from ..localization.projection import reprojection_errors
 from ..runtime import provenance
 from ..runtime.group_writer import GroupWriter
-from ..runtime.outputs import RunFolder
+from ..runtime.outputs import CONF, RunFolder
 from ..utils import colmap
+from ..utils.cli import InputError
 from ..utils.files import announce, file_sha256, replacing
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
 from .compact import CompactMap
 from .map import FINISHED, PLACE, RETRIEVAL, SFM, Map, with_projection
+
+COMPACT = "compact"  # in the configuration of a folder: the sha256 of the file
 
 
 @strings_as_paths
@@ -34,8 +37,11 @@ def main(path: Path, map_dir: Path, overwrite: bool = False) -> Map:
         InputError: when the file is broken, or the folder has another map.
     """
     compact = CompactMap(path)
+    before = provenance.read(map_dir / CONF)
+    if before and COMPACT not in before:
+        raise InputError(f"{map_dir} is a map of photos, not an unpacked one: use other --outputs.")
     digest = file_sha256(path)
-    with RunFolder(map_dir, {"compact": digest}, overwrite, inputs=[path]) as folder:
+    with RunFolder(map_dir, {COMPACT: digest}, overwrite, inputs=[path]) as folder:
         if not (map_dir / FINISHED).exists():
             with folder.stage("unpack"):
                 _write(compact, map_dir, digest)
@@ -49,7 +55,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
     conf = compact.write_projection(folder)
     model = pycolmap.Reconstruction()
     features = folder / f"{conf['output']}.h5"
-    header = {"compact": digest}
+    header = {COMPACT: digest}
     with GroupWriter(features, header, overwrite=True) as writer:
         for i, name in enumerate(progress(compact.names, "Unpacking", "image")):
             keypoints = _add_image(model, compact, i)

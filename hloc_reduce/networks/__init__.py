@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..utils import downloads
+from ..utils.cli import InputError
 
 
 @dataclass(frozen=True)
@@ -13,14 +14,14 @@ class Network:
     Args:
         dim: dimension of its descriptors.
         file: name of its weights in torch's cache.
-        urls: of the weights.
+        urls: of the weights; none if they ship with this package.
         sha256: of the weights; None where files that differ hold the same weights.
         computes: in that case, what they compute from a test image, see `loading.fingerprint`.
     """
 
     dim: int
     file: str
-    urls: tuple[str, ...]
+    urls: tuple[str, ...] = ()
     sha256: str | None = None
     computes: tuple[float, ...] = ()
 
@@ -50,8 +51,12 @@ ALIKED = {
     "aliked-t16": (64, (0.0260, 0.1223, 0.0226, 0.0870)),
 }
 
+MINI = ("mini32",)  # this project's own
+WEIGHTS = Path(__file__).parent / "weights"
+
 NETWORKS = (
-    {
+    {model: Network(int(model.removeprefix("mini")), f"{model}.safetensors") for model in MINI}
+    | {
         model: Network(
             int(model[1:]),
             f"edgepoint2_{model}.pth",
@@ -83,13 +88,23 @@ NETWORKS = (
 )
 
 
-def fetch_weights(name: str) -> Path:
-    """Return the file of a network's weights, in torch's cache; download it if it is missing.
+def fetch_weights(name: str, given: Path | str | None = None) -> Path:
+    """Return the file of a network's weights: it ships, or is downloaded into torch's cache once.
+
+    Args:
+        name: of the network.
+        given: a file of other weights, which is returned.
 
     Raises:
-        InputError: when it is broken or cannot be downloaded.
+        InputError: when it is missing or broken, or cannot be downloaded.
     """
+    if given is not None:
+        if not Path(given).is_file():
+            raise InputError(f"There is no file {given} of weights.")
+        return Path(given)
     network = NETWORKS[name]
+    if not network.urls:
+        return WEIGHTS / network.file
     otherwise = "or set TORCH_HOME to the folder whose hub/checkpoints has them"
     return downloads.fetch(
         *(downloads.cache() / network.file, network.urls, network.sha256),

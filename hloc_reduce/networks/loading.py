@@ -2,8 +2,11 @@
 
 import pickle
 from collections.abc import Callable
+from pathlib import Path
 
+import safetensors.torch
 import torch
+from safetensors import SafetensorError
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
@@ -31,17 +34,7 @@ def load_weights(module: nn.Module, name: str, compute: Compute | None = None) -
         InputError: when the weights cannot be downloaded, are broken, or are another network's.
     """
     path, what = fetch_weights(name), f"The weights of {name}"
-    try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError):
-        raise InputError(f"{what}, {path}, are broken. Delete the file.") from None
-    try:
-        missing, unexpected = module.load_state_dict(weights, strict=False)
-    except (RuntimeError, TypeError, AttributeError):
-        missing, unexpected = [path.name], []
-    if unexpected or any(not key.endswith(CONSTANT) for key in missing):
-        raise InputError(f"{what}, {path}, are those of another network.")
-    fold(module.eval()).requires_grad_(False)
+    load_file(module, path, what)
     expected = NETWORKS[name].computes
     found = fingerprint(compute or module)
     if expected and any(
@@ -51,6 +44,41 @@ def load_weights(module: nn.Module, name: str, compute: Compute | None = None) -
             f"{what}, {path}, are not the published ones: they compute {_rounded(found)} instead "
             f"of {_rounded(expected)}. Delete the file."
         )
+    return module
+
+
+def load_file(module: nn.Module, path: Path, what: str) -> nn.Module:
+    """Load weights as `read_into` does, fold the network's normalizations, and freeze it."""
+    return fold(read_into(module, path, what).eval()).requires_grad_(False)
+
+
+def read_into(module: nn.Module, path: Path, what: str) -> nn.Module:
+    """Load weights from a file.
+
+    Args:
+        module: the network.
+        path: a .safetensors file, or one of torch's, which is not unpickled.
+        what: names the weights in messages, as in "The weights of xfeat".
+
+    Returns:
+        The module.
+
+    Raises:
+        InputError: when the weights are missing, broken, or another network's.
+    """
+    try:
+        if path.suffix == ".safetensors":
+            weights = safetensors.torch.load_file(path)
+        else:
+            weights = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, SafetensorError):
+        raise InputError(f"{what}, {path}, are broken. Delete the file.") from None
+    try:
+        missing, unexpected = module.load_state_dict(weights, strict=False)
+    except (RuntimeError, TypeError, AttributeError):
+        missing, unexpected = [path.name], []
+    if unexpected or any(not key.endswith(CONSTANT) for key in missing):
+        raise InputError(f"{what}, {path}, are those of another network.")
     return module
 
 

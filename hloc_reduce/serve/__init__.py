@@ -6,20 +6,19 @@
 docs/serve.md has the parameters and the answers.
 """
 
+import asyncio
 import tempfile
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pycolmap
 
-from ..localization.intrinsics import from_list, to_list
+from ..localization.intrinsics import to_list
 from ..utils.cli import InputError
-from ..utils.parsers import CAMERA_MODELS
+from ..utils.parsers import parse_camera
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -32,7 +31,9 @@ MAX_MB = 20.0  # 1,000,000 bytes of a photo
 QUEUE = 32  # requests that may wait
 MAX_PIXELS = 100_000_000  # of a photo: a small file may be a huge image
 SHOWN = 5  # retrieved images in an answer
-BUSY_SECONDS = 2  # after which a refused client may try again
+BUSY, BUSY_SECONDS = 503, 2  # status of a full queue, after which a client may try again
+UPLOAD_SECONDS = 60.0
+FORMATS = ("JPEG", "PNG")
 
 
 class Refused(Exception):
@@ -54,38 +55,39 @@ def make_app(localizer: "Localizer", max_mb: float = MAX_MB, queue: int = QUEUE)
         queue: the number of requests above which further ones are refused.
     """
     from starlette.applications import Starlette
+    from starlette.requests import ClientDisconnect
     from starlette.responses import JSONResponse
     from starlette.routing import Route
 
     worker = ThreadPoolExecutor(1, "localize")
-    waiting = threading.BoundedSemaphore(queue)
     state = {"served": 0, "waiting": 0}
 
     async def health(_: "Request") -> "Response":
         return JSONResponse({"images": len(localizer.names), **state})
 
     async def localize(request: "Request") -> "Response":
-        import asyncio
-
-        if not waiting.acquire(blocking=False):
-            reason = f"{queue} requests are waiting"
-            return JSONResponse({"error": reason}, 503, {"Retry-After": str(BUSY_SECONDS)})
-        state["waiting"] += 1
         try:
             camera = _camera(request.query_params.get("camera"))
             photo = await _body(request, int(max_mb * 1e6))
+            return JSONResponse(await answered(request, photo, camera))
+        except Refused as error:
+            headers = {"Retry-After": str(BUSY_SECONDS)} if error.status == BUSY else None
+            return JSONResponse({"error": error.reason}, error.status, headers)
+        except ClientDisconnect:
+            return JSONResponse({"error": "the client is gone"}, 400)
+
+    async def answered(request: "Request", photo: bytes, camera: pycolmap.Camera | None) -> dict:
+        if state["waiting"] >= queue:
+            raise Refused(BUSY, f"{queue} requests are waiting")
+        state["waiting"] += 1
+        try:
             whole = request.query_params.get("inliers") == "1"
             work = partial(answer, localizer, photo, camera, whole)
             found = await asyncio.get_running_loop().run_in_executor(worker, work)
             state["served"] += 1
-            return JSONResponse(found)
-        except Refused as error:
-            return JSONResponse({"error": error.reason}, error.status)
-        except InputError as error:
-            return JSONResponse({"error": str(error)}, 400)
+            return found
         finally:
             state["waiting"] -= 1
-            waiting.release()
 
     routes = [
         Route("/localize", localize, methods=["POST"]),
@@ -95,17 +97,21 @@ def make_app(localizer: "Localizer", max_mb: float = MAX_MB, queue: int = QUEUE)
 
 
 async def _body(request: "Request", most: int) -> bytes:
-    """Read a body; refuse one that is too large before all of it is read."""
+    """Read a body; refuse one that is too large before all of it is read, or too slow."""
     too_large = Refused(413, f"a photo has at most {most:,} bytes")
     declared = request.headers.get("content-length", "0")
     if declared.isdigit() and int(declared) > most:
         raise too_large
     parts, size = [], 0
-    async for part in request.stream():
-        size += len(part)
-        if size > most:
-            raise too_large
-        parts.append(part)
+    try:
+        async with asyncio.timeout(UPLOAD_SECONDS):
+            async for part in request.stream():
+                size += len(part)
+                if size > most:
+                    raise too_large
+                parts.append(part)
+    except TimeoutError:
+        raise Refused(408, f"the upload took more than {UPLOAD_SECONDS:g} seconds") from None
     return b"".join(parts)
 
 
@@ -113,21 +119,10 @@ def _camera(text: str | None) -> pycolmap.Camera | None:
     """Parse intrinsics as in a query list: MODEL WIDTH HEIGHT PARAMS."""
     if text is None:
         return None
-    model, *numbers = text.replace(",", " ").split() or [""]
     try:
-        if model not in CAMERA_MODELS:
-            raise ValueError
-        width, height, *params = (float(number) for number in numbers)
-        camera = from_list([model, int(width), int(height), *params])
-        if not (
-            camera.verify_params() and np.isfinite(camera.params).all() and min(width, height) > 0
-        ):
-            raise ValueError
-    except (ValueError, TypeError, OverflowError):
-        raise Refused(
-            400, f"camera={text[:100]} is not of the form MODEL WIDTH HEIGHT PARAMS"
-        ) from None
-    return camera
+        return parse_camera(text.replace(",", " ").split())
+    except ValueError as error:
+        raise Refused(400, f"camera: {error}; it is MODEL WIDTH HEIGHT PARAMS") from None
 
 
 def answer(
@@ -148,15 +143,16 @@ def answer(
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(BytesIO(photo)) as opened:
+        with Image.open(BytesIO(photo), formats=FORMATS) as opened:
             width, height = opened.size
-            suffix = f".{(opened.format or 'jpg').lower()}"
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        raise Refused(400, "the body is not a photo") from None
+    except Image.DecompressionBombError:
+        width = height = MAX_PIXELS
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
+        raise Refused(400, "the body is not a JPEG or PNG file") from None
     if width * height > MAX_PIXELS:
         raise Refused(413, f"a photo has at most {MAX_PIXELS:,} pixels")
     # a file, as its EXIF data tell the intrinsics
-    with tempfile.NamedTemporaryFile(suffix=suffix) as file:
+    with tempfile.NamedTemporaryFile(suffix=".jpg") as file:
         Path(file.name).write_bytes(photo)
         try:
             pose, info = localizer.localize(file.name, camera)

@@ -7,6 +7,9 @@ from ..utils import cli
 from ..utils.cli import InputError
 from . import MAX_MB, QUEUE, __doc__, make_app
 
+MAX_PORT = 65_535
+UPLOADS = 32  # connections beside those that wait
+
 
 def _main() -> None:
     parser = cli.Parser(__doc__, "--map place.hlm --port 8000")
@@ -19,6 +22,10 @@ def _main() -> None:
     add("--queue", type=int, default=QUEUE, help="requests that may wait; others get status 503")
     args = parser.parse_args()
     cli.check_positive(args, "num_loc", "queue", "port")
+    if not args.max_mb > 0:
+        raise InputError(f"--max_mb {args.max_mb:g}: it must be above 0.")
+    if args.port > MAX_PORT:
+        raise InputError(f"--port {args.port}: at most {MAX_PORT}.")
     try:
         import uvicorn
     except ImportError:
@@ -28,7 +35,10 @@ def _main() -> None:
     localizer = Localizer(args.map, args.num_loc)
     logger.info("Serving %s at http://%s:%d.", args.map, args.host, args.port)
     app = make_app(localizer, args.max_mb, args.queue)
-    uvicorn.run(app, host=args.host, port=args.port, log_level="warning", timeout_keep_alive=30)
+    # photos that are being uploaded are in memory, too
+    most = args.queue + UPLOADS
+    address = {"host": args.host, "port": args.port}
+    uvicorn.run(app, **address, log_level="warning", limit_concurrency=most, timeout_keep_alive=30)
 
 
 if __name__ == "__main__":

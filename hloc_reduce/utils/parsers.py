@@ -155,7 +155,7 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
     queries: dict[str, pycolmap.Camera] = {}
     for place, (name, *words) in _lines(path, QUERY):
         try:
-            camera = _camera(words)
+            camera = parse_camera(words)
         except ValueError as error:
             # a name with spaces, or commas between the words, leave no model behind the name
             spaced = not any(word in CAMERA_MODELS for word in words[:1])
@@ -174,7 +174,7 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
     return list(queries.items())
 
 
-def _camera(words: list[str]) -> pycolmap.Camera:
+def parse_camera(words: list[str]) -> pycolmap.Camera:
     """Return the camera of the words `MODEL width height params...`.
 
     Raises:

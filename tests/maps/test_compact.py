@@ -1,5 +1,7 @@
 """Compact maps: one file to localize in."""
 
+import shutil
+
 import numpy as np
 import pycolmap
 import pytest
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from safetensors.numpy import load_file, save_file
 
-from hloc_reduce import Localizer, compact, maps
+from hloc_reduce import Localizer, compact, maps, projections
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.maps import points
 from hloc_reduce.maps.compact import CompactMap, hadamard
@@ -129,6 +131,38 @@ def test_a_file_localizes_as_its_map(built, tmp_path, run):
     assert (outputs / "map/map.json").stat().st_mtime_ns == again
 
 
+def test_a_limit_is_met_although_the_first_points_take_most(monkeypatch):
+    """As in large maps, where many images show those that are selected first."""
+
+    def encode(number):
+        seen = int(200 * number**0.7)
+        parts = {"coordinates": 6 * number, "descriptors": 8 * number, "visible": seen}
+        return bytes(200_000 + sum(parts.values())), parts
+
+    for limit in (0.21, 0.3, 1.0, 5.0):
+        number, content, _ = compact._fit(encode, 1_000_000, limit)
+        assert 0.9 * limit < len(content) / 1e6 <= limit and number > 0
+    with pytest.raises(InputError, match="too small"):
+        compact._fit(encode, 1_000_000, 0.2)
+
+
+def test_codes_of_a_projection_of_ones_own(built, tmp_path):
+    """The file brings it along; descriptors are those of the points that an image shows."""
+    folder, images = built
+    own = tmp_path / "my_sv32.safetensors"
+    own.write_bytes(projections.find("colmap_sift_sv32").read_bytes() + b"")
+    other = maps.main(tmp_path / "own", images, maps.Map(folder).sfm, "colmap_sift", own)
+    compact.main(tmp_path / "own.hlm", other.folder, storage="uint2")
+    expected, _ = Localizer(tmp_path / "own/").localize(images / "query/day/a.png")
+    shutil.rmtree(tmp_path / "own")
+    own.unlink()
+    localizer = Localizer(tmp_path / "own.hlm")
+    pose, _ = localizer.localize(images / "query/day/a.png")
+    assert max(pose_error(pose, expected)) < 0.2
+    for name, points_of in localizer.reference.visible.items():
+        assert localizer.describe(name).shape == (len(points_of), 32)
+
+
 def test_a_limit_of_the_size(built, tmp_path):
     folder, images = built
     whole, half = tmp_path / "whole.hlm", tmp_path / "half.hlm"
@@ -195,6 +229,10 @@ def change(file, name, value=None, **metadata):
     save_file(tensors, file, {"map": json.dumps(known | metadata)})
 
 
+REDUCED = {"name": "reduced", "base": {"name": "dog", "descriptor": "colmap_sift"}}
+REDUCED["projection"] = "colmap_sift_sv32"
+
+
 def nan(array):
     array[0] = np.nan
     return array
@@ -230,6 +268,24 @@ def nan(array):
         (None, None, {"cameras": [["PINHOLE", 1, 1, 1]]}),
         (None, None, {"conf": {}}),
         (None, None, {"conf": None}),
+        (None, None, {"conf": {"model": {"name": "hloc", "conf": {"name": "d2net"}}}}),
+        (None, None, {"conf": {"model": {"name": "mini", "weights": "/etc/passwd"}}}),
+        (None, None, {"conf": {"model": {**REDUCED, "projection": "/etc/x.safetensors"}}}),
+        (None, None, {"conf": {"model": {**REDUCED, "projection": "../../x"}}}),
+        (None, None, {"conf": {"model": {**REDUCED, "base": 5}}}),
+        (None, None, {"conf": {"model": REDUCED, "preprocessing": {"resize_max": 10**6}}}),
+        (None, None, {"cameras": [["NONE", 1, 1]]}),
+        (None, None, {"cameras": [["PINHOLE", 9, 9, float("nan"), 1, 1, 1]]}),
+        (None, None, {"known": {"a": ["PINHOLE", 9, 9, 1]}}),
+        (None, None, {"signs": 0}),
+        (None, None, {"feature": "a\0b"}),
+        ("vocabulary", lambda a: a * np.float16(np.nan), {}),
+        ("vocabulary", lambda a: a[:, :-1], {}),
+        ("descriptors", lambda a: a.astype(np.int64), {}),
+        ("rotations", lambda a: 0 * a, {}),
+        ("names", lambda a: np.frombuffer(b"a\na/b\nc\nd", np.uint8), {}),
+        ("names", lambda a: np.frombuffer(b"a\na\nc\nd", np.uint8), {}),
+        ("names", lambda a: np.frombuffer(b"/a\nb\nc\nd", np.uint8), {}),
         (None, None, {"version": 99}),
         (None, None, {"projection_sha256": "0"}),
     ],
@@ -243,7 +299,8 @@ def test_hostile_files(file, name, value, metadata):
 
 def test_a_file_writes_nothing_elsewhere(file, tmp_path):
     """Whatever it says of names of files."""
-    change(file, None, conf={**CompactMap(file).conf, "output": "../../evil"}, feature="../evil")
+    conf = {key: CompactMap(file).conf[key] for key in ("model", "preprocessing")}
+    change(file, None, conf={**conf, "output": "../../evil"}, feature="../evil")
     built = maps.unpack(file, tmp_path / "a/b/map")
     assert {path.name for path in (tmp_path / "a").iterdir()} == {"b"}
     assert {path.name for path in (tmp_path / "a/b").iterdir()} == {"map"}

@@ -1,6 +1,7 @@
 """The HTTP service, with a real client."""
 
 import json
+import socket
 import sys
 import threading
 import time
@@ -123,12 +124,24 @@ def test_garbage_is_refused(start):
     photo = png((8, 8))
     noise = np.random.default_rng(0).bytes(1000)
     for body in (b"", noise, photo[:20], b"GIF89a" + noise):
-        assert ask(url + "/localize", body) == (400, {"error": "the body is not a photo"})
+        assert ask(url + "/localize", body) == (
+            400,
+            {"error": "the body is not a JPEG or PNG file"},
+        )
     assert ask(url + "/localize", photo) == (400, {"error": "Cannot read image: it is truncated."})
     assert ask(url + "/localize", bytes(100_001))[0] == 413
-    status, found = ask(url + "/localize", png((12_000, 9_000), "1"))
-    assert status == 413 and "100,000,000 pixels" in found["error"]
-    for camera in ("", "x", "PINHOLE", "PINHOLE 1 1 1", "PINHOLE 9 9 nan 1 1 1", "NONE 1 1 1 1 1"):
+    for size in ((12_000, 9_000), (30_000, 20_000)):
+        status, found = ask(url + "/localize", png(size, "1"))
+        assert status == 413 and "100,000,000 pixels" in found["error"]
+    for camera in (
+        "",
+        "x",
+        "PINHOLE 9 9 0 1 1 1",
+        "PINHOLE",
+        "PINHOLE 1 1 1",
+        "PINHOLE 9 9 nan 1 1 1",
+        "NONE 1 1 1 1 1",
+    ):
         status, found = ask(f"{url}/localize?camera={quote(camera)}", photo)
         assert status == 400 and "MODEL WIDTH HEIGHT PARAMS" in found["error"], camera
     assert ask(url + "/localize")[0] == 405 and ask(url + "/map")[0] == 404
@@ -148,6 +161,23 @@ def test_a_full_queue_is_refused(start):
         localizer.released.set()
         assert [answer.result()[0] for answer in accepted] == [400, 400]
     assert ask(url + "/localize", photo)[0] == 400
+
+
+def test_slow_and_broken_uploads_hold_nobody_up(start, monkeypatch):
+    """Clients that send a part of a photo, and go away or not."""
+    monkeypatch.setattr(serve, "UPLOAD_SECONDS", 1.0)
+    localizer = Blocked()
+    localizer.released.set()
+    url = start(localizer, queue=1)
+    address = ("127.0.0.1", int(url.rpartition(":")[2]))
+    head = b"POST /localize HTTP/1.1\r\nHost: a\r\nContent-Length: 1000\r\n\r\nabc"
+    with socket.create_connection(address) as slow, socket.create_connection(address) as gone:
+        slow.sendall(head)
+        gone.sendall(head)
+        gone.close()
+        assert ask(url + "/localize", png((8, 8)))[0] == 400
+        assert b"408" in slow.recv(100)
+    assert ask(url + "/health")[1]["waiting"] == 0
 
 
 def test_a_missing_map(tmp_path, monkeypatch, caplog):
