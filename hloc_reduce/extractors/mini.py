@@ -1,8 +1,8 @@
 """Keypoints and descriptors of this project's own network."""
 
-from ..networks import MINI, NETWORKS, fetch_weights
+from ..networks import MINI, fetch_weights
 from ..networks.edgepoint2 import EdgePoint2 as Network
-from ..networks.loading import load_file
+from ..networks.loading import load_file, output_size
 from ..utils.cli import choose
 from .edgepoint2 import EdgePoint2
 
@@ -20,9 +20,9 @@ class Mini(EdgePoint2):
 
     def _init(self, conf: dict) -> None:
         name = choose("model_name", conf["model_name"], MINI)
-        self.dim = NETWORKS[name].dim
-        weights = fetch_weights(name, conf["weights"])
-        self.network = load_file(Network(SIZE, self.dim), weights, f"The weights of {name}")
+        weights, what = fetch_weights(name, conf["weights"]), f"The weights of {name}"
+        self.dim = output_size(weights, "desc_head.2", what)
+        self.network = load_file(Network(SIZE, self.dim), weights, what)
 
     @property
     def descriptor(self) -> str:

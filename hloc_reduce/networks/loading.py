@@ -47,6 +47,24 @@ def load_weights(module: nn.Module, name: str, compute: Compute | None = None) -
     return module
 
 
+def output_size(path: Path, layer: str, what: str) -> int:
+    """Return the number of outputs of a convolution in a .safetensors file.
+
+    Args:
+        path: the file.
+        layer: name of the convolution.
+        what: see `read_into`.
+
+    Raises:
+        InputError: when the file is broken, or another network's.
+    """
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            return int(file.get_slice(f"{layer}.weight").get_shape()[0])
+    except (OSError, SafetensorError, IndexError):
+        raise InputError(f"{what}, {path}, are broken, or those of another network.") from None
+
+
 def load_file(module: nn.Module, path: Path, what: str) -> nn.Module:
     """Load weights as `read_into` does, fold the network's normalizations, and freeze it."""
     return fold(read_into(module, path, what).eval()).requires_grad_(False)
@@ -57,7 +75,7 @@ def read_into(module: nn.Module, path: Path, what: str) -> nn.Module:
 
     Args:
         module: the network.
-        path: a .safetensors file, or one of torch's, which is not unpickled.
+        path: a .safetensors file, or one of torch's, of which only tensors are read.
         what: names the weights in messages, as in "The weights of xfeat".
 
     Returns:
@@ -72,7 +90,7 @@ def read_into(module: nn.Module, path: Path, what: str) -> nn.Module:
         else:
             weights = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, SafetensorError):
-        raise InputError(f"{what}, {path}, are broken. Delete the file.") from None
+        raise InputError(f"{what}, {path}, are broken.") from None
     try:
         missing, unexpected = module.load_state_dict(weights, strict=False)
     except (RuntimeError, TypeError, AttributeError):

@@ -19,14 +19,14 @@ from torch import nn
 from torch.nn.functional import cosine_similarity, grid_sample, normalize, smooth_l1_loss
 
 from .. import logger
-from ..networks import EDGEPOINT2, fetch_weights
+from ..networks import EDGEPOINT2, MINI, fetch_weights
 from ..networks.edgepoint2 import EdgePoint2
 from ..networks.keypoints import strongest
 from ..networks.loading import load_weights, read_into
 from ..runtime.versions import versions
 from ..utils import cli
 from ..utils.cli import InputError
-from ..utils.files import replacing
+from ..utils.files import file_sha256, replacing
 from ..utils.paths import strings_as_paths
 from . import views
 from .loop import device, fit
@@ -156,7 +156,7 @@ def main(
     torch.manual_seed(seed)
     student = EdgePoint2(ARCHITECTURE, dim)
     if start:
-        read_into(student, fetch_weights(f"mini{dim}", start), "The weights")
+        read_into(student, fetch_weights(MINI[0], start), "The weights")
     student = student.to(device())
     guide = load_weights(EdgePoint2(teacher[0], dim), teacher).to(device())
     metadata = {
@@ -169,11 +169,14 @@ def main(
         "steps": steps,
         "recipe": RECIPE,
         "seed": seed,
-        "start": start and hashlib.sha256(start.read_bytes()).hexdigest(),
+        "start": start and file_sha256(start),
     }
+    names = [f"{source.clean} {source.clean.stat().st_size}" for source in sources]
+    digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
     checkpoint = output.with_suffix(".checkpoint")
     step_loss = partial(loss, student, guide, sources, seed)
-    fit(student.train(), step_loss, steps, RECIPE, checkpoint, json.dumps(metadata))
+    made_from = json.dumps({**metadata, "digest": digest, "batch": BATCH})
+    fit(student.train(), step_loss, steps, RECIPE, checkpoint, made_from)
     metadata["versions"] = versions()
     weights = {key: value.contiguous().cpu() for key, value in student.state_dict().items()}
     with replacing(output) as temporary:
