@@ -28,10 +28,9 @@ RIVAL_BY_OTHERS = 0.8
 
 # The least agreement of a pose, from a confidence on. With a ratio test, wrong poses at copies of
 # repeated structures have confidences of 50 to 300. Below, there are few matches, so that the
-# agreement is less certain; above, there are mirrored facades, but many more right poses in noisy
-# scans. Without, mirrored facades have confidences above 1,200, and right poses agree more there.
+# agreement is less certain; above, there are many more right poses in noisy scans.
 Steps = tuple[tuple[float, float], ...]
-AGREEMENT: Steps = ((0, 0.3), (1200, 0.56))  # of matches without a strict ratio test
+AGREEMENT: Steps = ((0, 0.3),)  # of matches without a strict ratio test
 AGREEMENT_NOISY: Steps = ((0, 0.17),)  # the same for photos whose noise was reduced
 STRICT = 0.8  # the largest ratio of a strict test
 AGREEMENT_RATIO: Steps = ((0, 0.76), (50, 0.86), (300, 0.76))  # with a strict ratio test
