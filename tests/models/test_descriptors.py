@@ -194,5 +194,5 @@ def test_an_unknown_descriptor_is_answered_by_all_that_are_valid(act, valid, tmp
 )
 def test_an_unknown_base_is_answered_by_the_nearest(act, tmp_path, monkeypatch):
     (tmp_path / "images").mkdir()
-    with pytest.raises(InputError, match="Unknown descriptor 'sfit'. The nearest of 23: sift, "):
+    with pytest.raises(InputError, match="Unknown descriptor 'sfit'. The nearest of 24: sift, "):
         act(tmp_path, monkeypatch)

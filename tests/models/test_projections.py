@@ -88,10 +88,10 @@ def test_everything_ships_in_25_megabytes():
         for name in features.names(descriptor)
         if "@" not in name
     }
-    expected |= {"xfeat", "edgepoint2_m32", "edgepoint2_m64", "aliked"}  # levels
+    expected |= {"xfeat", "edgepoint2_m32", "edgepoint2_m64", "aliked", "mini32"}  # levels
     expected |= {f"aliked_{scheme}{dim}" for scheme in ("pca", "sv") for dim in (64, 32, 24, 16)}
     expected -= {"aliked_sv64"}  # no better than pca
-    assert set(projections.names()) == expected and len(expected) == 83
+    assert set(projections.names()) == expected and len(expected) == 84
     assert sum(path.stat().st_size for path in WEIGHTS.iterdir()) < 25e6
 
 
