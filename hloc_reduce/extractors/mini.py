@@ -12,7 +12,7 @@ SIZE = "M"  # of EdgePoint2's architecture
 class Mini(EdgePoint2):
     """A small network with EdgePoint2's architecture, trained for darkness, noise and codes.
 
-    `weights` is a file of `hloc_reduce.training.mini`, for a network of one's own. Its other
+    `weights` is a file from `hloc_reduce.training.mini`; default: the weights that ship. The other
     options are those of `edgepoint2`.
     """
 

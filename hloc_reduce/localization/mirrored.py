@@ -23,7 +23,7 @@ MirrorImages = Callable[[list[str]], tuple[Path, Path]]
 
 
 def is_doubtful(localized: bool, agreement: float, confidence: float) -> bool:
-    """Tell whether the mirror image of a query is to be tried."""
+    """Return whether a pose is so uncertain that the mirror image must be tried, too."""
     return localized and (agreement < DOUBTFUL[0] or confidence < DOUBTFUL[1])
 
 

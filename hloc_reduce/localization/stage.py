@@ -90,7 +90,7 @@ def main(
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
     if mirror_images:
         header["mirror_images"] = True
-    localize = partial(_localized, load_reference, config, skip_matches, gate, executor)
+    solve = partial(_localized, load_reference, config, skip_matches, gate, executor)
     with Log(log_file(results), header, overwrite) as log:
         todo = [(name, camera) for name, camera in queries if name not in log.records]
         for name, record in _refuse(load_reference, features, todo, retrieved):
@@ -102,7 +102,7 @@ def main(
         ]
         if tasks:
             _check_some_matched(matches, [name for name, _ in queries], retrieved)
-            for name, record in localize(features, matches, tasks, True):
+            for name, record in solve(features, matches, tasks, True):
                 log.add(name, record)
         tasks = [
             (name, mirror(camera), retrieved.get(name, []))
@@ -111,7 +111,7 @@ def main(
         ]
         if mirror_images and tasks:
             files, reference = mirror_images([name for name, _, _ in tasks]), load_reference()
-            for name, record in localize(*files, tasks, False):
+            for name, record in solve(*files, tasks, False):
                 names = [other for other in retrieved.get(name, []) if other in reference]
                 log.add(name, with_mirror_image(log.records[name], record, reference, names))
     records = {name: log.records[name] for name, _ in queries}

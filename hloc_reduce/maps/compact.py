@@ -213,18 +213,15 @@ class CompactMap:
         packed = _array(tensors, "visible", np.uint8, (None,))
         visible = points_of_map.unpack_visible(packed, metadata["visible"], counts, number)
         self.visible = dict(zip(names, visible, strict=True))
+        self._rows = {name: row for row, name in enumerate(names)}
         self._read_descriptors(metadata, tensors)
         self._read_feature(metadata)
         self._read_projection(metadata, tensors)
         self._read_retrieval(metadata, tensors)
-        finite = (self._translations, self.points, np.array(step), 1 / self._norms())
-        if not all(np.isfinite(values).all() for values in finite):
+        finite = (self._translations, self.points, np.array(step))
+        turned = np.linalg.norm(self._rotations, axis=1) > 0  # no NaN is
+        if not (turned.all() and all(np.isfinite(values).all() for values in finite)):
             raise ValueError("numbers that are not finite")
-
-    def _norms(self) -> np.ndarray:
-        """Return the norms of the quaternions (I,); those of zero as infinite."""
-        norms = np.linalg.norm(self._rotations.astype(np.float64), axis=1)
-        return np.where(norms > 0, norms, np.nan)
 
     def _read_descriptors(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
         self.storage = choose("storage", metadata["storage"], STORAGES)
@@ -318,7 +315,7 @@ class CompactMap:
 
     def pose(self, name: str) -> pycolmap.Rigid3d:
         """Return the pose of an image, camera from world."""
-        i = self.names.index(name)
+        i = self._rows[name]
         rotation = pycolmap.Rotation3d(self._rotations[i].astype(np.float64))
         return pycolmap.Rigid3d(rotation, self._translations[i])
 

@@ -121,7 +121,7 @@ class Localizer:
         cam_from_world, info = self._estimate(features, matches, camera, refinement)
         lap("pose")
         if mirrored.is_doubtful(info["reason"] is None, info["agreement"], info["confidence"]):
-            flipped = self._extract(image, mirrored=True)
+            flipped = self._extract(image, flip=True)
             matches = self._match(flipped["descriptors"], retrieved)
             camera = mirrored.mirror(camera)
             _, other = self._estimate(flipped, matches, camera, refinement, thorough=False)
@@ -135,9 +135,9 @@ class Localizer:
         }
         return cam_from_world if info["reason"] is None else None, info
 
-    def _extract(self, image: Path | np.ndarray, mirrored: bool = False) -> dict:
+    def _extract(self, image: Path | np.ndarray, flip: bool = False) -> dict:
         """Extract features as a feature file has them: keypoints (N, 2), descriptors (N, D)."""
-        preprocessing = {**self.preprocessing, "mirrored": mirrored}
+        preprocessing = {**self.preprocessing, "mirrored": flip}
         features: dict = extractors.extract(self.extractor, image, preprocessing, self.device)
         rounded = features["descriptors"].T.astype(self.dtype)
         descriptors = torch.from_numpy(rounded.astype(np.float32, order="C"))
