@@ -26,6 +26,7 @@ from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
 from ..extract_features import keep_present, keep_readable
 from ..localization import intrinsics
+from ..mapping import mapper, plausibility, registration
 from ..runtime import provenance
 from ..runtime.outputs import RunFolder
 from ..utils import colmap
@@ -266,9 +267,9 @@ class _Building:
             the model.
         """
         adaptive = features_confs.keypoints_of(conf["model"]) == "adaptive"
-        if not adaptive or len(self.names) > reconstruction.VERY_FEW:
+        if not adaptive or len(self.names) > mapper.VERY_FEW:
             sfm = self._reconstruct(conf, SFM)
-            reconstruction.check(self.folder.path / SFM, self.accept_partial)
+            registration.check(self.folder.path / SFM, self.accept_partial)
             return SFM, conf, sfm
         model = features_confs.with_keypoints(conf["model"], "colmap")
         more = {**conf, "output": f"{conf['output']}{MORE}", "model": model}
@@ -276,9 +277,9 @@ class _Building:
 
         def attempt(folder: str, conf: dict, once: bool = False) -> bool:
             """Return whether all photos are in the best model so far."""
-            with suppress(reconstruction.NoModelError):
+            with suppress(registration.NoModelError):
                 found.append((folder, conf, self._reconstruct(conf, folder, once)))
-            found.sort(key=lambda one: reconstruction.size(one[2]), reverse=True)
+            found.sort(key=lambda one: plausibility.size(one[2]), reverse=True)
             registered = found[0][2].num_reg_images() if found else 0
             logger.info("%d of %d photos are in the map.", registered, len(self.names))
             return registered == len(self.names)
@@ -289,8 +290,8 @@ class _Building:
             if not found or found[0][0] == SFM:
                 attempt(f"{SFM}{FURTHER}", conf)
         if not found:
-            raise reconstruction.NoModelError(reconstruction.nothing(self.image_dir))
-        reconstruction.check(self.folder.path / found[0][0], self.accept_partial)
+            raise registration.NoModelError(registration.nothing(self.image_dir))
+        registration.check(self.folder.path / found[0][0], self.accept_partial)
         return found[0]
 
     def _reconstruct(self, conf: dict, sfm: str, once: bool = False) -> pycolmap.Reconstruction:

@@ -96,7 +96,7 @@ def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeyp
 
     def fails_once(*args, once, **options):
         if once:
-            raise maps.build.reconstruction.NoModelError("COLMAP could not reconstruct the images.")
+            raise maps.build.registration.NoModelError("COLMAP could not reconstruct the images.")
         return reconstruct(*args, once=once, **options)
 
     monkeypatch.setattr(maps.build.reconstruction, "main", fails_once)
@@ -142,7 +142,7 @@ def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatc
     def fails_again(*args, once, **options):
         if once:
             return reconstruct(*args, once=once, **options)
-        raise maps.build.reconstruction.NoModelError("COLMAP could not reconstruct the images.")
+        raise maps.build.registration.NoModelError("COLMAP could not reconstruct the images.")
 
     monkeypatch.setattr(maps.build.reconstruction, "main", fails_again)
     outputs = tmp_path / "outputs"

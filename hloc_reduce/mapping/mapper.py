@@ -1,0 +1,161 @@
+"""COLMAP's incremental mapper, with several attempts."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from .. import logger
+from ..runtime import provenance
+from ..utils import colmap
+from .plausibility import (
+    MAX_DISTORTION,
+    SPREAD,
+    VIEWPOINTS,
+    Models,
+    focal_length_spread,
+    keep_plausible,
+    size,
+)
+from .registration import ENOUGH, REGISTRATION, NoModelError, nothing
+
+# half of COLMAP's thresholds, for missing images; a quarter of them gave wrong poses
+RELAXED = {
+    "init_min_num_inliers": 50,
+    "init_min_tri_angle": 8.0,
+    "abs_pose_min_num_inliers": 15,
+}
+FEW = 100  # images: further attempts take little time, even for one missing image
+VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
+SEEDS = (1, 2, 3)
+MORE = 1.5  # times as many images show that one camera took all
+# what the provenance of a model says of how it was chosen
+RULES = {
+    "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
+    "points": f"{MORE} times as many where focal lengths differ",
+    "spread": SPREAD,
+    "viewpoints": VIEWPOINTS,
+}
+
+
+def attempts_for(number: int) -> list[dict]:
+    """Return the changed mapper options of each attempt to reconstruct a number of images."""
+    attempts: list[dict] = [{}, {"mapper": RELAXED}]
+    for seed in SEEDS if number <= VERY_FEW else ():
+        attempts += [{"random_seed": seed}, {"random_seed": seed, "mapper": RELAXED}]
+    return attempts
+
+
+@dataclass
+class Mapper:
+    """COLMAP's incremental mapper, with several attempts."""
+
+    folder: Path  # of the new model
+    image_dir: Path
+    names: list[str]
+    image_options: dict  # of pycolmap's ImageReaderOptions
+    keypoints: dict[str, np.ndarray]  # from image to (N, 2), COLMAP's pixels
+    matches: dict[tuple[str, str], np.ndarray]  # from pair to (M, 2)
+    unverified: Path | None  # text file of pairs to verify by two-view geometry
+    attempts: list[dict]  # of pycolmap's IncrementalPipelineOptions
+    verbose: bool
+
+    def reconstruct(self, camera_mode: pycolmap.CameraMode) -> None:
+        """Write the best model, its database and its registration."""
+        database = self.write_database(camera_mode)
+        models, dropped = self.run(database)
+        registered, points = _size(models)
+        alike = camera_mode == pycolmap.CameraMode.AUTO and _are_alike(database)
+        several = len(self.attempts) > 1
+        few = several and MORE * registered <= len(_matched(database))
+        spread = focal_length_spread(models)
+        if alike and (few or spread > SPREAD):
+            logger.info("Trying again with one camera for all images.")
+            shared = self.write_database(pycolmap.CameraMode.SINGLE)
+            found, implausible = self.run(shared)
+            images, more = _size(found)
+            fits = spread > SPREAD and images >= registered and more >= MORE * points
+            if found and (images >= MORE * registered or fits):
+                models, dropped, database, alike = found, implausible, shared, False
+        if not models:
+            raise NoModelError(nothing(self.image_dir, dropped))
+        models[0].write(self.folder)
+        parts = _parts(models)
+        missing = sorted(set(self.names) - set(parts[0]))
+        state = {
+            "images": len(self.names),
+            "parts": parts,
+            "missing": missing,
+            "unmatched": sorted(set(self.names) - _matched(database)),
+            "implausible": {name: lens for name, lens in dropped.items() if name in missing},
+            "alike": alike,
+            "spread": round(focal_length_spread(models), 2),
+        }
+        provenance.write(self.folder / REGISTRATION, state)
+        database.rename(self.folder / "database.db")
+        for other in self.folder.glob("database-*"):
+            other.unlink()
+
+    def write_database(self, mode: pycolmap.CameraMode) -> Path:
+        """Write a database of the images and their verified matches."""
+        database = self.folder / f"database-{mode.name}.db"
+        colmap.import_images(database, self.image_dir, self.names, mode, self.image_options)
+        verified = {
+            pair: (indices, None if self.unverified else indices)
+            for pair, indices in self.matches.items()
+        }
+        colmap.write_matches(database, self.keypoints, verified)
+        if self.unverified:
+            colmap.verify_matches(database, self.unverified, self.verbose)
+        return database
+
+    def run(self, database: Path) -> Models:
+        """Return the plausible models of the best attempt; stop when enough images are in one."""
+        cameras, folder = colmap.read_cameras(database), self.folder / "models"
+        number = len(self.names)
+        enough = number if number <= FEW else ENOUGH * number
+        enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
+        best: Models = [], {}
+        for attempt, changed in enumerate(self.attempts, start=1):
+            options = colmap.mapper_options(changed)
+            found = colmap.incremental_mapping(
+                database, self.image_dir, folder, options, self.verbose
+            )
+            shutil.rmtree(folder, ignore_errors=True)
+            best = max(best, keep_plausible(found, cameras), key=lambda both: _size(both[0]))
+            registered = _size(best[0])[0]
+            logger.info(
+                "Attempt %d of up to %d: %d of %d images reconstructed.",
+                *(attempt, len(self.attempts), registered, number),
+            )
+            if registered >= enough:
+                break
+        return best
+
+
+def _matched(database: Path) -> set[str]:
+    """Return the images of a database that have verified matches with another."""
+    return {name for pair in colmap.count_verified(database) for name in pair}
+
+
+def _are_alike(database: Path) -> bool:
+    """Tell whether one camera may have taken all images, although each has its own."""
+    cameras = colmap.read_cameras(database).values()
+    return len(cameras) > len({(c.width, c.height, *c.params) for c in cameras}) == 1
+
+
+def _size(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
+    """Return the size of the first model."""
+    return size(models[0]) if models else (0, 0)
+
+
+def _parts(models: list[pycolmap.Reconstruction]) -> list[list[str]]:
+    """Return the images of each model that no larger one has: COLMAP's models may overlap."""
+    parts: list[list[str]] = []
+    for model in models:
+        names = {model.images[i].name for i in model.reg_image_ids()}
+        if new := sorted(names.difference(*parts)):
+            parts.append(new)
+    return parts

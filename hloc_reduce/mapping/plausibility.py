@@ -1,0 +1,124 @@
+"""Which images of a reconstructed model are plausible, and which models can be used."""
+
+from collections import Counter
+
+import numpy as np
+import pycolmap
+
+from .. import logger
+from ..localization.confidence import focal_lengths
+
+SPREAD = 1.2  # ratio of focal lengths above which one camera for all images is tried
+MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
+MANY = 3  # images of one camera estimate its focal length better than EXIF data do
+SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
+VIEWPOINTS = 3  # at least, of a model: two do not determine the focal lengths
+
+Models = tuple[list[pycolmap.Reconstruction], dict[str, str]]  # see `keep_plausible`
+
+
+def keep_plausible(
+    models: list[pycolmap.Reconstruction], cameras: dict[int, pycolmap.Camera]
+) -> Models:
+    """Drop images with implausible lenses from models, and images that only these connect.
+
+    Args:
+        models: of COLMAP's mapper.
+        cameras: from id to the initial camera.
+
+    Returns:
+        The models that have points, the largest first; and from the name of each dropped image to
+        what is implausible.
+    """
+    dropped: dict[str, str] = {}
+    for model in models:
+        images = [model.images[i] for i in model.reg_image_ids()]
+        shared = Counter(image.camera_id for image in images)
+        implausible = {}
+        for image in images:
+            camera_id = image.camera_id
+            lens = _implausible(model.cameras[camera_id], cameras[camera_id], shared[camera_id])
+            if lens is not None:
+                implausible[image.name] = lens
+                model.deregister_frame(image.frame_id)
+        if implausible:
+            _keep_connected(model)
+        dropped |= implausible
+    whole = []
+    for model in models:
+        if min(size(model)) < 2:
+            continue
+        if (number := count_viewpoints(model)) >= VIEWPOINTS:
+            whole.append(model)
+            continue
+        logger.info(
+            "A model of %d photos is not used: %d viewpoints do not determine focal lengths.",
+            *(model.num_reg_images(), number),
+        )
+    return sorted(whole, key=size, reverse=True), dropped
+
+
+def _implausible(camera: pycolmap.Camera, initial: pycolmap.Camera, number: int) -> str | None:
+    """Say what is implausible about the refined camera of a number of images, if anything."""
+    low, high = focal_lengths(initial, not initial.has_prior_focal_length or number >= MANY)
+    focal_length = camera.mean_focal_length()
+    if not low <= focal_length <= high:
+        return f"focal length {focal_length:.0f}"
+    distortion = max(camera.params[list(camera.extra_params_idxs())], key=abs, default=0.0)
+    return f"distortion {distortion:.1f}" if abs(distortion) > MAX_DISTORTION else None
+
+
+def count_viewpoints(model: pycolmap.Reconstruction) -> int:
+    """Count the viewpoints of a model: a burst of photos from one place is one viewpoint."""
+    points = {number: point.xyz for number, point in model.points3D.items()}
+    left: list[tuple[np.ndarray, float]] = []  # centres of images, and distances of their points
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.images[image_id]
+        centre = image.projection_center()
+        seen = [points[p.point3D_id] for p in image.points2D if p.has_point3D()]
+        if seen:
+            left.append((centre, float(np.median(np.linalg.norm(np.array(seen) - centre, axis=1)))))
+    number = 0
+    while left:
+        number, (first, distance) = number + 1, left[0]
+        left = [
+            (centre, other)
+            for centre, other in left[1:]
+            if np.linalg.norm(centre - first) > SAME_VIEWPOINT * min(distance, other)
+        ]
+    return number
+
+
+def _keep_connected(model: pycolmap.Reconstruction) -> None:
+    """Keep only the largest set of images that common points connect."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ids = sorted(model.reg_image_ids())
+    row = {image_id: number for number, image_id in enumerate(ids)}
+    seen = [
+        (row[element.image_id], number)
+        for number, point in enumerate(model.points3D.values())
+        for element in point.track.elements
+    ]
+    if not seen:
+        return
+    image, point = np.array(seen).T
+    sees = coo_array((np.ones(len(image)), (image, point)), (len(ids), point.max() + 1)).tocsr()
+    _, label = connected_components(sees @ sees.T, directed=False)
+    largest = np.bincount(label).argmax()
+    for image_id, part in zip(ids, label, strict=True):
+        if part != largest:
+            model.deregister_frame(model.images[image_id].frame_id)
+
+
+def size(model: pycolmap.Reconstruction) -> tuple[int, int]:
+    """Return the numbers of images and points of a model, by which models are compared."""
+    return model.num_reg_images(), model.num_points3D()
+
+
+def focal_length_spread(models: list[pycolmap.Reconstruction]) -> float:
+    """Return the ratio of the largest and the smallest focal length in the largest model, or 1."""
+    cameras = {image.camera_id for image in models[0].images.values()} if models else ()
+    focal_lengths = [models[0].cameras[i].mean_focal_length() for i in cameras]
+    return max(focal_lengths) / min(focal_lengths) if focal_lengths else 1.0

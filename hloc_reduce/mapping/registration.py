@@ -1,0 +1,126 @@
+"""Which images are in a model of photos alone, and what to say about the others."""
+
+from pathlib import Path
+
+from .. import logger
+from ..runtime import provenance
+from ..utils import cli
+from ..utils.cli import InputError
+from .plausibility import SPREAD, VIEWPOINTS
+
+REGISTRATION = "registration.json"  # which images are in the model, and in other parts
+# shares of registered images: a model with fewer is reported in detail, or refused
+ENOUGH, LEAST = 0.8, 0.5
+NAMED = 10  # images that a message names
+
+
+class NoModelError(InputError):
+    """No two images could be reconstructed."""
+
+
+def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
+    """Say that no image could be reconstructed, and what to try."""
+    advice = (
+        "Do enough of them overlap? Take photos from several places, each overlapping the one "
+        "before by about two thirds."
+    )
+    hint = _lenses(dropped) if dropped else advice
+    return (
+        f"COLMAP could not reconstruct the images of {image_dir} from {VIEWPOINTS} viewpoints or "
+        f"more. {hint}"
+    )
+
+
+def _lenses(dropped: dict[str, str]) -> str:
+    """Say which images have implausible lenses."""
+    lenses = [f"{name} ({lens})" for name, lens in dropped.items()]
+    return (
+        "These have focal lengths in pixels or distortions that no lens has, or focal lengths far "
+        f"from their EXIF data, so their poses are wrong: {cli.some(lenses, NAMED)}."
+    )
+
+
+def check(sfm_dir: Path, accept_partial: bool) -> None:
+    """Report which images are missing from a model.
+
+    Raises:
+        InputError: if it has fewer than half of the images, unless `accept_partial`.
+    """
+    state = provenance.read(sfm_dir / REGISTRATION)
+    missing, number, spread = state["missing"], state["images"], state.pop("spread", 1.0)
+    registered = number - len(missing)
+    if registered >= ENOUGH * number and len(state["parts"]) == 1:
+        if state["alike"] and spread > SPREAD:
+            logger.warning(
+                "The map may be wrong: its photos have the same size, but their estimated focal "
+                "lengths differ by a factor of %.2f. If one camera with a fixed zoom took all, run "
+                "again with --camera_mode single; otherwise add photos from more viewpoints.",
+                spread,
+            )
+        elif state["alike"]:
+            logger.info(
+                "EXIF data do not say which images share a camera, so each has its own. If one "
+                "camera with a fixed zoom took all, --camera_mode single gives better poses."
+            )
+        if missing:
+            implausible = state["implausible"]
+            logger.warning(
+                "%d of %d images are not in the map: %s.%s",
+                *(len(missing), number, cli.some(missing, NAMED)),
+                f" {_lenses(implausible)}" if implausible else "",
+            )
+        return
+    message = shortfall(sfm_dir / REGISTRATION, **state)
+    if registered < LEAST * number and not accept_partial:
+        raise InputError(f"{message} To use the map as it is, run again with --accept_partial.")
+    logger.warning(message)
+
+
+def shortfall(
+    path: Path,
+    images: int,
+    parts: list[list[str]],
+    missing: list[str],
+    unmatched: list[str],
+    implausible: dict[str, str],
+    alike: bool,
+) -> str:
+    """Say which images are not in a model, why, and what to try.
+
+    Args:
+        path: file with all names.
+        images: number of images.
+        parts: the images of each part that COLMAP reconstructed, the model first.
+        missing: the images that are not in the model.
+        unmatched: the images without verified matches.
+        implausible: from each dropped image to what is implausible about its lens.
+        alike: each image has its own camera, but one camera may have taken all.
+    """
+    registered = images - len(missing)
+    only = "Only " if registered < ENOUGH * images else ""
+    said = [
+        f"{only}{registered} of {images} photos are in the map.",
+        f"Missing: {cli.some(missing, NAMED)}{f' (all in {path})' * bool(missing[NAMED:])}.",
+    ]
+    tries = []
+    if len(parts) > 1:
+        sizes = [str(len(part)) for part in parts]
+        said.append(
+            f"COLMAP found {len(parts)} parts that do not connect, of {', '.join(sizes[:-1])} and "
+            f"{sizes[-1]} photos, and the map is the first"
+            + (f"; the second has {cli.some(parts[1], 3)}." if parts[1] != missing else ".")
+        )
+        tries.append("add photos between the parts, each overlapping the one before by two thirds")
+    elif set(missing) - set(unmatched) - set(implausible):
+        tries.append(
+            "add photos between those in the map and those that are not, and leave out photos of "
+            "other places"
+        )
+    if unmatched:
+        said.append(f"No other photo matches {cli.some(unmatched)}.")
+        tries.append("leave out photos of other places, and retake blurred or dark ones")
+    if implausible:
+        said.append(_lenses(implausible))
+    if alike:
+        tries.append("--camera_mode single, if one camera with a fixed zoom took all photos")
+    return f"{' '.join(said)} What to try: {'; '.join(tries)}."

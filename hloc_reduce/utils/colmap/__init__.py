@@ -1,0 +1,56 @@
+"""pycolmap: what differs between its versions, its models, databases and estimators."""
+
+import pycolmap
+
+from .databases import (
+    add_camera_mode,
+    camera_mode,
+    count_verified,
+    import_images,
+    read_cameras,
+    write_matches,
+    write_reference,
+)
+from .estimators import (
+    estimate_pose,
+    incremental_mapping,
+    mapper_options,
+    triangulate_points,
+    verify_matches,
+)
+from .models import (
+    add_image,
+    cam_from_img,
+    check_whole,
+    infer_camera,
+    point3D_ids,
+    read_model,
+    write_part,
+)
+from .sift import check_dog_options, detect_dog
+
+pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
+
+__all__ = [
+    "add_camera_mode",
+    "add_image",
+    "cam_from_img",
+    "camera_mode",
+    "check_dog_options",
+    "check_whole",
+    "count_verified",
+    "detect_dog",
+    "estimate_pose",
+    "import_images",
+    "incremental_mapping",
+    "infer_camera",
+    "mapper_options",
+    "point3D_ids",
+    "read_cameras",
+    "read_model",
+    "triangulate_points",
+    "verify_matches",
+    "write_matches",
+    "write_part",
+    "write_reference",
+]

@@ -1,0 +1,149 @@
+"""COLMAP databases: images and their cameras, keypoints and matches."""
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from ..cli import InputError, Parser, choose, some
+
+FULL = 2**16  # free bytes, below which COLMAP cannot even open a database
+
+
+@contextmanager
+def open_database(database: Path) -> Iterator[pycolmap.Database]:
+    """Open a COLMAP database, without a transaction: on a full disk it would abort the process."""
+    with full_disk(database), pycolmap.Database.open(database) as opened:
+        yield opened
+
+
+@contextmanager
+def full_disk(path: Path) -> Iterator[None]:
+    """Raise an OSError if the disk gets full in a block that writes `path`; COLMAP does not."""
+
+    def check() -> None:
+        if shutil.disk_usage(path.parent).free < FULL:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
+
+    try:
+        yield
+    except RuntimeError:
+        check()
+        raise
+    check()
+
+
+def write_reference(database: Path, reference: pycolmap.Reconstruction) -> None:
+    """Create a COLMAP database with the cameras and images of a model, with their ids."""
+    with open_database(database) as opened:
+        for camera in reference.cameras.values():
+            opened.write_camera(camera, use_camera_id=True)
+        for rig in reference.rigs.values():
+            opened.write_rig(rig, use_rig_id=True)
+        for frame in reference.frames.values():
+            opened.write_frame(frame, use_frame_id=True)
+        for image in reference.images.values():
+            opened.write_image(image, use_image_id=True)
+
+
+def camera_mode(name: str) -> pycolmap.CameraMode:
+    """Return COLMAP's camera mode by its name in lower or upper case, such as per_folder.
+
+    Raises:
+        InputError: for an unknown name.
+    """
+    modes = {mode.lower(): value for mode, value in pycolmap.CameraMode.__members__.items()}
+    return modes[choose("camera mode", name.lower(), modes)]
+
+
+def add_camera_mode(parser: Parser) -> None:
+    """Add --camera_mode."""
+    modes = ", ".join(mode.lower() for mode in pycolmap.CameraMode.__members__)
+    parser.add_argument(
+        "--camera_mode",
+        default="auto",
+        help=f"which photos share a camera, as in COLMAP: {modes}; auto, COLMAP's default: those "
+        "of the same make, model, focal length and size by EXIF data",
+    )
+
+
+def import_images(
+    database: Path,
+    image_dir: Path,
+    names: list[str],
+    camera_mode: pycolmap.CameraMode,
+    options: dict,
+) -> None:
+    """Create a COLMAP database with images, and cameras guessed from their EXIF data.
+
+    Raises:
+        InputError: for an unknown option, or an image that COLMAP skips.
+    """
+    with open_database(database):
+        pass
+    try:
+        reader = pycolmap.ImageReaderOptions(options)
+    except (AttributeError, TypeError, RuntimeError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"The image options {options} cannot be used ({reason}).") from None
+    pycolmap.import_images(database, image_dir, camera_mode, image_names=names, options=reader)
+    with open_database(database) as opened:
+        imported = {image.name for image in opened.read_all_images()}
+    if skipped := [name for name in names if name not in imported]:
+        reason = "they cannot be read"
+        if camera_mode in (pycolmap.CameraMode.SINGLE, pycolmap.CameraMode.PER_FOLDER):
+            reason += " or differ in size from the images that share their camera"
+        raise InputError(
+            f"COLMAP skipped {len(skipped)} images in {image_dir}, because {reason}: "
+            f"{some(skipped)}."
+        )
+
+
+def write_matches(
+    database: Path,
+    keypoints: dict[str, np.ndarray],
+    matches: dict[tuple[str, str], tuple[np.ndarray, np.ndarray | None]],
+) -> None:
+    """Write the keypoints and matches of images into a COLMAP database.
+
+    Args:
+        database: has the images.
+        keypoints: (N, 2) in COLMAP's pixels, by image name.
+        matches: all and the verified matches (M, 2) of pairs of image names; None instead of the
+            verified ones if `verify_matches` will find them.
+    """
+    with open_database(database) as opened:
+        image_ids = {image.name: image.image_id for image in opened.read_all_images()}
+        for name, points in keypoints.items():
+            opened.write_keypoints(image_ids[name], points.astype(np.float32))
+        for (name0, name1), (all_matches, verified) in matches.items():
+            ids = image_ids[name0], image_ids[name1]
+            opened.write_matches(*ids, all_matches.astype(np.uint32))
+            if verified is None:
+                continue
+            # COLMAP 4.2.1 and later skip geometries with an undefined configuration
+            geometry = pycolmap.TwoViewGeometry(
+                config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
+                inlier_matches=verified.astype(np.uint32),
+            )
+            opened.write_two_view_geometry(*ids, geometry)
+
+
+def read_cameras(database: Path) -> dict[int, pycolmap.Camera]:
+    """Return the cameras of a COLMAP database by their ids."""
+    with open_database(database) as opened:
+        return {camera.camera_id: camera for camera in opened.read_all_cameras()}
+
+
+def count_verified(database: Path) -> dict[tuple[str, str], int]:
+    """Return the number of verified matches of each pair of images that has any."""
+    with open_database(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        counts = zip(*opened.read_two_view_geometry_num_inliers(), strict=True)
+    ids = ((pycolmap.pair_id_to_image_pair(pair), int(count)) for pair, count in counts)
+    return {(names[pair[0]], names[pair[1]]): count for pair, count in ids if count}

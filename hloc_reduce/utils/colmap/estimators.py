@@ -1,0 +1,135 @@
+"""COLMAP's estimators: two-view geometries, points, models and the pose of a query."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from ..cli import InputError
+from ..interrupts import interruptible
+from ..parsers import parse_pairs, write_pairs
+from .databases import full_disk, open_database
+
+
+def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
+    """Convert a dict to pycolmap's mapper options.
+
+    Raises:
+        InputError: for an unknown option.
+    """
+    try:
+        return pycolmap.IncrementalPipelineOptions(options)
+    except (AttributeError, TypeError, RuntimeError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"The mapper options {options} cannot be used ({reason}).") from None
+
+
+def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
+    """Estimate the two-view geometries of the matches of a database, with hloc's options."""
+    options = {"ransac": {"max_num_trials": 20000, "min_inlier_ratio": 0.1, "random_seed": 0}}
+    with _log(verbose), _named_by_ids(database, pairs) as pairs_by_ids:
+        interruptible(pycolmap.verify_matches, database, pairs_by_ids, options=options)
+
+
+@contextmanager
+def _named_by_ids(database: Path, pairs: Path) -> Iterator[Path]:
+    """In a block, name the images of a database by their ids if any name contains spaces.
+
+    COLMAP cannot read a list of pairs with spaces in names. Yields a list that it can read.
+    """
+    with open_database(database) as opened:
+        images = opened.read_all_images()
+    names = {image.image_id: image.name for image in images}
+    if all(name.split() == [name] for name in names.values()):
+        yield pairs
+        return
+    ids = {name: str(image_id) for image_id, name in names.items()}
+    by_ids = database.with_name("pairs_by_ids.txt")
+    write_pairs(((ids[a], ids[b]) for a, b in parse_pairs(pairs)), by_ids)
+    _rename(database, images, {image_id: str(image_id) for image_id in names})
+    try:
+        yield by_ids
+    finally:
+        by_ids.unlink()
+        _rename(database, images, names)
+
+
+def _rename(database: Path, images: list[pycolmap.Image], names: dict[int, str]) -> None:
+    with open_database(database) as opened:
+        for image in images:
+            image.name = names[image.image_id]
+            opened.update_image(image)
+
+
+def triangulate_points(
+    reference: pycolmap.Reconstruction,
+    database: Path,
+    image_dir: Path,
+    output: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    verbose: bool,
+) -> pycolmap.Reconstruction:
+    """Triangulate the verified matches of a database into `output` with fixed poses.
+
+    Without any match the model is empty; COLMAP 3.13 would raise a ValueError.
+    """
+    with open_database(database) as opened:
+        if opened.num_inlier_matches() == 0:
+            return pycolmap.Reconstruction()
+    with _log(verbose), full_disk(output):
+        inputs = reference, database, image_dir, output
+        return interruptible(pycolmap.triangulate_points, *inputs, options=options)
+
+
+def incremental_mapping(
+    database: Path,
+    image_dir: Path,
+    output: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    verbose: bool,
+) -> list[pycolmap.Reconstruction]:
+    """Reconstruct the images of a database with verified matches; the largest model comes first."""
+    output.mkdir()
+    # the mapper warns at every failed attempt
+    with _log(verbose, pycolmap.logging.Level.FATAL), full_disk(output):
+        inputs = database, image_dir, output
+        models = interruptible(pycolmap.incremental_mapping, *inputs, options=options)
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+
+
+@contextmanager
+def _log(
+    verbose: bool, least: pycolmap.logging.Level = pycolmap.logging.Level.WARNING
+) -> Iterator[None]:
+    """Show COLMAP's log of a block if `verbose`, else messages of at least the level `least`."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.INFO if verbose else least)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def estimate_pose(
+    points2D: np.ndarray, points3D: np.ndarray, camera: pycolmap.Camera, config: dict, seed: int
+) -> dict | None:
+    """Estimate an absolute pose by PnP + LO-RANSAC and refine it, deterministically.
+
+    Args:
+        points2D: (M, 2) image points in COLMAP's pixels.
+        points3D: (M, 3) world points.
+        camera: the intrinsics.
+        config: hloc's dict, with options under "estimation" and "refinement".
+        seed: the seed of RANSAC.
+
+    Returns:
+        cam_from_world, num_inliers and inlier_mask (M,), or None.
+    """
+    estimation = {**config.get("estimation", {})}
+    estimation["ransac"] = {"random_seed": seed, **estimation.get("ransac", {})}
+    if len(points2D) == 0:
+        return None
+    estimate: Callable[..., dict | None] = pycolmap.estimate_and_refine_absolute_pose
+    return estimate(points2D, points3D, camera, estimation, config.get("refinement", {}))

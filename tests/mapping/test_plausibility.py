@@ -1,0 +1,131 @@
+"""Which images of a model of photos alone are plausible, and what is said of the others."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hloc_reduce.mapping import registration
+from hloc_reduce.mapping.plausibility import count_viewpoints, keep_plausible
+from hloc_reduce.utils import colmap
+
+
+def chain(cameras, places=None):
+    """Return a model of images that see points with the next one only, of cameras by number.
+
+    The points are 5 units in front of the images, which are at other places along a line.
+    """
+    model = pycolmap.Reconstruction()
+    for i, number in enumerate(cameras):
+        camera = pycolmap.Camera(
+            model="SIMPLE_PINHOLE", width=640, height=480, params=[500, 320, 240], camera_id=number
+        )
+        pixels = np.random.default_rng(i).uniform(0, 400, (20, 2))
+        image = pycolmap.Image(name=f"{i}.jpg", keypoints=pixels, camera_id=number, image_id=i + 1)
+        place = np.array([i if places is None else places[i], 0, 0])
+        colmap.add_image(model, camera, image, pycolmap.Rigid3d(pycolmap.Rotation3d(), -place))
+    for i in range(1, len(cameras)):
+        for j in range(10):
+            elements = [pycolmap.TrackElement(i, 10 + j), pycolmap.TrackElement(i + 1, j)]
+            model.add_point3D(np.array([0, 0, 5]), pycolmap.Track(elements))
+    given = {key: pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
+    return model, given
+
+
+def names_of(models):
+    return [{model.images[i].name for i in model.reg_image_ids()} for model in models]
+
+
+@pytest.mark.parametrize(
+    ("focal_length", "is_prior", "is_kept"),
+    [
+        (50.0, False, False),
+        (-500.0, False, False),
+        (1e6, False, False),
+        (1500.0, False, True),
+        (1500.0, True, False),
+        (700.0, True, True),
+    ],
+)
+def test_focal_lengths_that_no_lens_has(focal_length, is_prior, is_kept):
+    """Of 500 pixels at first, by EXIF data or guessed."""
+    model, given = chain([1, 2, 3, 4])
+    for camera in given.values():
+        camera.has_prior_focal_length = is_prior
+    model.cameras[4].focal_length = focal_length
+    found, dropped = keep_plausible([model], given)
+    everything = {f"{i}.jpg" for i in range(4)}
+    assert names_of(found) == [everything if is_kept else everything - {"3.jpg"}]
+    assert dropped == ({} if is_kept else {"3.jpg": f"focal length {focal_length:.0f}"})
+
+
+@pytest.mark.parametrize(("distortion", "is_kept"), [(-0.6, True), (4.56, False), (-5.9, False)])
+def test_distortions_that_no_lens_has(distortion, is_kept):
+    """Of photos of a flat wall, each with a camera of its own."""
+    model, given = chain([1, 2, 3, 4])
+    params = [500, 320, 240, distortion]
+    model.cameras[4].model, model.cameras[4].params = "SIMPLE_RADIAL", params
+    _, dropped = keep_plausible([model], given)
+    assert dropped == ({} if is_kept else {"3.jpg": f"distortion {distortion:.1f}"})
+
+
+def test_what_only_an_implausible_image_connects_is_dropped():
+    model, given = chain([1, 2, 3, 4, 5, 6])
+    model.cameras[3].focal_length = 1e6
+    found, dropped = keep_plausible([model], given)
+    assert names_of(found) == [{"3.jpg", "4.jpg", "5.jpg"}] and set(dropped) == {"2.jpg"}
+    model, given = chain([1, 2, 3])
+    model.cameras[2].focal_length = 1e6
+    assert keep_plausible([model], given)[0] == []
+
+
+@pytest.mark.parametrize(
+    ("places", "viewpoints"),
+    [((0, 0.1, 2, 2.05, 2.1), 2), ((0, 0, 0, 0, 0), 1), ((0, 0.1, 2, 2.05, 4), 3)],
+)
+def test_bursts_from_two_viewpoints_are_no_map(places, viewpoints):
+    """Nothing fixes their focal lengths, so that their poses may be wrong by 30 degrees."""
+    model, given = chain([1, 2, 3, 4, 5], places)
+    assert count_viewpoints(model) == viewpoints
+    found, dropped = keep_plausible([model], given)
+    assert bool(found) == (viewpoints >= 3) and not dropped
+
+
+def test_a_camera_of_many_photos_is_known_better_than_by_exif():
+    """As of photos that were cropped and kept their EXIF data."""
+    for cameras, is_kept in (([1, 1, 1, 1], True), ([1, 1, 2, 2], False)):
+        model, given = chain(cameras)
+        for camera in given.values():
+            camera.focal_length, camera.has_prior_focal_length = 200, True
+        found, dropped = keep_plausible([model], given)
+        assert bool(found) == is_kept and bool(dropped) != is_kept
+
+
+def test_no_plausible_image_at_all_is_said():
+    message = registration.nothing(Path("photos"), {"a.jpg": "focal length 12345"})
+    assert (
+        "no lens has" in message
+        and "a.jpg (focal length 12345)" in message
+        and "overlap" not in message
+    )
+
+
+def test_parts_that_do_not_connect():
+    state = {
+        "images": 10,
+        "parts": [["a", "b", "c", "d", "e"], ["f", "g", "h"]],
+        "missing": ["f", "g", "h", "i", "j"],
+        "unmatched": ["j"],
+        "implausible": {},
+        "alike": False,
+    }
+    message = registration.shortfall(Path("x"), **state)
+    assert "Only 5 of 10 photos" in message and "f, g, h, i, j." in message
+    assert "2 parts that do not connect, of 5 and 3 photos" in message
+    assert "the second has f, g, h." in message and "between the parts" in message
+    assert "matches j." in message and "--camera_mode" not in message
+    state |= {"implausible": {"i": "distortion 4.6"}, "alike": True}
+    message = registration.shortfall(Path("x"), **state)
+    assert "no lens has" in message and "i (distortion 4.6)." in message
+    assert "--camera_mode single, if one camera" in message
