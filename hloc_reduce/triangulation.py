@@ -93,20 +93,14 @@ def main(
     with replacing_map(sfm_dir, made_from, reference_model) as building:
         database = building / "database.db"
         colmap.write_reference(database, reference)
-        names = [image.name for image in reference.images.values()]
         _check_sizes(reference, features)
+        names = [image.name for image in reference.images.values()]
         keypoints, uncertainty, found = read_matches(
             names, pairs, features, matches, min_match_score
         )
-        verified: Verified
-        if skip_geometric_verification:
-            verified = {pair: (indices, indices) for pair, indices in found.items()}
-        elif estimate_two_view_geometries:
-            verified = {pair: (indices, None) for pair, indices in found.items()}
-        else:
-            verified = _verify_by_poses(reference, keypoints, uncertainty, found)
+        verified = _verify(verification, reference, keypoints, uncertainty, found)
         colmap.write_matches(database, keypoints, verified)
-        if estimate_two_view_geometries and not skip_geometric_verification:
+        if any(part is None for _, part in verified.values()):
             colmap.verify_matches(database, pairs, verbose)
         logger.info("Triangulating...")
         reconstruction = colmap.triangulate_points(
@@ -118,13 +112,17 @@ def main(
                 "Do the poses belong to these images, of this size, and do the pairs overlap?"
             )
     logger.info("The map %s:\n%s", sfm_dir, reconstruction.summary())
+    _warn_of_images_without_points(reconstruction)
+    return reconstruction
+
+
+def _warn_of_images_without_points(reconstruction: pycolmap.Reconstruction) -> None:
     images = reconstruction.images.values()
     if alone := sorted(image.name for image in images if image.num_points3D == 0):
         logger.warning(
             "%d of %d photos have no point in the map, so no query is localized with them: %s.",
             *(len(alone), len(images), cli.some(alone)),
         )
-    return reconstruction
 
 
 @contextmanager
@@ -226,6 +224,21 @@ def _check_sizes(reference: pycolmap.Reconstruction, features: Path) -> None:
             "that the model was made from, or resize its cameras.",
             *(len(wrong), len(reference.images), cli.some(wrong, 3)),
         )
+
+
+def _verify(
+    verification: dict,
+    reference: pycolmap.Reconstruction,
+    keypoints: dict[str, np.ndarray],
+    uncertainty: dict[str, float],
+    matches: dict[Pair, np.ndarray],
+) -> Verified:
+    """Return for each pair all matches and the verified ones, as the arguments of `main` ask."""
+    if verification["skip_geometric_verification"]:
+        return {pair: (indices, indices) for pair, indices in matches.items()}
+    if verification["estimate_two_view_geometries"]:
+        return {pair: (indices, None) for pair, indices in matches.items()}
+    return _verify_by_poses(reference, keypoints, uncertainty, matches)
 
 
 def _verify_by_poses(

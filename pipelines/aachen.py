@@ -15,7 +15,7 @@ from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.paths import strings_as_paths
 
 from . import options
-from .run import DatasetRun, Settings
+from .dataset import DatasetRun, Settings
 
 NUMBERS = {"num_covis": 20, "num_loc": 50}
 Place = Aachen

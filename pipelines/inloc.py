@@ -15,7 +15,7 @@ from hloc_reduce.utils import cli
 from hloc_reduce.utils.paths import strings_as_paths
 
 from . import options
-from .run import SHARED_POINTS, DatasetRun, Settings
+from .dataset import SHARED_POINTS, DatasetRun, Settings
 
 NUMBERS = {"num_loc": 40}
 Place = InLoc

@@ -83,9 +83,7 @@ def open_map(
         raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
     mode = colmap.camera_mode(camera_mode or "auto")
     if map_images is not None:
-        if model_or_map is not None and (
-            maps.is_map(model_or_map) or maps.is_compact(model_or_map)
-        ):
+        if model_or_map and (maps.is_map(model_or_map) or maps.is_compact(model_or_map)):
             raise InputError(
                 f"--map {model_or_map} is a map that was built: leave out --map_images to localize "
                 "in it, or give the COLMAP model that it was built from."
@@ -106,12 +104,7 @@ def open_map(
         )
     if model_or_map is None:
         raise InputError("Give --map_images, the folder of the photos to build a map of.")
-    if any(model_or_map.glob("cameras.*")):
-        raise InputError(f"{model_or_map} is a COLMAP model: give its photos, --map_images, too.")
-    if maps.is_compact(model_or_map):
-        built = maps.unpack(model_or_map, outputs / "map", overwrite)
-    else:
-        built = Map(model_or_map)
+    built = _open(model_or_map, outputs / "map", overwrite)
     contradictions.warn(built.contradicting)
     if feature or projection:
         built.check_feature(feature or features_confs.RECOMMENDED, projection)
@@ -122,6 +115,15 @@ def open_map(
                 f"The map {model_or_map} was built with --{option} {getattr(built, option)}."
             )
     return built
+
+
+def _open(model_or_map: Path, folder: Path, overwrite: bool) -> Map:
+    """Open a map that was built before; unpack a compact one into a folder."""
+    if any(model_or_map.glob("cameras.*")):
+        raise InputError(f"{model_or_map} is a COLMAP model: give its photos, --map_images, too.")
+    if maps.is_compact(model_or_map):
+        return maps.unpack(model_or_map, folder, overwrite)
+    return Map(model_or_map)
 
 
 @strings_as_paths
@@ -159,12 +161,7 @@ def main(
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
     photos = Photos(outputs / MADE_FROM, built, query_images, names)
-    conf = {
-        "map": built.place,
-        "query_images": str(query_images.resolve()),
-        "queries": str((queries or outputs / LISTED).resolve()),
-        "num_loc": num_loc,
-    }
+    conf = {"map": built.place, **_queries_of(outputs, query_images, queries), "num_loc": num_loc}
     inputs = [query_images, *([queries] if queries else [])]
     folder = RunFolder(outputs, conf, overwrite, inputs, stale=bool(photos.changed))
     with Run(folder, built.feature, built.matcher) as run:
@@ -194,23 +191,23 @@ def main(
                     built.conf, query_images, loc_pairs, features, built.features
                 ),
             )
+        limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
         summary = {
             "retrieval": "vlad",
-            "map": str(built.folder),
             "num_loc": num_loc,
+            "intrinsics": Counter(wanted.sources.values()),
+            "map": str(built.folder),
             "map_images": built.num_images,
             "map_points3D": built.num_points3D,
-            "intrinsics": Counter(wanted.sources.values()),
         }
-        limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
         files = {
             "query_images": query_images,
-            "map_images": built.images,
-            "map_features": built.features,
-            "map": built.sfm,
             "pairs": loc_pairs,
             "matches": matches,
             "ground_truth": ground_truth,
+            "map_images": built.images,
+            "map_features": built.features,
+            "map": built.sfm,
         }
         return run.finish(summary, wanted.lists, records, truth, limits, features, poses, files)
 
@@ -244,12 +241,17 @@ def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> P
     name = re.sub(NOT_IN_NAMES, "_", (queries or query_images.resolve()).stem).strip("._-")
     folder = outputs / f"queries-{name or 'all'}"
     before = provenance.read(folder / "conf.json")
-    own = {"query_images": str(query_images.resolve())}
-    own["queries"] = str((queries or folder / LISTED).resolve())
+    own = _queries_of(folder, query_images, queries)
     if any(before.get(key, value) != value for key, value in own.items()):
         where = f"{own['query_images']}\n{queries and own['queries']}"
         folder = folder.with_name(f"{folder.name}-{hashlib.sha256(where.encode()).hexdigest()[:8]}")
     return folder
+
+
+def _queries_of(folder: Path, query_images: Path, queries: Path | None) -> dict[str, str]:
+    """Return the part of the configuration of a folder for results that tells their queries."""
+    listed = queries or folder / LISTED
+    return {"query_images": str(query_images.resolve()), "queries": str(listed.resolve())}
 
 
 def _main() -> None:

@@ -5,11 +5,11 @@ keypoints. Localize in it with pipelines.localize --map FILE, or with Localizer(
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from .. import logger
 from ..aggregate_features import vocabulary_of
@@ -17,6 +17,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..localization import intrinsics
 from ..maps import compact, points
+from ..maps.compact import Source
 from ..maps.map import RETRIEVAL, Map
 from ..pairs_from_retrieval import read_global
 from ..utils import cli, colmap
@@ -77,31 +78,19 @@ def main(
         raise InputError("Give --map, or --sfm, --features and --feature, not both.")
     if map is not None:
         built = Map(map)
-        name, conf, usual = built.feature, built.conf, built.matcher
-        sfm, features, descriptors = built.sfm, built.features, built.descriptors
-        vocabulary, cameras = built.vocabulary, built.cameras
-        model = colmap.read_model(sfm)
+        features, source = built.features, _of_map(built)
+    elif sfm is None or features is None or feature is None:
+        raise InputError("Give --map, or --sfm, --features and --feature.")
     else:
-        if sfm is None or features is None or feature is None:
-            raise InputError("Give --map, or --sfm, --features and --feature.")
-        name, conf = features_confs.get(feature)
-        beside = features.parent / f"{RETRIEVAL['output']}_{features.stem}.h5"
-        descriptors = global_descriptors or beside
-        vocabulary = vocabulary_of(descriptors)
-        model = colmap.read_model(sfm)
-        sizes = {(camera.width, camera.height) for camera in model.cameras.values()}
-        cameras, usual = intrinsics.MapCameras({}, sizes), features_confs.matcher_of(conf)
-    matcher = matcher or MATCHERS.get(usual, usual)
+        source = _of_stages(sfm, features, global_descriptors, feature)
+    matcher = matcher or MATCHERS.get(source.matcher, source.matcher)
     cli.choose("matcher", matcher, matchers_confs.confs)
-    conf = {**conf, "storage": _storage(conf, storage)}
-    everything = points.collect(model, features)
-    dim, levels = everything.descriptors.shape[1], features_confs.levels(conf)
-    known = features_confs.dimension(name) if name in features_confs.confs else None
-    expected = known if levels is None else len(levels)
-    if expected not in (None, dim):
-        raise InputError(f"{features} has {dim} numbers a descriptor, but {name} has {expected}.")
-    rows = read_global(descriptors, everything.names)
-    encode = partial(_encode, everything, model, rows, vocabulary, name, conf, matcher, cameras)
+    conf = {**source.conf, "storage": _storage(source.conf, storage)}
+    source = replace(source, matcher=matcher, conf=conf)
+    everything = points.collect(source.model, features)
+    _check_dim(source, features, everything.descriptors.shape[1])
+    rows = read_global(source.global_descriptors, everything.names)
+    encode = partial(_encode, everything, source, rows)
     if max_mb is None:
         number = len(everything)
         content, parts = encode(number)
@@ -115,6 +104,37 @@ def main(
         ", ".join(f"{part} {size:,}" for part, size in parts.items()),
     )
     return parts
+
+
+def _of_map(built: Map) -> Source:
+    """Return what a map of `pipelines.localize` gives, with its own matcher."""
+    return Source(
+        *(colmap.read_model(built.sfm), built.feature, built.conf, built.matcher),
+        *(built.descriptors, built.vocabulary, built.cameras),
+    )
+
+
+def _of_stages(sfm: Path, features: Path, global_descriptors: Path | None, feature: str) -> Source:
+    """Return what the outputs of stages give, with the matcher of the feature."""
+    name, conf = features_confs.get(feature)
+    beside = features.parent / f"{RETRIEVAL['output']}_{features.stem}.h5"
+    descriptors = global_descriptors or beside
+    vocabulary = vocabulary_of(descriptors)
+    model = colmap.read_model(sfm)
+    sizes = {(camera.width, camera.height) for camera in model.cameras.values()}
+    return Source(
+        *(model, name, conf, features_confs.matcher_of(conf)),
+        *(descriptors, vocabulary, intrinsics.MapCameras({}, sizes)),
+    )
+
+
+def _check_dim(source: Source, features: Path, dim: int) -> None:
+    """Raise an InputError if the descriptors of a file are not those of the feature."""
+    name, levels = source.feature, features_confs.levels(source.conf)
+    known = features_confs.dimension(name) if name in features_confs.confs else None
+    expected = known if levels is None else len(levels)
+    if expected not in (None, dim):
+        raise InputError(f"{features} has {dim} numbers a descriptor, but {name} has {expected}.")
 
 
 def _storage(conf: dict, storage: str | None) -> str:
@@ -135,19 +155,11 @@ def _storage(conf: dict, storage: str | None) -> str:
 
 
 def _encode(
-    everything: points.Points,
-    model: pycolmap.Reconstruction,
-    rows: np.ndarray,
-    vocabulary: Path,
-    name: str,
-    conf: dict,
-    matcher: str,
-    cameras: intrinsics.MapCameras,
-    number: int,
+    everything: points.Points, source: Source, rows: np.ndarray, number: int
 ) -> tuple[bytes, dict[str, int]]:
     """Encode the points that images need most."""
     chosen = everything.only(points.select(everything, number))
-    return compact.encode(chosen, model, rows, vocabulary, name, conf, matcher, cameras)
+    return compact.encode(chosen, source, rows)
 
 
 def _fit(

@@ -96,19 +96,14 @@ def main(
     _check_names(names)
     has_points = reference is not None and reference.num_points3D() > 0
     exhaustive = not has_points and len(names) <= MAX_EXHAUSTIVE
-    made_by = extract_features.provenance(conf)
     if overwrite or not (map_dir / "conf.json").exists():
         extract_features.check_model(conf)
-    files = {f"images/{name}": image_dir / name for name in names}
-    files |= {f"model/{path.name}": path for path in _files_of(model)}
-    fingerprints = provenance.fingerprints(files, provenance.read(map_dir / FINGERPRINTS))
-    digests = {name: digest for name, (_, _, digest) in fingerprints.items()}
+    fingerprints, digests = _digests(map_dir, image_dir, names, model)
     made_from = {
-        "feature": made_by,
+        "feature": extract_features.provenance(conf),
         "matcher": matchers_confs.confs[matcher]["model"],
         "num_covis": num_covis,
-        "images": {name: digests[f"images/{name}"] for name in names},
-        "model": {path.name: digests[f"model/{path.name}"] for path in _files_of(model)},
+        **digests,
     }
     if exhaustive:
         made_from |= {"num_covis": None, "pairs": "exhaustive"}
@@ -169,6 +164,22 @@ def _check_names(names: list[str]) -> None:
                 f"{other} and {name} have the same name in match files, which replace / by -: "
                 "rename one of them."
             )
+
+
+def _digests(
+    map_dir: Path, image_dir: Path, names: list[str], model: Path | None
+) -> tuple[dict, dict[str, dict[str, str]]]:
+    """Return the fingerprints of a map's images and model, and the digests of both by name."""
+    groups = {
+        "images": {name: image_dir / name for name in names},
+        "model": {path.name: path for path in _files_of(model)},
+    }
+    files = {f"{key}/{name}": file for key, part in groups.items() for name, file in part.items()}
+    fingerprints = provenance.fingerprints(files, provenance.read(map_dir / FINGERPRINTS))
+    return fingerprints, {
+        key: {name: fingerprints[f"{key}/{name}"][2] for name in part}
+        for key, part in groups.items()
+    }
 
 
 def _files_of(model: Path | None) -> list[Path]:

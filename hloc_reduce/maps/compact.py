@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -49,96 +50,123 @@ def hadamard(rows: np.ndarray, number: int) -> np.ndarray:
     return values.reshape(len(rows), size)
 
 
+@dataclass(frozen=True)
+class Source:
+    """What a compact map is made from, apart from its points.
+
+    Args:
+        model: the COLMAP model that the points are from.
+        feature: name of the feature.
+        conf: its configuration, whose storage is that of the points' descriptors.
+        matcher: a key of `confs.matchers`.
+        global_descriptors: h5 file of the images' global descriptors.
+        vocabulary: of these.
+        cameras: what the map tells about the intrinsics of other photos.
+    """
+
+    model: pycolmap.Reconstruction
+    feature: str
+    conf: dict
+    matcher: str
+    global_descriptors: Path
+    vocabulary: Path
+    cameras: intrinsics.MapCameras
+
+
 def encode(
-    points: Points,
-    sfm: pycolmap.Reconstruction,
-    global_descriptors: np.ndarray,
-    vocabulary: Path,
-    feature: str,
-    conf: dict,
-    matcher: str,
-    cameras: intrinsics.MapCameras,
+    points: Points, source: Source, global_descriptors: np.ndarray
 ) -> tuple[bytes, dict[str, int]]:
     """Return the content of a compact map, the same for the same arguments.
 
     Args:
         points: that it has.
-        sfm: the model that they are from.
-        global_descriptors: (I, G) of its images.
-        vocabulary: of these.
-        feature: name of the feature.
-        conf: its configuration, whose storage is that of the points' descriptors.
-        matcher: a key of `confs.matchers`.
-        cameras: what the map tells about the intrinsics of other photos.
+        source: what it is made from.
+        global_descriptors: (I, G) of the images of the points.
 
     Returns:
         The content, and the number of bytes of each part.
     """
     from safetensors.numpy import save
 
-    from ..aggregators.vlad import VOCABULARY, read_vocabulary
-
-    storage = conf.get("storage", STORAGES[0])
-    _check_model(conf["model"], feature)
+    _check_model(source.conf["model"], source.feature)
     points = points.sorted()
-    images = {image.name: image for image in sfm.images.values()}
-    shown = [images[name] for name in points.names]
-    ids = sorted({image.camera_id for image in shown})
-    packed, least, step, bits = points_of_map.quantize(
-        points.xyz, points_of_map.precision(points, sfm)
-    )
-    visible, kind = points_of_map.pack_visible(points.visible, len(points))
-    levels = features_confs.levels(conf)
-    stored, attrs = store({"descriptors": points.descriptors.T}, storage, levels)
-    key = QUANTIZED.get(storage, "descriptors")
-    size = global_descriptors.shape[1]
-    signs = hadamard(global_descriptors, size)[:, :SIGNS] > 0
-    poses = [image.cam_from_world() for image in shown]
-    tensors: dict[str, np.ndarray] = {
-        "names": np.frombuffer("\n".join(points.names).encode(), np.uint8),
-        "rotations": np.array([pose.rotation.quat for pose in poses], np.float32),
-        "translations": np.array([pose.translation for pose in poses]),
-        "camera_of_image": np.array([ids.index(image.camera_id) for image in shown], np.uint32),
-        "coordinates": packed,
-        "descriptors": stored[key],
-        "num_visible": np.array([len(part) for part in points.visible], np.uint32),
-        "visible": visible,
-        "retrieval": np.packbits(signs, axis=1, bitorder="little"),
-    }
-    if levels is not None:
-        tensors["levels"] = attrs[key]["levels"]
-    if file_sha256(vocabulary) != file_sha256(VOCABULARY):
-        tensors["vocabulary"] = read_vocabulary(vocabulary).numpy().astype(np.float16)
-    metadata = {
+    tensors: dict[str, np.ndarray] = {}
+    metadata: dict[str, Any] = {
         "version": VERSION,
-        "feature": feature,
-        "conf": {key: conf[key] for key in ("model", "preprocessing")},
-        "storage": storage,
-        "scale": [float(value) for value in attrs.get(key, {}).values()] if levels is None else [],
-        "matcher": matcher,
-        "points": len(points),
-        "least": least.tolist(),
-        "step": step,
-        "bits": bits,
-        "visible": kind,
-        "signs": signs.shape[1],
-        "cameras": [intrinsics.to_list(sfm.cameras[i]) for i in ids],
-        "known": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
-        "sizes": sorted(cameras.sizes),
-        "models": sorted(cameras.models),
+        "feature": source.feature,
+        "conf": {key: source.conf[key] for key in ("model", "preprocessing")},
+        "matcher": source.matcher,
+        "known": {name: intrinsics.to_list(one) for name, one in source.cameras.known.items()},
+        "sizes": sorted(source.cameras.sizes),
+        "models": sorted(source.cameras.models),
     }
-    if projection := conf["model"].get("projection"):
-        file, prefix = projections.find(projection), projections.split_prefix(projection)[1]
-        metadata["projection_sha256"] = file_sha256(file)
-        name = file.stem + (prefix and f"@{prefix}")
-        metadata["projection_suffix"] = file.suffix
-        shipped = file.stem in projections.names() and projections.checksum(file.stem)
-        if shipped != metadata["projection_sha256"]:
-            tensors["projection"] = np.frombuffer(file.read_bytes(), np.uint8)
-        metadata["conf"]["model"] = {**conf["model"], "projection": name}
+    for add in (_add_images, _add_points, _add_descriptors, _add_vocabulary, _add_projection):
+        add(tensors, metadata, points, source)
+    signs = hadamard(global_descriptors, global_descriptors.shape[1])[:, :SIGNS] > 0
+    tensors["retrieval"] = np.packbits(signs, axis=1, bitorder="little")
+    metadata["signs"] = signs.shape[1]
     content = save(tensors, {"map": json.dumps(metadata, sort_keys=True)})
     parts = {name: tensor.nbytes for name, tensor in tensors.items()}
     return content, parts | {"header": len(content) - sum(parts.values())}
+
+
+def _add_images(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
+    images = {image.name: image for image in source.model.images.values()}
+    shown = [images[name] for name in points.names]
+    ids = sorted({image.camera_id for image in shown})
+    poses = [image.cam_from_world() for image in shown]
+    tensors["names"] = np.frombuffer("\n".join(points.names).encode(), np.uint8)
+    tensors["rotations"] = np.array([pose.rotation.quat for pose in poses], np.float32)
+    tensors["translations"] = np.array([pose.translation for pose in poses])
+    numbers = [ids.index(image.camera_id) for image in shown]
+    tensors["camera_of_image"] = np.array(numbers, np.uint32)
+    metadata["cameras"] = [intrinsics.to_list(source.model.cameras[i]) for i in ids]
+
+
+def _add_points(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
+    packed, least, step, bits = points_of_map.quantize(
+        points.xyz, points_of_map.precision(points, source.model)
+    )
+    visible, kind = points_of_map.pack_visible(points.visible, len(points))
+    tensors["coordinates"], tensors["visible"] = packed, visible
+    tensors["num_visible"] = np.array([len(part) for part in points.visible], np.uint32)
+    metadata |= {"points": len(points), "least": least.tolist(), "step": step}
+    metadata |= {"bits": bits, "visible": kind}
+
+
+def _add_descriptors(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
+    storage = source.conf.get("storage", STORAGES[0])
+    levels = features_confs.levels(source.conf)
+    stored, attrs = store({"descriptors": points.descriptors.T}, storage, levels)
+    key = QUANTIZED.get(storage, "descriptors")
+    tensors["descriptors"] = stored[key]
+    if levels is not None:
+        tensors["levels"] = attrs[key]["levels"]
+    scale = [] if levels is not None else [float(value) for value in attrs.get(key, {}).values()]
+    metadata |= {"storage": storage, "scale": scale}
+
+
+def _add_vocabulary(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
+    """Add the vocabulary unless it is the one that ships."""
+    from ..aggregators.vlad import VOCABULARY, read_vocabulary
+
+    if file_sha256(source.vocabulary) != file_sha256(VOCABULARY):
+        tensors["vocabulary"] = read_vocabulary(source.vocabulary).numpy().astype(np.float16)
+
+
+def _add_projection(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
+    """Name the projection, if any, and add it unless it is one that ships."""
+    projection = source.conf["model"].get("projection")
+    if not projection:
+        return
+    file, prefix = projections.find(projection), projections.split_prefix(projection)[1]
+    metadata["projection_sha256"] = file_sha256(file)
+    metadata["projection_suffix"] = file.suffix
+    shipped = file.stem in projections.names() and projections.checksum(file.stem)
+    if shipped != metadata["projection_sha256"]:
+        tensors["projection"] = np.frombuffer(file.read_bytes(), np.uint8)
+    name = file.stem + (prefix and f"@{prefix}")
+    metadata["conf"]["model"] = {**source.conf["model"], "projection": name}
 
 
 class CompactMap:

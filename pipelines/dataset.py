@@ -1,0 +1,216 @@
+"""A run of the pipeline of a data set: its inputs, and the stages that its pipelines share."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TypedDict
+
+from hloc_reduce import extract_features
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.datasets import true_poses
+from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.datasets.inloc import InLoc
+from hloc_reduce.detectors.dog import KEYPOINTS
+from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.localization.mirrored import MirrorImages
+from hloc_reduce.runtime import provenance
+from hloc_reduce.runtime.executors import SERIAL, Executor
+from hloc_reduce.runtime.outputs import RunFolder
+from hloc_reduce.utils.codes import STORAGES
+from hloc_reduce.utils.h5 import get_text, open_h5
+from hloc_reduce.utils.paths import strings_as_paths
+
+from .retrieval import check_retrieval, retrieval_name, retrieve
+from .run import Run, Thresholds, check_queries, readable, relative
+
+SHARED_POINTS = "points3D.h5"  # beside given features of InLoc: the 3D points of their keypoints
+
+
+class Settings(TypedDict, total=False):
+    """The arguments that pipelines of data sets hand on to `DatasetRun`, which explains them."""
+
+    matcher: str
+    retrieval: str
+    ground_truth: Path | None
+    overwrite: bool
+    projection: Path | None
+    storage: str
+    keypoints: str
+    executor: Executor
+    strict: bool
+    accept_partial: bool
+    gate: Gate
+
+
+class DatasetRun(Run):
+    """A run of the pipeline of a data set. All inputs are checked before any work is done.
+
+    Args:
+        place: the data set.
+        outputs: folder for the results.
+        feature: name of a feature, or its YAML file.
+        num_loc: retrieved map images per query.
+        numbers: further --num_... options of the pipeline.
+        matcher: name of the matcher.
+        retrieval: "vlad", or a file of pairs or of global descriptors.
+        ground_truth: true poses of the queries; default: those of the data set.
+        overwrite: recompute existing results.
+        projection: projection file to use with the base descriptor of `feature`.
+        storage: how descriptors of map images are stored.
+        keypoints: settings of the DoG detector.
+        executor: where the work is done.
+        features: feature file to use instead of extracting features.
+        strict: stop at an unreadable query photo instead of recording it as not localized.
+        accept_partial: build the map without photos that are missing or unreadable.
+        gate: what a pose must have for the query to be called localized.
+
+    Attributes:
+        query_names: the queries.
+        map_names: the map images that are needed; after `extract_features` the readable ones.
+        features: the feature file, after `extract_features`.
+        label: names files of results, such as `sift_sv64+NN-ratio_vlad50`.
+
+    Raises:
+        InputError: when something is missing or wrong.
+    """
+
+    @strings_as_paths
+    def __init__(
+        self,
+        place: Aachen | InLoc,
+        outputs: Path,
+        feature: str = features_confs.RECOMMENDED,
+        num_loc: int = 50,
+        numbers: Mapping[str, int] | None = None,
+        matcher: str | None = None,
+        retrieval: str = "vlad",
+        ground_truth: Path | None = None,
+        overwrite: bool = False,
+        projection: Path | None = None,
+        storage: str = STORAGES[0],
+        keypoints: str = KEYPOINTS[0],
+        executor: Executor = SERIAL,
+        features: Path | None = None,
+        strict: bool = False,
+        accept_partial: bool = False,
+        gate: Gate = DEFAULT_GATE,
+    ):
+        feature, self._conf = features_confs.get(feature, projection, storage, keypoints)
+        matcher = matcher or features_confs.matcher_of(self._conf)
+        self.place, self._retrieval, self.gate = place, retrieval, gate
+        self._strict, self._accept_partial = strict, accept_partial
+        self.numbers = {**(numbers or {}), "num_loc": num_loc}
+        retrieved = f"{retrieval_name(retrieval)}{num_loc}"
+        self.label = f"{feature}+{matcher}_{retrieved}"
+        self._pairs = outputs / f"pairs-query-{retrieved}.txt"
+        self.query_names, map_names = place.query_names(), place.map_names()
+        used = check_retrieval(retrieval, self._pairs, num_loc, self.query_names, map_names)
+        needed = map_names if place.whole_map else used
+        place.check([] if accept_partial and place.whole_map else needed)
+        self.map_names = extract_features.keep_present(place.images, needed, accept_partial)
+        self.is_partial = len(self.map_names) < len(needed)
+        if features is None:
+            check_queries(place.images, self.query_names, strict)
+        self.truth_file = ground_truth or place.ground_truth
+        self.truth = true_poses(self.query_names, self.truth_file, bool(ground_truth))
+        self._given, self.features = features, features or outputs / f"{self._conf['output']}.h5"
+        super().__init__(self._claim(outputs, matcher, overwrite), feature, matcher, executor)
+
+    def _claim(self, outputs: Path, matcher: str, overwrite: bool) -> RunFolder:
+        """Claim the outputs folder. Results of given features are stale if these were redone."""
+        conf = {
+            "dataset": str(self.place.root.resolve()),
+            "feature": extract_features.provenance(self._conf),
+            "matcher": matchers_confs.confs[matcher]["model"],
+            "retrieval": self._retrieval,
+            **self.numbers,
+        }
+        inputs = [] if self._retrieval == "vlad" else [Path(self._retrieval)]
+        if inputs and outputs.resolve().parent in inputs[0].resolve().parents:
+            conf["retrieval"] = relative(inputs[0], outputs)  # both may be moved together
+        if self._given is not None:
+            with open_h5(self._given) as file:
+                conf["features"] = get_text(file, "id", str(self._given))
+            before = provenance.read(outputs / "conf.json")
+            redone = before.get("features") not in (None, conf["features"])
+            overwrite |= redone and {**before, "features": conf["features"]} == conf
+        elif overwrite or not (outputs / "conf.json").exists():
+            extract_features.check_model(self._conf)
+        return RunFolder(outputs, conf, overwrite, inputs)
+
+    def extract_features(self) -> Path:
+        """Extract the features of all images, unless they are given."""
+        with self.stage("extract_features"):
+            if self._given is None:
+                extract_features.main(
+                    *(self._conf, self.place.images),
+                    feature_path=self.features,
+                    image_list=[*self.map_names, *self.query_names],
+                    executor=self.executor,
+                    strict=self._strict,
+                    queries=self.query_names,
+                )
+            kept = extract_features.keep_readable(
+                self.features, self.map_names, self._accept_partial
+            )
+            self.is_partial |= len(kept) < len(self.map_names)
+            self.map_names = kept
+        return self.features
+
+    def mirror_images_of_dataset(self) -> MirrorImages:
+        """Return what extracts and matches mirror images of queries, for a localization stage."""
+        images = self.place.images
+        return self.mirror_images(self._conf, images, self._pairs, self.features, self.features)
+
+    def retrieve(self) -> Path:
+        """Write the pairs of the readable queries and map images."""
+        with self.stage("retrieval"):
+            queries = readable(self.features, self.query_names)
+            num_loc = self.numbers["num_loc"]
+            retrieve(self._retrieval, self.features, self._pairs, num_loc, queries, self.map_names)
+        return self._pairs
+
+    def finish_dataset(
+        self,
+        lists: Mapping[str, Iterable[str]],
+        thresholds: Thresholds,
+        records: Mapping[str, dict],
+        poses: Path,
+        matches: Path,
+        built: Path,
+        **more: object,
+    ) -> dict:
+        """Write queries.csv and summary.json.
+
+        Args:
+            lists: the queries of each list.
+            thresholds: the recall thresholds of each list.
+            records: the record of each query.
+            poses: file of the poses.
+            matches: match file of the queries.
+            built: the map, see `finish`.
+            more: further entries of the summary.
+
+        Returns:
+            The summary.
+        """
+        images = self.place.images
+        summary = {
+            "retrieval": self._retrieval,
+            "dataset": str(self.place.root),
+            **self.numbers,
+            "map_images": len(self.map_names),
+            **more,
+        }
+        files = {
+            "query_images": images,
+            "map_images": images,
+            "map_features": self.features,
+            "map": built,
+            "pairs": self._pairs,
+            "matches": matches,
+            "ground_truth": self.truth_file if self.truth else None,
+        }
+        return self.finish(
+            summary, lists, records, self.truth, thresholds, self.features, poses, files
+        )
