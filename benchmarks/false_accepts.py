@@ -9,6 +9,7 @@ out other photos, builds other maps, and draws other photos of other places. Res
 trials.csv, and as a curve to false_accepts.svg; an interrupted run resumes with the next place.
 """
 
+import argparse
 import copy
 import csv
 import os
@@ -21,6 +22,7 @@ import h5py
 import numpy as np
 import pycolmap
 import torch
+from false_accepts_tables import RESHAPED, levels, own_table, plot, table
 
 from hloc_reduce import extract_features, localize_inloc, maps, projections
 from hloc_reduce.confs import features as features_confs
@@ -53,15 +55,12 @@ MAP_FEATURES = {"colmap_sift": "colmap_sift_sv64"}  # of a base; default: the ba
 EVERY = 3
 ALTERED = ("blurred", "mirrored", "black", "noise")
 BLUR = 6.0  # standard deviation in pixels
-RESHAPED = ("cropped", "squeezed")
 CROPPED, SQUEEZED = 0.7, 0.75  # share of width and height, share of the height
 OFF = 1.15  # factor of a wrong focal length
 # a pose is true within metres, or a share of the extent of the cameras, and degrees
 TRUE_METRES, TRUE_EXTENT, TRUE_DEGREES = 0.25, 0.01, 2.0
 # a pose that is not true is near within this share of the scene's depth and these degrees
 NEAR, NEAR_DEGREES = 0.1, 5.0
-LEVELS = (0, 2, 4, 6, 8, 10, 15, 20, 30)
-OLD_GATE = 8  # inliers, whatever the number of matches
 COLUMNS = (
     *("feature", "map", "place", "photo", "kind", "intrinsics", "matches", "inliers", "confidence"),
     *("agreement", "refusal", "position_error", "rotation_error_deg", "outcome"),
@@ -389,117 +388,6 @@ def outcome(
     return {"position_error": distance, "rotation_error_deg": degrees, "outcome": found}
 
 
-def same_place(row: dict, same: list[set[str]]) -> bool:
-    """Tell whether a photo is of the place of the map, or of one that sees it."""
-    return any({row["map"], row["place"]} <= names for names in same)
-
-
-def table(rows: list[dict], same: list[set[str]]) -> str:
-    """Format how many poses are accepted and refused, by feature."""
-    lines = [
-        "| feature | wrong place | accepted | with 8 inliers | highest confidence "
-        "| own, wrong pose | accepted | true pose | refused | lowest confidence |",
-        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
-    ]
-    for feature in dict.fromkeys(row["feature"] for row in rows):
-        of_feature = [row for row in rows if row["feature"] == feature]
-        away = [r for r in of_feature if is_away(r, same)]
-        wrong = [r for r in of_feature if is_plain(r) and r["outcome"] == "wrong"]
-        true = [r for r in of_feature if is_true(r)]
-        lines.append(
-            f"| {feature} | {len(away):,} | {_accepted(away)} | "
-            f"{sum(int(r['inliers']) >= OLD_GATE for r in away)} | "
-            f"{max(float(r['confidence']) for r in away):.1f} | {len(wrong):,} | "
-            f"{_accepted(wrong)} | {len(true):,} | {len(true) - _accepted(true)} | "
-            f"{min(float(r['confidence']) for r in true):.1f} |"
-        )
-    return "\n".join(lines)
-
-
-def own_table(rows: list[dict]) -> str:
-    """Format the outcomes of photos of the place itself."""
-    lines = [
-        "| feature | photo | intrinsics | number | right | near | wrong | true pose refused |",
-        "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: |",
-    ]
-    seen = dict.fromkeys((row["feature"], row["kind"], row["intrinsics"]) for row in rows)
-    for feature, kind, given in seen:
-        if kind not in ("own", "blurred", *RESHAPED):
-            continue
-        part = [
-            r for r in rows if (r["feature"], r["kind"], r["intrinsics"]) == (feature, kind, given)
-        ]
-        found = {
-            outcome: _accepted([row for row in part if row["outcome"] == outcome])
-            for outcome in ("true", "near", "wrong")
-        }
-        refused = sum(row["outcome"] == "true" for row in part) - found["true"]
-        counts = " | ".join(f"{count:,}" for count in (len(part), *found.values(), refused))
-        lines.append(f"| {feature} | {kind} | {given} | {counts} |")
-    return "\n".join(lines)
-
-
-def is_plain(row: dict) -> bool:
-    """Tell whether a photo is of the place, not reshaped, and without a wrong focal length."""
-    return row["kind"] in ("own", "blurred") and row["intrinsics"] != "off"
-
-
-def is_true(row: dict) -> bool:
-    """Tell whether a plain trial found the true pose."""
-    return is_plain(row) and row["outcome"] == "true"
-
-
-def is_away(row: dict, same: list[set[str]]) -> bool:
-    """Tell whether a photo shows nothing of the map, so that every pose is wrong."""
-    if row["kind"] == "other":
-        return not same_place(row, same)
-    return row["kind"] in ("mirrored", "black", "noise")
-
-
-def _accepted(rows: list[dict]) -> int:
-    return sum(not row["refusal"] for row in rows)
-
-
-def levels(rows: list[dict], same: list[set[str]]) -> str:
-    """Format how many poses each --min_confidence accepts and refuses, for all features."""
-    away = np.array([float(r["confidence"]) for r in rows if is_away(r, same)])
-    true = np.array([float(r["confidence"]) for r in rows if is_true(r)])
-    lines = [
-        f"| confidence | false accepts of {len(away):,} | true poses refused of {len(true):,} |",
-        "| ---: | ---: | ---: |",
-    ]
-    for level in LEVELS:
-        lines.append(f"| {level} | {(away > level).sum()} | {(true <= level).sum()} |")
-    return "\n".join(lines)
-
-
-def plot(rows: list[dict], same: list[set[str]], path: Path) -> None:
-    """Draw true accepts against false ones, by confidence and by the number of inliers."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(6, 4))
-    away = [row for row in rows if is_away(row, same)]
-    true = [row for row in rows if is_true(row)]
-    for key, label in (("confidence", "confidence"), ("inliers", "number of inliers")):
-        wrong, right = (np.array([float(row[key]) for row in part]) for part in (away, true))
-        at = np.unique(np.concatenate([wrong, right]))
-        axes.plot(
-            [(wrong >= level).mean() for level in at],
-            [(right >= level).mean() for level in at],
-            label=f"by {label}",
-        )
-    axes.set_xscale("symlog", linthresh=1e-4)
-    axes.set(xlabel="wrong poses accepted", ylabel="true poses accepted", ylim=(0.9, 1.003))
-    axes.legend(loc="lower right")
-    axes.grid(alpha=0.3)
-    figure.tight_layout()
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="svg", metadata={"Date": None})
-
-
 def _main() -> None:
     parser = cli.Parser(
         __doc__,
@@ -537,31 +425,9 @@ def _main() -> None:
     parser.add_argument("--output", type=Path, default=Path("outputs/false_accepts"))
     args = parser.parse_args()
     torch.set_num_threads(1)
-    bases = {base_name(feature.partition(":")[0]) for feature in args.feature}
-    if len(bases) > 1:
-        raise InputError(f"The features have several bases: {', '.join(sorted(bases))}.")
-    options = args.seed, *bases
-    conf = features_confs.get(args.feature[0].partition(":")[0])[1]
-    args.matcher = args.matcher or features_confs.matcher_of(conf)
     output = args.output / f"seed{args.seed}"
-    sources = [(root.name, of_dataset, (root,)) for root in args.dataset]
-    sources += [(name, split, (name, *both)) for name, both in parse_maps(args.map).items()]
-    places = {name: make(*given, output / name, *options) for name, make, given in sources}
-    rows = []
-    for name, place in places.items():
-        others = [other for other in places.values() if other is not place]
-        for feature in args.feature:
-            file = output / name / f"trials_{feature.replace(':', '-')}_{args.matcher}.csv"
-            if not file.exists():
-                found = run(
-                    *(place, others, output / name),
-                    *(feature, args.trials, args.matcher, args.seed),
-                )
-                write_csv(found, file, COLUMNS)
-            with file.open(newline="") as opened:
-                rows += csv.DictReader(opened)
-        print(f"{name}: {len(rows):,} trials", flush=True)
     same = [set(names) for names in args.same]
+    rows = _trials_of_all(args, output)
     write_csv(rows, output / "trials.csv", COLUMNS)
     print(table(sorted(rows, key=lambda row: args.feature.index(row["feature"])), same))
     print()
@@ -569,6 +435,31 @@ def _main() -> None:
     print()
     print(levels(rows, same))
     plot(rows, same, output / "false_accepts.svg")
+
+
+def _trials_of_all(args: argparse.Namespace, output: Path) -> list[dict]:
+    """Try all maps with all features, and return the rows of trials.csv."""
+    bases = {base_name(feature.partition(":")[0]) for feature in args.feature}
+    if len(bases) > 1:
+        raise InputError(f"The features have several bases: {', '.join(sorted(bases))}.")
+    options = args.seed, *bases
+    conf = features_confs.get(args.feature[0].partition(":")[0])[1]
+    matcher = args.matcher or features_confs.matcher_of(conf)
+    sources = [(root.name, of_dataset, (root,)) for root in args.dataset]
+    sources += [(name, split, (name, *both)) for name, both in parse_maps(args.map).items()]
+    places = {name: make(*given, output / name, *options) for name, make, given in sources}
+    rows: list[dict] = []
+    for name, place in places.items():
+        others = [other for other in places.values() if other is not place]
+        for feature in args.feature:
+            file = output / name / f"trials_{feature.replace(':', '-')}_{matcher}.csv"
+            if not file.exists():
+                options = feature, args.trials, matcher, args.seed
+                write_csv(run(place, others, output / name, *options), file, COLUMNS)
+            with file.open(newline="") as opened:
+                rows += csv.DictReader(opened)
+        print(f"{name}: {len(rows):,} trials", flush=True)
+    return rows
 
 
 if __name__ == "__main__":
