@@ -4,9 +4,10 @@ import cv2
 import pytest
 from command import outcome, run
 
-from hloc_reduce import Localizer
+from hloc_reduce import Localizer, extract_features
 from hloc_reduce.localization import mirrored
 from hloc_reduce.localization.records import log_file, read_records
+from hloc_reduce.utils.cli import InputError
 from pipelines import aachen, inloc, localize
 
 MATCHER = "--matcher", "NN-mutual"  # a ratio test would refuse most wrong matches here
@@ -59,6 +60,31 @@ def test_photos_of_ones_own(place, tmp_path, monkeypatch):
     monkeypatch.setattr(mirrored, "DOUBTFUL", (1.0, 0.0))
     pose, info = localizer.localize(new / "right.png")
     assert pose is not None and "mirror_image" in info["seconds"]
+
+
+def test_a_run_that_stops_before_the_mirror_images_resumes(place, tmp_path, monkeypatch):
+    """Its records say localized, but no poses are written."""
+    build, images, outputs = place
+    new = tmp_path / "new"
+    new.mkdir()
+    mirror(new / "mirrored.png", images / "query/day/a.png")
+    extract = extract_features.main
+
+    def stopped(conf, *args, **options):
+        if conf["preprocessing"].get("mirrored"):
+            raise InputError("stopped")
+        return extract(conf, *args, **options)
+
+    command = localize, *build, *MATCHER, "--query_images", new
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(extract_features, "main", stopped)
+        run(monkeypatch, *command)
+    results = outputs / "queries-new"
+    (records,) = results.glob("*_logs.jsonl")
+    assert read_records(records)["mirrored.png"]["localized"]
+    assert not list(results.glob("poses_*.txt")) and not (results / "summary.json").exists()
+    run(monkeypatch, *command)
+    assert outcome(results)[1]["mirrored.png"]["reason"].startswith("it is mirrored")
 
 
 def test_aachen(aachen_layout, tmp_path, monkeypatch):
