@@ -139,7 +139,7 @@ def estimate(
     others = np.flatnonzero(~best.inliers)
     if len(others) >= RIVAL * best.num_inliers > 0:
         poses.append(_estimate(matches, others))
-    return replace(best, refusal=_refusal(matches, best, poses, gate) or doubt)
+    return replace(best, refusal=_refusal(matches, best, poses, gate, doubt))
 
 
 def _quality(pose: Pose) -> tuple[float, int]:
@@ -277,8 +277,10 @@ def _choose(
     )
 
 
-def _refusal(matches: _Matches, pose: Pose, others: list[Pose], gate: Gate) -> str | None:
-    """Return why a pose is not trusted in view of other poses, None if it is."""
+def _refusal(
+    matches: _Matches, pose: Pose, others: list[Pose], gate: Gate, doubt: str | None
+) -> str | None:
+    """Return why a pose is not trusted in view of other poses and of `doubt`, None if it is."""
     number, listed = pose.num_inliers, matches.camera.mean_focal_length()
     relative = listed / max(matches.camera.width, matches.camera.height)
     if not (matches.is_focal_length_free or LISTED[0] <= relative <= LISTED[1]):
@@ -297,7 +299,7 @@ def _refusal(matches: _Matches, pose: Pose, others: list[Pose], gate: Gate) -> s
         return f"no plausible focal length: {found}, {low:.0f} to {high:.0f} were expected"
     if _is_swapped(matches.camera):
         return "the x and y of its listed principal point are swapped"
-    if reason := _imprecision(matches, pose, pose.cam_from_world):
+    if reason := doubt or _imprecision(matches, pose, pose.cam_from_world):
         return reason
     least = gate.least_agreement(pose.confidence)
     if pose.agreement < least:

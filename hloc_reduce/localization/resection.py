@@ -26,6 +26,9 @@ FAR = 1e6  # pixels
 # The search for all parameters: in a sample of SAMPLE matches with errors up to NEAR thresholds, it
 # starts with principal points in the middle and CORNER of width and height away from it.
 SAMPLE, NEAR, CORNER = 400, 5, 0.4
+SEARCHES, GAIN = 3, 1.01  # each from the result of the one before, while the score grows
+# of the linear start: six matches of a sample determine a projection
+SIX, TRIALS, SEED = 6, 200, 0
 
 
 class Resection(NamedTuple):
@@ -119,10 +122,40 @@ def resect_anew(
     """Estimate all parameters but the skew as `resect` does, even if the initial ones are far off.
 
     Many parameters have local optima. So this tries several starts: the initial PINHOLE intrinsics,
-    another aspect ratio, and principal points near the corners, with the camera turned accordingly.
+    another aspect ratio, principal points near the corners, with the camera turned accordingly, and
+    the linear solution of `linear`. It does so again from the result, while that gets better.
     """
+
+    def score(found: Resection) -> float:
+        """Return how many matches agree and how well, as MSAC does."""
+        errors, _ = reprojection_errors(
+            found.points2D, points3D, found.cam_from_world, found.camera
+        )
+        return float(np.maximum(0, 1 - (errors / max_error) ** 2).sum())
+
+    best, least, view = None, 0.0, (cam_from_world, camera)
+    for _ in range(SEARCHES):
+        starts = _search(points2D, points3D, *view, max_error)
+        tried = [resect(points2D, points3D, *start, max_error, ALL) for start in starts]
+        found = max((one for one in tried if one is not None), key=score, default=None)
+        if found is None or score(found) <= least:
+            break
+        best, least = found, GAIN * score(found)
+        view = found.cam_from_world, _camera(camera, "PINHOLE", *found.camera.params[:4])
+    return best
+
+
+def _search(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    cam_from_world: pycolmap.Rigid3d,
+    camera: pycolmap.Camera,
+    max_error: float,
+) -> list[tuple[pycolmap.Rigid3d, pycolmap.Camera]]:
+    """Return up to two poses with intrinsics that may be near the best ones, see `resect_anew`."""
     errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
     near = np.flatnonzero(errors <= NEAR * max_error)
+    found = linear(points2D[near], points3D[near], camera, max_error)
     near = near[:: -(-len(near) // SAMPLE) or 1]
     sample, everything = (points2D[near], points3D[near]), np.ones(len(near), bool)
     starts = [(cam_from_world, camera)]
@@ -130,13 +163,96 @@ def resect_anew(
     if stretched := resect(*sample, *starts[0], max_error, ASPECT):
         starts.append((stretched.cam_from_world, stretched.camera))
 
-    def loss(found: Resection) -> float:
-        errors, _ = reprojection_errors(*sample, found.cam_from_world, found.camera)
+    def loss(refined: Resection) -> float:
+        errors, _ = reprojection_errors(*sample, refined.cam_from_world, refined.camera)
         return float(np.log1p((errors / (NOISE * photo_scale(camera))) ** 2).sum())
 
     tried = [resect(*sample, *start, max_error, ALL, everything) for start in starts]
-    best = min((found for found in tried if found is not None), key=loss, default=None)
-    return best and resect(points2D, points3D, *best[:2], max_error, ALL)
+    refined = min((one for one in tried if one is not None), key=loss, default=None)
+    return [start for start in (refined and refined[:2], found) if start is not None]
+
+
+@np.errstate(divide="ignore", invalid="ignore")  # points at infinity are no inliers
+def linear(
+    points2D: np.ndarray, points3D: np.ndarray, camera: pycolmap.Camera, max_error: float
+) -> tuple[pycolmap.Rigid3d, pycolmap.Camera] | None:
+    """Estimate a pose and PINHOLE intrinsics without initial ones, by RANSAC and linear equations.
+
+    Points of a plane do not determine them (Hartley and Zisserman, Multiple View Geometry, 7.1).
+
+    Args:
+        points2D: (M, 2) image points, COLMAP's pixels.
+        points3D: (M, 3) their world points.
+        camera: of the same size.
+        max_error: inlier threshold in pixels.
+
+    Returns:
+        None where no projection is found.
+    """
+    if len(points2D) < 2 * SIX:
+        return None
+    generator, longer = np.random.default_rng(SEED), max(camera.width, camera.height)
+    middle = np.array([camera.width, camera.height]) / 2
+    centre = points3D.mean(axis=0)
+    scale = np.median(np.linalg.norm(points3D - centre, axis=1)) or 1.0
+    image, world = (points2D - middle) / longer, (points3D - centre) / scale
+    world = np.pad(world, ((0, 0), (0, 1)), constant_values=1)
+
+    def inliers(projections: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """Return which chosen matches (N,) agree with projections (..., 3, 4): (..., N) bool."""
+        projected = world[chosen] @ projections.swapaxes(-1, -2)
+        depth = projected[..., 2]
+        depth = depth * np.sign(np.median(depth, axis=-1, keepdims=True))
+        errors = np.linalg.norm(projected[..., :2] / projected[..., 2:] - image[chosen], axis=-1)
+        return (longer * errors <= max_error) & (depth > 0)
+
+    drawn = generator.integers(0, len(image), (TRIALS, SIX))
+    sample = generator.permutation(len(image))[:SAMPLE]
+    projections = _projections(image[drawn], world[drawn])
+    best = projections[inliers(projections, sample).sum(axis=1).argmax()]
+    everything = np.arange(len(image))
+    for _ in range(ROUNDS // 2):
+        agree = inliers(best, everything)
+        if agree.sum() < 2 * SIX:
+            return None
+        best = _projections(image[agree], world[agree])
+    to_pixels = np.array([[longer, 0, middle[0]], [0, longer, middle[1]], [0, 0, 1]])
+    to_world = np.vstack([np.eye(3, 4) / scale, [0, 0, 0, 1]])
+    to_world[:3, 3] = -centre / scale
+    return _decomposed(to_pixels @ best @ to_world, camera)
+
+
+def _projections(image: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """Solve for projections (..., 3, 4) of points (..., N, 4) to image points (..., N, 2)."""
+    nothing = np.zeros_like(world)
+    rows = [
+        np.concatenate([world, nothing, -image[..., :1] * world], axis=-1),
+        np.concatenate([nothing, world, -image[..., 1:] * world], axis=-1),
+    ]
+    equations = np.concatenate(rows, axis=-2)
+    *_, vectors = np.linalg.svd(equations, full_matrices=False)
+    return vectors[..., -1, :].reshape(*image.shape[:-2], 3, 4)
+
+
+def _decomposed(
+    projection: np.ndarray, camera: pycolmap.Camera
+) -> tuple[pycolmap.Rigid3d, pycolmap.Camera] | None:
+    """Split a projection (3, 4) into a pose and PINHOLE intrinsics, without its skew."""
+    from scipy.linalg import rq
+
+    if not np.isfinite(projection).all():
+        return None
+    if np.linalg.det(projection[:, :3]) < 0:
+        projection = -projection
+    calibration, rotation = rq(projection[:, :3])
+    signs = np.diag(np.where(np.diag(calibration) < 0, -1.0, 1.0))
+    calibration, rotation = calibration @ signs, signs @ rotation
+    if not np.diag(calibration).all():
+        return None
+    translation = np.linalg.solve(calibration, projection[:, 3])
+    (fx, _, cx), (_, fy, cy), _ = calibration / calibration[2, 2]
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
+    return pose, _camera(camera, "PINHOLE", fx, fy, cx, cy)
 
 
 def centred(

@@ -15,7 +15,15 @@ from hloc_reduce.localization.confidence import (
     uncertainty,
 )
 from hloc_reduce.localization.intrinsics import REFINEMENTS
-from hloc_reduce.localization.resection import ALL, RADIAL, SKEW, resect, undistort
+from hloc_reduce.localization.resection import (
+    ALL,
+    RADIAL,
+    SKEW,
+    linear,
+    resect,
+    resect_anew,
+    undistort,
+)
 
 TURN = pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04]))  # axis and angle
 POSE = pycolmap.Rigid3d(TURN, [0.3, 0.1, 8.0])
@@ -82,6 +90,40 @@ def test_photos_are_localized_though_cropped_or_stretched(photo, source):
     if found.degrees_of_freedom == ALL:
         expected = camera.calibration_matrix()
         assert np.abs(found.camera.calibration_matrix() - expected).max() < 0.05 * expected[0, 0]
+
+
+@pytest.mark.parametrize("photo", ["whole", "left two thirds", "corner", "squeezed"])
+def test_a_projection_is_found_without_a_start(photo):
+    """Though every fourth match is wrong."""
+    camera = PHOTOS[photo]
+    points2D, points3D = matches(camera, 300, wrong=100)
+    pose, found = linear(points2D, points3D, camera, 12.0)
+    expected = camera.calibration_matrix()
+    assert np.abs(found.calibration_matrix() - expected).max() < 0.05 * expected[0, 0]
+    moved = pose * POSE.inverse()
+    assert np.linalg.norm(moved.translation) < 0.4 and np.degrees(moved.rotation.angle()) < 1
+    assert linear(points2D[:11], points3D[:11], camera, 12.0) is None
+    flat, _ = matches(WHOLE, 300, depth=0)
+    linear(flat, np.zeros((len(flat), 3)), WHOLE, 12.0)  # whatever it finds
+
+
+@pytest.mark.parametrize("wrong", [100, 200, 300])
+def test_wrong_matches_near_a_wrong_start_do_not_keep_it(wrong):
+    """They are nearer to it than the right ones; squeezed photos were localized 17 degrees off."""
+    camera = PHOTOS["squeezed"]
+    points2D, points3D = matches(camera, 300, depth=1, wrong=wrong)
+    right = points2D[:300], points3D[:300]
+    one_focal_length = guessed(camera.width, camera.height)
+    its_matches = absolute_pose._Matches(*right, one_focal_length, REFINEMENTS["guess"])
+    start = absolute_pose._estimate(its_matches, np.arange(300))
+    assert start.num_inliers < 50 and error(start)[1] > 20
+    pinhole = camera_of(1600, 720, start.camera.params[[0, 0, 1, 2]], "PINHOLE")
+    _, near = reprojection_errors(points2D, points3D, start.cam_from_world, pinhole)
+    offsets = np.random.default_rng(1).uniform(-40, 40, (wrong, 2))
+    points2D[300:] = near[300:] + offsets
+    found = resect_anew(points2D, points3D, start.cam_from_world, pinhole, 12.0)
+    assert found.inliers[:300].all()
+    assert np.degrees((found.cam_from_world * POSE.inverse()).rotation.angle()) < 0.5
 
 
 @pytest.mark.parametrize("photo", ["left two thirds", "corner", "squeezed"])
