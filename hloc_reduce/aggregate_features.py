@@ -49,10 +49,10 @@ def main(
         InputError: when there are no features to learn a vocabulary from.
     """
     import torch
-    from safetensors.torch import save
+    from safetensors.numpy import save
 
     from . import aggregators
-    from .aggregators.vlad import read_vocabulary
+    from .light.vlad import read_vocabulary
 
     output = (export_dir or features.parent) / f"{conf['output']}_{features.stem}.h5"
     model = aggregators.load(conf["model"]).eval()

@@ -3,7 +3,6 @@
 import sys
 
 import numpy as np
-import torch
 
 from ..utils.base_model import BaseModel, dynamic_load
 
@@ -16,7 +15,7 @@ class Aggregator(BaseModel):
     """
 
     required_inputs = ("descriptors",)
-    vocabulary: torch.Tensor
+    vocabulary: np.ndarray
 
     def fit(self, descriptors: np.ndarray) -> None:
         """Learn the vocabulary from local descriptors (N, D), N > 0."""

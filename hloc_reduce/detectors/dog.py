@@ -5,10 +5,14 @@ they find too few keypoints to match, so settings that find finer and weaker one
 there are enough.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import cv2
 import numpy as np
 
 from ..utils import colmap
+from ..utils.cli import choose
 
 HLOC = {"first_octave": 0, "peak_threshold": 0.01}
 COLMAP = {"first_octave": -1, "peak_threshold": 0.0067}
@@ -26,8 +30,42 @@ LADDERS = {
     "large": ((0, 0.005), (0, 0.0025), (0, 0.001), (-1, 0.0033)),
 }
 
+# of the extractor `dog`
+CONF = {
+    "options": HLOC,
+    "keypoints": "adaptive",
+    "descriptor": "sift",
+    "max_keypoints": -1,
+    "mr_size": 12,
+}
+
+NOISE = 1.0  # standard deviation of keypoints in pixels, as hloc assumes
+
 BLUR = 4.0  # pixels, standard deviation of the blur that suppresses noise
 LEAST_SIGNAL = 5.0  # minimum contrast after the blur, relative to that of pure noise
+
+
+def detector(conf: dict) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Return what detects keypoints with a configuration like `CONF`, see `detect`.
+
+    Raises:
+        InputError: for unknown options or settings.
+    """
+    name = choose("keypoints", conf["keypoints"], KEYPOINTS)
+    colmap.check_dog_options(conf["options"])
+    own = conf["options"] != HLOC
+    options, adaptive = (conf["options"], False) if own else SETTINGS[name]
+    return partial(detect, options=options, adaptive=adaptive)
+
+
+def strongest(
+    keypoints: np.ndarray, descriptors: np.ndarray, number: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Keep a number of the largest keypoints (N, 4), as COLMAP ranks them; all if negative."""
+    if number < 0:
+        return keypoints, descriptors
+    order = np.argsort(-keypoints[:, 2], kind="stable")[:number]
+    return keypoints[order], descriptors[order]
 
 
 def detect(

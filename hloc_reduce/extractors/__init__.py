@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
@@ -14,7 +13,7 @@ from ..descriptors import DIM
 from ..networks.noise import reduce_noise
 from ..utils.base_model import BaseModel, dynamic_load
 from ..utils.hloc import is_installed
-from ..utils.images import convert, read_image
+from ..utils.images import in_original, resized
 
 # from an image (H, W) float32 in [0, 1] to what `utils.colmap.detect_dog` returns
 Detect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -137,37 +136,9 @@ def load(conf: dict) -> Extractor:
 
 
 def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:
-    """Read an image and resize its longer side to at most `resize_max` pixels.
-
-    With `resize_force` smaller images are enlarged to `resize_max` pixels.
-
-    Args:
-        image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-        preprocessing: `grayscale`, `resize_max`, `resize_force` of a feature's configuration; and
-            `mirrored`, whether to swap left and right.
-
-    Returns:
-        The image (1, C, H, W) float32 in [0, 1], and its original (width, height).
-
-    Raises:
-        InputError: when it cannot be read.
-    """
-    grayscale = preprocessing.get("grayscale", False)
-    pixels = (
-        convert(image, grayscale) if isinstance(image, np.ndarray) else read_image(image, grayscale)
-    )
-    if preprocessing.get("mirrored"):
-        pixels = pixels[:, ::-1]
-    pixels = pixels.astype(np.float32)
-    size = np.array(pixels.shape[1::-1])
-    resize_max = preprocessing.get("resize_max")
-    if resize_max and (size.max() > resize_max or preprocessing.get("resize_force")):
-        # at least one pixel: a panorama may be a thousand times wider than high
-        new_size = np.maximum(1, np.round(size * (resize_max / size.max())).astype(int))
-        smaller = (new_size <= size).all()
-        interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR  # as hloc
-        pixels = cv2.resize(pixels, new_size.tolist(), interpolation=interpolation)
-    pixels = np.atleast_3d(pixels).transpose(2, 0, 1) / 255
+    """Return what `utils.images.resized` does, the image as a tensor (1, C, H, W)."""
+    pixels, size = resized(image, preprocessing)
+    pixels = np.atleast_3d(pixels).transpose(2, 0, 1)
     return torch.from_numpy(np.ascontiguousarray(pixels))[None], size
 
 
@@ -178,8 +149,8 @@ def extract(
 
     Args:
         model: an extractor.
-        image: see `load_image`.
-        preprocessing: see `load_image`.
+        image: see `utils.images.resized`.
+        preprocessing: see `utils.images.resized`.
         device: of the model.
 
     Returns:
@@ -203,8 +174,8 @@ def extract_several(
 
     Args:
         models: extractors with equal `detection`.
-        image: see `load_image`.
-        preprocessing: see `load_image`.
+        image: see `utils.images.resized`.
+        preprocessing: see `utils.images.resized`.
         device: of the models.
         detect: replaces `detect` of the models, for example by a call in another process.
 
@@ -216,7 +187,6 @@ def extract_several(
     detect = detect or models[0].detect
     if detect is not None:
         data["detected"] = detect(pixels[0, 0].numpy())
-    ratio = (size / np.array(pixels.shape[:1:-1])).astype(np.float32)
     described: dict[str, dict] = {}
     extracted = []
     for model in models:
@@ -225,11 +195,6 @@ def extract_several(
             described[base] = model.base(data)
         found = model.reduce(described[base])
         features = {key: value[0].cpu().numpy() for key, value in found.items()}
-        features["keypoints"] = (features["keypoints"] + 0.5) * ratio - 0.5
-        if "scales" in features:
-            features["scales"] = features["scales"] * ratio.mean()
-        features["image_size"] = size
-        features["uncertainty"] = model.detection_noise * ratio.mean()
-        features["blur"] = features.get("blur", 0.0) * ratio.mean()
-        extracted.append(features)
+        shape = tuple(pixels.shape[2:])
+        extracted.append(in_original(features, shape, size, model.detection_noise))
     return extracted

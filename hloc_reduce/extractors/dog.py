@@ -1,7 +1,5 @@
 """DoG keypoints of COLMAP's SIFT, with a base descriptor of the patches around them."""
 
-from functools import partial
-
 import cv2
 import numpy as np
 import torch
@@ -10,7 +8,6 @@ from torch.nn.functional import grid_sample
 from ..descriptors import BASES, COLMAP, PATCH_SIZE
 from ..descriptors.model import Descriptor
 from ..detectors import dog
-from ..utils import colmap
 from ..utils.cli import InputError, choose
 from . import Detect, Extractor
 
@@ -86,23 +83,14 @@ class DoG(Extractor):
     override `keypoints`.
     """
 
-    default_conf = {
-        "options": dog.HLOC,
-        "keypoints": "adaptive",
-        "descriptor": "sift",
-        "max_keypoints": -1,
-        "mr_size": 12,
-    }
+    default_conf = dog.CONF
+    detection_noise = dog.NOISE
     detect: Detect
 
     def _init(self, conf: dict) -> None:
-        name = choose("keypoints", conf["keypoints"], dog.KEYPOINTS)
         descriptor = choose("descriptor", conf["descriptor"], BASES)
         self.describe = None if descriptor == COLMAP else Descriptor(descriptor)
-        colmap.check_dog_options(conf["options"])
-        own = conf["options"] != dog.HLOC
-        options, adaptive = (conf["options"], False) if own else dog.SETTINGS[name]
-        self.detect = partial(dog.detect, options=options, adaptive=adaptive)
+        self.detect = dog.detector(conf)
 
     @property
     def descriptor(self) -> str:
@@ -120,9 +108,7 @@ class DoG(Extractor):
         if image.shape[1] != 1:
             raise InputError("DoG needs grey images: preprocessing: {grayscale: true}.")
         keypoints, descriptors = data.get("detected") or self.detect(image[0, 0].cpu().numpy())
-        if self.conf["max_keypoints"] >= 0:
-            order = np.argsort(-keypoints[:, 2], kind="stable")[: self.conf["max_keypoints"]]
-            keypoints, descriptors = keypoints[order], descriptors[order]
+        keypoints, descriptors = dog.strongest(keypoints, descriptors, self.conf["max_keypoints"])
         if self.describe is None:
             descriptors = torch.from_numpy(descriptors).to(image.device)
         else:

@@ -13,6 +13,9 @@ import pycolmap
 from .. import projections
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..light.projection import Layer
+from ..light.projection import read as read_layers
+from ..light.vlad import VOCABULARY, read_vocabulary
 from ..localization import intrinsics
 from ..utils.cli import InputError, choose
 from ..utils.codes import CODED, FLOATS, QUANTIZED, STORAGES, check_levels, restore, store
@@ -148,10 +151,8 @@ def _add_descriptors(tensors: dict, metadata: dict, points: Points, source: Sour
 
 def _add_vocabulary(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
     """Add the vocabulary unless it is the one that ships."""
-    from ..aggregators.vlad import VOCABULARY, read_vocabulary
-
     if file_sha256(source.vocabulary) != file_sha256(VOCABULARY):
-        tensors["vocabulary"] = read_vocabulary(source.vocabulary).numpy().astype(np.float16)
+        tensors["vocabulary"] = read_vocabulary(source.vocabulary).astype(np.float16)
 
 
 def _add_projection(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
@@ -185,7 +186,7 @@ class CompactMap:
         names: the images, sorted.
         points: (P, 3) float64, coordinates.
         visible: of each image the points that it shows (M,).
-        vocabulary: (W, D) float32 tensor, of the global descriptors.
+        vocabulary: (W, D) float32, of the global descriptors.
         global_descriptors: (I, G) float32 of unit norm.
         dim: dimension of the descriptors.
         projection: content of the file of the projection, None without one.
@@ -303,24 +304,39 @@ class CompactMap:
         self.projection = projections.find(projection).read_bytes()
 
     def _read_retrieval(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
-        import torch
-
-        from ..aggregators.vlad import read_vocabulary
-
         self.vocabulary = read_vocabulary()
         if "vocabulary" in tensors:
             found = _array(tensors, "vocabulary", np.float16, (None, self.dim))
-            self.vocabulary = torch.from_numpy(found.astype(np.float32))
-        number, size = self.vocabulary.numel(), int(metadata["signs"])
+            self.vocabulary = found.astype(np.float32)
+        number, size = self.vocabulary.size, int(metadata["signs"])
         whole = 1 << max(number - 1, 0).bit_length()
         if self.vocabulary.shape[1] != self.dim or not 0 < number <= MAX_GLOBAL:
-            raise ValueError(f"a vocabulary of shape {tuple(self.vocabulary.shape)}")
-        if size != min(SIGNS, whole) or not self.vocabulary.isfinite().all():
+            raise ValueError(f"a vocabulary of shape {self.vocabulary.shape}")
+        if size != min(SIGNS, whole) or not np.isfinite(self.vocabulary).all():
             raise ValueError(f"{size} signs of global descriptors of {number} numbers")
         rows = _array(tensors, "retrieval", np.uint8, (len(self.names), -(-size // 8)))
         signs = 2 * np.unpackbits(rows, axis=1, count=size, bitorder="little") - np.float32(1)
         # the transform multiplies norms by sqrt(whole)
         self.global_descriptors = hadamard(signs, number)[:, :number] / np.sqrt(size * whole)
+
+    @property
+    def is_pickled(self) -> bool:
+        """Whether the projection is in a format that only torch reads."""
+        return self.projection is not None and self._suffix == ".pth"
+
+    def layers(self) -> list[Layer] | None:
+        """Return the layers of the projection, None without one.
+
+        Raises:
+            InputError: when it is broken.
+        """
+        if self.projection is None:
+            return None
+        prefix = projections.split_prefix(self.conf["model"]["projection"])[1]
+        try:
+            return read_layers(self.projection, prefix)
+        except ValueError as error:
+            raise InputError(f"{self.path}: its projection is broken ({error}).") from None
 
     def write_projection(self, folder: Path) -> dict:
         """Write the projection into a folder; return the configuration of the feature with it."""

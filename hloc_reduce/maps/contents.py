@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, Protocol
 
 import numpy as np
-import torch
 
-from .. import extractors
-from ..aggregators.vlad import read_vocabulary
 from ..confs import matchers as matchers_confs
-from ..extractors import Extractor
+from ..light.engine import LightEngine, takes
+from ..light.vlad import read_vocabulary
 from ..localization import intrinsics
 from ..localization.references import Reference, SfmMap
 from ..pairs_from_retrieval import read_global
@@ -24,18 +23,33 @@ from .compact import CompactMap, is_compact
 from .map import Map
 
 
+class Engine(Protocol):
+    """Computes for a map, see `light.engine.LightEngine` and `maps.engine.TorchEngine`."""
+
+    def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
+        """Extract the features of a photo, see `extractors.extract`."""
+
+    def aggregate(self, descriptors: np.ndarray) -> np.ndarray:
+        """Return the global descriptor (1, G) float32 of local ones (N, D) float32."""
+
+    def prepare(self, descriptors: np.ndarray) -> Any:
+        """Return descriptors (N, D) float32 as `match` takes them."""
+
+    def match(self, query: Any, described: Any, shown: np.ndarray) -> np.ndarray:
+        """Match the descriptors of a photo with the rows `shown` of those of a map image."""
+
+
 @dataclass(frozen=True)
 class Contents:
     """A map in memory.
 
     Args:
-        extractor: of its feature.
+        engine: extracts, aggregates and matches features.
         preprocessing: of photos.
         storage: of its descriptors.
         dim: of its descriptors.
         matcher: configuration of the matcher's model.
         cameras: what it tells about the intrinsics of other photos.
-        vocabulary: (W, D) float32, of global descriptors.
         reference: its points.
         names: its images.
         global_descriptors: (I, G) float32 of the images.
@@ -44,13 +58,12 @@ class Contents:
         on_demand: do not keep the descriptors of images in memory.
     """
 
-    extractor: Extractor
+    engine: Engine
     preprocessing: dict
     storage: str
     dim: int
     matcher: dict
     cameras: intrinsics.MapCameras
-    vocabulary: torch.Tensor
     reference: Reference
     names: list[str]
     global_descriptors: np.ndarray
@@ -72,7 +85,11 @@ def read(path: Path) -> Contents:
 
 
 def _of_folder(path: Path) -> Contents:
+    from .. import extractors
+    from .engine import TorchEngine
+
     built = Map(path)
+    matcher = matchers_confs.confs[built.matcher]["model"]
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)
 
@@ -81,13 +98,15 @@ def _of_folder(path: Path) -> Contents:
             return read_descriptors(file, name).restore(unbiased=built.storage not in FLOATS)
 
     return Contents(
-        extractor=extractors.load(built.conf["model"]),
+        engine=TorchEngine(
+            *(extractors.load(built.conf["model"]), matcher),
+            *(read_vocabulary(built.vocabulary), built.storage),
+        ),
         preprocessing=built.conf["preprocessing"],
         storage=built.storage,
         dim=dimension(built.features),
-        matcher=matchers_confs.confs[built.matcher]["model"],
+        matcher=matcher,
         cameras=built.cameras,
-        vocabulary=read_vocabulary(built.vocabulary),
         reference=reference,
         names=names,
         global_descriptors=read_global(built.descriptors, names),
@@ -98,16 +117,14 @@ def _of_folder(path: Path) -> Contents:
 
 def _of_file(path: Path) -> Contents:
     compact = CompactMap(path)
-    with TemporaryDirectory() as folder:
-        extractor = extractors.load(compact.write_projection(Path(folder))["model"])
+    matcher = matchers_confs.confs[compact.matcher]["model"]
     return Contents(
-        extractor=extractor,
+        engine=_light_engine(compact, matcher) or _torch_engine(compact, matcher),
         preprocessing=compact.conf["preprocessing"],
         storage=compact.storage,
         dim=compact.dim,
-        matcher=matchers_confs.confs[compact.matcher]["model"],
+        matcher=matcher,
         cameras=compact.cameras,
-        vocabulary=compact.vocabulary,
         reference=compact,
         names=compact.names,
         global_descriptors=compact.global_descriptors,
@@ -115,3 +132,19 @@ def _of_file(path: Path) -> Contents:
         shown={name: np.arange(len(rows)) for name, rows in compact.visible.items()},
         on_demand=True,
     )
+
+
+def _light_engine(compact: CompactMap, matcher: dict) -> Engine | None:
+    """Return an engine without torch, None if the map's feature or matcher needs torch."""
+    if not takes(compact.conf["model"], matcher) or compact.is_pickled:
+        return None
+    return LightEngine(compact.conf["model"], compact.layers(), matcher, compact.vocabulary)
+
+
+def _torch_engine(compact: CompactMap, matcher: dict) -> Engine:
+    from .. import extractors
+    from .engine import TorchEngine
+
+    with TemporaryDirectory() as folder:
+        extractor = extractors.load(compact.write_projection(Path(folder))["model"])
+    return TorchEngine(extractor, matcher, compact.vocabulary, compact.storage)

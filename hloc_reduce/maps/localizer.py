@@ -5,9 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-import torch
 
-from .. import aggregators, extractors, matchers
 from ..localization import intrinsics, mirrored, query
 from ..localization.confidence import DEFAULT_GATE, Gate
 from ..localization.query import merged
@@ -15,10 +13,9 @@ from ..localize_sfm import RANSAC_THRESH
 from ..pairs_from_retrieval import rank
 from ..runtime import parallel
 from ..utils.cli import InputError
-from ..utils.codes import FLOATS, to_integers
+from ..utils.codes import FLOATS
 from ..utils.feature_files import to_colmap
 from .contents import read
-from .map import RETRIEVAL
 
 
 class Localizer:
@@ -53,28 +50,13 @@ class Localizer:
         self.preprocessing, self.cameras = contents.preprocessing, contents.cameras
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
-        self.matcher = matchers.load(contents.matcher).eval()
         self.gate = gate.of_matches(contents.matcher, contents.dim)
-        self.device = "cuda" if torch.cuda.is_available() else "cpu"
-        coded = contents.storage not in FLOATS and self.matcher.takes_codes
-        # a code is rounded much more than integers are, and they are faster
-        self.as_integers = coded and self.device == "cpu"
-        self.extractor = contents.extractor.eval().to(self.device)
-        self.vlad = aggregators.load(RETRIEVAL["model"]).eval()
-        self.vlad.vocabulary = contents.vocabulary
+        self.engine, self.shown = contents.engine, contents.shown
         self.reference, self.names = contents.reference, contents.names
         self.global_descriptors = contents.global_descriptors
-        self.describe = lambda name: self._to_device(contents.describe(name))
+        self.describe = lambda name: self.engine.prepare(contents.describe(name))
         if not contents.on_demand:
             self.describe = {name: self.describe(name) for name in self.names}.__getitem__
-        self.shown = {
-            name: torch.from_numpy(rows).to(self.device) for name, rows in contents.shown.items()
-        }
-
-    def _to_device(self, descriptors: np.ndarray) -> torch.Tensor:
-        """Return descriptors (N, D) as they are matched."""
-        matched = to_integers(descriptors) if self.as_integers else descriptors
-        return torch.from_numpy(matched).to(self.device)
 
     def localize(
         self, image: Path | str | np.ndarray, camera: pycolmap.Camera | None = None
@@ -138,9 +120,9 @@ class Localizer:
     def _extract(self, image: Path | np.ndarray, flip: bool = False) -> dict:
         """Extract features as a feature file has them: keypoints (N, 2), descriptors (N, D)."""
         preprocessing = {**self.preprocessing, "mirrored": flip}
-        features: dict = extractors.extract(self.extractor, image, preprocessing, self.device)
+        features = self.engine.extract(image, preprocessing)
         rounded = features["descriptors"].T.astype(self.dtype)
-        descriptors = torch.from_numpy(rounded.astype(np.float32, order="C"))
+        descriptors = rounded.astype(np.float32, order="C")
         keypoints = to_colmap(features["keypoints"])
         return {**features, "descriptors": descriptors, "keypoints": keypoints}
 
@@ -161,18 +143,17 @@ class Localizer:
             thorough,
         )
 
-    def _retrieve(self, descriptors: torch.Tensor) -> list[str]:
+    def _retrieve(self, descriptors: np.ndarray) -> list[str]:
         """Return the names of the map images most similar to local descriptors (N, D)."""
-        query = self.vlad({"descriptors": descriptors.T[None]})["global_descriptor"]
-        query = query.half().float().numpy()  # rounded as in the map
+        # rounded as in the map
+        query = self.engine.aggregate(descriptors).astype(np.float16).astype(np.float32)
         return [self.names[j] for j in rank(query, self.global_descriptors, self.num_loc)[0]]
 
-    def _match(self, descriptors: torch.Tensor, names: list[str]) -> dict[str, np.ndarray]:
+    def _match(self, descriptors: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
         """Match descriptors (N, D) with those of map images that show a point."""
-        query = self._to_device(descriptors.numpy())
+        query = self.engine.prepare(descriptors)
 
         def match(name: str) -> np.ndarray:
-            described, shown = self.describe(name), self.shown[name]
-            return self.matcher.match_rows(query, described, shown).cpu().numpy()
+            return self.engine.match(query, self.describe(name), self.shown[name])
 
         return dict(zip(names, parallel.ordered("match", match, names), strict=True))

@@ -50,7 +50,7 @@ def main(path: Path, map_dir: Path, overwrite: bool = False) -> Map:
 
 def _write(compact: CompactMap, folder: Path, digest: str) -> None:
     """Write the files of a map."""
-    from safetensors.torch import save
+    from safetensors.numpy import save
 
     conf = compact.write_projection(folder)
     model = pycolmap.Reconstruction()

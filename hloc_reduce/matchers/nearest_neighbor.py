@@ -5,8 +5,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch.nn.utils.rnn import pad_sequence
 
-from ..utils import best_two
-from ..utils.codes import UNIT
+from ..light import matching
 from . import GPU_BYTES, Matcher, Tensors
 
 PART_BYTES = 2**19  # of descriptors1 at once: they stay in the cache of a core
@@ -23,7 +22,7 @@ def nearest(
     """Find the nearest descriptor1 of every descriptor0 that passes the tests.
 
     Args:
-        descriptors0: (N, D) of unit norm, or int16 from `utils.codes.to_integers`.
+        descriptors0: (N, D) of unit norm.
         descriptors1: (M, D) like these, M > 0, and M > 1 for a ratio test.
         ratio_threshold: maximum ratio of the distances to the nearest and the second nearest; None
             for no ratio test.
@@ -33,35 +32,16 @@ def nearest(
     Returns:
         Its index (N,) int64, -1 where it does not pass, and its cosine (N,).
     """
-    if descriptors0.dtype == torch.int16:
-        index, cosine, runner_up = _nearest_integers(descriptors0, descriptors1)
-    else:
-        index, cosine, runner_up = _nearest_floats(
-            descriptors0, descriptors1, ratio_threshold is not None, gpu_bytes
-        )
+    index, cosine, runner_up = _best_two(
+        descriptors0, descriptors1, ratio_threshold is not None, gpu_bytes
+    )
     accepted = _is_near(cosine, distance_threshold)
     if ratio_threshold is not None:
         accepted &= _is_distinct(cosine, runner_up, ratio_threshold)
     return torch.where(accepted, index, -1), cosine
 
 
-def _nearest_integers(
-    descriptors0: torch.Tensor, descriptors1: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Find the nearest neighbours of integers (N, D) among (M, D), as `_nearest_floats` does.
-
-    Whether by compiled code or by torch, the products are the same integers.
-    """
-    if best_two.instructions():
-        arrays = best_two.best_two(descriptors0.numpy(), descriptors1.numpy())
-        index, best, second = map(torch.from_numpy, arrays)
-        index = index.long()
-    else:
-        index, best, second = _nearest_floats(descriptors0.float(), descriptors1.float())
-    return index, best.float() / UNIT**2, second.float() / UNIT**2
-
-
-def _nearest_floats(
+def _best_two(
     descriptors0: torch.Tensor,
     descriptors1: torch.Tensor,
     two: bool = True,
@@ -138,8 +118,8 @@ def mutual_nearest(
     """Match descriptors that are each other's nearest and pass the tests of `nearest` both ways.
 
     Args:
-        descriptors0: (N, D), see `nearest`.
-        descriptors1: (M, D), see `nearest`.
+        descriptors0: (N, D) of unit norm, or int16 from `utils.codes.to_integers`.
+        descriptors1: (M, D) like these.
         ratio_threshold: see `nearest`.
         rows: (K,) rows of descriptors0 to match; default: all.
         gpu_bytes: see `nearest`.
@@ -149,6 +129,13 @@ def mutual_nearest(
     Returns:
         For each of the rows the index of its match (K,) int64, or -1, and its cosine (K,).
     """
+    if descriptors0.dtype == torch.int16:
+        numbers = None if rows is None else rows.numpy()
+        arrays = matching.mutual_nearest(
+            *(descriptors0.numpy(), descriptors1.numpy(), ratio_threshold, numbers),
+            *(distance_threshold, mutual),
+        )
+        return torch.from_numpy(arrays[0]), torch.from_numpy(arrays[1])
     chosen = descriptors0 if rows is None else descriptors0[rows]
     if min(len(chosen), len(descriptors1)) == 0:
         unmatched = torch.full((len(chosen),), -1, device=chosen.device)

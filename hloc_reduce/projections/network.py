@@ -10,6 +10,7 @@ from safetensors.torch import save as serialize
 from torch import nn
 
 from ..descriptors import DESCRIPTORS
+from ..light.projection import fold
 from ..utils.cli import InputError
 from ..utils.files import replacing
 from . import released
@@ -49,16 +50,9 @@ class Projection(nn.Module):
         self.sizes = mlp.sizes
         self.metadata = metadata or {}
         self.linears = nn.ModuleList(map(nn.Linear, mlp.sizes[:-1], mlp.sizes[1:]))
-        scale, shift = torch.ones(mlp.sizes[0]), torch.zeros(mlp.sizes[0])
-        for folded, linear, norm in zip(self.linears, mlp.linears, [*mlp.norms, None], strict=True):
-            # fold the normalization before the layer, x * scale + shift, into weight and bias; in
-            # float64, so that their rounding does not depend on the number of threads
-            weight, bias = (part.detach().double() for part in linear.parameters())
-            folded.weight.data = (weight * scale).float()
-            folded.bias.data = (bias + (weight * shift).sum(dim=1)).float()
-            if norm is not None:
-                scale = norm.weight.detach() / (norm.running_var + norm.eps).sqrt()
-                shift = norm.bias.detach() - norm.running_mean * scale
+        state = {key: value.cpu().numpy() for key, value in mlp.state_dict().items()}
+        for linear, (weight, bias) in zip(self.linears, fold(state), strict=True):
+            linear.weight.data, linear.bias.data = torch.from_numpy(weight), torch.from_numpy(bias)
         self.requires_grad_(False).eval()
 
     def cut(self, dim: int) -> "Projection":
@@ -81,10 +75,18 @@ class Projection(nn.Module):
 
     @torch.no_grad()
     def forward(self, descriptors: torch.Tensor) -> torch.Tensor:
-        """Map descriptors (N, 128) of unit norm to (N, dim) of unit norm."""
-        for linear in self.linears[:-1]:
-            descriptors = linear(descriptors).relu_()
-        return nn.functional.normalize(self.linears[-1](descriptors), dim=1)
+        """Map descriptors (N, 128) of unit norm to (N, dim) float32 of unit norm.
+
+        On a CPU it is computed in float64, as by `light.projection`, with which it agrees when both
+        are rounded to float16. Exported graphs are float32.
+        """
+        exact = descriptors.is_cpu and not torch.compiler.is_compiling()
+        values = descriptors.double() if exact else descriptors
+        for i, linear in enumerate(self.linears):
+            values = values.relu_() if i else values
+            layer = (part.to(values) for part in linear.parameters())
+            values = nn.functional.linear(values, *layer)
+        return nn.functional.normalize(values, dim=1).float()
 
 
 def save(

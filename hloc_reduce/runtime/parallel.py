@@ -1,5 +1,7 @@
 """The cores of a machine: each processes an item of its own, in one thread."""
 
+import os
+import sys
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,18 +22,21 @@ _threads = 1  # torch's threads before the first of them
 
 def cores() -> int:
     """Return the number of cores to use: OMP_NUM_THREADS if it is set, else all."""
-    import torch
-
+    torch = sys.modules.get("torch")
+    if torch is None:  # nothing here imports it for this alone
+        return int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
     with _lock:
         return _threads if _running else torch.get_num_threads()
 
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Let torch compute in the calling thread only; such blocks may overlap."""
+    """Let torch, if it is loaded, compute in the calling thread only; such blocks may overlap."""
     global _running, _threads
-    import torch
-
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
     with _lock:
         if not _running:
             _threads = torch.get_num_threads()

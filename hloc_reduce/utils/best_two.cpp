@@ -16,7 +16,7 @@
 #endif
 
 #ifndef __GNUC__
-#error "This needs the vector types of GCC and Clang. Without it, torch computes the same."
+#error "This needs the vector types of GCC and Clang. Without it, NumPy computes the same."
 #endif
 
 namespace {

@@ -1,6 +1,6 @@
 """Images: their names and their pixels."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -71,6 +71,63 @@ def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
     if image.ndim == 3 and grayscale:
         return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 and not grayscale else image
+
+
+def resized(image: Path | np.ndarray, preprocessing: Mapping) -> tuple[np.ndarray, np.ndarray]:
+    """Read an image and resize its longer side to at most `resize_max` pixels.
+
+    With `resize_force` smaller images are enlarged to `resize_max` pixels.
+
+    Args:
+        image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
+        preprocessing: `grayscale`, `resize_max`, `resize_force` of a feature's configuration; and
+            `mirrored`, whether to swap left and right.
+
+    Returns:
+        The image, (H, W) if `grayscale`, else (H, W, 3) RGB, float32 in [0, 1], and its original
+        (width, height).
+
+    Raises:
+        InputError: when it cannot be read.
+    """
+    grayscale = preprocessing.get("grayscale", False)
+    pixels = (
+        convert(image, grayscale) if isinstance(image, np.ndarray) else read_image(image, grayscale)
+    )
+    if preprocessing.get("mirrored"):
+        pixels = pixels[:, ::-1]
+    pixels = pixels.astype(np.float32)
+    size = np.array(pixels.shape[1::-1])
+    resize_max = preprocessing.get("resize_max")
+    if resize_max and (size.max() > resize_max or preprocessing.get("resize_force")):
+        # at least one pixel: a panorama may be a thousand times wider than high
+        new_size = np.maximum(1, np.round(size * (resize_max / size.max())).astype(int))
+        smaller = (new_size <= size).all()
+        interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR  # as hloc
+        pixels = cv2.resize(pixels, new_size.tolist(), interpolation=interpolation)
+    return pixels / 255, size
+
+
+def in_original(features: dict, shape: tuple[int, ...], size: np.ndarray, noise: float) -> dict:
+    """Return the features of a resized image in pixels of the original one.
+
+    Args:
+        features: `keypoints` (N, 2), and perhaps `scales` (N,) and `blur`, in pixels.
+        shape: height and width of the resized image, and perhaps more.
+        size: original (width, height).
+        noise: standard deviation of the keypoints in pixels of the resized image.
+
+    Returns:
+        All features, with `image_size` (2,), `uncertainty` and `blur`, pixels.
+    """
+    ratio = (size / np.array(shape[1::-1])).astype(np.float32)
+    features = {**features, "keypoints": (features["keypoints"] + 0.5) * ratio - 0.5}
+    if "scales" in features:
+        features["scales"] = features["scales"] * ratio.mean()
+    features["image_size"] = size
+    features["uncertainty"] = noise * ratio.mean()
+    features["blur"] = features.get("blur", 0.0) * ratio.mean()
+    return features
 
 
 class UnreadableImage(InputError):

@@ -88,9 +88,9 @@ def integers(descriptors):
     return torch.from_numpy(to_integers(descriptors.numpy()))
 
 
-@pytest.fixture(params=["compiled", "torch"])
+@pytest.fixture(params=["compiled", "numpy"])
 def arithmetic(request, monkeypatch):
-    if request.param == "torch":
+    if request.param == "numpy":
         monkeypatch.setattr(best_two, "instructions", list)
     elif not best_two.instructions():
         pytest.skip("integer matching was not compiled: no C++ compiler?")

@@ -14,7 +14,7 @@ CONF = {"output": "vlad", "model": {"name": "vlad", "num_words": 4, "max_samples
 
 def test_vlad_by_hand():
     model = VLAD({})
-    model.vocabulary = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
+    model.vocabulary = np.float32([[0.0, 0.0], [1.0, 0.0]])
     local = torch.tensor([[0.0, 0.3], [0.0, 0.1], [1.0, 0.2]]).T[None]
     vlad = model({"descriptors": local})["global_descriptor"][0]
     # each word's sum of residuals has length one before the whole has

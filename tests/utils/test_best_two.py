@@ -1,10 +1,9 @@
-"""The best two products of integers: compiled code, torch and the definition agree."""
+"""The best two products of integers: compiled code, NumPy and the definition agree."""
 
 import numpy as np
 import pytest
-import torch
 
-from hloc_reduce.matchers import nearest_neighbor
+from hloc_reduce.light import matching
 from hloc_reduce.utils import best_two
 from hloc_reduce.utils.codes import UNIT, to_integers
 
@@ -54,21 +53,18 @@ def test_each_instruction_set_agrees_with_the_definition(kind, instruction_set):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_torch_agrees_with_the_definition(kind, monkeypatch):
-    """Whatever the machine; in tiles, so that winners of parts are compared, too."""
-    monkeypatch.setattr(best_two, "instructions", list)
-    monkeypatch.setattr(nearest_neighbor, "PART_BYTES", 4 * 16 * 7)
+def test_numpy_agrees_with_the_definition(kind, monkeypatch):
+    """Whatever the machine; in blocks of a few rows."""
+    monkeypatch.setattr(matching, "TILE", 100)
     for number0, number1 in SIZES[1:]:
         for dim in DIMS:
             rows0, rows1 = draw(number0, dim, kind, 0), draw(number1, dim, kind, 1)
-            index, best, second = nearest_neighbor._nearest_integers(
-                torch.from_numpy(rows0), torch.from_numpy(rows1)
-            )
+            index, best, second = matching.best_two_of_blocks(rows0, rows1)
             right = by_definition(rows0, rows1)
             assert index.tolist() == right[0].tolist()
-            assert torch.equal(best, torch.from_numpy(right[1]).float() / UNIT**2)
+            assert best.tolist() == right[1].tolist()
             if number1 > 1:
-                assert torch.equal(second, torch.from_numpy(right[2]).float() / UNIT**2)
+                assert second.tolist() == right[2].tolist()
 
 
 @compiled

@@ -1,0 +1,1 @@
+"""Features, retrieval and matching in NumPy, for machines without torch."""

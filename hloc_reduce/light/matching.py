@@ -1,0 +1,103 @@
+"""Mutual nearest neighbours of descriptors that are rounded to integers."""
+
+import numpy as np
+
+from ..utils import best_two
+from ..utils.codes import UNIT
+
+TILE = 2**20  # products at once
+
+
+def nearest(
+    descriptors0: np.ndarray,
+    descriptors1: np.ndarray,
+    ratio_threshold: float | None,
+    distance_threshold: float | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the nearest descriptor1 of every descriptor0 that passes the tests.
+
+    Args:
+        descriptors0: (N, D) int16 from `utils.codes.to_integers`.
+        descriptors1: (M, D) like these, M > 0, and M > 1 for a ratio test.
+        ratio_threshold: maximum ratio of the distances to the nearest and the second nearest; None
+            for no ratio test.
+        distance_threshold: maximum distance to the nearest; None for any.
+
+    Returns:
+        Its index (N,) int64, -1 where it does not pass, and its cosine (N,) float32.
+    """
+    search = best_two.best_two if best_two.instructions() else best_two_of_blocks
+    index, *products = search(descriptors0, descriptors1)
+    cosine, runner_up = (part.astype(np.float32) / np.float32(UNIT**2) for part in products)
+    # squared distances of unit vectors are 2 - 2 * cosine
+    distance = 1 - cosine
+    accepted = np.ones(len(index), bool)
+    if distance_threshold is not None:
+        accepted = 2 * distance <= distance_threshold**2
+    if ratio_threshold is not None:
+        accepted &= distance <= np.float32(ratio_threshold**2) * (1 - runner_up)
+    return np.where(accepted, index, -1).astype(np.int64), cosine
+
+
+def best_two_of_blocks(
+    descriptors0: np.ndarray, descriptors1: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the best two products as `best_two.best_two` does, where nothing was compiled.
+
+    The products are whole numbers that float32 represents exactly.
+    """
+    number = len(descriptors0)
+    index = np.empty(number, np.int32)
+    best, second = np.empty((2, number), np.float32)
+    others = descriptors1.astype(np.float32).T
+    rows = max(1, TILE // len(descriptors1))
+    for start in range(0, number, rows):
+        chosen = slice(start, start + rows)
+        products = descriptors0[chosen].astype(np.float32) @ others
+        of_block = np.arange(len(products))
+        index[chosen] = winner = products.argmax(axis=1)
+        best[chosen] = products[of_block, winner]
+        products[of_block, winner] = -np.inf
+        second[chosen] = products.max(axis=1)
+    return index, best, second
+
+
+def mutual_nearest(
+    descriptors0: np.ndarray,
+    descriptors1: np.ndarray,
+    ratio_threshold: float | None,
+    rows: np.ndarray | None = None,
+    distance_threshold: float | None = None,
+    mutual: bool = True,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Match descriptors that are each other's nearest and pass the tests of `nearest` both ways.
+
+    Args:
+        descriptors0: (N, D) int16, see `nearest`.
+        descriptors1: (M, D) int16, see `nearest`.
+        ratio_threshold: see `nearest`.
+        rows: (K,) rows of descriptors0 to match; default: all.
+        distance_threshold: see `nearest`.
+        mutual: if False, match each row with its nearest only one way.
+
+    Returns:
+        For each of the rows the index of its match (K,) int64, or -1, and its cosine (K,) float32.
+    """
+    chosen = descriptors0 if rows is None else descriptors0[rows]
+    if min(len(chosen), len(descriptors1)) == 0:
+        return np.full(len(chosen), -1), np.zeros(len(chosen), np.float32)
+    # as in hloc, a lone descriptor on either side has no second nearest and skips the test
+    if min(len(descriptors0), len(descriptors1)) == 1:
+        ratio_threshold = None
+    limits = ratio_threshold, distance_threshold
+    forward, cosine = nearest(chosen, descriptors1, *limits)
+    if not mutual:
+        return forward, cosine
+    # the way back, only for descriptors that are someone's nearest
+    wanted = np.unique(forward[forward >= 0])
+    backward = np.full(len(descriptors1), -1)
+    if len(wanted):
+        backward[wanted], _ = nearest(descriptors1[wanted], descriptors0, *limits)
+    own = np.arange(len(descriptors0)) if rows is None else rows
+    matched = (backward[forward] == own) & (forward >= 0)
+    return np.where(matched, forward, -1), cosine

@@ -1,0 +1,65 @@
+"""VLAD: a global descriptor aggregated from local ones (Jégou et al., CVPR 2010)."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ..utils.cli import InputError
+
+# 64 words of sift_sv64, learned by aggregate_features from south-building
+VOCABULARY = Path(__file__).parent / "vlad_sift_sv64.safetensors"
+LEAST_NORM = 1e-12  # shorter vectors stay as they are
+
+
+def read_vocabulary(path: Path | str | None = None) -> np.ndarray:
+    """Read a vocabulary (words, D) float32 of aggregate_features; default: the shipped one.
+
+    Raises:
+        InputError: when the file is missing or is not a vocabulary.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    path = path or VOCABULARY
+    try:
+        vocabulary = load_file(path)["vocabulary"].astype(np.float32)
+        if vocabulary.ndim != 2 or not len(vocabulary) or not np.isfinite(vocabulary).all():
+            raise ValueError(f"shape {vocabulary.shape}, or not finite")
+        return vocabulary
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise InputError(f"{path} is not a vocabulary ({error}).") from None
+
+
+def aggregate(descriptors: np.ndarray, vocabulary: np.ndarray) -> np.ndarray:
+    """Sum the residuals of local descriptors to the words of a vocabulary.
+
+    The sum of each word is normalized, so that a repeated texture does not outweigh the rest
+    (intra-normalization, Arandjelovic and Zisserman, CVPR 2013), then the whole descriptor. It is
+    computed in float64, so that the result does not depend on the number of threads.
+
+    Args:
+        descriptors: (N, D) float32.
+        vocabulary: (W, D) float32.
+
+    Returns:
+        (W * D,) float32 of unit norm, zero without local descriptors.
+
+    Raises:
+        InputError: when the vocabulary is of descriptors of another dimension.
+    """
+    if descriptors.shape[1] != vocabulary.shape[1]:
+        raise InputError(
+            f"The vocabulary is of {vocabulary.shape[1]}-D descriptors, those of the image are "
+            f"{descriptors.shape[1]}-D."
+        )
+    descriptors, words = descriptors.astype(np.float64), vocabulary.astype(np.float64)
+    nearest = (2 * descriptors @ words.T - (words**2).sum(1)).argmax(axis=1)
+    assigned = (nearest == np.arange(len(words))[:, None]).astype(np.float64)
+    sums = assigned @ descriptors - assigned.sum(1)[:, None] * words
+    return unit(unit(sums).ravel()).astype(np.float32)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Divide vectors (..., D) by their norms; those of length 0 stay as they are."""
+    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.maximum(norm, LEAST_NORM)

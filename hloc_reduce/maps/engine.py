@@ -1,0 +1,62 @@
+"""What computes for a map in memory: any models, in torch."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from .. import aggregators, extractors, matchers
+from ..utils.codes import FLOATS, to_integers
+from .map import RETRIEVAL
+
+
+class TorchEngine:
+    """Features, retrieval and matches of one photo at a time, on a GPU if there is one.
+
+    Args:
+        extractor: of the map's feature.
+        matcher: configuration of the matcher.
+        vocabulary: (W, D) float32, of global descriptors.
+        storage: of the map's descriptors.
+    """
+
+    def __init__(
+        self,
+        extractor: extractors.Extractor,
+        matcher: dict,
+        vocabulary: np.ndarray,
+        storage: str,
+    ):
+        self._device = "cuda" if torch.cuda.is_available() else "cpu"
+        self._extractor = extractor.eval().to(self._device)
+        self._matcher = matchers.load(matcher).eval()
+        self._vlad = aggregators.load(RETRIEVAL["model"])
+        self._vlad.vocabulary = vocabulary
+        coded = storage not in FLOATS and self._matcher.takes_codes
+        # a code is rounded much more than integers are, and they are faster
+        self._as_integers = coded and self._device == "cpu"
+
+    def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
+        """Extract the features of a photo, see `extractors.extract`."""
+        return extractors.extract(self._extractor, image, preprocessing, self._device)
+
+    def aggregate(self, descriptors: np.ndarray) -> np.ndarray:
+        """Return the global descriptor (1, G) float32 of local ones (N, D) float32."""
+        local = torch.from_numpy(descriptors.T)[None]
+        return self._vlad({"descriptors": local})["global_descriptor"].numpy()
+
+    def prepare(self, descriptors: np.ndarray) -> torch.Tensor:
+        """Return descriptors (N, D) float32 as `match` takes them."""
+        matched = to_integers(descriptors) if self._as_integers else descriptors
+        return torch.from_numpy(matched).to(self._device)
+
+    def match(self, query: torch.Tensor, described: torch.Tensor, shown: np.ndarray) -> np.ndarray:
+        """Match the descriptors of a photo with some of a map image, see `Matcher.match_rows`.
+
+        Args:
+            query: (N, D) from `prepare`.
+            described: (M, D) from `prepare`.
+            shown: (K,) int64, ascending rows of these.
+        """
+        rows = torch.from_numpy(shown).to(self._device)
+        return self._matcher.match_rows(query, described, rows).cpu().numpy()
