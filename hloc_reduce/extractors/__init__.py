@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..descriptors import DIM
-from ..networks.noise import reduce_noise
+from ..light.noise import reduce_noise
 from ..utils.base_model import BaseModel, dynamic_load
 from ..utils.hloc import is_installed
 from ..utils.images import in_original, resized
@@ -82,7 +82,10 @@ class NetworkExtractor(Extractor):
     """
 
     def _forward(self, data: dict) -> dict:
-        image, blur = reduce_noise(data["image"]) if self.conf["denoise"] else (data["image"], 0.0)
+        image, blur = data["image"], 0.0
+        if self.conf["denoise"]:
+            channels, blur = reduce_noise(image[0].cpu().numpy())
+            image = torch.from_numpy(channels)[None].to(image) if blur else image
         return {**self._extract(image), "blur": torch.tensor([blur])}
 
     def _extract(self, image: torch.Tensor) -> dict:

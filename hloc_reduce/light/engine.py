@@ -1,57 +1,43 @@
-"""Features of COLMAP's SIFT, their retrieval and their matches, one photo at a time."""
+"""Features, retrieval and matches of one photo at a time."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..descriptors import COLMAP
 from ..detectors import dog
-from ..utils.cli import InputError
 from ..utils.codes import to_integers
 from ..utils.images import in_original, resized
-from . import matching, projection, vlad
+from . import matching, vlad
+from .extractors import Extract
 
 
-def takes(model: dict, matcher: dict) -> bool:
-    """Tell whether `LightEngine` can stand for models: COLMAP's SIFT, mutual nearest neighbours.
+def takes(matcher: dict) -> bool:
+    """Tell whether `LightEngine` has a matcher: mutual nearest neighbours."""
+    return matcher["name"] == "nearest_neighbor" and matcher.get("do_mutual_check", True)
 
-    Args:
-        model: configuration of an extractor.
-        matcher: configuration of a matcher.
-    """
+
+def is_colmap_sift(model: dict) -> bool:
+    """Tell whether an extractor's configuration is of COLMAP's SIFT, reduced or not."""
     base = model.get("base", model)
-    nearest = matcher["name"] == "nearest_neighbor" and matcher.get("do_mutual_check", True)
-    return base["name"] == "dog" and base.get("descriptor") == COLMAP and nearest
+    return base["name"] == "dog" and base.get("descriptor") == COLMAP
 
 
 class LightEngine:
-    """Computes with NumPy and pycolmap what `maps.engine.TorchEngine` does.
+    """Computes with NumPy what `maps.engine.TorchEngine` does with torch.
 
     Descriptors are matched as integers.
 
     Args:
-        model: configuration of an extractor that `takes` accepts.
-        layers: of the projection, if any.
-        matcher: configuration of the matcher.
-        vocabulary: (W, D) float32.
+        extract: of the map's feature.
+        matcher: configuration of a matcher that `takes` accepts.
+        vocabulary: (W, D) float32, of global descriptors.
     """
 
-    def __init__(
-        self,
-        model: dict,
-        layers: Sequence[projection.Layer] | None,
-        matcher: dict,
-        vocabulary: np.ndarray,
-    ):
-        base = model.get("base", model)
-        if unknown := set(base) - set(dog.CONF) - {"name"}:
-            raise InputError(f"DoG has no option {', '.join(sorted(unknown))}.")
-        self._conf = {**dog.CONF, **base}
-        self._detect = dog.detector(self._conf)
-        self._layers, self._vocabulary = layers, vocabulary
-        limits = matcher.get("ratio_threshold"), matcher.get("distance_threshold")
-        self._ratio_threshold, self._distance_threshold = limits
+    def __init__(self, extract: Extract, matcher: dict, vocabulary: np.ndarray):
+        self._extract, self._vocabulary = extract, vocabulary
+        self._ratio_threshold = matcher.get("ratio_threshold")
+        self._distance_threshold = matcher.get("distance_threshold")
 
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
         """Extract the features of a photo, see `extractors.extract`.
@@ -61,14 +47,7 @@ class LightEngine:
             preprocessing: see `utils.images.resized`.
         """
         pixels, size = resized(image, preprocessing)
-        if pixels.ndim != 2:
-            raise InputError("DoG needs grey images: preprocessing: {grayscale: true}.")
-        found = dog.strongest(*self._detect(pixels), self._conf["max_keypoints"])
-        keypoints, descriptors = found
-        if self._layers is not None:
-            descriptors = projection.project(descriptors, self._layers)
-        features = {"keypoints": keypoints[:, :2], "descriptors": descriptors.T}
-        return in_original(features, pixels.shape, size, dog.NOISE)
+        return in_original(self._extract(pixels), pixels.shape, size, dog.NOISE)
 
     def aggregate(self, descriptors: np.ndarray) -> np.ndarray:
         """Return the global descriptor (1, G) float32 of local ones (N, D) float32."""

@@ -9,13 +9,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
-from ..light.engine import LightEngine, takes
+from ..light.engine import LightEngine, is_colmap_sift, takes
+from ..light.extractors import ColmapSift, Extract, OnnxNetwork
 from ..light.vlad import read_vocabulary
 from ..localization import intrinsics
 from ..localization.references import Reference, SfmMap
 from ..pairs_from_retrieval import read_global
 from ..utils import colmap
+from ..utils.cli import InputError
 from ..utils.codes import FLOATS
 from ..utils.feature_files import dimension, read_descriptors
 from ..utils.h5 import open_h5
@@ -72,16 +75,22 @@ class Contents:
     on_demand: bool = False
 
 
-def read(path: Path) -> Contents:
+def read(path: Path, onnx: Path | None = None) -> Contents:
     """Read a map.
 
     Args:
         path: folder of a map of `maps.main`, or file of `hloc_reduce.compact`.
+        onnx: file of its feature from `hloc_reduce.export`, in which features are extracted from
+            photos; only for a file.
 
     Raises:
-        InputError: if it is neither, or broken.
+        InputError: if it is neither, or broken, or the ONNX file is of another feature.
     """
-    return _of_file(path) if is_compact(path) else _of_folder(path)
+    if is_compact(path):
+        return _of_file(path, onnx)
+    if onnx is not None:
+        raise InputError(f"An ONNX file needs a compact map, a file; {path} is none.")
+    return _of_folder(path)
 
 
 def _of_folder(path: Path) -> Contents:
@@ -115,11 +124,11 @@ def _of_folder(path: Path) -> Contents:
     )
 
 
-def _of_file(path: Path) -> Contents:
+def _of_file(path: Path, onnx: Path | None) -> Contents:
     compact = CompactMap(path)
     matcher = matchers_confs.confs[compact.matcher]["model"]
     return Contents(
-        engine=_light_engine(compact, matcher) or _torch_engine(compact, matcher),
+        engine=_light_engine(compact, matcher, onnx) or _torch_engine(compact, matcher),
         preprocessing=compact.conf["preprocessing"],
         storage=compact.storage,
         dim=compact.dim,
@@ -134,11 +143,20 @@ def _of_file(path: Path) -> Contents:
     )
 
 
-def _light_engine(compact: CompactMap, matcher: dict) -> Engine | None:
+def _light_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engine | None:
     """Return an engine without torch, None if the map's feature or matcher needs torch."""
-    if not takes(compact.conf["model"], matcher) or compact.is_pickled:
+    model = compact.conf["model"]
+    extract: Extract
+    if not takes(matcher):
         return None
-    return LightEngine(compact.conf["model"], compact.layers(), matcher, compact.vocabulary)
+    if onnx is not None:
+        denoise = features_confs.base_of(model).get("denoise", True)
+        extract = OnnxNetwork(onnx, compact.feature, denoise)
+    elif is_colmap_sift(model) and not compact.is_pickled:
+        extract = ColmapSift(model.get("base", model), compact.layers())
+    else:
+        return None
+    return LightEngine(extract, matcher, compact.vocabulary)
 
 
 def _torch_engine(compact: CompactMap, matcher: dict) -> Engine:

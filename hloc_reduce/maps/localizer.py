@@ -29,9 +29,11 @@ class Localizer:
         num_loc: the number of most similar map images that a photo is matched with.
         ransac_thresh: RANSAC inlier threshold in pixels.
         gate: what a pose must have to be trusted.
+        onnx: with a file from `hloc_reduce.compact`, the ONNX file of its feature from
+            `hloc_reduce.export`: features are extracted by ONNX Runtime instead of torch.
 
     Raises:
-        InputError: if it is not a map.
+        InputError: if it is not a map, or an ONNX file is of another feature.
 
     Example:
         >>> localizer = Localizer("outputs/map")  # doctest: +SKIP
@@ -44,8 +46,9 @@ class Localizer:
         num_loc: int = 50,
         ransac_thresh: float = RANSAC_THRESH,
         gate: Gate = DEFAULT_GATE,
+        onnx: Path | str | None = None,
     ):
-        contents = read(Path(map_dir))
+        contents = read(Path(map_dir), None if onnx is None else Path(onnx))
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.preprocessing, self.cameras = contents.preprocessing, contents.cameras
         # queries stay floats, rounded as in a feature file

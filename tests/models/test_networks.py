@@ -18,7 +18,6 @@ from hloc_reduce.confs import features
 from hloc_reduce.networks import EDGEPOINT2, NETWORKS, loading
 from hloc_reduce.networks.edgepoint2 import EdgePoint2
 from hloc_reduce.networks.keypoints import strongest, strongest_fixed
-from hloc_reduce.networks.noise import NOISY, reduce_noise, relative_noise
 from hloc_reduce.utils import downloads
 from hloc_reduce.utils.cli import InputError
 
@@ -88,52 +87,6 @@ def test_strongest_of_fixed_length(number, radius, border):
     keypoints, weighted = strongest_fixed(scores, radius, 0.5, border, number, weights)
     values = (their_scores * (10 - their_scores)).sort(descending=True).values
     torch.testing.assert_close(weighted[:some], values[:some])
-
-
-@pytest.mark.parametrize("sigma", [0.0, 0.02, 0.1])
-def test_noise_is_measured_in_units_of_the_contrast(textured, sigma):
-    clean = cv2.resize(textured, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC) / 255
-    noisy = clean + sigma * np.random.default_rng(0).standard_normal(clean.shape)
-    found = relative_noise(noisy.astype(np.float32))
-    assert found == pytest.approx(sigma / noisy.std(), rel=0.15, abs=0.02)
-    dark = relative_noise((0.2 * noisy + 0.1).astype(np.float32))
-    assert dark == pytest.approx(found, rel=0.05)
-
-
-def test_a_lamp_in_a_dark_photo_hides_neither_noise_nor_contrast(textured):
-    noise = np.random.default_rng(0).standard_normal(textured.shape)
-    photo = (textured / 2550 + 0.02 * noise).clip(0, 1).astype(np.float32)
-    found, lit = relative_noise(photo), photo.copy()
-    lit[20:50, 20:50] = 1
-    assert relative_noise(lit) == pytest.approx(found, rel=0.2)
-    plain, lamp = (reduce_noise(torch.from_numpy(image)[None, None])[0] for image in (photo, lit))
-    assert float(lamp.std()) == pytest.approx(float(plain.std()), rel=0.2)
-    assert lit.std() > 2 * photo.std()
-
-
-@pytest.mark.parametrize("sky", [0, 3, 8])
-def test_a_dark_sky_makes_no_photo_noisy(textured, sky):
-    """Half of the photo and more is nearly black, and all that is lit is above the median."""
-    photo = np.full((600, 320), sky / 255, np.float32)
-    photo[360:] = 0.7 * textured / 255
-    photo += np.random.default_rng(0).normal(0, 1 / 255, photo.shape)
-    image = torch.from_numpy(photo.clip(0, 1).astype(np.float32))[None, None]
-    assert reduce_noise(image) == (image, 0)
-
-
-def test_only_noisy_photos_are_blurred(textured):
-    clean = torch.from_numpy(textured.astype(np.float32) / 255)[None, None]
-    assert reduce_noise(clean) == (clean, 0)
-    noise = torch.randn(1, 3, 240, 320, generator=torch.Generator().manual_seed(0))
-    noisy = (clean / 10 + 0.1 + 0.02 * noise).clamp(0, 1)
-    blurred, blur = reduce_noise(noisy)
-    assert 0.5 < blur < 3
-    assert blurred.shape == noisy.shape and blurred.dtype == noisy.dtype
-    left = relative_noise(blurred[0].mean(dim=0).numpy())
-    assert left < NOISY / 2 < relative_noise(noisy[0].mean(dim=0).numpy())
-    for shape in ((1, 3, 64, 64), (1, 3, 20, 500), (1, 1, 1, 1)):
-        image = torch.full(shape, 0.5)
-        assert reduce_noise(image)[0] is image
 
 
 def test_folded_networks_compute_the_same(random_weights):

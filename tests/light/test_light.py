@@ -9,11 +9,13 @@ import pytest
 import torch
 from safetensors.numpy import load, save
 
-from hloc_reduce import Localizer, compact, projections
+from hloc_reduce import Localizer, compact, export, projections
+from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.light import projection
 from hloc_reduce.maps import contents
 from hloc_reduce.maps.compact import CompactMap
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.images import read_image
 from pipelines import localize
 
 PIPELINE = localize
@@ -59,7 +61,7 @@ def test_localization_without_torch(file, monkeypatch):
     assert found.returncode == 0, found.stderr
     *values, inliers, confidence = map(float, found.stdout.split())
 
-    monkeypatch.setattr(contents, "takes", lambda *models: False)
+    monkeypatch.setattr(contents, "takes", lambda matcher: False)
     localizer = Localizer(path)
     assert type(localizer.engine).__name__ == "TorchEngine"
     pose, info = localizer.localize(photo)
@@ -70,7 +72,7 @@ def test_localization_without_torch(file, monkeypatch):
 def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
     path, photo = file
     light = contents.read(path)
-    monkeypatch.setattr(contents, "takes", lambda *models: False)
+    monkeypatch.setattr(contents, "takes", lambda matcher: False)
     heavy = contents.read(path)
     found = [one.engine.extract(photo, one.preprocessing) for one in (light, heavy)]
     for key in ("keypoints", "image_size", "uncertainty", "blur"):
@@ -99,6 +101,33 @@ def test_features_that_need_torch(place, run, tmp_path):
     assert type(localizer.engine).__name__ == "TorchEngine"
     pose, _ = localizer.localize(images / "query/day/a.png")
     assert pose is not None
+
+
+def test_networks_run_by_onnx_runtime(place, run, tmp_path):
+    """Their poses are those of torch, but for rounding; also where the sides are no multiples."""
+    build, images, outputs = place
+    run(*build, "--feature", "mini32")
+    path, photo = tmp_path / "place.hlm", images / "query/day/a.png"
+    compact.main(path, outputs / "map")
+    onnx = export.main("mini32", tmp_path / "mini32.onnx")
+    expected, found = Localizer(path), Localizer(path, onnx=onnx)
+    assert type(found.engine).__name__ == "LightEngine"
+    pixels, camera = read_image(photo), next(iter(expected.reference.camera_of.values()))
+    for image in (pixels, pixels[:-7, :-19]):
+        camera.height, camera.width = image.shape[:2]
+        pose, info = found.localize(image, camera)
+        other, its_info = expected.localize(image, camera)
+        assert info["num_inliers"] > 0.9 * its_info["num_inliers"] > 50
+        assert pose_error(pose, other)[1] < 1
+    for wrong, message in (
+        (path.with_name("none.onnx"), "There is no file"),
+        (path, "is not a feature of hloc_reduce.export"),
+    ):
+        with pytest.raises(InputError, match=message) as error:
+            Localizer(path, onnx=wrong)
+        assert str(error.value).count("\n") == 0
+    with pytest.raises(InputError, match="needs a compact map"):
+        Localizer(path.parent / "outputs/map", onnx=onnx)
 
 
 NAMES = ["sift_sv64", "mkd_us16", "colmap_sift_sv32", "xfeat_pca24", "sift_nested@24"]
@@ -144,18 +173,19 @@ def _without_norms(tensors):
     del tensors["norms.0.running_var"]
 
 
-@pytest.mark.parametrize("change", [_without_a_layer, _cut, _not_finite, _without_norms, None])
-def test_broken_projections_of_a_file_are_refused(file, change, monkeypatch):
+def test_broken_projections_of_a_file_are_refused(file, monkeypatch):
     """Such as one that its user trained."""
     path, _ = file
     content = projections.find("colmap_sift_sv32").read_bytes()
-    tensors = load(content)
-    if change:
+    broken = [content[:-10]]
+    for change in (_without_a_layer, _cut, _not_finite, _without_norms):
+        tensors = load(content)
         change(tensors)
-    broken = save(tensors) if change else content[:-10]
+        broken.append(save(tensors))
     monkeypatch.setattr(CompactMap, "_read_projection", lambda self, *parts: None)
-    monkeypatch.setattr(CompactMap, "projection", broken, raising=False)
     monkeypatch.setattr(CompactMap, "_suffix", ".safetensors", raising=False)
-    with pytest.raises(InputError, match="its projection is broken") as error:
-        Localizer(path)
-    assert str(error.value).count("\n") == 0
+    for one in broken:
+        monkeypatch.setattr(CompactMap, "projection", one, raising=False)
+        with pytest.raises(InputError, match="its projection is broken") as error:
+            Localizer(path)
+        assert str(error.value).count("\n") == 0

@@ -2,7 +2,6 @@
 
 import cv2
 import numpy as np
-import torch
 
 BLOCK = 32  # pixels, the side of the blocks in which noise is measured
 SMOOTH = 0.1  # share of the blocks that are taken for smooth
@@ -48,19 +47,17 @@ def lamps(image: np.ndarray) -> float:
     return float(max(LAMPS * median, brightest))
 
 
-def reduce_noise(image: torch.Tensor) -> tuple[torch.Tensor, float]:
+def reduce_noise(channels: np.ndarray) -> tuple[np.ndarray, float]:
     """Blur an image and cut off its lamps if it is noisy.
 
     Args:
-        image: (1, C, H, W) float32 in [0, 1].
+        channels: (C, H, W) float32 in [0, 1].
 
     Returns:
         The image, as given if it is not noisy, and the standard deviation of the blur in pixels.
     """
-    channels = image[0].cpu().numpy()
     noise = relative_noise(channels.mean(axis=0))
     if noise < NOISY:
-        return image, 0.0
+        return channels, 0.0
     cut, blur = channels.clip(max=lamps(channels)), BLUR * np.sqrt(noise)
-    blurred = [cv2.GaussianBlur(channel, (0, 0), blur) for channel in cut]
-    return torch.from_numpy(np.stack(blurred))[None].to(image.device), float(blur)
+    return np.stack([cv2.GaussianBlur(channel, (0, 0), blur) for channel in cut]), float(blur)

@@ -1,0 +1,93 @@
+"""Features of photos: COLMAP's SIFT, or a network in an ONNX file."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..detectors import dog
+from ..utils.cli import InputError
+from . import projection
+from .noise import reduce_noise
+
+# from an image, (H, W) or (H, W, 3) RGB float32 in [0, 1], to `keypoints` (N, 2) x, y in its
+# pixels, centres at integers; `descriptors` (D, N) of unit norm; and perhaps `blur`, the standard
+# deviation in pixels of the blur by which the noise was reduced
+Extract = Callable[[np.ndarray], dict]
+
+
+class ColmapSift:
+    """COLMAP's SIFT, reduced by a projection.
+
+    Args:
+        conf: configuration of the extractor `dog`.
+        layers: of the projection, if any.
+
+    Raises:
+        InputError: for unknown options.
+    """
+
+    def __init__(self, conf: dict, layers: Sequence[projection.Layer] | None):
+        if unknown := set(conf) - set(dog.CONF) - {"name"}:
+            raise InputError(f"DoG has no option {', '.join(sorted(unknown))}.")
+        self._conf, self._layers = {**dog.CONF, **conf}, layers
+        self._detect = dog.detector(self._conf)
+
+    def __call__(self, image: np.ndarray) -> dict:
+        """Return the features of an image (H, W)."""
+        if image.ndim != 2:
+            raise InputError("DoG needs grey images: preprocessing: {grayscale: true}.")
+        found = dog.strongest(*self._detect(image), self._conf["max_keypoints"])
+        keypoints, descriptors = found
+        if self._layers is not None:
+            descriptors = projection.project(descriptors, self._layers)
+        return {"keypoints": keypoints[:, :2], "descriptors": descriptors.T}
+
+
+class OnnxNetwork:
+    """A feature that `hloc_reduce.export` wrote, run by ONNX Runtime.
+
+    Args:
+        path: the ONNX file.
+        feature: the name of the feature that it must be.
+        denoise: reduce the noise of noisy images first.
+
+    Raises:
+        InputError: when ONNX Runtime is not installed, or the file is broken or of another feature.
+    """
+
+    def __init__(self, path: Path, feature: str, denoise: bool):
+        try:
+            import onnxruntime
+        except ImportError:
+            raise InputError("ONNX files need: pip install onnxruntime.") from None
+        if not path.is_file():
+            raise InputError(f"There is no file {path}.")
+        try:
+            session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+            known = session.get_modelmeta().custom_metadata_map
+            stride, name = int(known["stride"]), known["feature"]
+        except Exception as error:  # ONNX Runtime raises RuntimeError and others of its own
+            reason = str(error).splitlines()[0][:200]
+            raise InputError(f"{path} is not a feature of hloc_reduce.export ({reason}).") from None
+        if name != feature:
+            raise InputError(f"{path} has the feature {name}, the map has {feature}.")
+        self._session, self._stride, self._denoise = session, stride, denoise
+
+    def __call__(self, image: np.ndarray) -> dict:
+        """Return the features of an image (H, W, 3)."""
+        if image.ndim != 3:
+            raise InputError("ONNX files take RGB images: preprocessing: {grayscale: false}.")
+        channels, blur = image.transpose(2, 0, 1), 0.0
+        if self._denoise:
+            channels, blur = reduce_noise(channels)
+        given = np.array(image.shape[1::-1])
+        size = np.maximum(1, given // self._stride) * self._stride
+        shown = size.tolist()
+        batch = np.stack([cv2.resize(channel, shown) for channel in channels])[None]
+        outputs = self._session.run(["keypoints", "descriptors"], {"image": batch})
+        keypoints, descriptors = outputs
+        ratio = (given / size).astype(np.float32)
+        moved = (keypoints + 0.5) * ratio - 0.5
+        return {"keypoints": moved, "descriptors": descriptors.T, "blur": blur}
