@@ -7,8 +7,9 @@ Inliers are those of finished runs of pipelines.aachen. Prints Markdown tables, 
 descriptors first.
 """
 
+import argparse
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -131,7 +132,13 @@ def _main() -> None:
         raise InputError("There is nothing to measure. Give --map or --outputs.")
     for descriptor in args.descriptor:
         cli.choose("descriptor", descriptor, features_confs.BASES)
-    panels = []
+    panels = [*(_by_ap(args) if args.map else ()), *(_by_inliers(args) if args.outputs else ())]
+    if args.plot:
+        plots.save(plots.figure(panels, columns=len(panels)), args.plot)
+
+
+def _by_ap(args: argparse.Namespace) -> list[Callable]:
+    """Measure and print AP; return its panel of the picture."""
 
     def load(maps: list[str], descriptor: str) -> list[tracks.Tracks]:
         return [
@@ -139,40 +146,45 @@ def _main() -> None:
             for name, (images, model) in tracks.parse_maps(maps).items()
         ]
 
-    if args.map:
-        measured: list[Row] = []
-        for descriptor in args.descriptor:
-            pairs = [draw_all(data, args.draws) for data in load(args.map, descriptor)]
-            fitted = levels.sample(load(args.fit, descriptor)) if args.fit else None
-            features = load_projections(descriptor, args.projection)
-            chosen = {
-                name: project
-                for name, project in features.items()
-                if not args.schemes
-                or name == descriptor
-                or any(f"_{scheme}" in name for scheme in args.schemes)
-            }
-            files = {file.name: file for file in args.projection}
-            measured += rows(chosen, files, pairs, fitted)
-        print(f"| bytes | feature | storage | {' / '.join(KINDS)} | both sides stored |")
-        print("| ---: | --- | --- | ---: | ---: |")
-        for size, name, storage, *both in sorted(measured, key=lambda row: -row[0]):
-            cells = (" / ".join(f"{value:.1f}" for value in values) for values in both)
-            print(f"| {size} | {name} | {storage} | {' | '.join(cells)} |")
-        mean = families([(size, name, np.mean(ap)) for size, name, _, ap, _ in measured])
-        panels.append(partial(panel, points=mean, label="matching AP [%]"))
-    if args.outputs:
-        found = inliers(args.outputs)
-        print("| bytes | feature | storage | mean inliers, day | night |")
-        print("| ---: | --- | --- | ---: | ---: |")
-        for size, name, storage, lists in found:
-            cells = " | ".join(f"{value:,.0f}" for value in lists.values())
-            print(f"| {size} | {name} | {storage} | {cells} |")
-        for which in found[0][-1]:
-            values = [(size, name, lists[which]) for size, name, _, lists in found]
-            panels.append(partial(panel, points=families(values), label=f"inliers, {which}"))
-    if args.plot:
-        plots.save(plots.figure(panels, columns=len(panels)), args.plot)
+    measured: list[Row] = []
+    for descriptor in args.descriptor:
+        pairs = [draw_all(data, args.draws) for data in load(args.map, descriptor)]
+        fitted = levels.sample(load(args.fit, descriptor)) if args.fit else None
+        features = load_projections(descriptor, args.projection)
+        chosen = {
+            name: project
+            for name, project in features.items()
+            if not args.schemes
+            or name == descriptor
+            or any(f"_{scheme}" in name for scheme in args.schemes)
+        }
+        files = {file.name: file for file in args.projection}
+        measured += rows(chosen, files, pairs, fitted)
+    print(f"| bytes | feature | storage | {' / '.join(KINDS)} | both sides stored |")
+    print("| ---: | --- | --- | ---: | ---: |")
+    for size, name, storage, *both in sorted(measured, key=lambda row: -row[0]):
+        cells = (" / ".join(f"{value:.1f}" for value in values) for values in both)
+        print(f"| {size} | {name} | {storage} | {' | '.join(cells)} |")
+    mean = families([(size, name, np.mean(ap)) for size, name, _, ap, _ in measured])
+    return [partial(panel, points=mean, label="matching AP [%]")]
+
+
+def _by_inliers(args: argparse.Namespace) -> list[Callable]:
+    """Print the inliers of finished runs; return their panels of the picture."""
+    found = inliers(args.outputs)
+    print("| bytes | feature | storage | mean inliers, day | night |")
+    print("| ---: | --- | --- | ---: | ---: |")
+    for size, name, storage, lists in found:
+        cells = " | ".join(f"{value:,.0f}" for value in lists.values())
+        print(f"| {size} | {name} | {storage} | {cells} |")
+    return [
+        partial(
+            panel,
+            points=families([(size, name, lists[which]) for size, name, _, lists in found]),
+            label=f"inliers, {which}",
+        )
+        for which in found[0][-1]
+    ]
 
 
 if __name__ == "__main__":

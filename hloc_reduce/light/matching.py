@@ -5,7 +5,7 @@ import numpy as np
 from ..utils import best_two
 from ..utils.codes import UNIT
 
-TILE = 2**20  # products at once
+TILE = 2**19  # products at once
 
 
 def nearest(

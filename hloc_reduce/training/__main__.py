@@ -77,14 +77,7 @@ def main(
     for place, (images, model) in maps.items():
         files[place] = tracks.main(images, model, cache / place, descriptor, seed, conf)
     data = [tracks.load(file) for file in files.values()]
-    training_data = {
-        place: {
-            "points": part.num_tracks,
-            "observations": len(part.track),
-            "sha256": file_sha256(file),
-        }
-        for (place, file), part in zip(files.items(), data, strict=True)
-    }
+    training_data = _summaries(files, data)
     size = data[0].descriptors.shape[-1]
     if trainer is raw:
         names = {size: descriptor}
@@ -113,6 +106,18 @@ def main(
                 file.unlink(missing_ok=True)
             logger.info("Saved %s.", path)
     return paths
+
+
+def _summaries(files: dict[str, Path], data: list[tracks.Tracks]) -> dict[str, dict]:
+    """Return what the metadata of a projection say of the tracks of each place."""
+    return {
+        place: {
+            "points": part.num_tracks,
+            "observations": len(part.track),
+            "sha256": file_sha256(file),
+        }
+        for (place, file), part in zip(files.items(), data, strict=True)
+    }
 
 
 def _exists(path: Path, metadata: dict) -> bool:
