@@ -10,7 +10,9 @@ import pycolmap
 from .. import logger
 from ..runtime import provenance
 from ..utils import colmap
+from . import copies
 from .plausibility import (
+    COPY,
     MAX_DISTORTION,
     SPREAD,
     VIEWPOINTS,
@@ -37,6 +39,7 @@ RULES = {
     "points": f"{MORE} times as many where focal lengths differ",
     "spread": SPREAD,
     "viewpoints": VIEWPOINTS,
+    "copies": f"sharing less than {copies.SHARE} of the points expected in {copies.ENOUGH}",
 }
 
 
@@ -89,7 +92,10 @@ class Mapper:
             "parts": parts,
             "missing": missing,
             "unmatched": sorted(set(self.names) - _matched(database)),
-            "implausible": {name: lens for name, lens in dropped.items() if name in missing},
+            "implausible": {
+                name: lens for name, lens in dropped.items() if name in missing and lens != COPY
+            },
+            "copies": sorted(name for name in missing if dropped.get(name) == COPY),
             "alike": alike,
             "spread": round(focal_length_spread(models), 2),
         }

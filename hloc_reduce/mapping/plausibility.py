@@ -7,6 +7,7 @@ import pycolmap
 
 from .. import logger
 from ..localization.confidence import focal_lengths
+from . import copies
 
 SPREAD = 1.2  # ratio of focal lengths above which one camera for all images is tried
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
@@ -14,13 +15,15 @@ MANY = 3  # images of one camera estimate its focal length better than EXIF data
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
 VIEWPOINTS = 3  # at least, of a model: two do not determine the focal lengths
 
+COPY = "another side or a copy"  # in place of an implausible lens, see `copies`
+
 Models = tuple[list[pycolmap.Reconstruction], dict[str, str]]  # see `keep_plausible`
 
 
 def keep_plausible(
     models: list[pycolmap.Reconstruction], cameras: dict[int, pycolmap.Camera]
 ) -> Models:
-    """Drop images with implausible lenses from models, and images that only these connect.
+    """Drop images with implausible lenses from models, copies, and what only these connect.
 
     Args:
         models: of COLMAP's mapper.
@@ -28,7 +31,7 @@ def keep_plausible(
 
     Returns:
         The models that have points, the largest first; and from the name of each dropped image to
-        what is implausible.
+        what is implausible, `COPY` for another side of the place.
     """
     dropped: dict[str, str] = {}
     for model in models:
@@ -43,7 +46,7 @@ def keep_plausible(
                 model.deregister_frame(image.frame_id)
         if implausible:
             _keep_connected(model)
-        dropped |= implausible
+        dropped |= implausible | dict.fromkeys(_drop_copies(model), COPY)
     whole = []
     for model in models:
         if min(size(model)) < 2:
@@ -87,6 +90,18 @@ def count_viewpoints(model: pycolmap.Reconstruction) -> int:
             if np.linalg.norm(centre - first) > SAME_VIEWPOINT * min(distance, other)
         ]
     return number
+
+
+def _drop_copies(model: pycolmap.Reconstruction) -> list[str]:
+    """Drop photos that contradict others, see `copies.find`; return their names."""
+    dropped: list[str] = []
+    while found := copies.find(model):
+        dropped += found
+        for image_id in model.reg_image_ids():
+            if model.images[image_id].name in found:
+                model.deregister_frame(model.images[image_id].frame_id)
+        _keep_connected(model)
+    return dropped
 
 
 def _keep_connected(model: pycolmap.Reconstruction) -> None:

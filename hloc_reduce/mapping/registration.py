@@ -6,7 +6,7 @@ from .. import logger
 from ..runtime import provenance
 from ..utils import cli
 from ..utils.cli import InputError
-from .plausibility import SPREAD, VIEWPOINTS
+from .plausibility import COPY, SPREAD, VIEWPOINTS
 
 REGISTRATION = "registration.json"  # which images are in the model, and in other parts
 # shares of registered images: a model with fewer is reported in detail, or refused
@@ -24,7 +24,8 @@ def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
         "Do enough of them overlap? Take photos from several places, each overlapping the one "
         "before by about two thirds."
     )
-    hint = _lenses(dropped) if dropped else advice
+    lenses = {name: lens for name, lens in (dropped or {}).items() if lens != COPY}
+    hint = _lenses(lenses) if lenses else advice
     return (
         f"COLMAP could not reconstruct the images of {image_dir} from {VIEWPOINTS} viewpoints or "
         f"more. {hint}"
@@ -40,13 +41,22 @@ def _lenses(dropped: dict[str, str]) -> str:
     )
 
 
+def _copies(names: list[str], missing: list[str]) -> str:
+    """Say which of the missing images show another side of the place."""
+    which = "" if names == missing else f" {cli.some(names, NAMED)}:"
+    return (
+        f"Another side of the place that looks the same, or a copy of it:{which} from where COLMAP "
+        "puts these photos, they would see many points of the others, but they match few of them."
+    )
+
+
 def check(sfm_dir: Path, accept_partial: bool) -> None:
     """Report which images are missing from a model.
 
     Raises:
         InputError: if it has fewer than half of the images, unless `accept_partial`.
     """
-    state = provenance.read(sfm_dir / REGISTRATION)
+    state = {"copies": [], **provenance.read(sfm_dir / REGISTRATION)}  # older maps have none
     missing, number, spread = state["missing"], state["images"], state.pop("spread", 1.0)
     registered = number - len(missing)
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
@@ -63,11 +73,12 @@ def check(sfm_dir: Path, accept_partial: bool) -> None:
                 "camera with a fixed zoom took all, --camera_mode single gives better poses."
             )
         if missing:
-            implausible = state["implausible"]
+            implausible, copies = state["implausible"], state["copies"]
             logger.warning(
-                "%d of %d images are not in the map: %s.%s",
+                "%d of %d images are not in the map: %s.%s%s",
                 *(len(missing), number, cli.some(missing, NAMED)),
                 f" {_lenses(implausible)}" if implausible else "",
+                f" {_copies(copies, missing)}" if copies else "",
             )
         return
     message = shortfall(sfm_dir / REGISTRATION, **state)
@@ -84,6 +95,7 @@ def shortfall(
     unmatched: list[str],
     implausible: dict[str, str],
     alike: bool,
+    copies: list[str],
 ) -> str:
     """Say which images are not in a model, why, and what to try.
 
@@ -95,6 +107,7 @@ def shortfall(
         unmatched: the images without verified matches.
         implausible: from each dropped image to what is implausible about its lens.
         alike: each image has its own camera, but one camera may have taken all.
+        copies: the dropped images that show another side of the place.
     """
     registered = images - len(missing)
     only = "Only " if registered < ENOUGH * images else ""
@@ -111,16 +124,18 @@ def shortfall(
             + (f"; the second has {cli.some(parts[1], 3)}." if parts[1] != missing else ".")
         )
         tries.append("add photos between the parts, each overlapping the one before by two thirds")
-    elif set(missing) - set(unmatched) - set(implausible):
-        tries.append(
-            "add photos between those in the map and those that are not, and leave out photos of "
-            "other places"
-        )
+    elif set(missing) - set(unmatched) - set(implausible) - set(copies):
+        tries.append("add photos between those in the map and those that are not")
     if unmatched:
         said.append(f"No other photo matches {cli.some(unmatched)}.")
-        tries.append("leave out photos of other places, and retake blurred or dark ones")
+        tries.append("retake blurred or dark photos")
+    if tries:
+        tries.append("leave out photos of other places")
     if implausible:
         said.append(_lenses(implausible))
+    if copies:
+        said.append(_copies(copies, missing))
+        tries.append("make a map of each side, or add photos all the way from one to the other")
     if alike:
         tries.append("--camera_mode single, if one camera with a fixed zoom took all photos")
     return f"{' '.join(said)} What to try: {'; '.join(tries)}."

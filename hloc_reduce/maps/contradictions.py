@@ -12,6 +12,7 @@ from ..localization import absolute_pose
 from ..localization.confidence import DEFAULT_GATE
 from ..localization.projection import reprojection_errors
 from ..localization.references import SfmMap
+from ..mapping import copies
 from ..runtime import parallel
 from ..utils import cli
 from ..utils.h5 import iterate_h5_names, open_h5
@@ -30,8 +31,8 @@ def find(sfm: pycolmap.Reconstruction, matches: Path) -> list[str]:
     A photo whose pose agrees with less than half of its matches with points that at least two
     other photos see is localized by these, with the intrinsics of the map. It contradicts the
     others if that gives a pose elsewhere, with the confidence of a localized query. So do photos
-    that were given wrong poses or that the mapper placed wrongly, and copies of a place that is in
-    the map twice.
+    that were given wrong poses or that the mapper placed wrongly, copies of a place that is in the
+    map twice, and sides of a place that were merged, see `mapping.copies`.
 
     Args:
         sfm: the map.
@@ -49,8 +50,8 @@ def find(sfm: pycolmap.Reconstruction, matches: Path) -> list[str]:
             return name if _contradicts(reference, name, partners[name], seen, file) else None
 
     names = sorted(partners)
-    judged = parallel.ordered("judge", judge, names)
-    return [name for name in progress(judged, "Judging poses", "image", len(names)) if name]
+    judged = progress(parallel.ordered("judge", judge, names), "Judging poses", "image", len(names))
+    return sorted({name for name in judged if name} | set(copies.find(sfm)))
 
 
 def warn(names: list[str]) -> None:

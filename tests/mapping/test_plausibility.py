@@ -119,6 +119,7 @@ def test_parts_that_do_not_connect():
         "unmatched": ["j"],
         "implausible": {},
         "alike": False,
+        "copies": [],
     }
     message = registration.shortfall(Path("x"), **state)
     assert "Only 5 of 10 photos" in message and "f, g, h, i, j." in message
@@ -129,3 +130,6 @@ def test_parts_that_do_not_connect():
     message = registration.shortfall(Path("x"), **state)
     assert "no lens has" in message and "i (distortion 4.6)." in message
     assert "--camera_mode single, if one camera" in message
+    message = registration.shortfall(Path("x"), **{**state, "copies": ["g"]})
+    assert "Another side of the place that looks the same, or a copy of it: g: from" in message
+    assert "make a map of each side" in message

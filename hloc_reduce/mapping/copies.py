@@ -1,0 +1,105 @@
+"""Find parts of a map that show the same place twice, merged by mistake.
+
+Two sides of a symmetric building, or two copies of a thing, have some matches, by which a mapper
+may put one upon the other. Then their photos seem to be taken from the same viewpoints, but few
+points are seen by both: what differs between the sides does not match.
+"""
+
+import numpy as np
+import pycolmap
+
+# a point is expected in a photo if another photo sees it from a direction that differs by at most
+# as many degrees, and from a distance that differs by at most this factor
+ANGLE, DISTANCE = 15.0, 1.5
+# Two groups of photos that share less of the expected points contradict each other, if a photo of
+# one expects enough of them in one of the other, on average. Sound maps share a quarter and more,
+# the two that were merged by mistake 1 and 10 % (docs/results.md).
+SHARE, ENOUGH = 0.15, 100
+WORK = 2e8  # pairs of observations and photos: above, only some of the points are used
+
+
+def find(model: pycolmap.Reconstruction) -> list[str]:
+    """Find the photos of a map that show another side of the place, or a copy of it.
+
+    Groups of photos are built by their shared points, as by average linkage, and compared where two
+    of them are joined.
+
+    Args:
+        model: the map.
+
+    Returns:
+        The smaller one of two groups that contradict each other; none if no groups do.
+    """
+    from scipy.cluster.hierarchy import average
+    from scipy.spatial.distance import squareform
+
+    images = [model.images[i] for i in sorted(model.reg_image_ids())]
+    if len(images) < 4:
+        return []
+    expected, shared, used = _count(model, images)
+    closeness = shared.max() - shared
+    np.fill_diagonal(closeness, 0)
+    groups = {i: [i] for i in range(len(images))}
+    sums = np.zeros((2, 2 * len(images), 2 * len(images)))
+    sums[:, : len(images), : len(images)] = expected, shared
+    worst, found = SHARE, list[int]()
+    for new, (a, b, *_) in enumerate(average(squareform(closeness)).astype(int), len(images)):
+        first, second = groups.pop(a), groups.pop(b)
+        wanted, common = sums[:, a, b]
+        enough = wanted >= ENOUGH * used * 2 * len(first) * len(second)
+        if enough and min(len(first), len(second)) > 1 and common < worst * wanted:
+            worst, found = common / wanted, min(second, first, key=len)
+        groups[new] = first + second
+        sums[:, new] = sums[:, a] + sums[:, b]
+        sums[:, :, new] = sums[:, :, a] + sums[:, :, b]
+    return sorted(images[i].name for i in found)
+
+
+def _count(
+    model: pycolmap.Reconstruction, images: list[pycolmap.Image]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Count the points that pairs of photos are expected to share, and that they share.
+
+    Returns:
+        Both counts (N, N), symmetric: the sums of both directions; and the share of the points that
+        was used.
+    """
+    number, points = len(images), model.points3D
+    used = min(1.0, WORK / (number * sum(image.num_points3D for image in images) or 1))
+    chosen = np.random.default_rng(0).random(len(points)) < used
+    ids = np.array(sorted(points))[chosen]
+    xyz = np.array([points[i].xyz for i in ids.tolist()]).reshape(-1, 3)
+    row_of = {point: row for row, point in enumerate(ids.tolist())}
+    seen, inside = np.zeros((2, number, len(ids)), bool)
+    centres = np.array([image.projection_center() for image in images])
+    for i, image in enumerate(images):
+        rows = [row_of.get(p.point3D_id, -1) for p in image.points2D if p.has_point3D()]
+        seen[i, [row for row in rows if row >= 0]] = True
+        inside[i] = _inside(image, xyz)
+    expected, shared = np.zeros((2, number, number))
+    for i in range(number):
+        its = np.flatnonzero(seen[i])
+        rays = xyz[its] - centres[:, None]
+        distance = np.maximum(np.linalg.norm(rays, axis=2), np.finfo(float).tiny)
+        cosine = np.einsum("jnd,nd->jn", rays, rays[i]) / distance / distance[i]
+        ratio = distance / distance[i]
+        alike = (cosine > np.cos(np.radians(ANGLE))) & (np.abs(np.log(ratio)) < np.log(DISTANCE))
+        wanted = alike & inside[:, its]
+        expected[i], shared[i] = wanted.sum(axis=1), (wanted & seen[:, its]).sum(axis=1)
+    np.fill_diagonal(expected, 0)
+    np.fill_diagonal(shared, 0)
+    return expected + expected.T, shared + shared.T, used
+
+
+def _inside(image: pycolmap.Image, xyz: np.ndarray) -> np.ndarray:
+    """Return which points (P, 3) are within a photo (P,)."""
+    pose, camera = image.cam_from_world(), image.camera
+    assert camera is not None  # the image belongs to a model
+    local = xyz @ pose.rotation.matrix().T + pose.translation
+    front = local[:, 2] > 0
+    found = np.zeros(len(xyz), bool)
+    if front.any():
+        projected = np.asarray(camera.img_from_cam(local[front]))
+        size = camera.width, camera.height
+        found[front] = ((projected > 0) & (projected < size)).all(axis=1)
+    return found

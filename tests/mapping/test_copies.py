@@ -1,0 +1,77 @@
+"""Sides of a place that a mapper put one upon the other."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hloc_reduce.mapping import copies
+from hloc_reduce.mapping.plausibility import COPY, keep_plausible
+from hloc_reduce.utils import colmap
+
+NUMBER = 5  # photos of each side
+
+
+def two_sides(common: int, turn: float = 2.0) -> pycolmap.Reconstruction:
+    """Photos on an arc, of two sides with 300 points each and some common ones.
+
+    Args:
+        common: the number of points that the photos of both sides see.
+        turn: degrees between the photos of one side and those of the other.
+    """
+    generator = np.random.default_rng(0)
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=640, height=480, params=[500, 320, 240], camera_id=1
+    )
+    points = generator.uniform(-1, 1, (600 + common, 3))
+    side = np.repeat([0, 1, 2], [300, 300, common])  # 2 is seen from both
+    for i in range(2 * NUMBER):
+        angle = np.radians(8 * (i % NUMBER) + turn * (i >= NUMBER))
+        rotation = pycolmap.Rotation3d(angle * np.array([0, 1, 0]))
+        pose = pycolmap.Rigid3d(rotation, [0, 0, 6])
+        local = points @ rotation.matrix().T + pose.translation
+        image = pycolmap.Image(
+            name=f"{i}.jpg", keypoints=camera.img_from_cam(local), camera_id=1, image_id=i + 1
+        )
+        colmap.add_image(model, camera, image, pose)
+    for row, point in enumerate(points):
+        shown = [i for i in range(2 * NUMBER) if side[row] in (2, i // NUMBER)]
+        elements = [pycolmap.TrackElement(i + 1, row) for i in shown]
+        model.add_point3D(point, pycolmap.Track(elements))
+    return model
+
+
+SIDES = [{f"{i}.jpg" for i in range(NUMBER)}, {f"{i + NUMBER}.jpg" for i in range(NUMBER)}]
+
+
+@pytest.mark.parametrize(
+    ("common", "turn", "is_found"),
+    [(12, 2.0, True), (0, 2.0, True), (200, 2.0, False), (12, 120.0, False)],
+)
+def test_sides_that_share_too_few_points(common, turn, is_found):
+    """Of photos from other directions, no common points are expected."""
+    found = copies.find(two_sides(common, turn))
+    assert set(found) in SIDES if is_found else found == []
+
+
+def test_some_of_the_points_are_enough(monkeypatch):
+    monkeypatch.setattr(copies, "WORK", 2e4)
+    assert set(copies.find(two_sides(12))) in SIDES
+    assert copies.find(two_sides(200)) == []
+
+
+def test_one_side_is_left_out_of_a_map():
+    """Queries of one side were localized at the other, with 691 inliers."""
+    model = two_sides(12)
+    given = {1: pycolmap.Camera(model.cameras[1].todict())}
+    (kept,), dropped = keep_plausible([model], given)
+    names = {kept.images[i].name for i in kept.reg_image_ids()}
+    assert names in SIDES and set(dropped.values()) == {COPY}
+    assert names | set(dropped) == SIDES[0] | SIDES[1]
+
+
+def test_few_photos_have_no_sides():
+    model = two_sides(12)
+    for image_id in list(model.reg_image_ids())[3:]:
+        model.deregister_frame(model.images[image_id].frame_id)
+    assert copies.find(model) == []
