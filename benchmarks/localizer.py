@@ -1,41 +1,68 @@
-"""Time a Localizer on photos, one at a time, stage by stage."""
+"""Time a Localizer on photos, one at a time, stage by stage, from the start of Python.
 
+Also prints the memory of the process, and how many photos are localized, with how many inliers. It
+imports torch only if the map's feature needs it.
+"""
+
+import resource
+import time
 from pathlib import Path
 
-import numpy as np
-import torch
+START = time.perf_counter()
 
-from hloc_reduce import Localizer
-from hloc_reduce.utils import cli
-from hloc_reduce.utils.images import list_images
-from hloc_reduce.utils.progress import progress
+from hloc_reduce.utils import cli  # noqa: E402
+from hloc_reduce.utils.images import list_images  # noqa: E402
+from hloc_reduce.utils.progress import progress  # noqa: E402
 
-STAGES = ("extraction", "retrieval", "matching", "pose")
+STAGES = ("extraction", "retrieval", "matching", "pose", "mirror_image")
+
+
+def megabytes() -> float:
+    """Return the largest resident size of this process so far, in 1,000,000 bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--map outputs/place/map --query_images photos")
-    parser.add_argument("--map", type=Path, required=True, help="map of pipelines.localize")
-    parser.add_argument("--query_images", type=Path, required=True, help="folder of photos")
-    args = parser.parse_args()
-    localizer = Localizer(args.map)
-    photos = [args.query_images / name for name in list_images(args.query_images)]
-    localizer.localize(photos[0])  # warm up
-    seconds = []
-    for photo in progress(photos, "Localizing", "photo"):
-        _, info = localizer.localize(photo)
-        seconds.append([info["seconds"][stage] for stage in STAGES])
-    seconds = np.array(seconds)
-    keypoints = np.mean([len(descriptors) for descriptors in localizer.descriptors.values()])
-    print(
-        f"{len(photos)} photos, map of {len(localizer.names)} with {keypoints:.0f} keypoints each, "
-        f"{torch.get_num_threads()} threads"
+    parser = cli.Parser(__doc__, "--map place.hlm --query_images photos")
+    parser.add_argument(
+        "--map",
+        type=Path,
+        required=True,
+        help="map folder of pipelines.localize, or file of hloc_reduce.compact",
     )
-    print("| seconds | " + " | ".join(STAGES) + " | all but extraction |")
-    print("| --- |" + " ---: |" * (len(STAGES) + 1))
-    for name, reduce in (("mean", np.mean), ("median", np.median), ("max", np.max)):
-        cells = [*reduce(seconds, axis=0), reduce(seconds[:, 1:].sum(axis=1))]
-        print(f"| {name} | " + " | ".join(f"{cell:.3f}" for cell in cells) + " |")
+    parser.add_argument("--query_images", type=Path, required=True, help="folder of photos")
+    parser.add_argument("--onnx", type=Path, help="the map's feature, from hloc_reduce.export")
+    args = parser.parse_args()
+    photos = [args.query_images / name for name in list_images(args.query_images)]
+    from hloc_reduce import Localizer
+
+    localizer = Localizer(args.map, onnx=args.onnx)
+    opened = time.perf_counter() - START
+    localizer.localize(photos[0])
+    print(
+        f"Map of {len(localizer.names)} images. Opened {opened:.2f} s after the start of Python, "
+        f"first photo localized after {time.perf_counter() - START:.2f} s, {megabytes():.0f} MB."
+    )
+    rows, inliers = [], []
+    for photo in progress(photos, "Localizing", "photo"):
+        pose, info = localizer.localize(photo)
+        seconds = [info["seconds"].get(stage, 0.0) for stage in STAGES]
+        rows.append([*seconds, sum(seconds), sum(seconds[1:])])
+        inliers += [info["num_inliers"]] if pose is not None else []
+    mean = sum(inliers) / (len(inliers) or 1)
+    print(
+        f"{len(inliers)} of {len(photos)} photos localized, {mean:.0f} inliers on average, "
+        f"at most {megabytes():.0f} MB.\n"
+    )
+    print(f"| milliseconds | {' | '.join(STAGES)} | all | all but extraction |")
+    print("| --- |" + " ---: |" * (len(STAGES) + 2))
+    columns = [sorted(column) for column in zip(*rows, strict=True)]
+    for name, reduce in (
+        ("mean", lambda column: sum(column) / len(column)),
+        ("median", lambda column: column[len(column) // 2]),
+        ("max", max),
+    ):
+        print(f"| {name} | {' | '.join(f'{1000 * reduce(column):.0f}' for column in columns)} |")
 
 
 if __name__ == "__main__":

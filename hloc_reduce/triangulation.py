@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 
 from . import logger
+from .mapping.epipolar import MAX_ERROR, epipolar_errors
 from .runtime import provenance
 from .utils import cli, colmap
 from .utils.cli import InputError
@@ -20,7 +21,6 @@ from .utils.parsers import parse_retrieval
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
-MAX_EPIPOLAR_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
 STAMP = "made_from.json"
 PARTS = ("cameras", "frames", "images", "points3D", "rigs")
 MADE_BY_HLOC = {"database.db", *(f"{part}.bin" for part in PARTS)}
@@ -253,7 +253,7 @@ def _verify_by_poses(
         camera, name = reference.cameras[image.camera_id], image.name
         poses[name] = image.cam_from_world()
         rays[name] = colmap.cam_from_img(camera, keypoints[name])
-        thresholds[name] = camera.cam_from_img_threshold(MAX_EPIPOLAR_ERROR * uncertainty[name])
+        thresholds[name] = camera.cam_from_img_threshold(MAX_ERROR * uncertainty[name])
     verified: Verified = {}
     ratios = []
     for (name0, name1), indices in matches.items():
@@ -272,33 +272,6 @@ def _verify_by_poses(
             *(100 * np.array([np.mean(ratios), np.median(ratios), min(ratios), max(ratios)])),
         )
     return verified
-
-
-def epipolar_errors(
-    cam1_from_cam0: pycolmap.Rigid3d, points0: np.ndarray, points1: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Measure how far matches lie from the epipolar lines of a known relative pose.
-
-    Args:
-        cam1_from_cam0: the relative pose.
-        points0: (M, 2) points on the normalized image plane of camera 0.
-        points1: (M, 2) their matches on the normalized image plane of camera 1.
-
-    Returns:
-        Distances (M,) of points0 and of points1 to their epipolar lines, on these planes; infinite
-        where a line is undefined.
-    """
-    tx, ty, tz = cam1_from_cam0.translation
-    cross = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]])
-    essential = cross @ cam1_from_cam0.rotation.matrix()
-    points0, points1 = (np.pad(p, ((0, 0), (0, 1)), constant_values=1) for p in (points0, points1))
-    lines1, lines0 = points0 @ essential.T, points1 @ essential
-    distance = np.abs((points1 * lines1).sum(1))
-    errors = []
-    for lines in (lines0, lines1):
-        norm = np.linalg.norm(lines[:, :2], axis=1)
-        errors.append(np.divide(distance, norm, out=np.full_like(norm, np.inf), where=norm > 0))
-    return errors[0], errors[1]
 
 
 def add_options(parser: cli.Parser) -> None:

@@ -10,9 +10,8 @@ import pycolmap
 from .. import logger
 from ..runtime import provenance
 from ..utils import colmap
-from . import copies
+from . import copies, epipolar
 from .plausibility import (
-    COPY,
     MAX_DISTORTION,
     SPREAD,
     VIEWPOINTS,
@@ -39,6 +38,7 @@ RULES = {
     "points": f"{MORE} times as many where focal lengths differ",
     "spread": SPREAD,
     "viewpoints": VIEWPOINTS,
+    "misplaced": f"{epipolar.AGREEING} of {epipolar.EVIDENCE} matches or more",
     "copies": f"sharing less than {copies.SHARE} of the points expected in {copies.ENOUGH}",
 }
 
@@ -92,10 +92,7 @@ class Mapper:
             "parts": parts,
             "missing": missing,
             "unmatched": sorted(set(self.names) - _matched(database)),
-            "implausible": {
-                name: lens for name, lens in dropped.items() if name in missing and lens != COPY
-            },
-            "copies": sorted(name for name in missing if dropped.get(name) == COPY),
+            "implausible": {name: what for name, what in dropped.items() if name in missing},
             "alike": alike,
             "spread": round(focal_length_spread(models), 2),
         }
@@ -120,6 +117,7 @@ class Mapper:
     def run(self, database: Path) -> Models:
         """Return the plausible models of the best attempt; stop when enough images are in one."""
         cameras, folder = colmap.read_cameras(database), self.folder / "models"
+        evidence = cameras, self.keypoints, colmap.read_verified(database)
         number = len(self.names)
         enough = number if number <= FEW else ENOUGH * number
         enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
@@ -130,7 +128,7 @@ class Mapper:
                 database, self.image_dir, folder, options, self.verbose
             )
             shutil.rmtree(folder, ignore_errors=True)
-            best = max(best, keep_plausible(found, cameras), key=lambda both: _size(both[0]))
+            best = max(best, keep_plausible(found, *evidence), key=lambda both: _size(both[0]))
             registered = _size(best[0])[0]
             logger.info(
                 "Attempt %d of up to %d: %d of %d images reconstructed.",

@@ -1,6 +1,7 @@
 """Which images of a reconstructed model are plausible, and which models can be used."""
 
 from collections import Counter
+from collections.abc import Mapping
 
 import numpy as np
 import pycolmap
@@ -8,6 +9,7 @@ import pycolmap
 from .. import logger
 from ..localization.confidence import focal_lengths
 from . import copies
+from .epipolar import Pair, misplaced
 
 SPREAD = 1.2  # ratio of focal lengths above which one camera for all images is tried
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
@@ -15,23 +17,30 @@ MANY = 3  # images of one camera estimate its focal length better than EXIF data
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
 VIEWPOINTS = 3  # at least, of a model: two do not determine the focal lengths
 
-COPY = "another side or a copy"  # in place of an implausible lens, see `copies`
+# in place of an implausible lens, see `epipolar.misplaced` and `copies`
+MISPLACED, COPY = "misplaced", "another side or a copy"
 
 Models = tuple[list[pycolmap.Reconstruction], dict[str, str]]  # see `keep_plausible`
 
 
 def keep_plausible(
-    models: list[pycolmap.Reconstruction], cameras: dict[int, pycolmap.Camera]
+    models: list[pycolmap.Reconstruction],
+    cameras: dict[int, pycolmap.Camera],
+    keypoints: Mapping[str, np.ndarray] | None = None,
+    verified: Mapping[Pair, np.ndarray] | None = None,
 ) -> Models:
-    """Drop images with implausible lenses from models, copies, and what only these connect.
+    """Drop images from models: those with implausible lenses, misplaced ones, and copies.
 
     Args:
         models: of COLMAP's mapper.
         cameras: from id to the initial camera.
+        keypoints: (N, 2) of each image, COLMAP's pixels; with `verified`.
+        verified: the matches (M, 2) of pairs that agree with a two-view geometry; default: no image
+            is taken for misplaced.
 
     Returns:
         The models that have points, the largest first; and from the name of each dropped image to
-        what is implausible, `COPY` for another side of the place.
+        what is implausible: the lens, `MISPLACED` or `COPY`.
     """
     dropped: dict[str, str] = {}
     for model in models:
@@ -46,7 +55,9 @@ def keep_plausible(
                 model.deregister_frame(image.frame_id)
         if implausible:
             _keep_connected(model)
-        dropped |= implausible | dict.fromkeys(_drop_copies(model), COPY)
+        dropped |= implausible
+        dropped |= dict.fromkeys(_drop_misplaced(model, keypoints or {}, verified or {}), MISPLACED)
+        dropped |= dict.fromkeys(_drop_copies(model), COPY)
     whole = []
     for model in models:
         if min(size(model)) < 2:
@@ -92,16 +103,34 @@ def count_viewpoints(model: pycolmap.Reconstruction) -> int:
     return number
 
 
+def _drop_misplaced(
+    model: pycolmap.Reconstruction,
+    keypoints: Mapping[str, np.ndarray],
+    verified: Mapping[Pair, np.ndarray],
+) -> list[str]:
+    """Drop photos that contradict their matches, see `epipolar.misplaced`; return their names."""
+    dropped: list[str] = []
+    while verified and (found := misplaced(model, keypoints, verified)):
+        dropped.append(found)
+        _drop(model, {found})
+    return dropped
+
+
 def _drop_copies(model: pycolmap.Reconstruction) -> list[str]:
     """Drop photos that contradict others, see `copies.find`; return their names."""
     dropped: list[str] = []
     while found := copies.find(model):
         dropped += found
-        for image_id in model.reg_image_ids():
-            if model.images[image_id].name in found:
-                model.deregister_frame(model.images[image_id].frame_id)
-        _keep_connected(model)
+        _drop(model, set(found))
     return dropped
+
+
+def _drop(model: pycolmap.Reconstruction, names: set[str]) -> None:
+    """Drop photos, and those that only these connect."""
+    for image_id in model.reg_image_ids():
+        if model.images[image_id].name in names:
+            model.deregister_frame(model.images[image_id].frame_id)
+    _keep_connected(model)
 
 
 def _keep_connected(model: pycolmap.Reconstruction) -> None:

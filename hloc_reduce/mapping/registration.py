@@ -6,12 +6,32 @@ from .. import logger
 from ..runtime import provenance
 from ..utils import cli
 from ..utils.cli import InputError
-from .plausibility import COPY, SPREAD, VIEWPOINTS
+from .plausibility import COPY, MISPLACED, SPREAD, VIEWPOINTS
 
 REGISTRATION = "registration.json"  # which images are in the model, and in other parts
 # shares of registered images: a model with fewer is reported in detail, or refused
 ENOUGH, LEAST = 0.8, 0.5
 NAMED = 10  # images that a message names
+
+
+LENS = "lens"
+# why photos were dropped; see `plausibility`
+WHY = {
+    LENS: (
+        "These have focal lengths in pixels or distortions that no lens has, or focal lengths far "
+        "from their EXIF data, so their poses are wrong"
+    ),
+    MISPLACED: "Most matches of these contradict the poses that COLMAP found",
+    COPY: (
+        "These show another side of the place that looks the same, or a copy of it: from where "
+        "COLMAP puts them, they would see many points of the others, but they match few of them"
+    ),
+}
+# what to try, of kinds other than LENS
+TRIES = {
+    MISPLACED: "add photos between those in the map and those that are not",
+    COPY: "make a map of each side, or add photos all the way from one to the other",
+}
 
 
 class NoModelError(InputError):
@@ -24,30 +44,22 @@ def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
         "Do enough of them overlap? Take photos from several places, each overlapping the one "
         "before by about two thirds."
     )
-    lenses = {name: lens for name, lens in (dropped or {}).items() if lens != COPY}
-    hint = _lenses(lenses) if lenses else advice
+    hint = _left_out(dropped, []) if dropped else advice
     return (
         f"COLMAP could not reconstruct the images of {image_dir} from {VIEWPOINTS} viewpoints or "
         f"more. {hint}"
     )
 
 
-def _lenses(dropped: dict[str, str]) -> str:
-    """Say which images have implausible lenses."""
-    lenses = [f"{name} ({lens})" for name, lens in dropped.items()]
-    return (
-        "These have focal lengths in pixels or distortions that no lens has, or focal lengths far "
-        f"from their EXIF data, so their poses are wrong: {cli.some(lenses, NAMED)}."
-    )
-
-
-def _copies(names: list[str], missing: list[str]) -> str:
-    """Say which of the missing images show another side of the place."""
-    which = "" if names == missing else f" {cli.some(names, NAMED)}:"
-    return (
-        f"Another side of the place that looks the same, or a copy of it:{which} from where COLMAP "
-        "puts these photos, they would see many points of the others, but they match few of them."
-    )
+def _left_out(dropped: dict[str, str], missing: list[str]) -> str:
+    """Say why images were dropped; names are not repeated if all `missing` ones have one reason."""
+    kinds: dict[str, list[str]] = {LENS: [], MISPLACED: [], COPY: []}
+    for name, what in sorted(dropped.items()):
+        kinds[what if what in kinds else LENS].append(name)
+    lenses = [f"{name} ({dropped[name]})" for name in kinds[LENS]]
+    named = {kind: names for kind, names in kinds.items() if names != missing} | {LENS: lenses}
+    said = {kind: f": {cli.some(names, NAMED)}" for kind, names in named.items()}
+    return " ".join(f"{WHY[kind]}{said.get(kind, '')}." for kind, names in kinds.items() if names)
 
 
 def check(sfm_dir: Path, accept_partial: bool) -> None:
@@ -56,7 +68,7 @@ def check(sfm_dir: Path, accept_partial: bool) -> None:
     Raises:
         InputError: if it has fewer than half of the images, unless `accept_partial`.
     """
-    state = {"copies": [], **provenance.read(sfm_dir / REGISTRATION)}  # older maps have none
+    state = provenance.read(sfm_dir / REGISTRATION)
     missing, number, spread = state["missing"], state["images"], state.pop("spread", 1.0)
     registered = number - len(missing)
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
@@ -73,12 +85,11 @@ def check(sfm_dir: Path, accept_partial: bool) -> None:
                 "camera with a fixed zoom took all, --camera_mode single gives better poses."
             )
         if missing:
-            implausible, copies = state["implausible"], state["copies"]
+            implausible = state["implausible"]
             logger.warning(
-                "%d of %d images are not in the map: %s.%s%s",
+                "%d of %d images are not in the map: %s.%s",
                 *(len(missing), number, cli.some(missing, NAMED)),
-                f" {_lenses(implausible)}" if implausible else "",
-                f" {_copies(copies, missing)}" if copies else "",
+                f" {_left_out(implausible, missing)}" if implausible else "",
             )
         return
     message = shortfall(sfm_dir / REGISTRATION, **state)
@@ -95,7 +106,6 @@ def shortfall(
     unmatched: list[str],
     implausible: dict[str, str],
     alike: bool,
-    copies: list[str],
 ) -> str:
     """Say which images are not in a model, why, and what to try.
 
@@ -105,9 +115,8 @@ def shortfall(
         parts: the images of each part that COLMAP reconstructed, the model first.
         missing: the images that are not in the model.
         unmatched: the images without verified matches.
-        implausible: from each dropped image to what is implausible about its lens.
+        implausible: from each dropped image to what is implausible about it.
         alike: each image has its own camera, but one camera may have taken all.
-        copies: the dropped images that show another side of the place.
     """
     registered = images - len(missing)
     only = "Only " if registered < ENOUGH * images else ""
@@ -115,7 +124,7 @@ def shortfall(
         f"{only}{registered} of {images} photos are in the map.",
         f"Missing: {cli.some(missing, NAMED)}{f' (all in {path})' * bool(missing[NAMED:])}.",
     ]
-    tries = []
+    tries: list[str] = []
     if len(parts) > 1:
         sizes = [str(len(part)) for part in parts]
         said.append(
@@ -124,7 +133,7 @@ def shortfall(
             + (f"; the second has {cli.some(parts[1], 3)}." if parts[1] != missing else ".")
         )
         tries.append("add photos between the parts, each overlapping the one before by two thirds")
-    elif set(missing) - set(unmatched) - set(implausible) - set(copies):
+    elif set(missing) - set(unmatched) - set(implausible):
         tries.append("add photos between those in the map and those that are not")
     if unmatched:
         said.append(f"No other photo matches {cli.some(unmatched)}.")
@@ -132,10 +141,8 @@ def shortfall(
     if tries:
         tries.append("leave out photos of other places")
     if implausible:
-        said.append(_lenses(implausible))
-    if copies:
-        said.append(_copies(copies, missing))
-        tries.append("make a map of each side, or add photos all the way from one to the other")
+        said.append(_left_out(implausible, missing))
+        tries += [TRIES[kind] for kind in TRIES if kind in implausible.values()]
     if alike:
         tries.append("--camera_mode single, if one camera with a fixed zoom took all photos")
-    return f"{' '.join(said)} What to try: {'; '.join(tries)}."
+    return f"{' '.join(said)} What to try: {'; '.join(dict.fromkeys(tries))}."

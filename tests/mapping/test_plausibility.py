@@ -119,7 +119,6 @@ def test_parts_that_do_not_connect():
         "unmatched": ["j"],
         "implausible": {},
         "alike": False,
-        "copies": [],
     }
     message = registration.shortfall(Path("x"), **state)
     assert "Only 5 of 10 photos" in message and "f, g, h, i, j." in message
@@ -130,6 +129,12 @@ def test_parts_that_do_not_connect():
     message = registration.shortfall(Path("x"), **state)
     assert "no lens has" in message and "i (distortion 4.6)." in message
     assert "--camera_mode single, if one camera" in message
-    message = registration.shortfall(Path("x"), **{**state, "copies": ["g"]})
-    assert "Another side of the place that looks the same, or a copy of it: g: from" in message
+    state["implausible"] = {"g": "another side or a copy", "h": "misplaced", "i": "distortion 4.6"}
+    message = registration.shortfall(Path("x"), **state)
+    assert "no lens has" in message and "i (distortion 4.6)." in message
+    assert "another side of the place that looks the same" in message and "them: g." in message
+    assert "contradict the poses that COLMAP found: h." in message
     assert "make a map of each side" in message
+    everything = dict.fromkeys(state["missing"], "misplaced")
+    message = registration.shortfall(Path("x"), **{**state, "implausible": everything})
+    assert "contradict the poses that COLMAP found. " in message

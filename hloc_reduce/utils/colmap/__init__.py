@@ -8,6 +8,7 @@ from .databases import (
     count_verified,
     import_images,
     read_cameras,
+    read_verified,
     write_matches,
     write_reference,
 )
@@ -48,6 +49,7 @@ __all__ = [
     "point3D_ids",
     "read_cameras",
     "read_model",
+    "read_verified",
     "triangulate_points",
     "verify_matches",
     "write_matches",

@@ -140,6 +140,18 @@ def read_cameras(database: Path) -> dict[int, pycolmap.Camera]:
         return {camera.camera_id: camera for camera in opened.read_all_cameras()}
 
 
+def read_verified(database: Path) -> dict[tuple[str, str], np.ndarray]:
+    """Return the verified matches (M, 2) int of each pair of images that has any."""
+    with open_database(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        geometries = zip(*opened.read_two_view_geometries(), strict=True)
+    found = (
+        (pycolmap.pair_id_to_image_pair(pair), np.asarray(geometry.inlier_matches, np.int64))
+        for pair, geometry in geometries
+    )
+    return {(names[pair[0]], names[pair[1]]): rows for pair, rows in found if len(rows)}
+
+
 def count_verified(database: Path) -> dict[tuple[str, str], int]:
     """Return the number of verified matches of each pair of images that has any."""
     with open_database(database) as opened:
