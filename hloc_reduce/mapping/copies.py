@@ -8,6 +8,8 @@ points are seen by both: what differs between the sides does not match.
 import numpy as np
 import pycolmap
 
+from . import groups
+
 # a point is expected in a photo if another photo sees it from a direction that differs by at most
 # as many degrees, and from a distance that differs by at most this factor
 ANGLE, DISTANCE = 15.0, 1.5
@@ -21,37 +23,21 @@ WORK = 2e8  # pairs of observations and photos: above, only some of the points a
 def find(model: pycolmap.Reconstruction) -> list[str]:
     """Find the photos of a map that show another side of the place, or a copy of it.
 
-    Groups of photos are built by their shared points, as by average linkage, and compared where two
-    of them are joined.
-
     Args:
         model: the map.
 
     Returns:
         The smaller one of two groups that contradict each other; none if no groups do.
     """
-    from scipy.cluster.hierarchy import average
-    from scipy.spatial.distance import squareform
-
     images = [model.images[i] for i in sorted(model.reg_image_ids())]
     if len(images) < 4:
         return []
     expected, shared, used = _count(model, images)
-    closeness = shared.max() - shared
-    np.fill_diagonal(closeness, 0)
-    groups = {i: [i] for i in range(len(images))}
-    sums = np.zeros((2, 2 * len(images), 2 * len(images)))
-    sums[:, : len(images), : len(images)] = expected, shared
-    worst, found = SHARE, list[int]()
-    for new, (a, b, *_) in enumerate(average(squareform(closeness)).astype(int), len(images)):
-        first, second = groups.pop(a), groups.pop(b)
-        wanted, common = sums[:, a, b]
-        enough = wanted >= ENOUGH * used * 2 * len(first) * len(second)
-        if enough and min(len(first), len(second)) > 1 and common < worst * wanted:
-            worst, found = common / wanted, min(second, first, key=len)
-        groups[new] = first + second
-        sums[:, new] = sums[:, a] + sums[:, b]
-        sums[:, :, new] = sums[:, :, a] + sums[:, :, b]
+
+    def enough(wanted: float, first: int, second: int) -> bool:
+        return min(first, second) > 1 and wanted >= ENOUGH * used * 2 * first * second
+
+    found = groups.contradicting(shared, expected, SHARE, enough)
     return sorted(images[i].name for i in found)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 
 from ..utils import colmap
+from . import groups
 
 MAX_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
 # verified matches of a pair that are evidence, and the share of an image's that must agree
@@ -18,40 +19,49 @@ def misplaced(
     model: pycolmap.Reconstruction,
     keypoints: Mapping[str, np.ndarray],
     verified: Mapping[Pair, np.ndarray],
-) -> str | None:
-    """Return the image whose pose contradicts its matches most, None if no pose does.
+) -> list[str]:
+    """Return images whose poses contradict their matches.
 
-    A mapper may place an image by a few wrong matches, in spite of all its other ones. Those are
-    then far from their epipolar lines.
+    A mapper may place an image, or a group of images, by a few wrong matches, in spite of all the
+    other ones. Those are then far from their epipolar lines.
 
     Args:
         model: the map.
         keypoints: (N, 2) of each image, COLMAP's pixels.
         verified: the matches (M, 2) of pairs that agree with a two-view geometry.
+
+    Returns:
+        The image that contradicts its matches most; or else the smaller one of two groups whose
+        matches with each other do; none if no poses do.
     """
-    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    images = [model.images[i] for i in sorted(model.reg_image_ids())]
+    row = {image.name: i for i, image in enumerate(images)}
     poses, rays, thresholds = {}, {}, {}
-    for name, image in images.items():
+    for image in images:
         assert image.camera is not None  # it belongs to a model
-        poses[name] = image.cam_from_world()
-        rays[name] = colmap.cam_from_img(image.camera, keypoints[name])
-        thresholds[name] = image.camera.cam_from_img_threshold(MAX_ERROR)
-    agree, number = dict.fromkeys(images, 0), dict.fromkeys(images, 0)
+        poses[image.name] = image.cam_from_world()
+        rays[image.name] = colmap.cam_from_img(image.camera, keypoints[image.name])
+        thresholds[image.name] = image.camera.cam_from_img_threshold(MAX_ERROR)
+    agree, number = np.zeros((2, len(images), len(images)))
     for (name0, name1), indices in verified.items():
-        if len(indices) < EVIDENCE or not {name0, name1} <= images.keys():
+        if len(indices) < EVIDENCE or not {name0, name1} <= row.keys():
             continue
         errors0, errors1 = epipolar_errors(
             poses[name1] * poses[name0].inverse(),
             rays[name0][indices[:, 0]],
             rays[name1][indices[:, 1]],
         )
-        agreeing = (errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])
-        for name in (name0, name1):
-            agree[name] += int(agreeing.sum())
-            number[name] += len(indices)
-    shares = {name: agree[name] / number[name] for name in images if number[name]}
-    worst = min(shares, key=shares.__getitem__, default=None)
-    return worst if worst is not None and shares[worst] < AGREEING else None
+        agreeing = ((errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])).sum()
+        i, j = row[name0], row[name1]
+        agree[i, j] = agree[j, i] = agreeing
+        number[i, j] = number[j, i] = len(indices)
+    all_of = number.sum(axis=1)
+    shares = np.divide(agree.sum(axis=1), all_of, out=np.ones(len(images)), where=all_of > 0)
+    found = [int(shares.argmin())] if (shares < AGREEING).any() else []
+    found = found or groups.contradicting(
+        agree, number, AGREEING, lambda wanted, *_: wanted >= EVIDENCE
+    )
+    return sorted(images[i].name for i in found)
 
 
 @np.errstate(invalid="ignore")  # points that no camera sees are infinite

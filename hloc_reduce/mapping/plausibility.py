@@ -111,8 +111,8 @@ def _drop_misplaced(
     """Drop photos that contradict their matches, see `epipolar.misplaced`; return their names."""
     dropped: list[str] = []
     while verified and (found := misplaced(model, keypoints, verified)):
-        dropped.append(found)
-        _drop(model, {found})
+        dropped += found
+        _drop(model, set(found))
     return dropped
 
 

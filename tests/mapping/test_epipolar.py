@@ -32,7 +32,7 @@ def row(turned: dict[int, float]) -> tuple[pycolmap.Reconstruction, dict, dict]:
     return model, keypoints, dict.fromkeys(pairs, np.repeat(np.arange(60)[:, None], 2, axis=1))
 
 
-@pytest.mark.parametrize(("turned", "worst"), [({}, None), ({2: 0.1}, None), ({2: 5.0}, "2.jpg")])
+@pytest.mark.parametrize(("turned", "worst"), [({}, []), ({2: 0.1}, []), ({2: 5.0}, ["2.jpg"])])
 def test_the_pose_that_contradicts_most_matches(turned, worst):
     model, *matched = row(turned)
     assert misplaced(model, *matched) == worst
@@ -41,8 +41,19 @@ def test_the_pose_that_contradicts_most_matches(turned, worst):
 def test_few_matches_are_no_evidence():
     model, keypoints, verified = row({2: 5.0})
     few = {pair: rows[:14] for pair, rows in verified.items()}
-    assert misplaced(model, keypoints, few) is None
-    assert misplaced(model, keypoints, {}) is None
+    assert misplaced(model, keypoints, few) == []
+    assert misplaced(model, keypoints, {}) == []
+
+
+def test_groups_that_contradict_each_other():
+    """Each agrees with itself, and all of its photos with most of their matches."""
+    model, keypoints, verified = row({3: 5.0, 4: 5.0, 5: 5.0})
+    across = {(f"{i}.jpg", f"{j}.jpg") for i in (3, 4, 5) for j in (0, 1, 2)}
+    verified = {pair: rows[:20] if pair in across else rows for pair, rows in verified.items()}
+    assert misplaced(model, keypoints, verified) in (
+        ["0.jpg", "1.jpg", "2.jpg"],
+        ["3.jpg", "4.jpg", "5.jpg"],
+    )
 
 
 def test_misplaced_photos_are_left_out_of_a_map():
