@@ -54,7 +54,7 @@ def test_fewer_than_half_of_the_photos(plane, tmp_path, monkeypatch, caplog, run
     build = ("--map_images", images, "--outputs", outputs)
     message = refused(*build)
     assert "Only 5 of 11 photos are in the map. Missing: 10.png, 5.png, 6.png" in message
-    assert "No other photo matches 10.png" in message and "retake blurred or dark ones" in message
+    assert "No other photo matches 10.png" in message and "retake blurred or dark photos" in message
     assert "--accept_partial" in message
     assert not (outputs / "map/map.json").exists()
     caplog.clear()
