@@ -69,6 +69,5 @@ class LightEngine:
             *(described, query, self._ratio_threshold, shown),
             distance_threshold=self._distance_threshold,
         )
-        matched = np.flatnonzero(matches >= 0)
-        matched = matched[np.argsort(-cosine[matched], kind="stable")]
-        return np.stack([matches[matched], shown[matched]], axis=1)
+        matched = matches >= 0
+        return matching.most_similar_first(matches[matched], shown[matched], cosine[matched])

@@ -62,6 +62,22 @@ def best_two_of_blocks(
     return index, best, second
 
 
+def most_similar_first(rows0: np.ndarray, rows1: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Order matches as those of a match file are: by their scores as float16, then by `rows0`.
+
+    Args:
+        rows0: (M,) descriptors of the query.
+        rows1: (M,) their matches.
+        cosine: (M,) float32 of the matches.
+
+    Returns:
+        (M, 2) int64, the most similar first.
+    """
+    score = ((np.minimum(cosine, 1) + 1) / 2).astype(np.float16)
+    order = np.lexsort((rows0, -score))
+    return np.stack([rows0[order], rows1[order]], axis=1)
+
+
 def mutual_nearest(
     descriptors0: np.ndarray,
     descriptors1: np.ndarray,

@@ -49,11 +49,13 @@ class Matcher(BaseModel):
             rows1: (K,) int64, ascending rows of descriptors1.
 
         Returns:
-            Matches (L, 2) int64, rows of descriptors0 and descriptors1, the most similar first.
+            Matches (L, 2) int64, rows of descriptors0 and descriptors1, the most similar first, in
+            the order that `utils.match_files.most_similar_first` gives.
         """
         ((matches0, scores),) = self.match([(descriptors0, descriptors1)])
         rows0 = torch.nonzero(torch.isin(matches0, rows1))[:, 0]
-        rows0 = rows0[scores[rows0].argsort(descending=True, stable=True)]
+        # as float16, as a match file has them
+        rows0 = rows0[scores[rows0].half().float().argsort(descending=True, stable=True)]
         return torch.stack([rows0, matches0[rows0]], dim=1)
 
 

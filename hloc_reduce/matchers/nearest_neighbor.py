@@ -263,9 +263,10 @@ class NearestNeighbor(Matcher):
             *(descriptors1, descriptors0, self.conf["ratio_threshold"], rows1),
             distance_threshold=self.conf["distance_threshold"],
         )
-        matched = torch.nonzero(matches1 >= 0)[:, 0]
-        matched = matched[cosine[matched].argsort(descending=True, stable=True)]
-        return torch.stack([matches1[matched], rows1[matched]], dim=1)
+        matched = matches1 >= 0
+        found = (matches1[matched], rows1[matched], cosine[matched])
+        ordered = matching.most_similar_first(*(part.cpu().numpy() for part in found))
+        return torch.from_numpy(ordered).to(matches1.device)
 
     def _forward(self, data: dict) -> dict:
         pair = (data["descriptors0"][0].T.contiguous(), data["descriptors1"][0].T.contiguous())

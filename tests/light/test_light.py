@@ -11,9 +11,10 @@ from safetensors.numpy import load, save
 
 from hloc_reduce import Localizer, compact, export, projections
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.light import projection
+from hloc_reduce.light import matching, projection
 from hloc_reduce.maps import contents
 from hloc_reduce.maps.compact import CompactMap
+from hloc_reduce.utils import match_files
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.images import read_image
 from pipelines import localize
@@ -90,6 +91,19 @@ def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
         ]
         np.testing.assert_array_equal(*matched)
     assert any(len(pairs) > 50 for pairs in matched)
+
+
+def test_matches_are_in_the_order_of_a_match_file():
+    """Localizer ordered them by exact cosines, and found another confidence than the pipeline."""
+    generator = np.random.default_rng(0)
+    cosine = (0.9 + 1e-4 * generator.random(200)).astype(np.float32)  # many equal as float16
+    rows0, rows1 = generator.permutation(500)[:200], generator.permutation(300)[:200]
+    found = matching.most_similar_first(rows0, rows1, cosine)
+    by_query = np.argsort(rows0)
+    pairs = np.stack([rows0, rows1], axis=1)[by_query]
+    scores = ((cosine[by_query] + 1) / 2).astype(np.float16)
+    assert len(np.unique(scores)) < 20
+    np.testing.assert_array_equal(found, match_files.most_similar_first(pairs, scores))
 
 
 def test_features_that_need_torch(place, run, tmp_path):
