@@ -42,6 +42,6 @@ def test_wheel_is_complete(tmp_path):
     assert weights and weights <= names
     if has_compiler() and platform.system() == "Linux":
         assert any(name.startswith("hloc_reduce/utils/_best_two.") for name in names)
-    assert "hloc_reduce/aggregators/vlad_sift_sv64.safetensors" in names
+    assert "hloc_reduce/light/vlad_sift_sv64.safetensors" in names
     assert {f"hloc_reduce/report/page.{kind}" for kind in ("html", "css", "js")} <= names
     assert "hloc_reduce/evaluation/published/localization_recall.csv" in names

@@ -31,13 +31,13 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
     monkeypatch.setattr(extract_features.parallel, "cores", lambda: 1)  # no process detects
     count(dog, "detect")
     count(Descriptor, "forward")
-    count(extractors, "read_image")
+    count(extractors, "resized")
     count(aggregate_features, "main")
     features = ["sift_sv64", "sift", "sift_sv16", "colmap_sift"]
     grid = {"dataset": str(aachen_layout), "feature": features, "matcher": "NN-ratio"}
     outputs = run_batch(grid)
     images = 7
-    assert done["detect"] == done["read_image"] == images
+    assert done["detect"] == done["resized"] == images
     assert done["forward"] == images
     assert done["main"] == 1
     folder = outputs / aachen_layout.name
