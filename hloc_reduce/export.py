@@ -185,10 +185,12 @@ def _image(height: int, width: int) -> "torch.Tensor":
 
 
 def _write(content: Content, path: Path) -> None:
-    """Write an ONNX file."""
+    """Write an ONNX file; it computes in float32."""
     import torch
     from onnx_ir import Shape
     from onnx_ir.passes.common import ClearMetadataAndDocStringPass
+
+    from .projections.network import Projection
 
     shape = next(iter(content.shapes.values()))
     sides = {
@@ -196,6 +198,9 @@ def _write(content: Content, path: Path) -> None:
         for axis, side in enumerate(shape)
         if isinstance(side, str)
     }
+    for module in content.module.modules():
+        if isinstance(module, Projection):
+            module.exact = False
     with _quiet(), torch.no_grad():
         traced = torch.export.export(
             content.module, (content.made_with,), dynamic_shapes=(sides,), strict=False

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from . import logger
-from .mapping.epipolar import MAX_ERROR, epipolar_errors
+from .mapping.epipolar import agreeing
 from .runtime import provenance
 from .utils import cli, colmap
 from .utils.cli import InputError
@@ -248,24 +248,11 @@ def _verify_by_poses(
     matches: dict[Pair, np.ndarray],
 ) -> Verified:
     """Return for each pair all matches, and those close to the epipolar lines of known poses."""
-    poses, rays, thresholds = {}, {}, {}
-    for image in reference.images.values():
-        camera, name = reference.cameras[image.camera_id], image.name
-        poses[name] = image.cam_from_world()
-        rays[name] = colmap.cam_from_img(camera, keypoints[name])
-        thresholds[name] = camera.cam_from_img_threshold(MAX_ERROR * uncertainty[name])
-    verified: Verified = {}
-    ratios = []
-    for (name0, name1), indices in matches.items():
-        errors0, errors1 = epipolar_errors(
-            poses[name1] * poses[name0].inverse(),
-            rays[name0][indices[:, 0]],
-            rays[name1][indices[:, 1]],
-        )
-        valid = (errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])
-        verified[name0, name1] = indices, indices[valid]
-        if len(indices):
-            ratios.append(valid.mean())
+    agree = agreeing(reference.images.values(), keypoints, matches, uncertainty)
+    verified: Verified = {
+        pair: (indices, indices[agree[pair]]) for pair, indices in matches.items()
+    }
+    ratios = [valid.mean() for valid in agree.values() if len(valid)]
     if ratios:
         logger.info(
             "Matches on epipolar lines: mean %.1f %%, median %.1f %%, min %.1f %%, max %.1f %%.",

@@ -38,8 +38,8 @@ class ColmapSift:
         """Return the features of an image (H, W)."""
         if image.ndim != 2:
             raise InputError("DoG needs grey images: preprocessing: {grayscale: true}.")
-        found = dog.strongest(*self._detect(image), self._conf["max_keypoints"])
-        keypoints, descriptors = found
+        number = self._conf["max_keypoints"]
+        keypoints, descriptors = dog.strongest(*self._detect(image), number)
         if self._layers is not None:
             descriptors = projection.project(descriptors, self._layers)
         return {"keypoints": keypoints[:, :2], "descriptors": descriptors.T}

@@ -8,6 +8,8 @@ points are seen by both: what differs between the sides does not match.
 import numpy as np
 import pycolmap
 
+from ..localization.projection import reprojection_errors
+from ..utils.colmap import point3D_ids
 from . import groups
 
 # a point is expected in a photo if another photo sees it from a direction that differs by at most
@@ -53,15 +55,11 @@ def _count(
     number, points = len(images), model.points3D
     used = min(1.0, WORK / (number * sum(image.num_points3D for image in images) or 1))
     chosen = np.random.default_rng(0).random(len(points)) < used
-    ids = np.array(sorted(points))[chosen]
+    ids = np.array(sorted(points), np.int64)[chosen]
     xyz = np.array([points[i].xyz for i in ids.tolist()]).reshape(-1, 3)
-    row_of = {point: row for row, point in enumerate(ids.tolist())}
-    seen, inside = np.zeros((2, number, len(ids)), bool)
     centres = np.array([image.projection_center() for image in images])
-    for i, image in enumerate(images):
-        rows = [row_of.get(p.point3D_id, -1) for p in image.points2D if p.has_point3D()]
-        seen[i, [row for row in rows if row >= 0]] = True
-        inside[i] = _inside(image, xyz)
+    seen = np.array([np.isin(ids, point3D_ids(image)) for image in images])
+    inside = np.array([_inside(image, xyz) for image in images])
     expected, shared = np.zeros((2, number, number))
     for i in range(number):
         its = np.flatnonzero(seen[i])
@@ -79,13 +77,9 @@ def _count(
 
 def _inside(image: pycolmap.Image, xyz: np.ndarray) -> np.ndarray:
     """Return which points (P, 3) are within a photo (P,)."""
-    pose, camera = image.cam_from_world(), image.camera
+    camera = image.camera
     assert camera is not None  # the image belongs to a model
-    local = xyz @ pose.rotation.matrix().T + pose.translation
-    front = local[:, 2] > 0
-    found = np.zeros(len(xyz), bool)
-    if front.any():
-        projected = np.asarray(camera.img_from_cam(local[front]))
-        size = camera.width, camera.height
-        found[front] = ((projected > 0) & (projected < size)).all(axis=1)
-    return found
+    _, projected = reprojection_errors(np.zeros((len(xyz), 2)), xyz, image.cam_from_world(), camera)
+    # comparisons with NaN, behind the camera, are false
+    size = np.array([camera.width, camera.height])
+    return np.all((projected > 0) & (projected < size), axis=1)

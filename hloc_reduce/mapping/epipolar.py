@@ -1,6 +1,6 @@
 """Matches of photos against their poses, by epipolar geometry."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pycolmap
@@ -15,53 +15,82 @@ EVIDENCE, AGREEING = 15, 0.5
 Pair = tuple[str, str]
 
 
-def misplaced(
-    model: pycolmap.Reconstruction,
+def agreeing(
+    images: Iterable[pycolmap.Image],
     keypoints: Mapping[str, np.ndarray],
-    verified: Mapping[Pair, np.ndarray],
-) -> list[str]:
-    """Return images whose poses contradict their matches.
-
-    A mapper may place an image, or a group of images, by a few wrong matches, in spite of all the
-    other ones. Those are then far from their epipolar lines.
+    matches: Mapping[Pair, np.ndarray],
+    uncertainty: Mapping[str, float] | None = None,
+) -> dict[Pair, np.ndarray]:
+    """Return which matches are close to the epipolar lines of the poses of images of a model.
 
     Args:
-        model: the map.
+        images: with poses.
         keypoints: (N, 2) of each image, COLMAP's pixels.
-        verified: the matches (M, 2) of pairs that agree with a two-view geometry.
+        matches: (M, 2) of pairs; those of other images are left out.
+        uncertainty: of the keypoints of each image in pixels; default: 1.
 
     Returns:
-        The image that contradicts its matches most; or else the smaller one of two groups whose
-        matches with each other do; none if no poses do.
+        From pair to (M,) bool.
     """
-    images = [model.images[i] for i in sorted(model.reg_image_ids())]
-    row = {image.name: i for i, image in enumerate(images)}
     poses, rays, thresholds = {}, {}, {}
     for image in images:
-        assert image.camera is not None  # it belongs to a model
-        poses[image.name] = image.cam_from_world()
-        rays[image.name] = colmap.cam_from_img(image.camera, keypoints[image.name])
-        thresholds[image.name] = image.camera.cam_from_img_threshold(MAX_ERROR)
-    agree, number = np.zeros((2, len(images), len(images)))
-    for (name0, name1), indices in verified.items():
-        if len(indices) < EVIDENCE or not {name0, name1} <= row.keys():
+        name, camera = image.name, image.camera
+        assert camera is not None  # it belongs to a model
+        poses[name] = image.cam_from_world()
+        rays[name] = colmap.cam_from_img(camera, keypoints[name])
+        pixels = MAX_ERROR * (1 if uncertainty is None else uncertainty[name])
+        thresholds[name] = camera.cam_from_img_threshold(pixels)
+    found = {}
+    for (name0, name1), indices in matches.items():
+        if not {name0, name1} <= poses.keys():
             continue
         errors0, errors1 = epipolar_errors(
             poses[name1] * poses[name0].inverse(),
             rays[name0][indices[:, 0]],
             rays[name1][indices[:, 1]],
         )
-        agreeing = ((errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])).sum()
+        found[name0, name1] = (errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])
+    return found
+
+
+def misplaced(
+    model: pycolmap.Reconstruction,
+    keypoints: Mapping[str, np.ndarray],
+    verified: Mapping[Pair, np.ndarray],
+) -> list[str]:
+    """Return the images whose poses contradict their matches.
+
+    A mapper may place an image, or a group of images, by a few wrong matches, in spite of all the
+    other ones. Those are then far from their epipolar lines. The image that contradicts its matches
+    most is taken away, or, if none does, the smaller one of two groups whose matches with each
+    other do; and so on with the others.
+
+    Args:
+        model: the map.
+        keypoints: (N, 2) of each image, COLMAP's pixels.
+        verified: the matches (M, 2) of pairs that agree with a two-view geometry.
+    """
+    images = [model.images[i] for i in sorted(model.reg_image_ids())]
+    row = {image.name: i for i, image in enumerate(images)}
+    agree, number = np.zeros((2, len(images), len(images)))
+    evidence = {pair: rows for pair, rows in verified.items() if len(rows) >= EVIDENCE}
+    for (name0, name1), valid in agreeing(images, keypoints, evidence).items():
         i, j = row[name0], row[name1]
-        agree[i, j] = agree[j, i] = agreeing
-        number[i, j] = number[j, i] = len(indices)
-    all_of = number.sum(axis=1)
-    shares = np.divide(agree.sum(axis=1), all_of, out=np.ones(len(images)), where=all_of > 0)
-    found = [int(shares.argmin())] if (shares < AGREEING).any() else []
-    found = found or groups.contradicting(
-        agree, number, AGREEING, lambda wanted, *_: wanted >= EVIDENCE
-    )
-    return sorted(images[i].name for i in found)
+        agree[i, j] = agree[j, i] = valid.sum()
+        number[i, j] = number[j, i] = len(valid)
+    left = np.arange(len(images))
+    while len(left) and (found := _worst(agree[np.ix_(left, left)], number[np.ix_(left, left)])):
+        left = np.delete(left, found)
+    return sorted(set(row).difference(images[i].name for i in left))
+
+
+def _worst(agree: np.ndarray, number: np.ndarray) -> list[int]:
+    """Return the image, or else the group, of (N, N) matches of which the fewest agree, if any."""
+    of_each = number.sum(axis=1)
+    shares = np.divide(agree.sum(axis=1), of_each, out=np.ones(len(agree)), where=of_each > 0)
+    if shares.min() < AGREEING:
+        return [int(shares.argmin())]
+    return groups.contradicting(agree, number, AGREEING, lambda wanted, *_: wanted >= EVIDENCE)
 
 
 @np.errstate(invalid="ignore")  # points that no camera sees are infinite

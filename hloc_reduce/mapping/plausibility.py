@@ -109,10 +109,9 @@ def _drop_misplaced(
     verified: Mapping[Pair, np.ndarray],
 ) -> list[str]:
     """Drop photos that contradict their matches, see `epipolar.misplaced`; return their names."""
-    dropped: list[str] = []
-    while verified and (found := misplaced(model, keypoints, verified)):
-        dropped += found
-        _drop(model, set(found))
+    dropped = misplaced(model, keypoints, verified) if verified else []
+    if dropped:
+        _drop(model, set(dropped))
     return dropped
 
 

@@ -12,8 +12,6 @@ REGISTRATION = "registration.json"  # which images are in the model, and in othe
 # shares of registered images: a model with fewer is reported in detail, or refused
 ENOUGH, LEAST = 0.8, 0.5
 NAMED = 10  # images that a message names
-
-
 LENS = "lens"
 # why photos were dropped; see `plausibility`
 WHY = {
@@ -27,8 +25,9 @@ WHY = {
         "COLMAP puts them, they would see many points of the others, but they match few of them"
     ),
 }
-# what to try, of kinds other than LENS
+# what to try
 TRIES = {
+    LENS: "use the photos as the camera wrote them, neither cropped nor edited",
     MISPLACED: "add photos between those in the map and those that are not",
     COPY: "make a map of each side, or add photos all the way from one to the other",
 }
@@ -51,15 +50,22 @@ def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
     )
 
 
+def _kinds(dropped: dict[str, str]) -> dict[str, list[str]]:
+    """Return the names of dropped images by the kind of what is implausible, sorted."""
+    kinds: dict[str, list[str]] = {kind: [] for kind in WHY}
+    for name, what in sorted(dropped.items()):
+        kinds[what if what in WHY else LENS].append(name)
+    return {kind: names for kind, names in kinds.items() if names}
+
+
 def _left_out(dropped: dict[str, str], missing: list[str]) -> str:
     """Say why images were dropped; names are not repeated if all `missing` ones have one reason."""
-    kinds: dict[str, list[str]] = {LENS: [], MISPLACED: [], COPY: []}
-    for name, what in sorted(dropped.items()):
-        kinds[what if what in kinds else LENS].append(name)
-    lenses = [f"{name} ({dropped[name]})" for name in kinds[LENS]]
-    named = {kind: names for kind, names in kinds.items() if names != missing} | {LENS: lenses}
-    said = {kind: f": {cli.some(names, NAMED)}" for kind, names in named.items()}
-    return " ".join(f"{WHY[kind]}{said.get(kind, '')}." for kind, names in kinds.items() if names)
+    said = []
+    for kind, names in _kinds(dropped).items():
+        shown = [f"{name} ({dropped[name]})" for name in names] if kind == LENS else names
+        named = "" if shown == missing else f": {cli.some(shown, NAMED)}"
+        said.append(f"{WHY[kind]}{named}.")
+    return " ".join(said)
 
 
 def check(sfm_dir: Path, accept_partial: bool) -> None:
@@ -142,7 +148,7 @@ def shortfall(
         tries.append("leave out photos of other places")
     if implausible:
         said.append(_left_out(implausible, missing))
-        tries += [TRIES[kind] for kind in TRIES if kind in implausible.values()]
+        tries += [TRIES[kind] for kind in _kinds(implausible)]
     if alike:
         tries.append("--camera_mode single, if one camera with a fixed zoom took all photos")
     return f"{' '.join(said)} What to try: {'; '.join(dict.fromkeys(tries))}."

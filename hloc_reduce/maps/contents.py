@@ -90,7 +90,19 @@ def read(path: Path, onnx: Path | None = None) -> Contents:
         return _of_file(path, onnx)
     if onnx is not None:
         raise InputError(f"An ONNX file needs a compact map, a file; {path} is none.")
+    _check_torch(path, "a map folder")
     return _of_folder(path)
+
+
+def _check_torch(path: Path, kind: str) -> None:
+    """Raise an InputError if torch is not installed."""
+    try:
+        import torch  # noqa: F401
+    except ModuleNotFoundError:
+        raise InputError(
+            f"{path} is {kind}, which needs torch. Without torch, compact maps of colmap_sift "
+            "features can be used, and those of networks with the network's ONNX file."
+        ) from None
 
 
 def _of_folder(path: Path) -> Contents:
@@ -147,6 +159,8 @@ def _light_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engi
     """Return an engine without torch, None if the map's feature or matcher needs torch."""
     model = compact.conf["model"]
     extract: Extract
+    if onnx is not None and not takes(matcher):
+        raise InputError(f"{compact.path} has the matcher {compact.matcher}, which needs torch.")
     if not takes(matcher):
         return None
     if onnx is not None:
@@ -160,6 +174,7 @@ def _light_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engi
 
 
 def _torch_engine(compact: CompactMap, matcher: dict) -> Engine:
+    _check_torch(compact.path, f"a map with the feature {compact.feature}")
     from .. import extractors
     from .engine import TorchEngine
 

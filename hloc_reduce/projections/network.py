@@ -43,7 +43,12 @@ class Projection(nn.Module):
     Args:
         mlp: the trained network; its running statistics are used.
         metadata: of its training: descriptor, scheme, dim, ...
+
+    Attributes:
+        exact: whether to compute in float64 on a CPU; False in exported graphs.
     """
+
+    exact = True
 
     def __init__(self, mlp: MLP, metadata: dict | None = None):
         super().__init__()
@@ -78,10 +83,9 @@ class Projection(nn.Module):
         """Map descriptors (N, 128) of unit norm to (N, dim) float32 of unit norm.
 
         On a CPU it is computed in float64, as by `light.projection`, with which it agrees when both
-        are rounded to float16. Exported graphs are float32.
+        are rounded to float16, unless `exact` is False.
         """
-        exact = descriptors.is_cpu and not torch.compiler.is_compiling()
-        values = descriptors.double() if exact else descriptors
+        values = descriptors.double() if self.exact and descriptors.is_cpu else descriptors
         for i, linear in enumerate(self.linears):
             values = values.relu_() if i else values
             layer = (part.to(values) for part in linear.parameters())

@@ -15,7 +15,7 @@ def _main() -> None:
     parser = cli.Parser(__doc__, "--map place.hlm --port 8000")
     add = parser.add_argument
     add("--map", type=Path, required=True, help="map folder, or file of hloc_reduce.compact")
-    add("--onnx", type=Path, help="feature of the map, a file of hloc_reduce.export, without torch")
+    add("--onnx", type=Path, help="the map's feature, from hloc_reduce.export: needs no torch")
     add("--host", default="127.0.0.1", help="address to listen on; 0.0.0.0 for all networks")
     add("--port", type=int, default=8000, help="port to listen on")
     add("--num_loc", type=int, default=50, help="retrieved map images per photo")

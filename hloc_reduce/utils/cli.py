@@ -10,6 +10,8 @@ from typing import Any
 from .. import logger
 from . import interrupts
 
+# packages that an installation for a robot leaves out
+LEFT_OUT = ("kornia", "sklearn", "torch")
 NEAREST = 8  # names shown in place of an unknown one
 
 
@@ -19,6 +21,8 @@ class InputError(ValueError):
 
 def run(main: Callable[[], None]) -> None:
     """Run a command line: an error that a user can mend is one logged line and exit code 2.
+
+    So is a package that is missing where the project was installed without all of its dependencies.
 
     Ctrl-C and SIGTERM (as from Slurm) end it like an error, so that finished work is written.
     """
@@ -36,6 +40,11 @@ def run(main: Callable[[], None]) -> None:
         sys.exit(1)
     except InputError as error:
         logger.error(error)
+        sys.exit(2)
+    except ModuleNotFoundError as error:
+        if error.name not in LEFT_OUT:
+            raise
+        logger.error(f"This needs {error.name}, which is not installed: pip install {error.name}.")
         sys.exit(2)
     except OSError as error:
         file = error.filename2 or error.filename

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import numpy as np
@@ -21,27 +22,41 @@ from pipelines import localize
 
 PIPELINE = localize
 ROOT = Path(__file__).parents[2]
-# what docs/robot.md installs, with what these need themselves
-INSTALLED = {
-    *("cloudpickle", "cv2", "h5py", "loky", "numpy", "packaging", "PIL", "pycolmap", "safetensors"),
-    *("scipy", "tqdm", "yaml"),
-}
+REQUIREMENTS = ROOT / "requirements-light.txt"  # what docs/robot.md installs
 PROGRAM = """
 import sys
 from importlib.metadata import packages_distributions
+
+from hloc_reduce.utils.cli import InputError
 
 class Absent:
     def find_spec(self, name, path=None, target=None):
         if name in BLOCKED:
             raise ModuleNotFoundError(f"{name} is not installed")
 
-BLOCKED = set(packages_distributions()) - set(sys.argv[3].split(","))
+ALLOWED = sys.argv[3].split(",")
+BLOCKED = {name for name, of in packages_distributions().items() if not {*of} & {*ALLOWED}}
 sys.meta_path.insert(0, Absent())
 from hloc_reduce import Localizer
 
-pose, info = Localizer(sys.argv[1]).localize(sys.argv[2])
-print(*pose.rotation.quat, *pose.translation, info["num_inliers"], info["confidence"])
+try:
+    pose, info = Localizer(sys.argv[1]).localize(sys.argv[2])
+    print(*pose.rotation.quat, *pose.translation, info["num_inliers"], info["confidence"])
+except InputError as error:
+    print(error)
 """
+
+
+def without_torch(path: Path, photo: Path) -> str:
+    """Localize a photo in a process where only what `REQUIREMENTS` names can be imported."""
+    lines = [line for line in REQUIREMENTS.read_text().splitlines() if not line.startswith("#")]
+    names = {line.partition(">")[0].lower() for line in lines}
+    known = {of for every in packages_distributions().values() for of in every}
+    allowed = {name for name in known if name.lower() in {*names, "cloudpickle", "hloc-reduce"}}
+    command = [sys.executable, "-c", PROGRAM, path, photo, ",".join(allowed)]
+    found = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert found.returncode == 0, found.stderr
+    return found.stdout
 
 
 @pytest.fixture
@@ -56,11 +71,7 @@ def file(place, run, tmp_path):
 def test_localization_without_torch(file, monkeypatch):
     """The pose and its confidence are those that torch gives."""
     path, photo = file
-    allowed = ",".join({*INSTALLED, "hloc_reduce", "confs", "pipelines"})
-    command = [sys.executable, "-c", PROGRAM, path, photo, allowed]
-    found = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
-    assert found.returncode == 0, found.stderr
-    *values, inliers, confidence = map(float, found.stdout.split())
+    *values, inliers, confidence = map(float, without_torch(path, photo).split())
 
     monkeypatch.setattr(contents, "takes", lambda matcher: False)
     localizer = Localizer(path)
@@ -115,6 +126,9 @@ def test_features_that_need_torch(place, run, tmp_path):
     assert type(localizer.engine).__name__ == "TorchEngine"
     pose, _ = localizer.localize(images / "query/day/a.png")
     assert pose is not None
+    for path, said in ((tmp_path / "place.hlm", "the feature sift_sv32"), (outputs / "map", "map")):
+        message = without_torch(path, images / "query/day/a.png")
+        assert said in message and "needs torch. Without torch, compact maps" in message
 
 
 def test_networks_run_by_onnx_runtime(place, run, tmp_path):

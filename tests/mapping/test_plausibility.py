@@ -138,3 +138,12 @@ def test_parts_that_do_not_connect():
     everything = dict.fromkeys(state["missing"], "misplaced")
     message = registration.shortfall(Path("x"), **{**state, "implausible": everything})
     assert "contradict the poses that COLMAP found. " in message
+
+
+def test_there_is_always_something_to_try():
+    state = {"images": 4, "parts": [["a", "b", "c"]], "missing": ["d"], "unmatched": []}
+    lens = {"implausible": {"d": "focal length 9"}, "alike": False}
+    message = registration.shortfall(Path("x"), **state, **lens)
+    assert message.endswith(
+        "What to try: use the photos as the camera wrote them, neither cropped nor edited."
+    )

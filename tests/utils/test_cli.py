@@ -31,3 +31,16 @@ def test_every_command_line_is_such_a_parser():
     paths = [path for top in tops for path in (root / top).rglob("*.py")]
     made = [path.name for path in paths if "argparse.ArgumentParser(" in path.read_text()]
     assert len(paths) > 100 and made == []
+
+
+def test_packages_that_a_robot_does_without(caplog):
+    """Are named in a line; other missing packages are defects, and shown as such."""
+
+    def needs(name):
+        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+    with pytest.raises(SystemExit) as exit:
+        cli.run(lambda: needs("torch"))
+    assert exit.value.code == 2 and "This needs torch, which is not installed" in caplog.text
+    with pytest.raises(ModuleNotFoundError):
+        cli.run(lambda: needs("numpi"))
