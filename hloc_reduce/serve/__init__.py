@@ -1,9 +1,7 @@
 """Localize photos in a map over HTTP.
 
-    POST /localize    a photo as the body (JPEG or PNG); the pose as JSON
-    GET /health       whether the map is loaded, and how many requests wait
-
-docs/serve.md has the parameters and the answers.
+POST /localize takes a photo, JPEG or PNG, as its body and answers with the pose as JSON. GET
+/health tells how many requests wait. docs/serve.md has the parameters and the answers.
 """
 
 import asyncio
