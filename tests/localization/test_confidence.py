@@ -137,7 +137,7 @@ def test_uncertainty_is_the_spread_of_poses(free):
     found = [solve(*matches(60, 0, noise=0), camera=camera, config=config)]
     keypoints, points = matches(60, 0, noise=0)
     generator = np.random.default_rng(0)
-    for _ in range(60):
+    for _ in range(30):
         noisy = keypoints + 2 * generator.standard_normal(keypoints.shape)
         found.append(solve(noisy, points, camera=camera, config=config))
     centres = [pose.cam_from_world.inverse().translation for pose in found]

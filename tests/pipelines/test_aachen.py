@@ -9,6 +9,7 @@ from command import outcome
 from demo_photos import scaled
 
 from hloc_reduce import demo
+from hloc_reduce.demo.cameras import MAP
 from pipelines import aachen
 
 PIPELINE = aachen
@@ -156,16 +157,19 @@ def test_herz_jesus(herz_jesus, tmp_path, run):
 
 
 @pytest.mark.parametrize(
-    "width, least", [(512, 80), pytest.param(1024, 90, marks=pytest.mark.long)]
+    "width, step, least", [(512, 2, 80), pytest.param(1024, 1, 90, marks=pytest.mark.long)]
 )
-def test_demo(width, least, tmp_path, monkeypatch, run):
+def test_demo(width, step, least, tmp_path, monkeypatch, run):
     """The built-in town: rendered, localized, easy by day and hard by night."""
-    photos = [scaled(photo, width, width * 3 // 4) for photo in demo.list_photos(0)]
+    listed = demo.list_photos(0)
+    photos = [photo for photo in listed if photo.kind == MAP]
+    photos += [photo for photo in listed if photo.kind != MAP][::step]
+    photos = [scaled(photo, width, width * 3 // 4) for photo in photos]
     monkeypatch.setattr(demo, "list_photos", lambda seed: photos)
     monkeypatch.chdir(tmp_path)
     run("--demo", "--feature", "colmap_sift_sv64")
     summary, rows = outcome(tmp_path / "outputs/demo_town/colmap_sift_sv64")
-    assert len(rows) == 20
+    assert len(rows) == 20 // step
     day = summary["lists"]["day_time_queries_with_intrinsics"]
     night = summary["lists"]["night_time_queries_with_intrinsics"]
     assert day["recall_percent"][0] >= least

@@ -96,7 +96,7 @@ cli.run(lambda: exec("signal.raise_signal(signal.SIGTERM)", {"signal": signal}))
 @pytest.mark.parametrize(
     "pipeline, workers, signals, number",
     [
-        ("aachen", None, KILL, 2),
+        ("aachen", None, KILL, 1),
         ("inloc", 2, KILL, 1),
         ("aachen", 2, STOP, 1),
         ("inloc", None, STOP, 1),
