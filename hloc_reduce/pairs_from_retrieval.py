@@ -77,18 +77,32 @@ def main(
     return output
 
 
-def rank(queries: np.ndarray, database: np.ndarray, num_matched: int) -> np.ndarray:
+def similarity(queries: np.ndarray, database: np.ndarray) -> np.ndarray:
+    """Return the similarity of global descriptors.
+
+    Args:
+        queries: (Q, G) of unit norm.
+        database: (N, G) of unit norm, or zero for images without features.
+
+    Returns:
+        (Q, N) cosines, -inf for images without features.
+    """
+    found = queries @ database.T
+    found[:, ~database.any(axis=1)] = -np.inf
+    return found
+
+
+def rank(similarity: np.ndarray, num_matched: int) -> np.ndarray:
     """Find the most similar images of a database.
 
     Args:
-        queries: (Q, G) global descriptors of unit norm.
-        database: (N, G) global descriptors of unit norm, or zero for images without features.
+        similarity: (Q, N) of queries to the database.
         num_matched: maximum number of images to find.
 
     Returns:
-        (Q, num_matched) rows of the database, best first.
+        (Q, num_matched) rows of the database, best first; ties keep their order.
     """
-    return _best(_similarity(queries, database), num_matched)
+    return np.argsort(-similarity, axis=1, kind="stable")[:, :num_matched]
 
 
 def _rank_file(
@@ -96,7 +110,7 @@ def _rank_file(
 ) -> np.ndarray:
     """Rank as `rank` does, but read the database from a file, `size` images at once."""
     rows = np.empty((len(queries), 0), np.int64)
-    similarity = np.empty((len(queries), 0), np.float32)
+    cosines = np.empty((len(queries), 0), np.float32)
     for start in range(0, len(names), size):
         database = read_global(path, names[start : start + size])
         if queries.shape[1] != database.shape[1]:
@@ -108,23 +122,12 @@ def _rank_file(
         best = []
         for i in range(0, len(queries), QUERIES):
             part = slice(i, i + QUERIES)
-            values = np.hstack([similarity[part], _similarity(queries[part], database)])
+            values = np.hstack([cosines[part], similarity(queries[part], database)])
             found = np.hstack([rows[part], np.broadcast_to(new, (len(values), len(new)))])
-            order = _best(values, num_matched)
+            order = rank(values, num_matched)
             best.append([np.take_along_axis(array, order, 1) for array in (found, values)])
-        rows, similarity = (np.concatenate(parts) for parts in zip(*best, strict=True))
+        rows, cosines = (np.concatenate(parts) for parts in zip(*best, strict=True))
     return rows
-
-
-def _similarity(queries: np.ndarray, database: np.ndarray) -> np.ndarray:
-    similarity = queries @ database.T
-    similarity[:, ~database.any(axis=1)] = -np.inf  # images without features come last
-    return similarity
-
-
-def _best(similarity: np.ndarray, number: int) -> np.ndarray:
-    """Return the columns of the largest numbers of each row; ties keep their order."""
-    return np.argsort(-similarity, axis=1, kind="stable")[:, :number]
 
 
 @strings_as_paths

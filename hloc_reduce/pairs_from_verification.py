@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from . import logger
-from .pairs_from_retrieval import rank, read_global
+from .pairs_from_retrieval import rank, read_global, similarity
 from .runtime import provenance
 from .triangulation import Pair, Verified, read_matches
 from .utils import cli, colmap
@@ -127,7 +127,7 @@ def more_pairs(
     found = dict.fromkeys(_by_neighbours(limits, listed, connected))
     for start in range(0, len(weak), BLOCK):
         block = weak[start : start + BLOCK]
-        ranking = rank(descriptors[block], descriptors, len(names))
+        ranking = rank(similarity(descriptors[block], descriptors), len(names))
         for i, row in zip(block, ranking, strict=True):
             others = (
                 _unordered(names[i], names[j])

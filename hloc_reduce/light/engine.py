@@ -57,17 +57,15 @@ class LightEngine:
         """Return descriptors (N, D) float32 as `match` takes them: (N, D) int16."""
         return to_integers(descriptors)
 
-    def match(self, query: np.ndarray, described: np.ndarray, shown: np.ndarray) -> np.ndarray:
-        """Match the descriptors of a photo with some of a map image, see `Matcher.match_rows`.
+    def match_points(
+        self, query: np.ndarray, described: np.ndarray, images: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """Match the descriptors of a photo with images, see `matching.match_images_of_points`.
 
         Args:
             query: (N, D) from `prepare`.
-            described: (M, D) from `prepare`.
-            shown: (K,) int64, ascending rows of these.
+            described: (P, D) from `prepare`, of points.
+            images: of each image the rows of its points (K,) int64, ascending.
         """
-        matches, cosine = matching.mutual_nearest(
-            *(described, query, self._ratio_threshold, shown),
-            distance_threshold=self._distance_threshold,
-        )
-        matched = matches >= 0
-        return matching.most_similar_first(matches[matched], shown[matched], cosine[matched])
+        limits = self._ratio_threshold, self._distance_threshold
+        return matching.match_images_of_points(described, query, images, *limits)

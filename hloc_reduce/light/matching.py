@@ -2,10 +2,12 @@
 
 import numpy as np
 
+from ..runtime import parallel
 from ..utils import best_two
 from ..utils.codes import UNIT
 
 TILE = 2**19  # products at once
+ROWS = 2048  # descriptors that a thread matches at once
 
 
 def nearest(
@@ -109,11 +111,66 @@ def mutual_nearest(
     forward, cosine = nearest(chosen, descriptors1, *limits)
     if not mutual:
         return forward, cosine
-    # the way back, only for descriptors that are someone's nearest
+    own = np.arange(len(descriptors0)) if rows is None else rows
+    return _confirmed(forward, own, descriptors0, descriptors1, limits), cosine
+
+
+def _confirmed(
+    forward: np.ndarray,
+    rows: np.ndarray,
+    descriptors0: np.ndarray,
+    descriptors1: np.ndarray,
+    limits: tuple[float | None, float | None],
+) -> np.ndarray:
+    """Replace the nearest descriptors1 (K,) of some descriptors0 by -1 unless these are theirs."""
     wanted = np.unique(forward[forward >= 0])
     backward = np.full(len(descriptors1), -1)
     if len(wanted):
         backward[wanted], _ = nearest(descriptors1[wanted], descriptors0, *limits)
-    own = np.arange(len(descriptors0)) if rows is None else rows
-    matched = (backward[forward] == own) & (forward >= 0)
-    return np.where(matched, forward, -1), cosine
+    return np.where((backward[forward] == rows) & (forward >= 0), forward, -1)
+
+
+def match_images_of_points(
+    points: np.ndarray,
+    query: np.ndarray,
+    images: list[np.ndarray],
+    ratio_threshold: float | None,
+    distance_threshold: float | None = None,
+) -> list[np.ndarray]:
+    """Match a photo with images that share descriptors, those of the points that they show.
+
+    The matches of each image are those of `mutual_nearest`. The nearest descriptor of the photo to
+    a point is searched for only once, for all images that show it.
+
+    Args:
+        points: (P, D) int16, see `nearest`.
+        query: (N, D) int16, see `nearest`.
+        images: of each image the rows of its points (K,) int64, ascending.
+        ratio_threshold: see `nearest`.
+        distance_threshold: see `nearest`.
+
+    Returns:
+        For each image (M, 2) int64, the rows of the photo's descriptors and of `images[i]`, the
+        most similar first.
+    """
+    limits = ratio_threshold, distance_threshold
+    forward, cosine = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
+    blocks = [slice(start, start + ROWS) for start in range(0, len(points), ROWS)]
+
+    def search(block: slice) -> None:
+        forward[block], cosine[block] = nearest(points[block], query, *limits)
+
+    def match(rows: np.ndarray) -> np.ndarray:
+        own = np.arange(len(rows))
+        if min(len(query), len(rows)) > 1:
+            similar = cosine[rows]
+            matches = _confirmed(forward[rows], own, points[rows], query, limits)
+        else:  # no ratio test
+            options = ratio_threshold, None, distance_threshold
+            matches, similar = mutual_nearest(points[rows], query, *options)
+        matched = matches >= 0
+        return most_similar_first(matches[matched], own[matched], similar[matched])
+
+    if len(query) > 1:
+        list(parallel.ordered("match", search, blocks))
+    return list(parallel.ordered("match", match, images))

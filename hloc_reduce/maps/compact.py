@@ -27,6 +27,7 @@ from .points import Points
 VERSION = 1
 SUFFIX = ".hlm"
 SIGNS = 1024  # bits of an image's retrieval descriptor
+IMAGES = 1024  # whose signs are unpacked at once
 # what a file may ask for
 MAX_DIM, MAX_GLOBAL, MAX_SIDE, LEAST_OCTAVE = 512, 2**14, 4096, -1
 PROJECTION = re.compile(r"[\w+-]+(@\d+)?")  # a name, and a prefix of a nested one
@@ -184,10 +185,8 @@ class CompactMap:
         cameras: what the map tells about the intrinsics of other photos.
         camera_number, camera_of: the number of each image's camera, and its intrinsics.
         names: the images, sorted.
-        points: (P, 3) float64, coordinates.
-        visible: of each image the points that it shows (M,).
+        points: the coordinates.
         vocabulary: (W, D) float32, of the global descriptors.
-        global_descriptors: (I, G) float32 of unit norm.
         dim: dimension of the descriptors.
         projection: content of the file of the projection, None without one.
 
@@ -234,22 +233,18 @@ class CompactMap:
         self.camera_of = {name: cameras[i] for name, i in self.camera_number.items()}
         bits, step = int(metadata["bits"]), float(metadata["step"])
         least = np.array(metadata["least"], np.float64)
-        coordinates = _array(tensors, "coordinates", np.uint8, (-(-number * 3 * bits // 8),))
-        if not (0 < bits <= points_of_map.MAX_BITS and number > 0 and least.shape == (3,)):
-            raise ValueError(f"{number} points of {bits} bits")
-        self.points = points_of_map.restore(coordinates, number, least, step, bits)
+        coordinates = _array(tensors, "coordinates", np.uint8, (None,))
+        self.points = points_of_map.Coordinates(coordinates, number, least, step, bits)
         counts = _array(tensors, "num_visible", np.uint32, (count,)).astype(np.int64)
         packed = _array(tensors, "visible", np.uint8, (None,))
-        visible = points_of_map.unpack_visible(packed, metadata["visible"], counts, number)
-        self.visible = dict(zip(names, visible, strict=True))
+        self._visible = points_of_map.Visible(packed, metadata["visible"], counts, number)
         self._rows = {name: row for row, name in enumerate(names)}
         self._read_descriptors(metadata, tensors)
         self._read_feature(metadata)
         self._read_projection(metadata, tensors)
         self._read_retrieval(metadata, tensors)
-        finite = (self._translations, self.points, np.array(step))
         turned = np.linalg.norm(self._rotations, axis=1) > 0  # no NaN is
-        if not (turned.all() and all(np.isfinite(values).all() for values in finite)):
+        if not (turned.all() and np.isfinite(self._translations).all()):
             raise ValueError("numbers that are not finite")
 
     def _read_descriptors(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
@@ -314,10 +309,38 @@ class CompactMap:
             raise ValueError(f"a vocabulary of shape {self.vocabulary.shape}")
         if size != min(SIGNS, whole) or not np.isfinite(self.vocabulary).all():
             raise ValueError(f"{size} signs of global descriptors of {number} numbers")
-        rows = _array(tensors, "retrieval", np.uint8, (len(self.names), -(-size // 8)))
-        signs = 2 * np.unpackbits(rows, axis=1, count=size, bitorder="little") - np.float32(1)
+        self._signs = _array(tensors, "retrieval", np.uint8, (len(self.names), -(-size // 8)))
+        self._num_signs = size
+
+    def global_descriptors(self) -> np.ndarray:
+        """Return those of the images (I, G) float32 as their signs tell them.
+
+        Norms are 1, or 0 for images without points.
+        """
+        number, size = self.vocabulary.size, self._num_signs
+        found = hadamard(self._unpacked(slice(None)), number)
+        found[self._visible.counts == 0] = 0
         # the transform multiplies norms by sqrt(whole)
-        self.global_descriptors = hadamard(signs, number)[:, :number] / np.sqrt(size * whole)
+        return found[:, :number] / np.float32(np.sqrt(size * found.shape[1]))
+
+    def similarity(self, descriptor: np.ndarray) -> np.ndarray:
+        """Return the similarity (I,) of a global descriptor (G,) to those of the images.
+
+        It is the product with `global_descriptors`, without these; -inf for images without points.
+        """
+        transformed = hadamard(descriptor[None], len(descriptor))[0]
+        parts = [
+            self._unpacked(slice(start, start + IMAGES)) @ transformed[: self._num_signs]
+            for start in range(0, len(self.names), IMAGES)
+        ]
+        found = np.concatenate(parts) / np.float32(np.sqrt(self._num_signs * len(transformed)))
+        found[self._visible.counts == 0] = -np.inf
+        return found
+
+    def _unpacked(self, images: slice) -> np.ndarray:
+        """Return the signs of some images (N, S) float32, -1 and 1."""
+        bits = np.unpackbits(self._signs[images], axis=1, count=self._num_signs, bitorder="little")
+        return 2 * bits.astype(np.float32) - 1
 
     @property
     def is_pickled(self) -> bool:
@@ -351,11 +374,18 @@ class CompactMap:
 
     def stored(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
         """Return the descriptors of the points that an image shows, as a feature file has them."""
-        return {self._key: self._descriptors[:, self.visible[name]]}, {self._key: self._attrs}
+        return self._stored(self.visible(name))
 
-    def descriptors(self, name: str, unbiased: bool = False) -> np.ndarray:
-        """Return the descriptors of the points that an image shows (M, D), see `codes.restore`."""
-        return restore(*self.stored(name), unbiased)
+    def _stored(self, points: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
+        return {self._key: self._descriptors[:, points]}, {self._key: self._attrs}
+
+    def descriptors(self, points: np.ndarray, unbiased: bool = False) -> np.ndarray:
+        """Return the descriptors (K, D) float32 of points (K,), see `codes.restore`."""
+        return restore(*self._stored(points), unbiased)
+
+    def visible(self, name: str) -> np.ndarray:
+        """Return the points (M,) int64 that an image shows, ascending."""
+        return self._visible[self._rows[name]]
 
     def pose(self, name: str) -> pycolmap.Rigid3d:
         """Return the pose of an image, camera from world."""
@@ -364,15 +394,15 @@ class CompactMap:
         return pycolmap.Rigid3d(rotation, self._translations[i])
 
     def __contains__(self, name: str) -> bool:
-        return name in self.visible
+        return name in self._rows
 
     def num_keypoints(self, name: str) -> int:
         """Return the number of points that an image shows: these are its keypoints."""
-        return len(self.visible[name])
+        return int(self._visible.counts[self._rows[name]])
 
     def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the ids and the coordinates of points that an image shows."""
-        rows = self.visible[name][keypoints]
+        rows = self.visible(name)[keypoints]
         return rows, self.points[rows]
 
     def clusters(self, names: list[str]) -> list[list[str]]:

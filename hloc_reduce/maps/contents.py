@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
@@ -16,7 +15,8 @@ from ..light.extractors import ColmapSift, Extract, OnnxNetwork
 from ..light.vlad import read_vocabulary
 from ..localization import intrinsics
 from ..localization.references import Reference, SfmMap
-from ..pairs_from_retrieval import read_global
+from ..pairs_from_retrieval import read_global, similarity
+from ..runtime import parallel
 from ..utils import colmap
 from ..utils.cli import InputError
 from ..utils.codes import FLOATS
@@ -38,8 +38,10 @@ class Engine(Protocol):
     def prepare(self, descriptors: np.ndarray) -> Any:
         """Return descriptors (N, D) float32 as `match` takes them."""
 
-    def match(self, query: Any, described: Any, shown: np.ndarray) -> np.ndarray:
-        """Match the descriptors of a photo with the rows `shown` of those of a map image."""
+    def match_points(
+        self, query: Any, described: Any, images: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """Match the descriptors of a photo with the rows that each image has of those of points."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +57,9 @@ class Contents:
         cameras: what it tells about the intrinsics of other photos.
         reference: its points.
         names: its images.
-        global_descriptors: (I, G) float32 of the images.
-        describe: returns the descriptors (N, D) float32 of an image.
-        shown: of each image the rows of these that show a point (M,).
-        on_demand: do not keep the descriptors of images in memory.
+        similarity: returns the similarity (I,) of a global descriptor (G,) to those of its images.
+        match: matches descriptors (N, D) float32 of a photo with images; returns for each of these
+            names the rows (M, 2) int64 of the photo's descriptors and of the image's keypoints.
     """
 
     engine: Engine
@@ -69,10 +70,8 @@ class Contents:
     cameras: intrinsics.MapCameras
     reference: Reference
     names: list[str]
-    global_descriptors: np.ndarray
-    describe: Callable[[str], np.ndarray]
-    shown: dict[str, np.ndarray]
-    on_demand: bool = False
+    similarity: Callable[[np.ndarray], np.ndarray]
+    match: Callable[[np.ndarray, list[str]], dict[str, np.ndarray]]
 
 
 def read(path: Path, onnx: Path | None = None) -> Contents:
@@ -113,16 +112,30 @@ def _of_folder(path: Path) -> Contents:
     matcher = matchers_confs.confs[built.matcher]["model"]
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)
+    engine = TorchEngine(
+        *(extractors.load(built.conf["model"]), matcher),
+        *(read_vocabulary(built.vocabulary), built.storage),
+    )
+    with open_h5(built.features) as file:
+        described = {
+            name: engine.prepare(
+                read_descriptors(file, name).restore(unbiased=built.storage not in FLOATS)
+            )
+            for name in names
+        }
+    shown = {name: np.flatnonzero(reference.point_rows(name) >= 0) for name in names}
+    global_descriptors = read_global(built.descriptors, names)
 
-    def describe(name: str) -> np.ndarray:
-        with open_h5(built.features) as file:
-            return read_descriptors(file, name).restore(unbiased=built.storage not in FLOATS)
+    def match(descriptors: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
+        query = engine.prepare(descriptors)
+
+        def match_image(name: str) -> np.ndarray:
+            return engine.match(query, described[name], shown[name])
+
+        return dict(zip(names, parallel.ordered("match", match_image, names), strict=True))
 
     return Contents(
-        engine=TorchEngine(
-            *(extractors.load(built.conf["model"]), matcher),
-            *(read_vocabulary(built.vocabulary), built.storage),
-        ),
+        engine=engine,
         preprocessing=built.conf["preprocessing"],
         storage=built.storage,
         dim=dimension(built.features),
@@ -130,17 +143,26 @@ def _of_folder(path: Path) -> Contents:
         cameras=built.cameras,
         reference=reference,
         names=names,
-        global_descriptors=read_global(built.descriptors, names),
-        describe=describe,
-        shown={name: np.flatnonzero(reference.point_rows(name) >= 0) for name in names},
+        similarity=lambda descriptor: similarity(descriptor[None], global_descriptors)[0],
+        match=match,
     )
 
 
 def _of_file(path: Path, onnx: Path | None) -> Contents:
     compact = CompactMap(path)
     matcher = matchers_confs.confs[compact.matcher]["model"]
+    engine = _light_engine(compact, matcher, onnx) or _torch_engine(compact, matcher)
+
+    def match(descriptors: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
+        visible = [compact.visible(name) for name in names]
+        points = np.unique(np.concatenate([np.zeros(0, np.int64), *visible]))
+        described = compact.descriptors(points, unbiased=compact.storage not in FLOATS)
+        images = [np.searchsorted(points, part) for part in visible]
+        prepared = engine.prepare(descriptors), engine.prepare(described)
+        return dict(zip(names, engine.match_points(*prepared, images), strict=True))
+
     return Contents(
-        engine=_light_engine(compact, matcher, onnx) or _torch_engine(compact, matcher),
+        engine=engine,
         preprocessing=compact.conf["preprocessing"],
         storage=compact.storage,
         dim=compact.dim,
@@ -148,10 +170,8 @@ def _of_file(path: Path, onnx: Path | None) -> Contents:
         cameras=compact.cameras,
         reference=compact,
         names=compact.names,
-        global_descriptors=compact.global_descriptors,
-        describe=partial(compact.descriptors, unbiased=compact.storage not in FLOATS),
-        shown={name: np.arange(len(rows)) for name, rows in compact.visible.items()},
-        on_demand=True,
+        similarity=compact.similarity,
+        match=match,
     )
 
 

@@ -6,6 +6,9 @@ import numpy as np
 import torch
 
 from .. import aggregators, extractors, matchers
+from ..light.engine import takes
+from ..light.matching import match_images_of_points
+from ..runtime import parallel
 from ..utils.codes import FLOATS, to_integers
 from .map import RETRIEVAL
 
@@ -50,13 +53,26 @@ class TorchEngine:
         matched = to_integers(descriptors) if self._as_integers else descriptors
         return torch.from_numpy(matched).to(self._device)
 
-    def match(self, query: torch.Tensor, described: torch.Tensor, shown: np.ndarray) -> np.ndarray:
+    def match(self, query: torch.Tensor, described: torch.Tensor, rows: np.ndarray) -> np.ndarray:
         """Match the descriptors of a photo with some of a map image, see `Matcher.match_rows`.
 
         Args:
             query: (N, D) from `prepare`.
             described: (M, D) from `prepare`.
-            shown: (K,) int64, ascending rows of these.
+            rows: (K,) int64, ascending rows of these.
         """
-        rows = torch.from_numpy(shown).to(self._device)
-        return self._matcher.match_rows(query, described, rows).cpu().numpy()
+        chosen = torch.from_numpy(rows).to(self._device)
+        return self._matcher.match_rows(query, described, chosen).cpu().numpy()
+
+    def match_points(
+        self, query: torch.Tensor, described: torch.Tensor, images: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """Match the descriptors of a photo with images, see `LightEngine.match_points`."""
+        if self._as_integers and takes(self._matcher.conf):
+            limits = self._matcher.conf["ratio_threshold"], self._matcher.conf["distance_threshold"]
+            return match_images_of_points(described.numpy(), query.numpy(), images, *limits)
+
+        def match(rows: np.ndarray) -> np.ndarray:
+            return self.match(query, described[rows], np.arange(len(rows)))
+
+        return list(parallel.ordered("match", match, images))

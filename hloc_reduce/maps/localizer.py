@@ -11,7 +11,6 @@ from ..localization.confidence import DEFAULT_GATE, Gate
 from ..localization.query import merged
 from ..localize_sfm import RANSAC_THRESH
 from ..pairs_from_retrieval import rank
-from ..runtime import parallel
 from ..utils.cli import InputError
 from ..utils.codes import FLOATS
 from ..utils.feature_files import to_colmap
@@ -54,12 +53,12 @@ class Localizer:
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
         self.gate = gate.of_matches(contents.matcher, contents.dim)
-        self.engine, self.shown = contents.engine, contents.shown
-        self.reference, self.names = contents.reference, contents.names
-        self.global_descriptors = contents.global_descriptors
-        self.describe = lambda name: self.engine.prepare(contents.describe(name))
-        if not contents.on_demand:
-            self.describe = {name: self.describe(name) for name in self.names}.__getitem__
+        self.engine, self.reference, self.names = (
+            contents.engine,
+            contents.reference,
+            contents.names,
+        )
+        self._similarity, self._match = contents.similarity, contents.match
 
     def localize(
         self, image: Path | str | np.ndarray, camera: pycolmap.Camera | None = None
@@ -149,14 +148,5 @@ class Localizer:
     def _retrieve(self, descriptors: np.ndarray) -> list[str]:
         """Return the names of the map images most similar to local descriptors (N, D)."""
         # rounded as in the map
-        query = self.engine.aggregate(descriptors).astype(np.float16).astype(np.float32)
-        return [self.names[j] for j in rank(query, self.global_descriptors, self.num_loc)[0]]
-
-    def _match(self, descriptors: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
-        """Match descriptors (N, D) with those of map images that show a point."""
-        query = self.engine.prepare(descriptors)
-
-        def match(name: str) -> np.ndarray:
-            return self.engine.match(query, self.describe(name), self.shown[name])
-
-        return dict(zip(names, parallel.ordered("match", match, names), strict=True))
+        query = self.engine.aggregate(descriptors)[0].astype(np.float16).astype(np.float32)
+        return [self.names[j] for j in rank(self._similarity(query)[None], self.num_loc)[0]]

@@ -179,17 +179,41 @@ def quantize(xyz: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, floa
     return np.concatenate(packed), least, step, bits
 
 
-def restore(
-    packed: np.ndarray, number: int, least: np.ndarray, step: float, bits: int
-) -> np.ndarray:
-    """Return the coordinates (number, 3) float64 of `quantize`."""
-    xyz, weights = np.empty((number, 3)), 2.0 ** np.arange(bits)
-    for start in range(0, number, CHUNK):
-        part = xyz[start : start + CHUNK]
-        begin = start * 3 * bits // 8
-        flags = np.unpackbits(packed[begin:], count=3 * bits * len(part), bitorder="little")
-        part[:] = least + step * (flags.reshape(-1, bits) @ weights).reshape(-1, 3)
-    return xyz
+class Coordinates:
+    """Coordinates of points in a few bits each, unpacked when they are needed.
+
+    Args:
+        packed: bytes (N,) uint8 from `quantize`, and the other values from there.
+        number: of points.
+
+    Raises:
+        ValueError: when they contradict each other, or are not finite.
+    """
+
+    def __init__(self, packed: np.ndarray, number: int, least: np.ndarray, step: float, bits: int):
+        if not (0 < bits <= MAX_BITS and number > 0 and least.shape == (3,)):
+            raise ValueError(f"{number} points of {bits} bits")
+        if len(packed) != -(-number * 3 * bits // 8):
+            raise ValueError(f"{len(packed)} bytes of {number} points of {bits} bits")
+        if not np.isfinite(least + step * 2.0**bits).all():
+            raise ValueError("coordinates that are not finite")
+        self._packed = np.append(packed, np.zeros(8, np.uint8))  # eight bytes are read at once
+        self._number, self._least, self._step, self._bits = number, least, step, bits
+
+    def __len__(self) -> int:
+        return self._number
+
+    def __getitem__(self, rows: np.ndarray) -> np.ndarray:
+        """Return the coordinates (K, 3) float64 of points (K,)."""
+        start = (3 * rows[:, None] + np.arange(3)) * self._bits
+        words = self._packed[(start >> 3)[..., None] + np.arange(8)].view("<u8")[..., 0]
+        whole = words >> (start & 7).astype(np.uint64) & np.uint64(2**self._bits - 1)
+        return self._least + self._step * whole
+
+    def all(self) -> np.ndarray:
+        """Return the coordinates (P, 3) float64 of all points."""
+        parts = np.split(np.arange(len(self)), range(CHUNK, len(self), CHUNK))
+        return np.concatenate([self[part] for part in parts])
 
 
 def pack_visible(visible: list[np.ndarray], number: int) -> tuple[np.ndarray, str]:
@@ -221,47 +245,74 @@ def pack_visible(visible: list[np.ndarray], number: int) -> tuple[np.ndarray, st
     return packed, "deltas"
 
 
-def unpack_visible(
-    packed: np.ndarray, kind: str, counts: np.ndarray, number: int
-) -> list[np.ndarray]:
-    """Return the points that each image shows.
+class Visible:
+    """The points that each image shows, unpacked when they are needed.
 
     Args:
-        packed: from `pack_visible`.
+        packed: bytes (N,) uint8 from `pack_visible`.
         kind: "bitmaps" or "deltas".
-        counts: of each image the number of its points.
+        counts: (I,) int64, of each image the number of its points.
         number: of points.
 
     Raises:
         ValueError: when they contradict each other.
     """
-    if kind == "bitmaps":
-        width = -(-number // 8)
-        if len(packed) != len(counts) * width:
-            raise ValueError(f"{len(packed)} bytes of {len(counts)} bitmaps of {width} bytes")
-        rows = packed.reshape(len(counts), width)
-        visible = [
-            np.flatnonzero(np.unpackbits(row, count=number, bitorder="little")) for row in rows
-        ]
-        if [len(points) for points in visible] != counts.tolist():
+
+    def __init__(self, packed: np.ndarray, kind: str, counts: np.ndarray, number: int):
+        if kind not in ("bitmaps", "deltas"):
+            raise ValueError(f"visible points as {kind!r}")
+        self.counts, self._number = counts, number
+        self._packed, self._as_bitmaps = packed, kind == "bitmaps"
+        self._ends = (self._ends_of_bitmaps if self._as_bitmaps else self._ends_of_deltas)()
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    def __getitem__(self, image: int) -> np.ndarray:
+        """Return the points (M,) int64 that an image shows, ascending."""
+        part = self._packed[self._ends[image] : self._ends[image + 1]]
+        if self._as_bitmaps:
+            return np.flatnonzero(np.unpackbits(part, count=self._number, bitorder="little"))
+        return np.cumsum(_deltas(part)) - 1
+
+    def _ends_of_bitmaps(self) -> np.ndarray:
+        """Return where the bytes of each image end (I + 1,), from 0 on, after checking all."""
+        width = -(-self._number // 8)
+        ends = width * np.arange(len(self) + 1)
+        if len(self._packed) != ends[-1]:
+            raise ValueError(f"{len(self._packed)} bytes of {len(self)} bitmaps of {width} bytes")
+        rows = self._packed.reshape(len(self), width)
+        shown = [np.unpackbits(row, count=self._number, bitorder="little").sum() for row in rows]
+        if not np.array_equal(shown, self.counts):
             raise ValueError("bitmaps of other numbers of points")
-        return visible
-    if kind != "deltas":
-        raise ValueError(f"visible points as {kind!r}")
+        return ends
+
+    def _ends_of_deltas(self) -> np.ndarray:
+        """Return what `_ends_of_bitmaps` does."""
+        total, last = int(self.counts.sum()), np.flatnonzero(self._packed < 128)
+        if len(last) != total or (total and last[-1] != len(self._packed) - 1):
+            raise ValueError(f"{len(last)} differences, not {total}")
+        numbers = np.concatenate([[0], np.cumsum(self.counts)])
+        ends = np.concatenate([[0], last + 1])[numbers]
+        for images in np.array_split(np.arange(len(self)), min(len(self), 1 + total // CHUNK)):
+            deltas = _deltas(self._packed[ends[images[0]] : ends[images[-1] + 1]])
+            starts = (numbers - numbers[images[0]])[images[self.counts[images] > 0]]
+            if len(deltas) and (
+                deltas.min() < 1 or np.add.reduceat(deltas, starts).max() > self._number
+            ):
+                raise ValueError("visible points that do not exist")
+        return ends
+
+
+def _deltas(packed: np.ndarray) -> np.ndarray:
+    """Return the differences (M,) int64 in bytes of `pack_visible`."""
     last = np.flatnonzero(packed < 128)
-    total = int(counts.sum())
-    if len(last) != total or (total and last[-1] != len(packed) - 1):
-        raise ValueError(f"{len(last)} differences, not {total}")
-    starts = np.concatenate([[0], last[:-1] + 1]) if total else last
+    starts = np.concatenate([[0], last[:-1] + 1]) if len(last) else last
     lengths = last - starts + 1
-    if total and lengths.max() > 5:
+    if lengths.max(initial=0) > 5:
         raise ValueError("a difference of more than 5 bytes")
-    deltas = np.zeros(total, np.int64)
-    for i in range(5):
-        has = lengths > i
+    deltas = packed[starts].astype(np.int64) & 127
+    for i in range(1, lengths.max(initial=0)):
+        has = np.flatnonzero(lengths > i)
         deltas[has] |= (packed[starts[has] + i].astype(np.int64) & 127) << 7 * i
-    ends = np.cumsum(counts)
-    visible = [np.cumsum(part) - 1 for part in np.split(deltas, ends[:-1])]
-    if total and (deltas.min() < 1 or max(p[-1] for p in visible if len(p)) >= number):
-        raise ValueError("visible points that do not exist")
-    return visible
+    return deltas

@@ -72,7 +72,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
     model.write(folder / SFM)
     descriptors = folder / f"{RETRIEVAL['output']}_{features.stem}.h5"
     with GroupWriter(descriptors, header, overwrite=True) as writer:
-        for name, row in zip(compact.names, compact.global_descriptors, strict=True):
+        for name, row in zip(compact.names, compact.global_descriptors(), strict=True):
             writer.add(name, {"global_descriptor": row})
     with replacing(descriptors.with_suffix(".vocabulary.safetensors")) as temporary:
         temporary.write_bytes(save({"vocabulary": compact.vocabulary}))
@@ -99,7 +99,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
 def _add_image(model: pycolmap.Reconstruction, compact: CompactMap, number: int) -> np.ndarray:
     """Add an image; return the projections of its points (M, 2), COLMAP's pixels."""
     name = compact.names[number]
-    points = compact.points[compact.visible[name]]
+    points = compact.points[compact.visible(name)]
     camera, pose = compact.camera_of[name], compact.pose(name)
     _, projected = reprojection_errors(np.zeros((len(points), 2)), points, pose, camera)
     projected = np.nan_to_num(projected, posinf=0.0, neginf=0.0)
@@ -113,15 +113,14 @@ def _add_image(model: pycolmap.Reconstruction, compact: CompactMap, number: int)
 
 def _add_points(model: pycolmap.Reconstruction, compact: CompactMap) -> None:
     """Add the points with their tracks."""
-    image = np.repeat(
-        np.arange(len(compact.names)), [len(compact.visible[name]) for name in compact.names]
-    )
-    keypoint = np.concatenate([np.arange(len(compact.visible[name])) for name in compact.names])
-    point = np.concatenate([compact.visible[name] for name in compact.names])
+    visible = [compact.visible(name) for name in compact.names]
+    image = np.repeat(np.arange(len(visible)), [len(part) for part in visible])
+    keypoint = np.concatenate([np.arange(len(part)) for part in visible])
+    point = np.concatenate(visible)
     order = np.argsort(point, kind="stable")
     ends = np.cumsum(np.bincount(point, minlength=len(compact.points)))
-    for number, rows in enumerate(np.split(order, ends[:-1])):
+    for at, rows in zip(compact.points.all(), np.split(order, ends[:-1]), strict=True):
         track = pycolmap.Track(
             [pycolmap.TrackElement(int(image[row]) + 1, int(keypoint[row])) for row in rows]
         )
-        model.add_point3D(compact.points[number], track)
+        model.add_point3D(at, track)

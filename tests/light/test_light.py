@@ -17,6 +17,7 @@ from hloc_reduce.maps import contents
 from hloc_reduce.maps.compact import CompactMap
 from hloc_reduce.utils import match_files
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.codes import to_integers
 from hloc_reduce.utils.images import read_image
 from pipelines import localize
 
@@ -92,16 +93,34 @@ def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
     rounded = [one["descriptors"].T.astype(np.float16) for one in found]
     np.testing.assert_array_equal(*rounded)
     query = rounded[0].astype(np.float32)
-    np.testing.assert_array_equal(*(one.engine.aggregate(query) for one in (light, heavy)))
+    both = light, heavy
+    np.testing.assert_array_equal(*(one.engine.aggregate(query) for one in both))
+    np.testing.assert_array_equal(*(one.similarity(one.engine.aggregate(query)[0]) for one in both))
+    matched = [one.match(query, one.names) for one in both]
     for name in light.names:
-        matched = [
-            one.engine.match(
-                one.engine.prepare(query), one.engine.prepare(one.describe(name)), one.shown[name]
-            )
-            for one in (light, heavy)
-        ]
-        np.testing.assert_array_equal(*matched)
-    assert any(len(pairs) > 50 for pairs in matched)
+        np.testing.assert_array_equal(*(pairs[name] for pairs in matched))
+    assert any(len(pairs) > 50 for pairs in matched[0].values())
+
+
+@pytest.mark.parametrize("ratio_threshold", [None, 0.8])
+@pytest.mark.parametrize("number", [0, 1, 2, 300])
+def test_images_of_points_are_matched_one_by_one(ratio_threshold, number, monkeypatch):
+    """What images share is searched once, in parts."""
+    monkeypatch.setattr(matching, "ROWS", 7)
+    generator = np.random.default_rng(0)
+    drawn = generator.standard_normal((100 + number, 16)).astype(np.float32)
+    drawn[100 : 100 + number // 2] = drawn[: number // 2] + 0.02 * drawn[-(number // 2) or 100 :]
+    drawn = to_integers(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
+    points, query = drawn[:100], drawn[100:]
+    images = [np.sort(generator.permutation(100)[:size]) for size in (0, 1, 2, 40, 100)]
+    found = matching.match_images_of_points(points, query, images, ratio_threshold, 0.7)
+    assert len(found) == len(images)
+    for rows, pairs in zip(images, found, strict=True):
+        matches, cosine = matching.mutual_nearest(points[rows], query, ratio_threshold, None, 0.7)
+        own = np.flatnonzero(matches >= 0)
+        expected = matching.most_similar_first(matches[own], own, cosine[own])
+        np.testing.assert_array_equal(pairs, expected)
+    assert len(found[-1]) >= number // 3
 
 
 def test_matches_are_in_the_order_of_a_match_file():

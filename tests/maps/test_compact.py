@@ -39,7 +39,10 @@ def built(place, run):
 @settings(deadline=None)
 def test_coordinates_are_within_half_a_step(xyz, step):
     packed, least, used, bits = points.quantize(xyz, step)
-    restored = points.restore(packed, len(xyz), least, used, bits)
+    coordinates = points.Coordinates(packed, len(xyz), least, used, bits)
+    restored = coordinates.all()
+    rows = np.arange(len(xyz))[::-2]
+    assert np.array_equal(coordinates[rows], restored[rows])
     assert np.abs(restored - xyz).max() <= 0.5001 * used + 1e-9 * np.abs(xyz).max()
     assert len(packed) == -(-len(xyz) * 3 * bits // 8)
     assert used == step or np.ptp(xyz, axis=0).max() / step > 2**31
@@ -51,9 +54,8 @@ def test_coordinates_of_many_points_are_packed_in_parts(monkeypatch):
     monkeypatch.setattr(points, "CHUNK", 16)
     parts = points.quantize(xyz, 0.01)
     assert np.array_equal(whole[0], parts[0])
-    assert np.array_equal(
-        points.restore(*parts[:1], 100, *parts[1:]), points.restore(*whole[:1], 100, *whole[1:])
-    )
+    every = [points.Coordinates(packed, 100, *rest).all() for packed, *rest in (whole, parts)]
+    assert np.array_equal(*every)
 
 
 @given(st.lists(st.sets(st.integers(0, 40_000), max_size=30), min_size=1, max_size=5))
@@ -63,8 +65,9 @@ def test_visible_points_survive(chosen):
         visible = [np.array(sorted(part), np.int64) for part in chosen]
         packed, kind = points.pack_visible(visible, number)
         counts = np.array([len(part) for part in visible])
-        found = points.unpack_visible(packed, kind, counts, number)
-        assert [part.tolist() for part in found] == [part.tolist() for part in visible]
+        found = points.Visible(packed, kind, counts, number)
+        assert len(found) == len(visible)
+        assert [found[i].tolist() for i in range(len(found))] == [part.tolist() for part in visible]
 
 
 def test_the_shorter_way_is_taken():
@@ -159,8 +162,7 @@ def test_codes_of_a_projection_of_ones_own(built, tmp_path):
     localizer = Localizer(tmp_path / "own.hlm")
     pose, _ = localizer.localize(images / "query/day/a.png")
     assert max(pose_error(pose, expected)) < 0.2
-    for name, points_of in localizer.reference.visible.items():
-        assert localizer.describe(name).shape == (len(points_of), 32)
+    assert localizer.reference.descriptors(np.arange(5)).shape == (5, 32)
 
 
 def test_a_limit_of_the_size(built, tmp_path):
@@ -249,6 +251,7 @@ def nan(array):
         ("levels", lambda a: -a, {}),
         ("visible", lambda a: a[:-1], {}),
         ("visible", lambda a: np.full_like(a, 255), {}),
+        ("visible", lambda a: np.full_like(a, 1), {"visible": "deltas"}),
         ("num_visible", lambda a: a + 2**31, {}),
         ("camera_of_image", lambda a: a + 9, {}),
         ("retrieval", lambda a: a[:, :1], {}),
