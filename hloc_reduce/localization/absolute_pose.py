@@ -25,6 +25,7 @@ from .resection import Resection
 
 SEED = 0
 MAX_ERROR = 12.0  # pixels, pycolmap's default
+LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 ROUNDS = 3  # of estimation from the inliers among all matches
@@ -138,7 +139,9 @@ def estimate(
     best = replace(best, agreement=agreement(best.inliers, images))
     others = np.flatnonzero(~best.inliers)
     if len(others) >= RIVAL * best.num_inliers > 0:
-        poses.append(_estimate(matches, others))
+        # half as many inliers as a rival of this confidence is expected to have
+        least = RIVAL / 2 * best.num_inliers / len(others)
+        poses.append(_estimate(matches, others, max(LEAST_RATIO, least)))
     return replace(best, refusal=_refusal(matches, best, poses, gate, doubt))
 
 
@@ -146,14 +149,21 @@ def _quality(pose: Pose) -> tuple[float, int]:
     return pose.confidence, pose.num_inliers
 
 
-def _estimate(matches: _Matches, chosen: np.ndarray) -> Pose:
-    """Estimate a pose from chosen matches, then from all matches that agree with it."""
+def _estimate(matches: _Matches, chosen: np.ndarray, least_ratio: float = LEAST_RATIO) -> Pose:
+    """Estimate a pose from chosen matches, then from all matches that agree with it.
+
+    Args:
+        matches: of the query.
+        chosen: (N,) indices of some of them.
+        least_ratio: share of inliers below which RANSAC need not find a pose among these.
+    """
     points2D, points3D, number = matches.points2D, matches.points3D, len(matches)
+    ransac = {"random_seed": SEED, "min_inlier_ratio": least_ratio}
     pose = Pose(None, matches.camera, np.zeros(number, bool))
     for _ in range(1 if len(chosen) == number else ROUNDS):
         camera = copy.deepcopy(pose.camera)
         chosen_points = points2D[chosen], points3D[chosen]
-        found = colmap.estimate_pose(*chosen_points, camera, matches.config, SEED)
+        found = colmap.estimate_pose(*chosen_points, camera, matches.config, ransac)
         if not found:
             break
         cam_from_world = found["cam_from_world"]

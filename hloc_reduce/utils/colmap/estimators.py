@@ -113,7 +113,7 @@ def _log(
 
 
 def estimate_pose(
-    points2D: np.ndarray, points3D: np.ndarray, camera: pycolmap.Camera, config: dict, seed: int
+    points2D: np.ndarray, points3D: np.ndarray, camera: pycolmap.Camera, config: dict, ransac: dict
 ) -> dict | None:
     """Estimate an absolute pose by PnP + LO-RANSAC and refine it, deterministically.
 
@@ -122,13 +122,13 @@ def estimate_pose(
         points3D: (M, 3) world points.
         camera: the intrinsics.
         config: hloc's dict, with options under "estimation" and "refinement".
-        seed: the seed of RANSAC.
+        ransac: options of RANSAC, such as its `random_seed`; those in `config` take precedence.
 
     Returns:
         cam_from_world, num_inliers and inlier_mask (M,), or None.
     """
     estimation = {**config.get("estimation", {})}
-    estimation["ransac"] = {"random_seed": seed, **estimation.get("ransac", {})}
+    estimation["ransac"] = {**ransac, **estimation.get("ransac", {})}
     if len(points2D) == 0:
         return None
     estimate: Callable[..., dict | None] = pycolmap.estimate_and_refine_absolute_pose
