@@ -24,7 +24,8 @@ from ..utils.parsers import check_names, parse_camera
 from . import points as points_of_map
 from .points import Points
 
-VERSION = 1
+VERSION = 2
+VERSIONS = 1, VERSION  # that are read; in the first one, all coordinates have the same bits
 SUFFIX = ".hlm"
 SIGNS = 1024  # bits of an image's retrieval descriptor
 IMAGES = 1024  # whose signs are unpacked at once
@@ -202,10 +203,12 @@ class CompactMap:
             with safe_open(path, "np") as file:
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
                 metadata = json.loads((file.metadata() or {})["map"])
-            if metadata["version"] != VERSION:
+            if metadata["version"] not in VERSIONS:
                 raise InputError(
                     f"{path} is a compact map of version {metadata['version']}, not {VERSION}."
                 )
+            if metadata["version"] == 1:
+                metadata["bits"] = 3 * [metadata["bits"]]
             self._read(metadata, tensors)
         except FileNotFoundError:
             raise InputError(f"There is no map {path}.") from None
@@ -231,7 +234,7 @@ class CompactMap:
         used = _array(tensors, "camera_of_image", np.uint32, (count,))
         self.camera_number = dict(zip(names, used.tolist(), strict=True))
         self.camera_of = {name: cameras[i] for name, i in self.camera_number.items()}
-        bits, step = int(metadata["bits"]), float(metadata["step"])
+        bits, step = [int(number) for number in metadata["bits"]], float(metadata["step"])
         least = np.array(metadata["least"], np.float64)
         coordinates = _array(tensors, "coordinates", np.uint8, (None,))
         self.points = points_of_map.Coordinates(coordinates, number, least, step, bits)

@@ -156,7 +156,7 @@ def precision(points: Points, sfm: pycolmap.Reconstruction) -> float:
     return 2 * pixels * per_pixel / np.sqrt(3)  # the error is up to half a step in each axis
 
 
-def quantize(xyz: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, float, int]:
+def quantize(xyz: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, float, list[int]]:
     """Pack coordinates into as few bits as a step needs.
 
     Args:
@@ -164,18 +164,21 @@ def quantize(xyz: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, floa
         step: of the coordinates; larger if the extent needs more than `MAX_BITS` bits.
 
     Returns:
-        Bytes (N,) uint8; the least coordinates (3,); the step; and the bits of a coordinate.
+        Bytes (N,) uint8; the least coordinates (3,); the step; and the bits of each coordinate.
     """
     least = xyz.min(axis=0)
     extent = float((xyz - least).max())
     step = max(step, extent / (2**MAX_BITS - 1), np.finfo(np.float64).tiny)
     whole = np.rint((xyz - least) / step).astype(np.uint64)
-    bits = max(1, int(whole.max()).bit_length())
+    bits = [max(1, int(largest).bit_length()) for largest in whole.max(axis=0)]
     packed = []
     for start in range(0, len(whole), CHUNK):
-        part = whole[start : start + CHUNK].reshape(-1, 1)
-        flags = (part >> np.arange(bits, dtype=np.uint64) & np.uint64(1)).astype(np.uint8)
-        packed.append(np.packbits(flags, bitorder="little"))
+        columns = whole[start : start + CHUNK].T[..., None]
+        flags = [
+            column >> np.arange(number, dtype=np.uint64) & 1
+            for column, number in zip(columns, bits, strict=True)
+        ]
+        packed.append(np.packbits(np.hstack(flags).astype(bool), bitorder="little"))
     return np.concatenate(packed), least, step, bits
 
 
@@ -190,24 +193,27 @@ class Coordinates:
         ValueError: when they contradict each other, or are not finite.
     """
 
-    def __init__(self, packed: np.ndarray, number: int, least: np.ndarray, step: float, bits: int):
-        if not (0 < bits <= MAX_BITS and number > 0 and least.shape == (3,)):
-            raise ValueError(f"{number} points of {bits} bits")
-        if len(packed) != -(-number * 3 * bits // 8):
+    def __init__(
+        self, packed: np.ndarray, number: int, least: np.ndarray, step: float, bits: list[int]
+    ):
+        fits = least.shape == (3,) == np.shape(bits) and all(0 < n <= MAX_BITS for n in bits)
+        if not (fits and number > 0 and len(packed) == -(-number * sum(bits) // 8)):
             raise ValueError(f"{len(packed)} bytes of {number} points of {bits} bits")
-        if not np.isfinite(least + step * 2.0**bits).all():
+        if not np.isfinite(least + step * 2.0**MAX_BITS).all():
             raise ValueError("coordinates that are not finite")
         self._packed = np.append(packed, np.zeros(8, np.uint8))  # eight bytes are read at once
-        self._number, self._least, self._step, self._bits = number, least, step, bits
+        self._number, self._least, self._step = number, least, step
+        self._size, self._begin = sum(bits), np.cumsum([0, *bits[:2]])
+        self._masks = np.array([2**n - 1 for n in bits], np.uint64)
 
     def __len__(self) -> int:
         return self._number
 
     def __getitem__(self, rows: np.ndarray) -> np.ndarray:
         """Return the coordinates (K, 3) float64 of points (K,)."""
-        start = (3 * rows[:, None] + np.arange(3)) * self._bits
+        start = rows[:, None] * self._size + self._begin
         words = self._packed[(start >> 3)[..., None] + np.arange(8)].view("<u8")[..., 0]
-        whole = words >> (start & 7).astype(np.uint64) & np.uint64(2**self._bits - 1)
+        whole = words >> (start & 7).astype(np.uint64) & self._masks
         return self._least + self._step * whole
 
     def all(self) -> np.ndarray:

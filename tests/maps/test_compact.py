@@ -44,7 +44,7 @@ def test_coordinates_are_within_half_a_step(xyz, step):
     rows = np.arange(len(xyz))[::-2]
     assert np.array_equal(coordinates[rows], restored[rows])
     assert np.abs(restored - xyz).max() <= 0.5001 * used + 1e-9 * np.abs(xyz).max()
-    assert len(packed) == -(-len(xyz) * 3 * bits // 8)
+    assert len(packed) == -(-len(xyz) * sum(bits) // 8)
     assert used == step or np.ptp(xyz, axis=0).max() / step > 2**31
 
 
@@ -235,6 +235,22 @@ REDUCED = {"name": "reduced", "base": {"name": "dog", "descriptor": "colmap_sift
 REDUCED["projection"] = "colmap_sift_sv32"
 
 
+def test_files_of_the_first_version_are_read(file):
+    """All their coordinates have the same number of bits."""
+    before = CompactMap(file)
+    expected, bits = before.points.all(), 12
+    step = float(np.ptp(expected, axis=0).max()) / (2**bits - 1)
+    least = expected.min(axis=0)
+    whole = np.rint((expected - least) / step).astype(int)
+    packed = np.packbits(whole[..., None] >> np.arange(bits) & 1, bitorder="little")
+    change(
+        file,
+        *("coordinates", lambda array: packed),
+        **{"version": 1, "bits": bits, "step": step, "least": least.tolist()},
+    )
+    np.testing.assert_allclose(CompactMap(file).points.all(), expected, atol=0.51 * step)
+
+
 def nan(array):
     array[0] = np.nan
     return array
@@ -259,8 +275,10 @@ def nan(array):
         (None, None, {"points": 10**12}),
         (None, None, {"points": -1}),
         (None, None, {"points": "many"}),
-        (None, None, {"bits": 10**6}),
-        (None, None, {"bits": 0}),
+        (None, None, {"bits": [10**6] * 3}),
+        (None, None, {"bits": [0, 8, 8]}),
+        (None, None, {"bits": [8, 8]}),
+        (None, None, {"bits": 8}),
         (None, None, {"step": "wide"}),
         (None, None, {"least": [0, 0]}),
         (None, None, {"signs": 10**10}),
