@@ -9,15 +9,12 @@ numbers. What rounding has lost stays lost when descriptors are converted back t
 
 from pathlib import Path
 
-import h5py
-import numpy as np
-
 from . import logger, projections
 from .runtime.group_writer import GroupWriter
 from .utils import cli
 from .utils.cli import InputError
 from .utils.codes import CODED, QUANTIZED, STORAGES, store
-from .utils.feature_files import get_descriptors
+from .utils.feature_files import get_descriptors, read_others, stored_descriptors
 from .utils.h5 import file_provenance, list_h5_names, open_h5
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
@@ -64,14 +61,12 @@ def main(
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [name for name in names if name not in writer]
             for name in progress(todo, "Converting features", "image"):
-                datasets = {
-                    key: dataset
-                    for key, dataset in file[name].items()
-                    if isinstance(dataset, h5py.Dataset) and dataset.shape is not None
-                }
-                arrays = {key: np.asarray(d[()], d.dtype) for key, d in datasets.items()}
-                attrs = {key: dict(dataset.attrs) for key, dataset in datasets.items()}
-                if QUANTIZED.get(storage) not in arrays:
+                arrays, attrs = read_others(file, name)
+                found = stored_descriptors(file, name)
+                key = found.name.rpartition("/")[2]
+                if QUANTIZED.get(storage) == key:
+                    stored, own = {key: found[()]}, {key: dict(found.attrs)}
+                else:
                     descriptors = get_descriptors(file, name).T
                     if levels is not None and len(levels) != len(descriptors):
                         raise InputError(
@@ -79,10 +74,7 @@ def main(
                             f"those of {projection} are {len(levels)}-D."
                         )
                     stored, own = store({"descriptors": descriptors}, storage, levels)
-                    for key in ("descriptors", *QUANTIZED.values()):
-                        arrays.pop(key, None)
-                    arrays, attrs = arrays | stored, attrs | own
-                writer.add(name, arrays, attrs)
+                writer.add(name, arrays | stored, attrs | own)
     logger.info("%d images, descriptors as %s: %s", len(names), storage, output)
     return output
 

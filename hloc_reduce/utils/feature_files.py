@@ -9,7 +9,7 @@ import numpy as np
 
 from .cli import InputError
 from .codes import QUANTIZED, restore
-from .h5 import get_array, get_dataset, iterate_h5_names, open_h5, reading
+from .h5 import get_array, get_dataset, get_text, iterate_h5_names, open_h5, reading
 
 
 def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
@@ -72,6 +72,21 @@ def stored_descriptors(file: h5py.File, name: str) -> h5py.Dataset:
             "(D, N) and (N, 2) are expected."
         )
     return dataset
+
+
+def read_others(file: h5py.File, name: str) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
+    """Read all arrays of an image but its descriptors, their attributes, and its own ("")."""
+    with reading(file.filename):
+        datasets = {
+            key: dataset
+            for key, dataset in file[name].items()
+            if isinstance(dataset, h5py.Dataset) and dataset.shape is not None
+        }
+        for key in ("descriptors", *QUANTIZED.values()):
+            datasets.pop(key, None)
+        arrays = {key: np.asarray(d[()], d.dtype) for key, d in datasets.items()}
+        attrs = {key: dict(dataset.attrs) for key, dataset in datasets.items()}
+        return arrays, attrs | {"": {key: get_text(file[name], key) for key in file[name].attrs}}
 
 
 def dimension(features: Path) -> int:
