@@ -11,6 +11,7 @@ from .. import logger
 from ..runtime import provenance
 from ..utils import colmap
 from . import copies, epipolar
+from . import database as databases
 from .plausibility import (
     MAX_DISTORTION,
     SPREAD,
@@ -103,16 +104,10 @@ class Mapper:
 
     def write_database(self, mode: pycolmap.CameraMode) -> Path:
         """Write a database of the images and their verified matches."""
-        database = self.folder / f"database-{mode.name}.db"
-        colmap.import_images(database, self.image_dir, self.names, mode, self.image_options)
-        verified = {
-            pair: (indices, None if self.unverified else indices)
-            for pair, indices in self.matches.items()
-        }
-        colmap.write_matches(database, self.keypoints, verified)
-        if self.unverified:
-            colmap.verify_matches(database, self.unverified, self.verbose)
-        return database
+        path = self.folder / f"database-{mode.name}.db"
+        arguments = self.image_dir, self.keypoints, self.matches, self.unverified, mode
+        databases.write(path, *arguments, self.image_options, self.verbose)
+        return path
 
     def run(self, database: Path) -> Models:
         """Return the plausible models of the best attempt; stop when enough images are in one."""

@@ -1,12 +1,14 @@
 """Match files in hloc's format."""
 
 import json
+from collections.abc import Iterable
+from pathlib import Path
 
 import h5py
 import numpy as np
 
 from .cli import InputError
-from .h5 import get_array, get_text, reading
+from .h5 import get_array, get_text, iterate_h5_names, open_h5, reading
 
 
 def get_matcher(match_file: h5py.File) -> dict:
@@ -39,6 +41,25 @@ def find_pair(file: h5py.File, name0: str, name1: str) -> tuple[str | None, bool
             if found:
                 return pair, reverse
     return None, False
+
+
+def list_pairs(path: Path, names: Iterable[str]) -> list[tuple[str, str]]:
+    """List the pairs of some images in a match file.
+
+    Raises:
+        InputError: when the file is missing or broken, or it names two of the images alike.
+    """
+    known: dict[str, str] = {}
+    for name in names:
+        if known.setdefault(name_in_pair(name), name) != name:
+            raise InputError(f"{path} cannot tell {known[name_in_pair(name)]} and {name} apart.")
+    pairs = []
+    with open_h5(path) as file:
+        for group in iterate_h5_names(file.id):
+            ends = [i for i, letter in enumerate(group) if letter == ("/" if "/" in group else "_")]
+            both = ((group[:i], group[i + 1 :]) for i in ends)
+            pairs += [(known[a], known[b]) for a, b in both if a in known and b in known]
+    return pairs
 
 
 def get_matches(

@@ -1,0 +1,91 @@
+"""Write features and matches into a new COLMAP database.
+
+For `colmap mapper`, GLOMAP and `colmap gui`. The database has the keypoints, the matches, and the
+matches that are verified by two-view geometry; no descriptors, as COLMAP has none of other sizes.
+"""
+
+import tempfile
+from pathlib import Path
+
+import pycolmap
+
+from . import logger
+from .mapping import database as databases
+from .triangulation import read_matches
+from .utils import cli, colmap
+from .utils.cli import InputError
+from .utils.files import replacing
+from .utils.h5 import list_h5_names
+from .utils.images import list_images
+from .utils.match_files import list_pairs
+from .utils.parsers import write_pairs
+from .utils.paths import strings_as_paths
+
+
+@strings_as_paths
+def main(
+    features: Path,
+    matches: Path,
+    image_dir: Path,
+    database: Path,
+    camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
+    overwrite: bool = False,
+    verbose: bool = False,
+) -> Path:
+    """Write a COLMAP database of all images of a feature file.
+
+    Args:
+        features: feature file.
+        matches: match file; pairs with other images are left out.
+        image_dir: folder of the images, whose EXIF data give the intrinsics.
+        database: the new file.
+        camera_mode: which images share a camera.
+        overwrite: replace a file that exists.
+        verbose: show COLMAP's log.
+
+    Returns:
+        `database`.
+
+    Raises:
+        InputError: when an input is missing or broken, no pair is matched, or the file exists.
+    """
+    cli.check_file(database, "the database")
+    if database.exists() and not overwrite:
+        raise InputError(f"{database} exists: choose another --database, or --overwrite it.")
+    names = list_images(image_dir, list_h5_names(features))
+    pairs = list_pairs(matches, names)
+    if not pairs:
+        raise InputError(f"{matches} has no pair of images of {features}.")
+    with tempfile.TemporaryDirectory() as folder, replacing(database) as temporary:
+        listed = Path(folder) / "pairs.txt"
+        write_pairs(pairs, listed)
+        keypoints, _, found = read_matches(names, listed, features, matches, None)
+        arguments = image_dir, keypoints, found, listed, camera_mode
+        databases.write(temporary, *arguments, verbose=verbose)
+        verified = colmap.count_verified(temporary)
+    logger.info(
+        "%d images, %d of %d pairs with verified matches: %s",
+        *(len(names), len(verified), len(found), database),
+    )
+    return database
+
+
+def _main() -> None:
+    parser = cli.Parser(
+        __doc__,
+        "--features outputs/feats-dog-colmap_sift_sv64.h5 --matches outputs/matches.h5 "
+        "--image_dir photos --database new.db",
+    )
+    parser.add_argument("--features", type=Path, required=True, help="feature file")
+    parser.add_argument("--matches", type=Path, required=True, help="match file")
+    parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
+    parser.add_argument("--database", type=Path, required=True, help="the new database")
+    colmap.add_camera_mode(parser)
+    parser.add_argument("--overwrite", action="store_true", help="replace a file that exists")
+    parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
+    args = parser.parse_args()
+    main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})
+
+
+if __name__ == "__main__":
+    cli.run(_main)
