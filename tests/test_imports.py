@@ -68,6 +68,8 @@ COMMANDS = [
             "localize_sfm",
             "report",
             "storage",
+            "reduce",
+            "to_colmap",
         )
     ),
 ]
