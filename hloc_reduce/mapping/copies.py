@@ -19,6 +19,9 @@ ANGLE, DISTANCE = 15.0, 1.5
 # one expects enough of them in one of the other, on average. Sound maps share a quarter and more,
 # the two that were merged by mistake 1 and 10 % (docs/results.md).
 SHARE, ENOUGH = 0.15, 100
+# The same for any two groups, also of sides that the mapper did not connect directly: sound maps
+# share a tenth and more, a pillar with two equal sides 0 %.
+APART = 0.05
 WORK = 2e8  # pairs of observations and photos: above, only some of the points are used
 
 
@@ -36,10 +39,11 @@ def find(model: pycolmap.Reconstruction) -> list[str]:
         return []
     expected, shared, used = _count(model, images)
 
-    def enough(wanted: float, first: int, second: int) -> bool:
-        return min(first, second) > 1 and wanted >= ENOUGH * used * 2 * first * second
+    def enough(wanted: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        several = np.minimum(first, second) > 1
+        return several & (wanted >= ENOUGH * used * 2 * first * second)
 
-    found = groups.contradicting(shared, expected, SHARE, enough)
+    found = groups.contradicting(shared, expected, SHARE, enough, APART)
     return sorted(images[i].name for i in found)
 
 

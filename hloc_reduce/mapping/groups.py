@@ -4,24 +4,30 @@ from collections.abc import Callable
 
 import numpy as np
 
+MOST = 300  # photos: any two of their groups are compared
+
 
 def contradicting(
     common: np.ndarray,
     expected: np.ndarray,
     share: float,
-    enough: Callable[[float, int, int], bool],
+    enough: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    apart: float = 0.0,
 ) -> list[int]:
     """Return the smaller one of the two groups of photos that contradict each other most.
 
     Groups are built by what their photos have in common, as by average linkage, and compared where
     two of them are joined: they contradict each other if they have less in common than `share` of
-    what is expected.
+    what is expected. If none do, any other two groups do that have less than `apart`, in sets of up
+    to `MOST` photos.
 
     Args:
         common: (N, N) what each pair of photos has in common, symmetric.
         expected: (N, N) what it is expected to have, symmetric.
         share: see above.
-        enough: whether the sum of what is expected of two groups, of these sizes, is evidence.
+        enough: whether sums of what is expected of two groups, of these sizes, are evidence: of
+            arrays that broadcast.
+        apart: see above.
 
     Returns:
         Indices of the group; none if no groups contradict each other.
@@ -34,17 +40,26 @@ def contradicting(
         return []
     distance = common.max() - common
     np.fill_diagonal(distance, 0)
-    groups = {i: [i] for i in range(number)}
-    sums = np.zeros((2, 2 * number, 2 * number))
-    sums[:, :number, :number] = common, expected
-    worst, found = share, list[int]()
     joined = average(squareform(distance, checks=False))[:, :2].astype(int)
-    for new, (a, b) in enumerate(joined.tolist(), number):
-        first, second = groups.pop(a), groups.pop(b)
-        shared, wanted = sums[:, a, b].tolist()
-        if enough(wanted, len(first), len(second)) and shared < worst * wanted:
-            worst, found = shared / wanted, min(second, first, key=len)
-        groups[new] = first + second
-        sums[:, new] = sums[:, a] + sums[:, b]
-        sums[:, :, new] = sums[:, :, a] + sums[:, :, b]
-    return found
+    belongs = np.eye(2 * number - 1, number)  # photos to groups
+    for new, pair in enumerate(joined, number):
+        belongs[new] = belongs[pair].sum(axis=0)
+    sizes = belongs.sum(axis=1)
+
+    def shares_of(pairs: np.ndarray, sums: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Return what pairs of groups (P, 2) share of what is expected, inf without evidence."""
+        evident = (wanted > 0) & enough(wanted, *sizes[pairs.T])
+        return np.divide(sums, wanted, out=np.full_like(sums, np.inf), where=evident)
+
+    pairs, both = joined, belongs[joined]
+    totals = [((both[:, 0] @ values) * both[:, 1]).sum(axis=1) for values in (common, expected)]
+    shares = shares_of(pairs, *totals)
+    worst = shares.argmin()
+    if shares[worst] >= share and apart > 0 and number <= MOST:
+        pairs = np.argwhere(np.triu(belongs @ belongs.T == 0))
+        totals = [(belongs @ values @ belongs.T)[tuple(pairs.T)] for values in (common, expected)]
+        shares = shares_of(pairs, *totals)
+        share, worst = apart, np.where(shares < apart, totals[1], 0).argmax()
+    if shares[worst] >= share:
+        return []
+    return np.flatnonzero(belongs[min(pairs[worst][::-1], key=sizes.__getitem__)]).tolist()

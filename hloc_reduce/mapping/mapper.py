@@ -40,7 +40,8 @@ RULES = {
     "spread": SPREAD,
     "viewpoints": VIEWPOINTS,
     "misplaced": f"{epipolar.AGREEING} of {epipolar.EVIDENCE} matches or more",
-    "copies": f"sharing less than {copies.SHARE} of the points expected in {copies.ENOUGH}",
+    "copies": f"sharing less than {copies.SHARE} of the points expected in {copies.ENOUGH}, any "
+    f"less than {copies.APART}",
 }
 
 

@@ -22,7 +22,8 @@ WHY = {
     MISPLACED: "Most matches of these contradict the poses that COLMAP found",
     COPY: (
         "These show another side of the place that looks the same, or a copy of it: from where "
-        "COLMAP puts them, they would see many points of the others, but they match few of them"
+        "COLMAP puts them, they would see many points of the others, but they match few of them. "
+        "Photos that are in the map may be at the wrong side, too"
     ),
 }
 # what to try

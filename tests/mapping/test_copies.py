@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hloc_reduce.mapping import copies
+from hloc_reduce.mapping import copies, groups
 from hloc_reduce.mapping.plausibility import COPY, keep_plausible
 from hloc_reduce.utils import colmap
 
@@ -68,6 +68,25 @@ def test_one_side_is_left_out_of_a_map():
     names = {kept.images[i].name for i in kept.reg_image_ids()}
     assert names in SIDES and set(dropped.values()) == {COPY}
     assert names | set(dropped) == SIDES[0] | SIDES[1]
+
+
+def test_sides_that_are_not_joined_directly():
+    """A pillar with sides A B A C: both A are one, and B and C are seen from the same places."""
+    side = np.array(["A"] * 4 + ["B"] * 2 + ["C"] * 2)
+    strength = {"AA": 900, "BB": 900, "CC": 900, "AB": 500, "AC": 450, "BC": 0}
+    shared = np.array([[strength["".join(sorted(a + b))] for b in side] for a in side], float)
+    expected = np.full_like(shared, 1000)
+    for values in (shared, expected):
+        np.fill_diagonal(values, 0)
+
+    def enough(wanted, first, second):
+        return np.minimum(first, second) > 1
+
+    assert groups.contradicting(shared, expected, copies.SHARE, enough) == []
+    found = groups.contradicting(shared, expected, copies.SHARE, enough, copies.APART)
+    assert found in ([4, 5], [6, 7])
+    shared[shared == 0] = 80  # as photos of another season
+    assert groups.contradicting(shared, expected, copies.SHARE, enough, copies.APART) == []
 
 
 def test_few_photos_have_no_sides():
