@@ -22,15 +22,17 @@ WHY = {
     MISPLACED: "Most matches of these contradict the poses that COLMAP found",
     COPY: (
         "These show another side of the place that looks the same, or a copy of it: from where "
-        "COLMAP puts them, they would see many points of the others, but they match few of them. "
-        "Photos that are in the map may be at the wrong side, too"
+        "COLMAP puts them, they would see many points of the others, but they match few of them"
     ),
 }
 # what to try
 TRIES = {
     LENS: "use the photos as the camera wrote them, neither cropped nor edited",
     MISPLACED: "add photos between those in the map and those that are not",
-    COPY: "make a map of each side, or add photos all the way from one to the other",
+    COPY: (
+        "make a map of each side, because other photos of this one may be at the wrong side, too, "
+        "or add photos all the way from one side to the other"
+    ),
 }
 
 
