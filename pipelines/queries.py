@@ -1,8 +1,8 @@
 """The queries of pipelines.localize: their names and intrinsics, and whether photos changed."""
 
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
@@ -35,10 +35,12 @@ class Queries:
         lists: the names of the queries of each list.
         inferred: intrinsics with their sources, as from `intrinsics.infer`, but none of unreadable
             photos; None if the lists have intrinsics.
+        refinements: which of these are refined with the pose, see `intrinsics.refinement`.
     """
 
     lists: dict[str, list[str]]
     inferred: dict[str, tuple[pycolmap.Camera, str]] | None = None
+    refinements: Mapping[str, dict] = field(default_factory=dict)
 
     @classmethod
     def find(cls, query_images: Path, queries: Path | None, built: Map, strict: bool) -> Self:
@@ -60,7 +62,10 @@ class Queries:
             return listed
         names = list_images(query_images)
         inferred = _infer(query_images, names, built.cameras, strict)
-        return cls({query_images.resolve().name: names}, inferred)
+        refinements = {
+            name: intrinsics.refinement(*found, built.cameras) for name, found in inferred.items()
+        }
+        return cls({query_images.resolve().name: names}, inferred, refinements)
 
     @property
     def names(self) -> list[str]:
@@ -73,12 +78,6 @@ class Queries:
         if self.inferred is None:
             return dict.fromkeys(self.names, "list")
         return {name: source for name, (_, source) in self.inferred.items()}
-
-    @property
-    def refinements(self) -> dict[str, dict]:
-        """Which inferred intrinsics are refined with the pose."""
-        inferred = (self.inferred or {}).items()
-        return {name: intrinsics.REFINEMENTS[source] for name, (_, source) in inferred}
 
     def write(self, path: Path) -> list[tuple[str, pycolmap.Camera | None]]:
         """Write the inferred intrinsics and return those of all queries, None if not known."""

@@ -121,10 +121,9 @@ def _of_stages(sfm: Path, features: Path, global_descriptors: Path | None, featu
     descriptors = global_descriptors or beside
     vocabulary = vocabulary_of(descriptors)
     model = colmap.read_model(sfm)
-    sizes = {(camera.width, camera.height) for camera in model.cameras.values()}
     return Source(
         *(model, name, conf, features_confs.matcher_of(conf)),
-        *(descriptors, vocabulary, intrinsics.MapCameras({}, sizes)),
+        *(descriptors, vocabulary, intrinsics.of_cameras(model.cameras.values())),
     )
 
 

@@ -39,6 +39,7 @@ RIGHT = 1.1  # above it, the other intrinsics are right
 # multiples of MAX_POSITION and MAX_ROTATION
 TOLERANT = 1.2  # between poses with listed and other focal lengths: many lists are 5 % off
 CROPPED = 3.0, 2.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
+ZOOMED = 1.2  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
 LISTED = 0.1, 50.0  # range of listed focal lengths, in longer sides
 # distances of the principal point from the centre, as shares of the size
 OFF_CENTRE, CENTRED = 0.15, 0.02
@@ -90,9 +91,12 @@ class _Matches:
     def max_error(self) -> float:
         return self.config.get("estimation", {}).get("ransac", {}).get("max_error", MAX_ERROR)
 
-    @property
-    def may_be_cropped(self) -> bool:
-        return bool(self.config.get("photo", {}).get("cropped"))
+    def may_be_cropped(self, pose: Pose) -> bool:
+        """Return whether the photo may be cropped, or enlarged, too, by the focal length found."""
+        photo = self.config.get("photo", {})
+        low, high = photo.get("focal_lengths", (0, np.inf))
+        fits = low / ZOOMED <= pose.camera.mean_focal_length() <= ZOOMED * high
+        return bool(photo.get("cropped")) or not fits
 
     @property
     def is_focal_length_guessed(self) -> bool:
@@ -125,7 +129,7 @@ def estimate(
         images: of each map image the indices of its matches, the most similar first.
         camera: intrinsics.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement"; under
-            "photo", whether it may be "cropped".
+            "photo", whether it may be "cropped", or the range of the map's "focal_lengths".
         gate: what a pose must have to be trusted.
         thorough: try the matches of single images, too.
     """
@@ -217,7 +221,7 @@ def _calibrate(matches: _Matches, pose: Pose) -> tuple[Pose, str | None]:
         centred = resection.centred(pose.cam_from_world, pose.camera)
         guesses = (image, start), (matches.points2D, centred)
         return pose, _contradiction(matches, pose, other, guesses)
-    unclear = 1.0 if matches.may_be_cropped else UNCLEAR
+    unclear = 1.0 if matches.may_be_cropped(assumed) else UNCLEAR
     return _choose(assumed, other, points3D, unclear) if other else (assumed, None)
 
 
@@ -327,7 +331,7 @@ def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d
     """Return how the inliers fail to determine a pose, None if they determine it."""
     inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
     limits = [(pose.degrees_of_freedom, (1.0, 1.0), "the inliers do not fix the pose: its")]
-    if matches.may_be_cropped:
+    if matches.may_be_cropped(pose):
         reason = "it may be cropped, and without its intrinsics its"
         limits.append((ALL, CROPPED, reason))
     elif _is_off_centre(matches.camera):

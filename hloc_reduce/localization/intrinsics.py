@@ -1,6 +1,6 @@
 """Intrinsics of queries without a list: those of the map's camera, from EXIF data, or guessed."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,11 +70,14 @@ class MapCameras(NamedTuple):
         known: cameras that took several of its photos, by their `ExifCamera.name`.
         sizes: (width, height) of its photos.
         models: `ExifCamera.model` of all cameras that took its photos.
+        focal_lengths: the least and the largest of its cameras, in longer sides; None if the map
+            does not know.
     """
 
     known: dict[str, pycolmap.Camera]
     sizes: set[tuple[int, int]]
     models: Collection[str] = ()
+    focal_lengths: tuple[float, float] | None = None
 
 
 def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera, str]:
@@ -113,6 +116,33 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
     return camera, "guess" if has_size and not is_cut else "unknown"
 
 
+def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict:
+    """Return the options of `localize_sfm.main` for a photo with inferred intrinsics.
+
+    Args:
+        camera: from `infer`, like `source`.
+        source: a key of `REFINEMENTS`.
+        of_map: what the map tells.
+
+    Returns:
+        Those of `REFINEMENTS`; for a "guess" also the `focal_lengths` in pixels of the map's
+        cameras. A photo that has another one may have been cropped and enlarged.
+    """
+    options = REFINEMENTS[source]
+    if source != "guess" or of_map.focal_lengths is None:
+        return options
+    side = max(camera.width, camera.height)
+    return options | {"photo": {"focal_lengths": [side * f for f in of_map.focal_lengths]}}
+
+
+def of_cameras(cameras: Iterable[pycolmap.Camera]) -> MapCameras:
+    """Return what cameras of a map tell about the intrinsics of other photos."""
+    cameras = list(cameras)
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    found = [camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras]
+    return MapCameras({}, sizes, focal_lengths=(min(found), max(found)) if found else None)
+
+
 def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> MapCameras:
     """Return what a map tells about the intrinsics of other photos.
 
@@ -120,7 +150,6 @@ def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> MapCamer
         reconstruction: the map.
         image_dir: the folder of its photos.
     """
-    sizes = {(camera.width, camera.height) for camera in reconstruction.cameras.values()}
     models: set[str] = set()
     found: dict[str, list[int]] = {}
     for image in reconstruction.images.values():
@@ -133,12 +162,22 @@ def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> MapCamer
         for name, ids in found.items()
         if len(ids) >= WELL_KNOWN and len(set(ids)) == 1
     }
-    return MapCameras(known, sizes, models)
+    return of_cameras(reconstruction.cameras.values())._replace(known=known, models=models)
 
 
 def to_list(camera: pycolmap.Camera) -> list:
     """Return intrinsics as JSON values: model, width, height and parameters."""
     return [camera.model.name, camera.width, camera.height, *camera.params.tolist()]
+
+
+def to_range(values: Sequence[float] | None) -> tuple[float, float] | None:
+    """Return a range of focal lengths in JSON; raise a ValueError if it is wrong."""
+    if values is None:
+        return None
+    low, high = map(float, values)
+    if not 0 < low <= high < np.inf:
+        raise ValueError(f"focal lengths from {low} to {high}")
+    return low, high
 
 
 def to_lists(queries: Sequence[tuple[str, pycolmap.Camera | None]]) -> dict[str, list | None]:

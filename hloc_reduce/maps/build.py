@@ -241,6 +241,7 @@ class _Building:
             "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
             "sizes": sorted(cameras.sizes),
             "camera_models": sorted(cameras.models),
+            "focal_lengths": cameras.focal_lengths,
             "seconds": self.folder.seconds(),
         }
         provenance.write(self.folder.path / FINISHED, summary)

@@ -104,6 +104,7 @@ def encode(
         "known": {name: intrinsics.to_list(one) for name, one in source.cameras.known.items()},
         "sizes": sorted(source.cameras.sizes),
         "models": sorted(source.cameras.models),
+        "focal_lengths": source.cameras.focal_lengths,
     }
     for add in (_add_images, _add_points, _add_descriptors, _add_vocabulary, _add_projection):
         add(tensors, metadata, points, source)
@@ -282,7 +283,8 @@ class CompactMap:
         self.matcher = choose("matcher", metadata["matcher"], matchers_confs.confs)
         sizes = {(int(width), int(height)) for width, height in metadata["sizes"]}
         known = {str(name): _camera(values) for name, values in metadata["known"].items()}
-        self.cameras = intrinsics.MapCameras(known, sizes, {str(m) for m in metadata["models"]})
+        models, focal = {str(m) for m in metadata["models"]}, metadata.get("focal_lengths")
+        self.cameras = intrinsics.MapCameras(known, sizes, models, intrinsics.to_range(focal))
 
     def _read_projection(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
         self.projection: bytes | None = None

@@ -89,7 +89,7 @@ class Localizer:
         source, refinement = "given", {}
         if camera is None:
             camera, source = intrinsics.infer(image, self.cameras)
-            refinement = intrinsics.REFINEMENTS[source]
+            refinement = intrinsics.refinement(camera, source, self.cameras)
         features = self._extract(image)
         width, height = map(int, features["image_size"])
         if (camera.width, camera.height) != (width, height):

@@ -82,6 +82,7 @@ class Map:
             {name: intrinsics.from_list(values) for name, values in known},
             {(int(width), int(height)) for width, height in content.get("sizes", [])},
             {str(model) for model in content.get("camera_models", [])},
+            intrinsics.to_range(content.get("focal_lengths")),
         )
         conf = dict(content["conf"])
         conf |= {key: dict(conf[key]) for key in ("model", "preprocessing")}

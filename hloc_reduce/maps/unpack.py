@@ -92,6 +92,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
         "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
         "sizes": sorted(cameras.sizes),
         "camera_models": sorted(cameras.models),
+        "focal_lengths": cameras.focal_lengths,
     }
     provenance.write(folder / FINISHED, content)
 

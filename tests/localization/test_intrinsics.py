@@ -98,6 +98,23 @@ def test_a_photo_of_the_size_of_the_map_is_hardly_cropped():
         assert camera.params.tolist() == [576, 240, 180, 0] and found == source
 
 
+def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):
+    """A crop that was enlarged has the size of the map's photos, but a longer focal length."""
+    known = intrinsics.of_map(map_of([1, 2]), tmp_path)
+    assert known.focal_lengths == (PARAMS[0] / 480, PARAMS[0] / 480)
+    for size in ((360, 480), (480, 360)):
+        camera, source = intrinsics.infer(np.zeros(size, np.uint8), known)
+        found = dict(intrinsics.refinement(camera, source, known))
+        assert found.pop("photo")["focal_lengths"] == pytest.approx([500, 500])
+        assert found == intrinsics.REFINEMENTS["guess"]
+    assert intrinsics.refinement(camera, "unknown", known) == intrinsics.REFINEMENTS["unknown"]
+    before = known._replace(focal_lengths=None)  # a map of an earlier version
+    assert intrinsics.refinement(camera, "guess", before) == intrinsics.REFINEMENTS["guess"]
+    for wrong in ([1], [2, 1], [0, 1], [1, float("nan")], ["a", "b"]):
+        with pytest.raises(ValueError):
+            intrinsics.to_range(wrong)
+
+
 def test_intrinsics_in_a_list_are_the_same():
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=480, height=360, params=PARAMS)
     again = intrinsics.from_list(intrinsics.to_list(camera))

@@ -147,6 +147,23 @@ def test_a_slightly_better_fit_turns_a_photo_that_may_be_cropped(unclear, is_tru
     assert found is assumed and (doubt is None) == is_trusted
 
 
+@pytest.mark.parametrize(
+    "focal_length, photo, expected",
+    [
+        (1400, {}, False),
+        (1400, {"cropped": True}, True),
+        (1400, {"focal_lengths": [1200, 1300]}, False),
+        (1400, {"focal_lengths": [900, 1100]}, True),  # cropped and enlarged: 3 of 16 were wrong
+        (1400, {"focal_lengths": [1700, 1900]}, True),
+        (1400, {"focal_lengths": [900, 1900]}, False),
+    ],
+)
+def test_other_focal_lengths_than_those_of_the_map_may_be_of_crops(focal_length, photo, expected):
+    camera = camera_of(1600, 1200, [focal_length, 800, 600, 0], "SIMPLE_RADIAL")
+    its_matches = absolute_pose._Matches(*matches(WHOLE, 20), camera, {"photo": photo})
+    assert its_matches.may_be_cropped(Pose(POSE, camera, np.ones(20, bool))) == expected
+
+
 def test_the_principal_point_of_a_flat_scene_is_not_made_up():
     """A plane does not tell it, so it stays in the middle."""
     found = solve(*matches(WHOLE, 300, depth=0.05), guessed(1600, 1200), "guess")
