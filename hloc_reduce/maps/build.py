@@ -36,7 +36,7 @@ from ..utils.files import replacing
 from ..utils.images import list_images
 from ..utils.match_files import name_in_pair
 from ..utils.paths import strings_as_paths
-from . import contradictions
+from . import contradictions, precision
 from .map import FINGERPRINTS, FINISHED, FURTHER, MORE, PLACE, RETRIEVAL, SFM, Map, with_projection
 
 MAX_EXHAUSTIVE = 100  # photos without covisibility that are all paired with each other
@@ -138,6 +138,7 @@ def main(
             )
         _drop_others(folder, built)  # a killed run may have left some
         contradictions.warn(built.contradicting)
+        precision.warn(built.uncertain)
         return built
 
 
@@ -223,6 +224,8 @@ class _Building:
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         contradictions.warn(contradicting)
+        uncertain = precision.find(sfm) if model is None else {}
+        precision.warn(uncertain)
         cameras = intrinsics.of_map(sfm, self.image_dir)
         summary = {
             "id": uuid.uuid4().hex,
@@ -237,6 +240,7 @@ class _Building:
             "images": len(self.names),
             "images_with_pose": sfm.num_reg_images(),
             "images_contradicting_others": contradicting,
+            "images_of_uncertain_position": uncertain,
             "points3D": sfm.num_points3D(),
             "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
             "sizes": sorted(cameras.sizes),

@@ -42,6 +42,7 @@ class Map:
         images: folder of the photos.
         num_images: images with a pose.
         contradicting: images whose poses contradict the others.
+        uncertain: images whose positions are uncertain, see `precision.find`.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
         cameras: what the map tells about the intrinsics of other photos.
@@ -75,6 +76,8 @@ class Map:
         self.images = Path(content["image_dir"])
         self.num_images = int(content["images_with_pose"])
         self.contradicting = list(content.get("images_contradicting_others", []))
+        found = content.get("images_of_uncertain_position", {}).items()
+        self.uncertain = {str(name): float(share) for name, share in found}
         self.num_points3D = int(content["points3D"])
         self.camera_mode = content.get("camera_mode")
         known = content.get("cameras", {}).items()

@@ -1,0 +1,51 @@
+"""Photos whose positions the points of a map hardly determine."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hloc_reduce.maps import precision
+from hloc_reduce.utils import colmap
+
+
+def seen_from(distances, depth, one_camera=False):
+    """Make a map of points in a box of a depth, with photos at some distances."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-1, 1, (200, 3)) * [1, 1, depth / 2]
+    model = pycolmap.Reconstruction()
+    tracks = [pycolmap.Track() for _ in points]
+    for i, distance in enumerate(distances):
+        camera = pycolmap.Camera(
+            model="SIMPLE_PINHOLE",
+            width=1000,
+            height=800,
+            params=[200 * distance, 500, 400],
+            camera_id=1 if one_camera else i + 1,
+        )
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), [0.1 * i, 0, distance])
+        pixels = camera.img_from_cam(pose * points) + generator.normal(0, 1, (200, 2))
+        image = pycolmap.Image(
+            name=f"{i}.jpg", keypoints=pixels, camera_id=camera.camera_id, image_id=i + 1
+        )
+        colmap.add_image(model, camera, image, pose)
+        for row, track in enumerate(tracks):
+            track.add_element(i + 1, row)
+    for at, track in zip(points, tracks, strict=True):
+        model.add_point3D(at, track)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("distances", "depth", "one_camera", "expected"),
+    [
+        ([4, 4, 4, 4], 1, False, []),
+        ([4, 4, 4, 40], 0.1, False, ["3.jpg"]),  # nearly flat, and far away
+        ([40, 40, 40, 40], 0.1, True, []),
+    ],
+)
+def test_a_distant_photo_of_a_flat_scene_is_named(distances, depth, one_camera, expected, caplog):
+    found = precision.find(seen_from(distances, depth, one_camera))
+    assert expected == [name for name, share in found.items() if share > 0.3]
+    precision.warn(found)
+    assert all(f"{name} (" in caplog.text for name in expected)
+    assert bool(caplog.text) == bool(found)
