@@ -63,8 +63,10 @@ class Map:
         except (OSError, ValueError, KeyError, TypeError):
             if not folder.is_dir():
                 raise no_folder(folder) from None
+            inner = folder / "map"
+            hint = f" Did you mean {inner}?" if (inner / FINISHED).is_file() else ""
             raise InputError(
-                f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}."
+                f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}.{hint}"
             ) from None
         self._check()
 

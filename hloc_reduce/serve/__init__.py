@@ -75,12 +75,14 @@ def make_app(localizer: "Localizer", max_mb: float = MAX_MB, queue: int = QUEUE)
             return JSONResponse({"error": "the client is gone"}, 400)
 
     async def answered(request: "Request", photo: bytes, camera: pycolmap.Camera | None) -> dict:
+        whole = request.query_params.get("inliers", "0")
+        if whole not in ("0", "1"):
+            raise Refused(400, f"inliers is {whole[:20]!r}: it is 0 or 1")
         if state["waiting"] >= queue:
             raise Refused(BUSY, f"{queue} requests are waiting")
         state["waiting"] += 1
         try:
-            whole = request.query_params.get("inliers") == "1"
-            work = partial(answer, localizer, photo, camera, whole)
+            work = partial(answer, localizer, photo, camera, whole == "1")
             found = await asyncio.get_running_loop().run_in_executor(worker, work)
             state["served"] += 1
             return found

@@ -24,6 +24,8 @@ def test_a_map_is_built_once(place, capsys, run, refused):
     run(*build)
     assert "Localize photos in it with --query_images" in capsys.readouterr().out
     before = state(outputs / "map")
+    with pytest.raises(InputError, match=f"Did you mean {outputs}/map?"):
+        maps.Map(outputs)
     for folder in ("query/day", "query/night"):
         run(*build, "--query_images", images / folder)
     assert state(outputs / "map") == before

@@ -133,6 +133,8 @@ def test_garbage_is_refused(start):
     for size in ((12_000, 9_000), (30_000, 20_000)):
         status, found = ask(url + "/localize", png(size, "1"))
         assert status == 413 and "100,000,000 pixels" in found["error"]
+    status, found = ask(url + "/localize?inliers=abc", photo)
+    assert status == 400 and found["error"] == "inliers is 'abc': it is 0 or 1"
     for camera in (
         "",
         "x",
