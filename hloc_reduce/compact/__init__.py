@@ -83,7 +83,28 @@ def main(
         raise InputError("Give --map, or --sfm, --features and --feature.")
     else:
         source = _of_stages(sfm, features, global_descriptors, feature)
-    matcher = matcher or MATCHERS.get(source.matcher, source.matcher)
+    return write(output, source, features, matcher, storage, max_mb)
+
+
+def write(
+    output: Path,
+    source: Source,
+    features: Path,
+    matcher: str | None = None,
+    storage: str | None = None,
+    max_mb: float | None = None,
+) -> dict[str, int]:
+    """Write a compact map of what a pipeline has in memory and in files.
+
+    Args:
+        output: see `main`, like `matcher`, `storage`, `max_mb`, the result and the errors.
+        source: what it is made from.
+        features: feature file of the images.
+        matcher: see `output`.
+        storage: see `output`.
+        max_mb: see `output`.
+    """
+    matcher = matcher or matcher_of(source.matcher)
     cli.choose("matcher", matcher, matchers_confs.confs)
     conf = {**source.conf, "storage": _storage(source.conf, storage)}
     source = replace(source, matcher=matcher, conf=conf)
@@ -104,6 +125,11 @@ def main(
         ", ".join(f"{part} {size:,}" for part, size in parts.items()),
     )
     return parts
+
+
+def matcher_of(matcher: str) -> str:
+    """Return the matcher of a compact map of a map with a matcher, a key of `confs.matchers`."""
+    return MATCHERS.get(matcher, matcher)
 
 
 def _of_map(built: Map) -> Source:
