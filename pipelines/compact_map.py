@@ -88,7 +88,7 @@ def main(
                 *(built.sfm, place.queries, pairs, features, matches, poses),
                 executor=run.executor,
                 gate=run.gate,
-                mirror_images=part.mirror_images(built.conf, place.images, *query_files),
+                mirror_images=part.mirror_images(run.conf, place.images, *query_files),
             )
         files = run.files(built.features, built.sfm, pairs, matches)
         return part.finish(

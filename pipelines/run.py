@@ -37,7 +37,7 @@ class Run:
         matcher: name of the matcher.
         executor: where the work is done.
         earlier: an outputs folder whose stages this run continues: the summary counts them, but
-            for those that this run repeats.
+            for those that this run repeats. Features of mirror images are kept there.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Run:
             mirrored = extract_features.main(
                 {**conf, "preprocessing": {**conf["preprocessing"], "mirrored": True}},
                 image_dir,
-                feature_path=self.folder.path / f"{features.stem}-mirrored.h5",
+                feature_path=self._folders[0].path / f"{features.stem}-mirrored.h5",
                 image_list=names,
                 executor=self.executor,
                 strict=False,
