@@ -28,8 +28,9 @@ def main(
     export_dir: Path | None = None,
     overwrite: bool = False,
     vocabulary: Path | None = None,
+    image_list: list[str] | None = None,
 ) -> Path:
-    """Compute a global descriptor of every image of a feature file that could be read.
+    """Compute a global descriptor of every image of a feature file that could be read, or of some.
 
     Stale ones, of other features or another vocabulary, are replaced.
 
@@ -41,6 +42,7 @@ def main(
             the features.
         overwrite: learn the vocabulary and compute all descriptors again.
         vocabulary: file of an existing vocabulary, such as the map's for queries.
+        image_list: the images; default: all.
 
     Returns:
         The h5 file of global descriptors, `global_descriptor` (G,) float16 of unit norm.
@@ -57,7 +59,8 @@ def main(
     output = (export_dir or features.parent) / f"{conf['output']}_{features.stem}.h5"
     model = aggregators.load(conf["model"]).eval()
     failed = failures(features)
-    names = [name for name in list_h5_names(features) if name not in failed]
+    listed = list_h5_names(features) if image_list is None else image_list
+    names = [name for name in listed if name not in failed]
     learned_from = "\n".join(vocabulary_images or [])
     made_by = {
         "model": conf["model"],

@@ -14,7 +14,7 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.paths import strings_as_paths
 
-from . import options
+from . import compact_map, options
 from .dataset import DatasetRun, Settings
 
 NUMBERS = {"num_covis": 20, "num_loc": 50}
@@ -28,6 +28,8 @@ def main(
     feature: str = features_confs.RECOMMENDED,
     num_covis: int = NUMBERS["num_covis"],
     num_loc: int = NUMBERS["num_loc"],
+    compact: bool = False,
+    max_mb: float | None = None,
     **settings: Unpack[Settings],
 ) -> dict:
     """Run all stages and return the summary, as in summary.json.
@@ -38,8 +40,13 @@ def main(
         feature: name of a feature, or its YAML file.
         num_covis: other images that each map image is matched with.
         num_loc: retrieved map images per query.
+        compact: localize in a compact map, one file, instead of the whole map. The file and the
+            results are in a folder of `outputs`, see `compact_map.folder`; whole and compact maps
+            share the features.
+        max_mb: the size of this file in 1,000,000 bytes; default: all points.
         settings: further arguments of `DatasetRun`.
     """
+    compact_map.check(compact, max_mb, settings.get("retrieval", "vlad"))
     place = Aachen(dataset)
     lists = {name: [query for query, _ in part] for name, part in place.query_lists().items()}
     with DatasetRun(place, outputs, feature, num_loc, {"num_covis": num_covis}, **settings) as run:
@@ -57,7 +64,10 @@ def main(
             reconstruction = triangulation.main(
                 sfm, reference, place.images, sfm_pairs, features, sfm_matches
             )
+        limits = {name: thresholds(name) for name in lists}
         loc_pairs = run.retrieve()
+        if compact:
+            return compact_map.main(run, place, sfm, max_mb, lists, limits)
         loc_matches = run.match("match_queries", loc_pairs, features)
         poses = outputs / f"Aachen-v1.1_hloc_{run.label}.txt"
         with run.stage("localization"):
@@ -67,11 +77,8 @@ def main(
                 gate=run.gate,
                 mirror_images=run.mirror_images_of_dataset(),
             )
-        limits = {name: thresholds(name) for name in lists}
-        map_points3D = reconstruction.num_points3D()
-        return run.finish_dataset(
-            lists, limits, records, poses, loc_matches, sfm, map_points3D=map_points3D
-        )
+        sizes = {"map_points3D": reconstruction.num_points3D(), "map_bytes": run.map_bytes(sfm)}
+        return run.finish_dataset(lists, limits, records, poses, loc_matches, sfm, **sizes)
 
 
 def _main() -> None:
@@ -89,6 +96,17 @@ def _main() -> None:
         type=int,
         default=NUMBERS["num_covis"],
         help="other images that each map image is matched with",
+    )
+    parser.add_argument(
+        "--compact",
+        action="store_true",
+        help="pack the map into one file and localize in that; the file and the results are in the "
+        "folder compact of --outputs",
+    )
+    parser.add_argument(
+        "--max_mb",
+        type=float,
+        help="with --compact: size of the file in 1,000,000 bytes; the folder is compact-<size>MB",
     )
     given = options.parse(parser)
     is_demo = given.pop("demo")

@@ -2,14 +2,19 @@
 
 A data set is in the layout of Aachen Day-Night or of InLoc. On Aachen Day-Night v1.1 and InLoc
 themselves the paper's recall is shown below each feature. Each feature has its own outputs folder,
-like those of pipelines.aachen and pipelines.inloc, so an interrupted comparison resumes.
+like those of pipelines.aachen and pipelines.inloc, so an interrupted comparison resumes. With
+--max_mb, compact maps of these sizes are compared, too, and accuracy is drawn against megabytes.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from hloc_reduce import logger, report
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.evaluation import plots
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate, add_gate_options
 from hloc_reduce.report import runs
 from hloc_reduce.runtime import provenance
@@ -19,6 +24,7 @@ from hloc_reduce.utils.files import write_csv
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned, joined
 
+from . import aachen, compact_map
 from .layouts import pipeline_of
 from .options import add_retrieval_option
 
@@ -32,8 +38,12 @@ def main(
     retrieval: str = "vlad",
     ground_truth: Path | None = None,
     gate: Gate = DEFAULT_GATE,
+    max_mb: Iterable[float] = (),
 ) -> dict[str, str]:
     """Localize the queries of a data set with several features, print a table, write a report.
+
+    With `max_mb`, also in compact maps of each feature, which share its features and map. Then
+    compare.svg is drawn, too.
 
     Args:
         dataset: data set folder.
@@ -44,39 +54,88 @@ def main(
         ground_truth: true poses of the queries; default: those that a finished run had, else
             those of the data set.
         gate: what a pose must have for the query to be called localized.
+        max_mb: sizes of compact maps in 1,000,000 bytes. Those above the first one that all points
+            fit into are left out.
 
     Returns:
-        The error message of each feature that failed.
+        The error message of each feature, and of each size of its map, that failed.
 
     Raises:
         InputError: for an unknown layout or feature, or if all features failed.
     """
-    pipeline = pipeline_of(dataset).main
+    pipeline, sizes = pipeline_of(dataset).main, sorted(set(max_mb))
+    _check_sizes(dataset, sizes, retrieval)
     report.check()
     page = page or outputs / "report.html"
     cli.check_folder(outputs)
     cli.check_file(page, "the HTML file")
     given = {features_confs.get(feature)[0]: feature for feature in features}
-    finished, failed = [], {}
+    finished: list[Path] = []
+    failed: dict[str, str] = {}
     for name, feature in given.items():
-        logger.info("%s:", name)
         folder = outputs / name
         before = provenance.read(folder / "summary.json").get("files", {}).get("ground_truth")
         truth = ground_truth or (before and folder / before)
-        try:
-            pipeline(dataset, folder, feature, retrieval=retrieval, ground_truth=truth, gate=gate)
-        except (InputError, OSError) as error:
-            logger.error("%s failed: %s", name, error)
-            failed[name] = str(error)
-        else:
-            finished.append(folder)
+        given_to_all = {"retrieval": retrieval, "ground_truth": truth, "gate": gate}
+        run = partial(pipeline, dataset, folder, feature, **given_to_all)
+        finished += _run_sizes(run, name, folder, sizes, failed)
     if not finished:
         raise InputError(f"None of {len(failed)} features could be run.")
-    tables = runs.recall_tables(runs.load(finished))
+    compared = runs.load(finished)
+    tables = runs.recall_tables(compared)
     write_csv(rows(tables), outputs / "compare.csv")
-    print(table(tables))
+    print((size_table if sizes else table)(tables))
+    if panels := [*report.map_panels(compared).values()]:
+        plots.save(plots.figure(panels, len(panels)), outputs / "compare.svg")
     report.main(finished, page)
     return failed
+
+
+def _check_sizes(dataset: Path, sizes: list[float], retrieval: str) -> None:
+    """Raise an InputError for sizes of compact maps that cannot be compared."""
+    if sizes and pipeline_of(dataset) is not aachen:
+        raise InputError(
+            "--max_mb is for data sets in the layout of Aachen: others have no compact maps."
+        )
+    for size in sizes:
+        compact_map.check(True, size, retrieval)
+
+
+def _run_sizes(
+    run: Callable[..., dict], name: str, outputs: Path, sizes: list[float], failed: dict[str, str]
+) -> list[Path]:
+    """Localize in the whole map of a feature, then in compact ones, until all points fit into one.
+
+    Args:
+        run: the pipeline, which takes the options of compact maps.
+        name: the feature.
+        outputs: its outputs folder.
+        sizes: of compact maps, ascending.
+        failed: messages of failed runs, to which those of this feature are added.
+
+    Returns:
+        The folders of finished runs.
+    """
+    finished: list[Path] = []
+    whole: dict[str, Any] = {}
+    maps: dict[str, dict[str, Any]] = {name: {}}
+    maps |= {f"{name}, at most {size:g} MB": {"compact": True, "max_mb": size} for size in sizes}
+    for label, options in maps.items():
+        logger.info("%s:", label)
+        try:
+            summary = run(**options)
+        except (InputError, OSError) as error:
+            logger.error("%s failed: %s", label, error)
+            failed[label] = str(error)
+            if not options:
+                break
+            continue
+        finished.append(compact_map.folder(outputs, bool(options), options.get("max_mb")))
+        whole = whole or summary
+        if options and summary["map_points3D"] == whole["map_points3D"]:
+            logger.info("%s: all points fit, so that larger files would be the same.", label)
+            break
+    return finished
 
 
 def rows(tables: list[dict]) -> list[dict]:
@@ -89,12 +148,15 @@ def rows(tables: list[dict]) -> list[dict]:
         {
             "feature": row["run"].label,
             "bytes": row["run"].bytes,
+            "map_bytes": row["run"].map_bytes,
+            "hloc_bytes": row["run"].hloc_bytes,
             "seconds": round(row["run"].seconds, 1),
             "list": found["list"],
             "threshold_m": metres,
             "threshold_deg": degrees,
             "recall_percent": recall,
             "paper_percent": paper,
+            "median_position_error_m": row["summary"].get("median_position_error_m"),
             "mean_inliers": row["summary"]["mean_inliers"],
         }
         for found in tables
@@ -129,6 +191,33 @@ def table(tables: list[dict]) -> str:
     return aligned(lines)
 
 
+def size_table(tables: list[dict]) -> str:
+    """Format recall, median errors and inliers, one row per map, and the size of hloc's files."""
+    heads = [[found["list"], "error [cm]", "inliers"] for found in tables]
+    lines = [["", "MB", *chain(*heads)]]
+    for unit, place in (("distance [m]", 0), ("orient. [deg]", 1)):
+        limits = [[limit[place] for limit in found["thresholds"]] for found in tables]
+        lines.append([unit, "", *chain(*([joined(values, "g"), "", ""] for values in limits))])
+    for of_lists in zip(*(found["rows"] for found in tables), strict=True):
+        run = of_lists[0]["run"]
+        cells = chain(*(_accuracy(row["recall"], row["summary"]) for row in of_lists))
+        lines.append([run.label, _megabytes(run.map_bytes), *cells])
+        if run.hloc_bytes:
+            lines.append(["  as hloc's files", _megabytes(run.hloc_bytes), *[""] * 3 * len(tables)])
+    return aligned(lines)
+
+
+def _accuracy(recall: list[float | None], summary: dict) -> list[str]:
+    """Return the cells of a list: recall, median error, inliers."""
+    error = summary.get("median_position_error_m")
+    cm = None if error is None else 100 * error
+    return [joined(recall, ".1f"), joined([cm], ".2f"), f"{summary['mean_inliers']:,.0f}"]
+
+
+def _megabytes(size: int | None) -> str:
+    return joined([size and size / runs.MEGABYTE], ".3g")
+
+
 def _main() -> None:
     parser = cli.Parser(__doc__, "--dataset datasets/demo_town --features sift sift_sv64 sift_sv16")
     parser.add_argument("--dataset", type=Path, required=True, help="folder of the data set")
@@ -150,6 +239,13 @@ def _main() -> None:
         "--ground_truth",
         type=Path,
         help="true poses of the queries (default: as in finished runs, else those of the data set)",
+    )
+    parser.add_argument(
+        "--max_mb",
+        type=float,
+        nargs="+",
+        default=[],
+        help="sizes of compact maps in 1,000,000 bytes, to be compared with the whole maps",
     )
     add_gate_options(parser)
     args = vars(parser.parse_args())

@@ -11,8 +11,10 @@ from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.detectors.dog import KEYPOINTS
+from hloc_reduce.evaluation.summaries import map_bytes
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.localization.mirrored import MirrorImages
+from hloc_reduce.maps.map import RETRIEVAL
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.runtime.outputs import RunFolder
@@ -65,6 +67,7 @@ class DatasetRun(Run):
         gate: what a pose must have for the query to be called localized.
 
     Attributes:
+        conf: the configuration of the feature.
         query_names: the queries.
         map_names: the map images that are needed; after `extract_features` the readable ones.
         features: the feature file, after `extract_features`.
@@ -95,8 +98,8 @@ class DatasetRun(Run):
         accept_partial: bool = False,
         gate: Gate = DEFAULT_GATE,
     ):
-        feature, self._conf = features_confs.get(feature, projection, storage, keypoints)
-        matcher = matcher or features_confs.matcher_of(self._conf)
+        feature, self.conf = features_confs.get(feature, projection, storage, keypoints)
+        matcher = matcher or features_confs.matcher_of(self.conf)
         self.place, self._retrieval, self.gate = place, retrieval, gate
         self._strict, self._accept_partial = strict, accept_partial
         self.numbers = {**(numbers or {}), "num_loc": num_loc}
@@ -113,14 +116,14 @@ class DatasetRun(Run):
             check_queries(place.images, self.query_names, strict)
         self.truth_file = ground_truth or place.ground_truth
         self.truth = true_poses(self.query_names, self.truth_file, bool(ground_truth))
-        self._given, self.features = features, features or outputs / f"{self._conf['output']}.h5"
+        self._given, self.features = features, features or outputs / f"{self.conf['output']}.h5"
         super().__init__(self._claim(outputs, matcher, overwrite), feature, matcher, executor)
 
     def _claim(self, outputs: Path, matcher: str, overwrite: bool) -> RunFolder:
         """Claim the outputs folder. Results of given features are stale if these were redone."""
         conf = {
             "dataset": str(self.place.root.resolve()),
-            "feature": extract_features.provenance(self._conf),
+            "feature": extract_features.provenance(self.conf),
             "matcher": matchers_confs.confs[matcher]["model"],
             "retrieval": self._retrieval,
             **self.numbers,
@@ -135,7 +138,7 @@ class DatasetRun(Run):
             redone = before.get("features") not in (None, conf["features"])
             overwrite |= redone and {**before, "features": conf["features"]} == conf
         elif overwrite or not (outputs / "conf.json").exists():
-            extract_features.check_model(self._conf)
+            extract_features.check_model(self.conf)
         return RunFolder(outputs, conf, overwrite, inputs)
 
     def extract_features(self) -> Path:
@@ -143,7 +146,7 @@ class DatasetRun(Run):
         with self.stage("extract_features"):
             if self._given is None:
                 extract_features.main(
-                    *(self._conf, self.place.images),
+                    *(self.conf, self.place.images),
                     feature_path=self.features,
                     image_list=[*self.map_names, *self.query_names],
                     executor=self.executor,
@@ -157,10 +160,19 @@ class DatasetRun(Run):
             self.map_names = kept
         return self.features
 
+    @property
+    def global_descriptors(self) -> Path:
+        """The file of the global descriptors that `retrieve` computes for VLAD."""
+        return self.features.with_name(f"{RETRIEVAL['output']}_{self.features.stem}.h5")
+
+    def map_bytes(self, sfm: Path) -> int:
+        """Measure the map that queries are localized in, see `summaries.map_bytes`."""
+        return map_bytes(sfm, self.map_names, [self.features, self.global_descriptors])
+
     def mirror_images_of_dataset(self) -> MirrorImages:
         """Return what extracts and matches mirror images of queries, for a localization stage."""
         images = self.place.images
-        return self.mirror_images(self._conf, images, self._pairs, self.features, self.features)
+        return self.mirror_images(self.conf, images, self._pairs, self.features, self.features)
 
     def retrieve(self) -> Path:
         """Write the pairs of the readable queries and map images."""
@@ -194,23 +206,33 @@ class DatasetRun(Run):
         Returns:
             The summary.
         """
-        images = self.place.images
-        summary = {
+        files = self.files(self.features, built, self._pairs, matches)
+        return self.finish(
+            *(self.summary(**more), lists, records, self.truth, thresholds),
+            *(self.features, poses, files),
+        )
+
+    def summary(self, **more: object) -> dict:
+        """Return what the summary begins with; `more` are further entries."""
+        return {
             "retrieval": self._retrieval,
             "dataset": str(self.place.root),
             **self.numbers,
             "map_images": len(self.map_names),
             **more,
         }
-        files = {
+
+    def files(
+        self, map_features: Path, built: Path, pairs: Path, matches: Path
+    ) -> dict[str, Path | None]:
+        """Return the files that a report reads, see `finish`."""
+        images = self.place.images
+        return {
             "query_images": images,
             "map_images": images,
-            "map_features": self.features,
+            "map_features": map_features,
             "map": built,
-            "pairs": self._pairs,
+            "pairs": pairs,
             "matches": matches,
             "ground_truth": self.truth_file if self.truth else None,
         }
-        return self.finish(
-            summary, lists, records, self.truth, thresholds, self.features, poses, files
-        )

@@ -10,30 +10,24 @@ import re
 from collections import Counter
 from pathlib import Path
 
-from hloc_reduce import (
-    aggregate_features,
-    extract_features,
-    localize_sfm,
-    maps,
-    pairs_from_retrieval,
-)
+from hloc_reduce import extract_features, localize_sfm, maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.maps import contradictions
-from hloc_reduce.maps.map import RETRIEVAL, Map
+from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance, trace
 from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES
-from hloc_reduce.utils.parsers import write_pairs
 from hloc_reduce.utils.paths import strings_as_paths
 
 from . import options
 from .queries import Photos, Queries
+from .retrieval import retrieve_in_map
 from .run import Run, readable
 
 MADE_FROM = "made_from.json"  # the map and the photos of the queries
@@ -178,7 +172,8 @@ def main(
         photos.forget(failures(features))
         loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
         with run.stage("retrieval"):
-            _retrieve(built, features, loc_pairs, num_loc, readable(features, names), map_names)
+            queries_read = readable(features, names)
+            retrieve_in_map(built, features, loc_pairs, num_loc, queries_read, map_names)
         matches = run.match("match_queries", loc_pairs, features, built.features)
         poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
         with run.stage("localization"):
@@ -210,22 +205,6 @@ def main(
             "map": built.sfm,
         }
         return run.finish(summary, wanted.lists, records, truth, limits, features, poses, files)
-
-
-def _retrieve(
-    built: Map, features: Path, output: Path, num_loc: int, queries: list[str], map_names: list[str]
-) -> None:
-    """Retrieve map images by VLAD with the map's vocabulary."""
-    descriptors = aggregate_features.main(RETRIEVAL, features, vocabulary=built.vocabulary)
-    if not queries:
-        write_pairs([], output)
-        return
-    pairs_from_retrieval.main(
-        *(descriptors, output, num_loc),
-        query_list=queries,
-        db_list=map_names,
-        db_descriptors=built.descriptors,
-    )
 
 
 def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> Path:

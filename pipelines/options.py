@@ -12,6 +12,8 @@ from hloc_reduce.runtime import trace
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 
+from . import compact_map
+
 SUBMIT = "For recall, submit {} to https://www.visuallocalization.net."
 
 
@@ -126,19 +128,21 @@ def run_on_dataset(main: Callable[..., dict], dataset: Path, options: dict) -> N
     outputs = options.pop("outputs") or Path("outputs") / dataset.name / feature
     with trace.recording(outputs / "trace.json" if options.pop("profile") else None):
         summary = main(dataset, outputs, **options)
-    print_result(summary, outputs, SUBMIT)
+    results = compact_map.folder(outputs, options.get("compact", False), options.get("max_mb"))
+    print_result(summary, results, SUBMIT)
 
 
 def print_result(summary: dict, outputs: Path, unknown: str) -> None:
     """Print recall or, where no true poses are known, the message `unknown`."""
     unreadable = summary["queries_unreadable"]
     logger.info(
-        "Localized %d of %d queries%s in %.0f s; %d bytes a descriptor. Results are in %s.",
+        "Localized %d of %d queries%s in %.0f s; %d bytes a descriptor%s. Results are in %s.",
         summary["queries_localized"],
         summary["queries"],
         f" ({unreadable} unreadable)" * bool(unreadable),
         sum(summary["seconds"].values()),
         summary["bytes_per_keypoint"]["descriptor"],
+        f", {summary['map_bytes']:,} bytes of map" if "map_bytes" in summary else "",
         outputs,
     )
     if any("recall_percent" in result for result in summary["lists"].values()):

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from hloc_reduce import aggregate_features, pairs_from_retrieval
 from hloc_reduce.confs import retrieval as retrieval_confs
+from hloc_reduce.maps.map import RETRIEVAL, Map
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.h5 import list_h5_names
 from hloc_reduce.utils.parsers import parse_retrieval, write_pairs
@@ -54,6 +55,35 @@ def retrieve(
     of_descriptors = source.suffix in GLOBAL_SUFFIXES
     select = pairs_from_retrieval.main if of_descriptors else pairs_from_retrieval.select
     select(source, output, num_loc, query_list=query_names, db_list=map_names)
+
+
+def retrieve_in_map(
+    built: Map,
+    features: Path,
+    output: Path,
+    num_loc: int,
+    query_names: list[str],
+    map_names: list[str],
+) -> None:
+    """Write pairs of queries and the images of a map, by VLAD with the map's vocabulary.
+
+    The global descriptors of the queries are written into the folder of `output`.
+    """
+    if not query_names:
+        write_pairs([], output)
+        return
+    descriptors = aggregate_features.main(
+        *(RETRIEVAL, features),
+        export_dir=output.parent,
+        vocabulary=built.vocabulary,
+        image_list=query_names,
+    )
+    pairs_from_retrieval.main(
+        *(descriptors, output, num_loc),
+        query_list=query_names,
+        db_list=map_names,
+        db_descriptors=built.descriptors,
+    )
 
 
 def retrieval_name(retrieval: str) -> str:

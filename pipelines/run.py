@@ -36,11 +36,21 @@ class Run:
         feature: name of the feature.
         matcher: name of the matcher.
         executor: where the work is done.
+        earlier: an outputs folder whose stages this run continues: the summary counts them, but
+            for those that this run repeats. Features of mirror images are kept there.
     """
 
-    def __init__(self, folder: RunFolder, feature: str, matcher: str, executor: Executor = SERIAL):
+    def __init__(
+        self,
+        folder: RunFolder,
+        feature: str,
+        matcher: str,
+        executor: Executor = SERIAL,
+        earlier: RunFolder | None = None,
+    ):
         self.folder, self.feature, self.matcher = folder, feature, matcher
         self.executor = executor
+        self._folders = [folder] if earlier is None else [earlier, folder]
 
     def __enter__(self) -> Self:
         self.folder.__enter__()
@@ -99,7 +109,7 @@ class Run:
             mirrored = extract_features.main(
                 {**conf, "preprocessing": {**conf["preprocessing"], "mirrored": True}},
                 image_dir,
-                feature_path=self.folder.path / f"{features.stem}-mirrored.h5",
+                feature_path=self._folders[0].path / f"{features.stem}-mirrored.h5",
                 image_list=names,
                 executor=self.executor,
                 strict=False,
@@ -159,8 +169,8 @@ class Run:
                 for name in lists
             },
             "bytes_per_keypoint": bytes_per_keypoint(files["map_features"] or features),
-            "seconds": self.folder.seconds(),
-            "bytes": self.folder.bytes(),
+            "seconds": {k: v for folder in self._folders for k, v in folder.seconds().items()},
+            "bytes": {k: v for folder in self._folders for k, v in folder.bytes().items()},
             "versions": versions(),
             "poses": poses.name,
             "files": {

@@ -31,7 +31,7 @@ TRIES = 12  # sizes that are tried to come close to a limit
 AIM, CLOSE = 0.99, 0.97  # shares of the limit that are aimed at, and are close enough
 # descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
-FEW = 32  # numbers that are stored as uint4; more as uint2
+FEW = 32  # numbers of DoG's features that are stored as uint4; others as uint2
 
 
 @strings_as_paths
@@ -59,7 +59,7 @@ def main(
         matcher: a key of `confs.matchers`; default: the map's, or the feature's, but NN-ratio90
             instead of NN-ratio.
         storage: of the points' descriptors; default: that of the map if it has codes, else uint4
-            for up to 32 numbers, uint2 for more, and float16 for features without levels.
+            for up to 32 numbers of DoG's features, uint2 for others, and float16 without levels.
         max_mb: the size of the file in 1,000,000 bytes; points that images need least are left out.
 
     Returns:
@@ -83,7 +83,28 @@ def main(
         raise InputError("Give --map, or --sfm, --features and --feature.")
     else:
         source = _of_stages(sfm, features, global_descriptors, feature)
-    matcher = matcher or MATCHERS.get(source.matcher, source.matcher)
+    return write(output, source, features, matcher, storage, max_mb)
+
+
+def write(
+    output: Path,
+    source: Source,
+    features: Path,
+    matcher: str | None = None,
+    storage: str | None = None,
+    max_mb: float | None = None,
+) -> dict[str, int]:
+    """Write a compact map of what a pipeline has in memory and in files.
+
+    Args:
+        output: see `main`, like `matcher`, `storage`, `max_mb`, the result and the errors.
+        source: what it is made from.
+        features: feature file of the images.
+        matcher: see `output`.
+        storage: see `output`.
+        max_mb: see `output`.
+    """
+    matcher = matcher or matcher_of(source.matcher)
     cli.choose("matcher", matcher, matchers_confs.confs)
     conf = {**source.conf, "storage": _storage(source.conf, storage)}
     source = replace(source, matcher=matcher, conf=conf)
@@ -104,6 +125,11 @@ def main(
         ", ".join(f"{part} {size:,}" for part, size in parts.items()),
     )
     return parts
+
+
+def matcher_of(matcher: str) -> str:
+    """Return the matcher of a compact map of a map with a matcher, a key of `confs.matchers`."""
+    return MATCHERS.get(matcher, matcher)
 
 
 def _of_map(built: Map) -> Source:
@@ -147,8 +173,9 @@ def _storage(conf: dict, storage: str | None) -> str:
     if features_confs.level_file(conf) is None:
         return STORAGES[0]
     try:
-        dim = features_confs.levels({**conf, "storage": "uint4"})
-        return "uint4" if dim is not None and len(dim) <= FEW else "uint2"
+        levels = features_confs.levels({**conf, "storage": "uint4"})
+        few = levels is not None and len(levels) <= FEW
+        return "uint4" if few and not features_confs.network_of(conf["model"]) else "uint2"
     except InputError:  # a projection without levels
         return STORAGES[0]
 

@@ -26,7 +26,8 @@ def _main() -> None:
     add(
         "--storage",
         help=f"storage of the points' descriptors, one of {', '.join(STORAGES)} (default: the "
-        f"map's if it is one of codes, else uint4 for up to {FEW} numbers and uint2 for more)",
+        f"map's if it is one of codes, else uint4 for up to {FEW} numbers of DoG features "
+        "and uint2 for others)",
     )
     add(
         "--max_mb",

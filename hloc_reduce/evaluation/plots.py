@@ -1,6 +1,7 @@
 """Plots of results with matplotlib, which the extra `report` installs."""
 
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.util import find_spec
@@ -28,6 +29,12 @@ AXES = np.array([220, 140])  # approximate size of a panel in points
 SIDES = np.array([(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)])
 NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 LINES = (("-", "o"), ("--", "s"), (":", "^"))  # style and marker of each query list
+# the marker of each kind of map, if it is not that of the query list
+MAPS: dict[str, dict] = {
+    "compact map": {},
+    "whole map": {"linestyle": "", "markerfacecolor": "none"},
+    "hloc's files": {"linestyle": "", "marker": "x"},
+}
 NOISE_COLOURS = {"easy": "#009e73", "hard": "#e69f00", "tough": "#d55e00"}
 STYLE: dict = {
     "axes.grid": True,
@@ -183,12 +190,7 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
             marked += [(run[key], run["value"], f"{run['bytes']} B", colour) for run in own]
     values = [run["value"] for runs in lists.values() for run in runs]
     axis.set(xlabel=label, ylabel=measure)
-    axis.margins(0.12, 0.2)
-    if measure.endswith("[%]"):
-        axis.set_ylim(min(values) - 5 - 0.1 * (100 - min(values)), 102)
-        axis.set_yticks([tick for tick in axis.get_yticks() if min(values) - 5 <= tick <= 100])
-    else:
-        axis.set_ylim(max(0, axis.get_ylim()[0]))
+    _limit(axis, measure, values)
     if key == "seconds":
         _mark(axis, list(dict.fromkeys(marked)))
     else:
@@ -196,6 +198,59 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
         axis.set_xscale("log", base=2)
         axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.minorticks_off()
+
+
+def _limit(axis: "Axes", measure: str, values: Sequence[float]) -> None:
+    """Set the limits of the axis of a measure."""
+    axis.margins(0.12, 0.2)
+    if measure.endswith("[%]"):
+        axis.set_ylim(min(values) - 5 - 0.1 * (100 - min(values)), 102)
+        axis.set_yticks([tick for tick in axis.get_yticks() if min(values) - 5 <= tick <= 100])
+    else:
+        axis.set_ylim(max(0, axis.get_ylim()[0]))
+
+
+def map_sizes(points: Mapping[str, Mapping[str, list[dict]]]) -> "dict[str, Panel]":
+    """Plot accuracy against the size of the map, for each measure.
+
+    Args:
+        points: from measure and query list to a dict for each map: `feature`, whose compact maps a
+            line joins; `kind`, a key of `MAPS`; `megabytes`; and `value` of the measure.
+
+    Returns:
+        Panels by name, such as `mean_inliers_megabytes`.
+    """
+    return {
+        f"{re.split('[,[]', measure)[0].strip().replace(' ', '_')}_megabytes": partial(
+            _map_sizes, measure=measure, lists=lists
+        )
+        for measure, lists in points.items()
+    }
+
+
+def _map_sizes(axis: "Axes", measure: str, lists: Mapping) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    features = dict.fromkeys(run["feature"] for runs in lists.values() for run in runs)
+    for colour, feature in zip(cycle(COLOURS), features, strict=False):
+        for (line, marker), (name, runs) in zip(cycle(LINES), lists.items(), strict=False):
+            own = sorted((r for r in runs if r["feature"] == feature), key=lambda r: r["megabytes"])
+            style = {"linestyle": line, "marker": marker, "markersize": 5, "linewidth": 1.2}
+            for i, (kind, special) in enumerate(MAPS.items()):
+                axis.plot(
+                    [run["megabytes"] for run in own if run["kind"] == kind],
+                    [run["value"] for run in own if run["kind"] == kind],
+                    color=colour,
+                    label=None if i else _label(f"{feature}, {name}"),
+                    **style | special,
+                )
+    for kind in list(MAPS)[1:]:
+        axis.plot([], [], color="#555555", label=kind, **{"marker": "o", **MAPS[kind]})
+    axis.set(xlabel="megabytes of the map", ylabel=measure, xscale="log")
+    _limit(axis, measure, [run["value"] for runs in lists.values() for run in runs])
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _mark(axis: "Axes", marked: list[tuple[float, float, str, str]]) -> None:

@@ -11,7 +11,7 @@ from ..localization.records import pose_of
 from ..utils.codes import storage_of
 from ..utils.feature_files import stored_descriptors
 from ..utils.files import replacing
-from ..utils.h5 import list_h5_names, open_h5
+from ..utils.h5 import list_h5_names, open_h5, stored_bytes
 from ..utils.tables import aligned
 from .poses import ERRORS, pose_error, status, summarize_errors
 
@@ -101,6 +101,23 @@ def bytes_per_keypoint(features: Path) -> dict:
         "keypoints": total,
         "images": len(names),
     }
+
+
+def map_bytes(sfm: Path, names: list[str], files: Iterable[Path]) -> int:
+    """Measure what localization needs of a map.
+
+    Args:
+        sfm: COLMAP model; its database is not counted.
+        names: the images of the map.
+        files: h5 files with their features and global descriptors, and perhaps those of queries,
+            which are not counted; missing files are left out.
+    """
+    size = sum(path.stat().st_size for path in sfm.glob("*.bin"))
+    for path in files:
+        if path.is_file():
+            with open_h5(path) as file:
+                size += sum(stored_bytes(file, name) for name in names)
+    return size
 
 
 def write_summary(summary: dict, path: Path) -> None:

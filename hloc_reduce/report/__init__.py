@@ -3,7 +3,9 @@
 import base64
 import json
 import re
+from collections.abc import Iterable
 from importlib.util import find_spec
+from math import isfinite
 from pathlib import Path
 
 from .. import __version__, logger
@@ -20,6 +22,7 @@ from .runs import Run
 FOLDER = Path(__file__).parent
 NUM_QUERIES = 6
 RECALL, INLIERS = "recall, finest threshold [%]", "mean inliers"
+ERROR = "median error [cm]"
 
 
 @strings_as_paths
@@ -117,20 +120,57 @@ def _drawn(run: Run, query: str) -> dict:
 def _panels(compared: list[Run]) -> "dict[str, dict[str, plots.Panel]]":
     """Return the panels of accuracy, and of errors where they are known, by name."""
     curves: dict[str, dict] = {}
-    points: dict[str, dict] = {RECALL: {}, INLIERS: {}}
     for run in compared:
-        for name, summary in run.summary["lists"].items():
-            short = runs.short(name)
+        for name in run.summary["lists"]:
             if errors := run.errors(name):
-                curves.setdefault(short, {})[run.label] = errors
-            values = {INLIERS: summary["mean_inliers"]}
-            if "recall_percent" in summary:
-                values[RECALL] = summary["recall_percent"][0]
-            point = {"family": run.family, "bytes": run.bytes, "seconds": run.seconds}
-            for measure, value in values.items():
-                points[measure].setdefault(short, []).append({**point, "value": value})
-    known = {measure: lists for measure, lists in points.items() if lists}
-    return {"accuracy": plots.size_and_time(known), "errors": plots.error_curves(curves)}
+                curves.setdefault(runs.short(name), {})[run.label] = errors
+    described = [run for run in compared if not run.is_compact] or compared
+    points = [
+        (run, {"family": run.family, "bytes": run.bytes, "seconds": run.seconds})
+        for run in described
+    ]
+    return {
+        "accuracy": plots.size_and_time(_measured(points, (RECALL, INLIERS))),
+        "maps": map_panels(compared),
+        "errors": plots.error_curves(curves),
+    }
+
+
+def map_panels(compared: list[Run]) -> "dict[str, plots.Panel]":
+    """Return the panels of accuracy against the size of maps by name; none without compact maps."""
+    if not any(run.is_compact for run in compared):
+        return {}
+    compact, whole, hloc = plots.MAPS
+    points = []
+    for run in compared:
+        sizes = {compact if run.is_compact else whole: run.map_bytes, hloc: run.hloc_bytes}
+        points += [
+            (run, {"feature": run.feature, "kind": kind, "megabytes": size / runs.MEGABYTE})
+            for kind, size in sizes.items()
+            if size
+        ]
+    return plots.map_sizes(_measured(points, (RECALL, ERROR, INLIERS)))
+
+
+def _measured(
+    points: Iterable[tuple[Run, dict]], measures: tuple[str, ...]
+) -> dict[str, dict[str, list[dict]]]:
+    """Return points by measure and query list, with its known values; several may be of a run."""
+    found: dict[str, dict] = {measure: {} for measure in measures}
+    for run, point in points:
+        for name, summary in run.summary["lists"].items():
+            error = summary.get("median_position_error_m")
+            values = {
+                RECALL: summary.get("recall_percent", [None])[0],
+                ERROR: None if error is None else 100 * error,
+                INLIERS: summary["mean_inliers"],
+            }
+            for measure in measures:
+                value = values[measure]
+                if value is not None and isfinite(value):
+                    of_list = found[measure].setdefault(runs.short(name), [])
+                    of_list.append({**point, "value": value})
+    return {measure: lists for measure, lists in found.items() if lists}
 
 
 def _scenes(compared: list[Run]) -> dict[str, dict]:

@@ -24,6 +24,7 @@ from ..utils.cli import InputError, no_folder
 from ..utils.h5 import open_h5
 from ..utils.parsers import parse_poses, parse_retrieval
 
+MEGABYTE = 1_000_000
 COUNTS = ("num_matches", "num_correspondences", "num_inliers")
 BEGUN = ("conf.json", "summary.json")  # either tells that a pipeline has begun a run
 
@@ -39,9 +40,12 @@ class Run:
         files: the files of the run by their keys in the summary, None if the run has none.
         rows: queries.csv by query, counts as int, errors as float or None if unknown.
         records: the record of each query, as from `localization.main`.
+        feature: name of the feature.
         label: the name of the run in a report.
         family: its feature without the dimension: `sift_sv` for sift_sv64.
         bytes: size of a descriptor.
+        map_bytes: size of the map, None if unknown.
+        is_compact: whether the map is one file of `hloc_reduce.compact`.
         seconds: time of all stages.
 
     Raises:
@@ -57,8 +61,12 @@ class Run:
             files = self.summary["files"].items()
             self.files = {key: value and folder / value for key, value in files}
             self.rows = _read_rows(folder / "queries.csv")
-            self.label = str(self.summary["feature"])
+            self.feature = self.label = str(self.summary["feature"])
             self.family = self.label.rstrip("0123456789")
+            self.map_bytes: int | None = self.summary.get("map_bytes")
+            self.is_compact = "compact" in self.summary
+            if self.is_compact:
+                self.label += f", {int(self.summary['map_bytes']) / MEGABYTE:.3g} MB"
             self.bytes = int(self.summary["bytes_per_keypoint"]["descriptor"])
             self.seconds = float(sum(self.summary["seconds"].values()))
             poses = folder / self.summary["poses"]
@@ -75,6 +83,18 @@ class Run:
         self.records = read_records(log_file(poses))
         if self.records.keys() != self.rows.keys():
             raise InputError(f"{folder} is the folder of a run that did not finish: run it again.")
+
+    @property
+    def hloc_bytes(self) -> int | None:
+        """Size of the files that hloc has in their place: features and the COLMAP model.
+
+        The feature file of a data set has the queries, too, and the folder of the model has its
+        database. None for a compact map or one of scans.
+        """
+        model = self.files["map"]
+        if self.is_compact or not model.is_dir():
+            return None
+        return sum(path.stat().st_size for path in (self.files["map_features"], *model.iterdir()))
 
     @property
     def place(self) -> Path:

@@ -181,6 +181,12 @@ def get_dataset(file: h5py.File, name: str, key: str) -> h5py.Dataset:
     return dataset
 
 
+def stored_bytes(file: h5py.File, name: str) -> int:
+    """Return the size of the data sets of an image or a pair as they are stored, compressed."""
+    with reading(file.filename):
+        return sum(dataset.id.get_storage_size() for dataset in file[name].values())
+
+
 def get_array(file: h5py.File, name: str, key: str, least: tuple[int, ...]) -> np.ndarray:
     """Read a data set of finite numbers of an image or a pair.
 

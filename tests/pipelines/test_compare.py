@@ -52,6 +52,47 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
     assert command.state(outputs / "sift_sv16") == times
 
 
+def test_sizes_of_maps(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
+    """The smallest is too small for a point, and all points fit into the second largest."""
+    outputs, shown = tmp_path / "outputs", []
+    monkeypatch.setattr(compare.report, "main", lambda folders, page: shown.append(folders))
+    given = ("--dataset", aachen_layout, "--outputs", outputs, "--features", "colmap_sift_sv32")
+    sizes = ("--max_mb", 0.03, 0.001, 0.02, 0.012)
+    with pytest.raises(SystemExit) as exit:
+        command.run(monkeypatch, compare, *given, *sizes)
+    assert exit.value.code == 2
+    assert "colmap_sift_sv32, at most 0.001 MB failed: --max_mb 0.001 is too small" in caplog.text
+    assert "at most 0.02 MB: all points fit" in caplog.text
+    whole = outputs / "colmap_sift_sv32"
+    folders = [whole, whole / "compact-0.012MB", whole / "compact-0.02MB"]
+    assert shown == [folders]
+    assert {path.parent for path in outputs.rglob("map.hlm")} == {*folders[1:]}
+
+    printed = capsys.readouterr().out.splitlines()
+    lines = [[cell.strip() for cell in line.split("|")] for line in printed]
+    head = ["error [cm]", "inliers"]
+    assert lines[0] == ["", "MB", "day", *head, "night", *head]
+    of_hloc = lines.pop(4)
+    assert of_hloc[0] == "as hloc's files" and float(of_hloc[1]) > float(lines[3][1])
+    summaries = [command.outcome(folder)[0] for folder in folders]
+    for line, summary in zip(lines[3:], summaries, strict=True):
+        night = summary["lists"]["night_time_queries_with_intrinsics"]
+        size = f"{summary['map_bytes'] / 1e6:.3g}"
+        assert line[0] == "colmap_sift_sv32" + (f", {size} MB" if "compact" in summary else "")
+        assert line[1:3] == [size, "50.0 / 50.0 / 50.0"]
+        error = f"{100 * night['median_position_error_m']:.2f}"
+        assert line[-3:] == ["100.0 / 100.0 / 100.0", error, f"{night['mean_inliers']:.0f}"]
+    rows = command.table(outputs / "compare.csv")
+    assert [int(row["map_bytes"]) for row in rows[::3][:3]] == [s["map_bytes"] for s in summaries]
+    assert rows[0]["hloc_bytes"] and not rows[3]["hloc_bytes"]
+    drawn = (outputs / "compare.svg").read_text()
+    assert "megabytes of the map" in drawn and "colmap_sift_sv32, night" in drawn
+
+    times = command.state(whole)
+    command.run(monkeypatch, compare, *given, "--max_mb", 0.012)
+    assert command.state(whole) == times and len(times) > 30
+
+
 def test_compare_wrong_input(aachen_layout, inloc_layout, tmp_path, monkeypatch, caplog):
     def message(dataset, *features):
         command_line = ("--dataset", dataset, "--outputs", tmp_path / "o", "--features", *features)
@@ -60,6 +101,8 @@ def test_compare_wrong_input(aachen_layout, inloc_layout, tmp_path, monkeypatch,
     assert "neither of the folders 3D-models and database" in message(tmp_path, "sift")
     assert "Unknown feature 'sift_sv65'" in message(aachen_layout, "sift", "sift_sv65")
     assert "is a folder: name the HTML file" in message(aachen_layout, "sift", "-o", tmp_path)
+    assert "must be above 0" in message(aachen_layout, "sift", "--max_mb", 1, 0)
+    assert "in the layout of Aachen" in message(inloc_layout, "sift", "--max_mb", 1)
     assert not (tmp_path / "o").exists()
     (tmp_path / "o/sift/conf.json").mkdir(parents=True)
     given = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--features", "sift")

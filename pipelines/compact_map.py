@@ -1,0 +1,116 @@
+"""Localize the queries of a data set in a compact map, as `pipelines.localize` does."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from hloc_reduce import compact, localize_sfm, logger, maps
+from hloc_reduce.aggregate_features import vocabulary_of
+from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.localization import intrinsics
+from hloc_reduce.maps.compact import SUFFIX, Source
+from hloc_reduce.maps.map import Map
+from hloc_reduce.runtime import provenance
+from hloc_reduce.runtime.outputs import RunFolder
+from hloc_reduce.utils import colmap
+from hloc_reduce.utils.cli import InputError
+
+from .dataset import DatasetRun
+from .retrieval import retrieve_in_map
+from .run import Run, Thresholds, readable
+
+FILE = f"map{SUFFIX}"
+MADE_FROM = "made_from.json"  # the model that the file was made from
+
+
+def check(is_compact: bool, max_mb: float | None, retrieval: str) -> None:
+    """Raise an InputError for options that do not go together, or a size that is none."""
+    if max_mb is not None and not is_compact:
+        raise InputError(f"--max_mb {max_mb:g} is the size of a compact map: give --compact, too.")
+    if max_mb is not None and not max_mb > 0:
+        raise InputError(f"--max_mb {max_mb:g}: it must be above 0.")
+    if is_compact and retrieval != "vlad":
+        raise InputError(
+            "Images of a compact map are retrieved by what is in it: leave out --retrieval."
+        )
+
+
+def folder(outputs: Path, is_compact: bool, max_mb: float | None) -> Path:
+    """Return the folder for the results of a run: in the outputs folder for a compact map."""
+    if not is_compact:
+        return outputs
+    return outputs / ("compact" if max_mb is None else f"compact-{max_mb:g}MB")
+
+
+def main(
+    run: DatasetRun,
+    place: Aachen,
+    sfm: Path,
+    max_mb: float | None,
+    lists: Mapping[str, Iterable[str]],
+    limits: Thresholds,
+) -> dict:
+    """Pack the map of a run into a file, localize the queries in it and return the summary.
+
+    The file and the results are in a folder of the run's outputs folder, whose features they share.
+    They are stale if the map has changed.
+
+    Args:
+        run: the run, with features, map and global descriptors.
+        place: its data set.
+        sfm: its map.
+        max_mb: see `hloc_reduce.compact.main`.
+        lists: the queries of each list.
+        limits: the recall thresholds of each list.
+
+    Raises:
+        InputError: when `max_mb` is too small.
+    """
+    outputs = folder(run.folder.path, True, max_mb)
+    made_from = provenance.of_inputs({}, [sfm / "points3D.bin"])
+    is_old = (outputs / MADE_FROM).exists()
+    if stale := is_old and not provenance.is_current(outputs / MADE_FROM, made_from):
+        logger.info("Results in %s are stale, as the map has changed.", outputs)
+    results = RunFolder(outputs, {"max_mb": max_mb}, overwrite=False, stale=stale)
+    matcher = compact.matcher_of(run.matcher)
+    with Run(results, run.feature, matcher, run.executor, run.folder) as part:
+        provenance.write(outputs / MADE_FROM, made_from)
+        built = _pack(run, part, place, sfm, max_mb)
+        features, num_loc = run.features, run.numbers["num_loc"]
+        pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
+        with part.stage("retrieval"):
+            queries = readable(features, run.query_names)
+            retrieve_in_map(built, features, pairs, num_loc, queries, built.names())
+        matches = part.match("match_queries", pairs, features, built.features)
+        poses = outputs / f"Aachen-v1.1_hloc_{run.feature}+{matcher}_vlad{num_loc}.txt"
+        query_files = pairs, features, built.features
+        with part.stage("localization"):
+            records = localize_sfm.main(
+                *(built.sfm, place.queries, pairs, features, matches, poses),
+                executor=run.executor,
+                gate=run.gate,
+                mirror_images=part.mirror_images(run.conf, place.images, *query_files),
+            )
+        files = run.files(built.features, built.sfm, pairs, matches)
+        return part.finish(
+            run.summary(
+                compact=FILE,
+                map_images=built.num_images,
+                map_points3D=built.num_points3D,
+                map_bytes=(outputs / FILE).stat().st_size,
+            ),
+            *(lists, records, run.truth, limits, features, poses, files),
+        )
+
+
+def _pack(run: DatasetRun, part: Run, place: Aachen, sfm: Path, max_mb: float | None) -> Map:
+    """Pack a map into a file, unless that is there, and unpack it, in which stages localize."""
+    file = part.folder.path / FILE
+    with part.stage("compact"):
+        if not file.exists():
+            model = colmap.read_model(sfm)
+            source = Source(
+                *(model, run.feature, run.conf, run.matcher, run.global_descriptors),
+                *(vocabulary_of(run.global_descriptors), intrinsics.of_map(model, place.images)),
+            )
+            compact.write(file, source, run.features, max_mb=max_mb)
+        return maps.unpack(file, part.folder.path / "map")
