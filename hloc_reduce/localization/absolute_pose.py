@@ -339,11 +339,12 @@ def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d
         limits.append((ALL, CROPPED, reason))
     for freedom, (far, turned), reason in limits:
         position, rotation = uncertainty(*inliers, cam_from_world, pose.camera, freedom)
+        hint = "; known intrinsics would help" if matches.is_focal_length_free else ""
         if position > far * MAX_POSITION or rotation > turned * MAX_ROTATION:
             return (
                 f"{reason} position is uncertain by {100 * position:.1f} % of the distance, its "
                 f"rotation by {rotation:.1f} degrees; at most {100 * far * MAX_POSITION:.0f} % and "
-                f"{turned * MAX_ROTATION:.0f} degrees are accepted"
+                f"{turned * MAX_ROTATION:.0f} degrees are accepted{hint}"
             )
     return None
 

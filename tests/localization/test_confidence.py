@@ -156,6 +156,9 @@ def test_inliers_that_do_not_fix_the_pose_are_refused():
     keypoints += generator.standard_normal(keypoints.shape)
     found = solve(keypoints, points)
     assert "the inliers do not fix the pose" in found.refusal
+    assert "known intrinsics would help" not in found.refusal
+    its_matches = absolute_pose._Matches(keypoints, points, CAMERA, FREE)
+    assert "known intrinsics would help" in absolute_pose._imprecision(its_matches, found, TRUE)
     assert uncertainty(keypoints[:3], points[:3], TRUE, CAMERA) == (np.inf, np.inf)
 
 
