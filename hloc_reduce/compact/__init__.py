@@ -28,7 +28,7 @@ from ..utils.paths import strings_as_paths
 
 MEGABYTE = 1_000_000
 TRIES = 12  # sizes that are tried to come close to a limit
-AIM, CLOSE = 0.99, 0.97  # shares of the limit that are aimed at, and are close enough
+AIM, CLOSE = 0.998, 0.995  # shares of the limit that are aimed at, and are close enough
 # descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
 FEW = 32  # numbers of DoG's features that are stored as uint4; others as uint2
