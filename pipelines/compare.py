@@ -20,7 +20,7 @@ from hloc_reduce.report import runs
 from hloc_reduce.runtime import provenance
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.files import write_csv
+from hloc_reduce.utils.files import MEGABYTE, write_csv
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned, joined
 
@@ -215,7 +215,7 @@ def _accuracy(recall: list[float | None], summary: dict) -> list[str]:
 
 
 def _megabytes(size: int | None) -> str:
-    return joined([size and size / runs.MEGABYTE], ".3g")
+    return joined([size and size / MEGABYTE], ".3g")
 
 
 def _main() -> None:

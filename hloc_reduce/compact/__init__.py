@@ -23,10 +23,9 @@ from ..pairs_from_retrieval import read_global
 from ..utils import cli, colmap
 from ..utils.cli import InputError
 from ..utils.codes import STORAGES
-from ..utils.files import replacing
+from ..utils.files import MEGABYTE, replacing
 from ..utils.paths import strings_as_paths
 
-MEGABYTE = 1_000_000
 TRIES = 12  # sizes that are tried to come close to a limit
 AIM, CLOSE = 0.998, 0.995  # shares of the limit that are aimed at, and are close enough
 # descriptors of points are means, so that a less strict ratio test is enough

@@ -22,37 +22,15 @@ from ..utils.codes import CODED, FLOATS, QUANTIZED, STORAGES, check_levels, rest
 from ..utils.files import file_sha256, replacing
 from ..utils.parsers import check_names, parse_camera
 from . import points as points_of_map
+from . import signs
 from .points import Points
 
 VERSION = 2
 VERSIONS = 1, VERSION  # that are read; in the first one, all coordinates have the same bits
 SUFFIX = ".hlm"
-SIGNS = 1024  # bits of an image's retrieval descriptor
-IMAGES = 1024  # whose signs are unpacked at once
 # what a file may ask for
 MAX_DIM, MAX_GLOBAL, MAX_SIDE, LEAST_OCTAVE = 512, 2**14, 4096, -1
 PROJECTION = re.compile(r"[\w+-]+(@\d+)?")  # a name, and a prefix of a nested one
-
-
-def hadamard(rows: np.ndarray, number: int) -> np.ndarray:
-    """Return the Walsh-Hadamard transform of rows, which is its own inverse but for a factor.
-
-    Args:
-        rows: (N, G) float32.
-        number: the least length of the transform, which is a power of two.
-
-    Returns:
-        (N, H) float32, where H is the next power of two from `number` on.
-    """
-    size = 1 << max(number - 1, 0).bit_length()
-    values = np.zeros((len(rows), size), np.float32)
-    values[:, : rows.shape[1]] = rows
-    half = 1
-    while half < size:
-        parts = values.reshape(len(rows), -1, 2, half)
-        values = np.stack([parts[:, :, 0] + parts[:, :, 1], parts[:, :, 0] - parts[:, :, 1]], 2)
-        half *= 2
-    return values.reshape(len(rows), size)
 
 
 @dataclass(frozen=True)
@@ -108,9 +86,7 @@ def encode(
     }
     for add in (_add_images, _add_points, _add_descriptors, _add_vocabulary, _add_projection):
         add(tensors, metadata, points, source)
-    signs = hadamard(global_descriptors, global_descriptors.shape[1])[:, :SIGNS] > 0
-    tensors["retrieval"] = np.packbits(signs, axis=1, bitorder="little")
-    metadata["signs"] = signs.shape[1]
+    tensors["retrieval"], metadata["signs"] = signs.pack(global_descriptors)
     content = save(tensors, {"map": json.dumps(metadata, sort_keys=True)})
     parts = {name: tensor.nbytes for name, tensor in tensors.items()}
     return content, parts | {"header": len(content) - sum(parts.values())}
@@ -309,43 +285,30 @@ class CompactMap:
             found = _array(tensors, "vocabulary", np.float16, (None, self.dim))
             self.vocabulary = found.astype(np.float32)
         number, size = self.vocabulary.size, int(metadata["signs"])
-        whole = 1 << max(number - 1, 0).bit_length()
         if self.vocabulary.shape[1] != self.dim or not 0 < number <= MAX_GLOBAL:
             raise ValueError(f"a vocabulary of shape {self.vocabulary.shape}")
-        if size != min(SIGNS, whole) or not np.isfinite(self.vocabulary).all():
+        if size != signs.count(number) or not np.isfinite(self.vocabulary).all():
             raise ValueError(f"{size} signs of global descriptors of {number} numbers")
-        self._signs = _array(tensors, "retrieval", np.uint8, (len(self.names), -(-size // 8)))
-        self._num_signs = size
+        packed = _array(tensors, "retrieval", np.uint8, (len(self.names), -(-size // 8)))
+        self._retrieval = signs.Signs(packed, number)
 
     def global_descriptors(self) -> np.ndarray:
         """Return those of the images (I, G) float32 as their signs tell them.
 
         Norms are 1, or 0 for images without points.
         """
-        number, size = self.vocabulary.size, self._num_signs
-        found = hadamard(self._unpacked(slice(None)), number)
+        found = self._retrieval.descriptors()
         found[self._visible.counts == 0] = 0
-        # the transform multiplies norms by sqrt(whole)
-        return found[:, :number] / np.float32(np.sqrt(size * found.shape[1]))
+        return found
 
     def similarity(self, descriptor: np.ndarray) -> np.ndarray:
         """Return the similarity (I,) of a global descriptor (G,) to those of the images.
 
-        It is the product with `global_descriptors`, without these; -inf for images without points.
+        It is -inf for images without points.
         """
-        transformed = hadamard(descriptor[None], len(descriptor))[0]
-        parts = [
-            self._unpacked(slice(start, start + IMAGES)) @ transformed[: self._num_signs]
-            for start in range(0, len(self.names), IMAGES)
-        ]
-        found = np.concatenate(parts) / np.float32(np.sqrt(self._num_signs * len(transformed)))
+        found = self._retrieval.similarity(descriptor)
         found[self._visible.counts == 0] = -np.inf
         return found
-
-    def _unpacked(self, images: slice) -> np.ndarray:
-        """Return the signs of some images (N, S) float32, -1 and 1."""
-        bits = np.unpackbits(self._signs[images], axis=1, count=self._num_signs, bitorder="little")
-        return 2 * bits.astype(np.float32) - 1
 
     @property
     def is_pickled(self) -> bool:

@@ -13,7 +13,7 @@ from ..evaluation import plots
 from ..evaluation.poses import ERRORS
 from ..utils import cli
 from ..utils.cli import InputError
-from ..utils.files import replacing
+from ..utils.files import MEGABYTE, replacing
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
 from . import pictures, runs, scene
@@ -145,7 +145,7 @@ def map_panels(compared: list[Run]) -> "dict[str, plots.Panel]":
     for run in compared:
         sizes = {compact if run.is_compact else whole: run.map_bytes, hloc: run.hloc_bytes}
         points += [
-            (run, {"feature": run.feature, "kind": kind, "megabytes": size / runs.MEGABYTE})
+            (run, {"feature": run.feature, "kind": kind, "megabytes": size / MEGABYTE})
             for kind, size in sizes.items()
             if size
         ]

@@ -21,10 +21,10 @@ from ..maps.map import is_map
 from ..runtime.outputs import SHARED
 from ..utils import cli, colmap
 from ..utils.cli import InputError, no_folder
+from ..utils.files import MEGABYTE
 from ..utils.h5 import open_h5
 from ..utils.parsers import parse_poses, parse_retrieval
 
-MEGABYTE = 1_000_000
 COUNTS = ("num_matches", "num_correspondences", "num_inliers")
 BEGUN = ("conf.json", "summary.json")  # either tells that a pipeline has begun a run
 

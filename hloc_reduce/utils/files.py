@@ -11,6 +11,8 @@ from pathlib import Path
 
 from .cli import check_file, make_folder
 
+MEGABYTE = 1_000_000  # bytes, in options and tables
+
 _observers: list[Callable[[Path], None]] = []
 
 

@@ -13,8 +13,9 @@ from safetensors.numpy import load_file, save_file
 
 from hloc_reduce import Localizer, compact, maps, projections
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.maps import points
-from hloc_reduce.maps.compact import CompactMap, hadamard
+from hloc_reduce.maps import points, signs
+from hloc_reduce.maps.compact import CompactMap
+from hloc_reduce.maps.signs import Signs, hadamard, pack
 from hloc_reduce.utils import parsers
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize
@@ -88,6 +89,18 @@ def test_hadamard_is_its_own_inverse():
     assert there.shape == (3, 16)
     np.testing.assert_allclose(there @ there.T, 16 * rows @ rows.T, rtol=1e-4)
     np.testing.assert_allclose(hadamard(there, 12)[:, :12] / 16, rows, atol=1e-5)
+
+
+@pytest.mark.parametrize("number", [12, 1024, 3000])
+def test_signs_retrieve_as_the_descriptors_that_they_tell(number, monkeypatch):
+    monkeypatch.setattr(signs, "ROWS", 3)
+    descriptors = np.random.default_rng(0).standard_normal((10, number)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    found = Signs(pack(descriptors)[0], number)
+    products = descriptors @ found.descriptors().T
+    for query, expected in zip(descriptors, products, strict=True):
+        np.testing.assert_allclose(found.similarity(query), expected, atol=1e-5)
+    assert (products.argmax(axis=1) == np.arange(10)).all()
 
 
 def test_selected_points_are_spread():
