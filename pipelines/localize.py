@@ -2,7 +2,7 @@
 
 Builds the map once, from photos and a COLMAP model of them or from photos alone; later runs
 localize other photos in it. Without --query_images only the map is built. A new map has the feature
-colmap_sift_sv64 and its matcher unless you choose others.
+colmap_sift_sv64 and its matcher unless you choose others. A map grows with --add_images.
 """
 
 import hashlib
@@ -23,6 +23,7 @@ from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES
+from hloc_reduce.utils.parsers import image_names
 from hloc_reduce.utils.paths import strings_as_paths
 
 from . import options
@@ -32,6 +33,7 @@ from .run import Run, readable
 
 MADE_FROM = "made_from.json"  # the map and the photos of the queries
 LISTED = "queries_with_intrinsics.txt"  # written for a folder of queries
+CHANGES = "add_images", "add_model", "refine_map", "remove_images"  # options
 NOT_IN_NAMES = r"[^\w.-]+"  # characters of a glob
 
 
@@ -263,6 +265,7 @@ def _main() -> None:
     parser.add_argument(
         "--num_covis", type=int, default=20, help="other images that each map image is matched with"
     )
+    _add_changes(parser)
     colmap.add_camera_mode(parser)
     options.add_feature_options(parser)
     options.add_localization_options(parser, "none", 50)
@@ -272,13 +275,72 @@ def _main() -> None:
     for name, names in (("storage", STORAGES), ("keypoints", KEYPOINTS)):
         if given[name] is not None:
             cli.choose(name, given[name], names)
-    if given["outputs"] is None:
+    changes = {name: given.pop(name) for name in CHANGES}
+    if given["outputs"] is None and (
+        given["query_images"] is not None or not any(changes.values())
+    ):
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
-    trace_file = given["outputs"] / "trace.json" if given.pop("profile") else None
+    profiled = given.pop("profile") and given["outputs"] is not None
+    trace_file = given["outputs"] / "trace.json" if profiled else None
     with trace.recording(trace_file):
-        _run(given)
+        if any(changes.values()):
+            _change(given["map"], given["map_images"], **changes)
+        if given["outputs"] is not None:
+            _run(given)
+
+
+def _add_changes(parser: cli.Parser) -> None:
+    """Add the options that change a map."""
+    parser.add_argument(
+        "--add_images",
+        type=Path,
+        help="folder of photos to add to --map, a map that was built before",
+    )
+    parser.add_argument(
+        "--add_model",
+        type=Path,
+        help="COLMAP model with the poses of --add_images in the frame of the map, which are kept "
+        "(default: the photos are localized in the map)",
+    )
+    parser.add_argument(
+        "--refine_map",
+        action="store_true",
+        help="adjust the poses of all photos of the map to those of --add_images",
+    )
+    parser.add_argument(
+        "--remove_images", type=Path, help="text file of the names of photos to remove from --map"
+    )
+
+
+def _change(
+    folder: Path | None,
+    map_images: Path | None,
+    add_images: Path | None,
+    add_model: Path | None,
+    refine_map: bool,
+    remove_images: Path | None,
+) -> None:
+    """Remove photos from a map that was built before, and add others."""
+    if add_images is None and (add_model is not None or refine_map):
+        raise InputError(
+            "--add_model and --refine_map are for photos that are added: --add_images."
+        )
+    if folder is None or map_images is not None or not maps.is_map(folder):
+        raise InputError(
+            "--add_images and --remove_images change a map that was built before: give its folder, "
+            "--map, without --map_images."
+        )
+    built = Map(folder)
+    if remove_images is not None:
+        built = maps.remove(built, image_names(remove_images))
+        print(f"{built.num_images} photos are left in the map {folder}.")
+    if add_images is not None:
+        before = built.num_images
+        built = maps.add(built, add_images, add_model, refine_map=refine_map)
+        added = built.num_images - before
+        print(f"{added} photos were added to the map {folder}, which has {built.num_images} now.")
 
 
 def _run(given: dict) -> None:

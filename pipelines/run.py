@@ -17,13 +17,14 @@ from hloc_reduce.evaluation.summaries import (
     write_summary,
 )
 from hloc_reduce.localization.mirrored import MirrorImages
+from hloc_reduce.maps.mirroring import mirror_images
 from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.runtime.versions import versions
 from hloc_reduce.utils.files import write_csv
 from hloc_reduce.utils.images import list_images
-from hloc_reduce.utils.parsers import parse_pairs, parse_retrieval, write_pairs
+from hloc_reduce.utils.parsers import parse_pairs
 
 Thresholds = Mapping[str, tuple[tuple[float, float], ...]]  # of each query list, metres and degrees
 
@@ -102,22 +103,11 @@ class Run:
             map_features: feature file of the map images.
         """
 
-        def main(names: list[str]) -> tuple[Path, Path]:
-            listed = self.folder.path / f"{pairs.stem}-mirrored.txt"
-            retrieved = parse_retrieval(pairs)
-            write_pairs([(name, other) for name in names for other in retrieved[name]], listed)
-            mirrored = extract_features.main(
-                {**conf, "preprocessing": {**conf["preprocessing"], "mirrored": True}},
-                image_dir,
-                feature_path=self._folders[0].path / f"{features.stem}-mirrored.h5",
-                image_list=names,
-                executor=self.executor,
-                strict=False,
-                queries=names,
-            )
-            return mirrored, self._match(listed, mirrored, map_features)
+        def match(listed: Path, mirrored: Path) -> Path:
+            return self._match(listed, mirrored, map_features)
 
-        return main
+        mirrored = self._folders[0].path / f"{features.stem}-mirrored.h5"
+        return mirror_images(conf, image_dir, pairs, mirrored, match, self.executor)
 
     def finish(
         self,

@@ -143,16 +143,23 @@ def of_cameras(cameras: Iterable[pycolmap.Camera]) -> MapCameras:
     return MapCameras({}, sizes, focal_lengths=(min(found), max(found)) if found else None)
 
 
-def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> MapCameras:
-    """Return what a map tells about the intrinsics of other photos.
+def of_map(
+    reconstruction: pycolmap.Reconstruction,
+    image_dir: Path,
+    names: Collection[str] | None = None,
+) -> MapCameras:
+    """Return what photos of a map tell about the intrinsics of other photos.
 
     Args:
         reconstruction: the map.
-        image_dir: the folder of its photos.
+        image_dir: the folder of the photos.
+        names: the photos; default: all of the map.
     """
     models: set[str] = set()
     found: dict[str, list[int]] = {}
-    for image in reconstruction.images.values():
+    images = reconstruction.images.values()
+    photos = [image for image in images if names is None or image.name in names]
+    for image in photos:
         if (exif := exif_camera(image_dir / image.name)) is not None:
             models.add(exif.model)
             if not exif.zoomed:
@@ -162,7 +169,26 @@ def of_map(reconstruction: pycolmap.Reconstruction, image_dir: Path) -> MapCamer
         for name, ids in found.items()
         if len(ids) >= WELL_KNOWN and len(set(ids)) == 1
     }
-    return of_cameras(reconstruction.cameras.values())._replace(known=known, models=models)
+    cameras = [reconstruction.cameras[i] for i in {image.camera_id for image in photos}]
+    return of_cameras(cameras)._replace(known=known, models=models)
+
+
+def merged(first: MapCameras, second: MapCameras) -> MapCameras:
+    """Return what two groups of photos of a map tell; the first one's known cameras count."""
+    models = {*first.models, *second.models}
+    ranges = [cameras.focal_lengths for cameras in (first, second) if cameras.focal_lengths]
+    lengths = (min(low for low, _ in ranges), max(high for _, high in ranges)) if ranges else None
+    return MapCameras(second.known | first.known, first.sizes | second.sizes, models, lengths)
+
+
+def to_dict(cameras: MapCameras) -> dict:
+    """Return what a map tells as JSON values, by their names in map.json."""
+    return {
+        "cameras": {name: to_list(one) for name, one in cameras.known.items()},
+        "sizes": sorted(cameras.sizes),
+        "camera_models": sorted(cameras.models),
+        "focal_lengths": cameras.focal_lengths,
+    }
 
 
 def to_list(camera: pycolmap.Camera) -> list:

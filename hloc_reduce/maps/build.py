@@ -34,7 +34,7 @@ from ..utils.cli import InputError
 from ..utils.codes import STORAGES
 from ..utils.files import replacing
 from ..utils.images import list_images
-from ..utils.match_files import name_in_pair
+from ..utils.match_files import check_names
 from ..utils.paths import strings_as_paths
 from . import contradictions, precision
 from .map import FINGERPRINTS, FINISHED, FURTHER, MORE, PLACE, RETRIEVAL, SFM, Map, with_projection
@@ -93,7 +93,7 @@ def main(
     if reference is not None and not reference.images:
         raise InputError(f"The model {model} has no images.")
     names = _list(image_dir, reference, accept_partial)
-    _check_names(names)
+    check_names(names)
     has_points = reference is not None and reference.num_points3D() > 0
     exhaustive = not has_points and len(names) <= MAX_EXHAUSTIVE
     if overwrite or not (map_dir / "conf.json").exists():
@@ -153,18 +153,6 @@ def _list(
         return names
     names = sorted(image.name for image in reference.images.values())
     return list_images(image_dir, keep_present(image_dir, names, accept_partial))
-
-
-def _check_names(names: list[str]) -> None:
-    """Raise an InputError for two images that have one name in match files, as in hloc's."""
-    known: dict[str, str] = {}
-    for name in names:
-        other = known.setdefault(name_in_pair(name), name)
-        if other != name:
-            raise InputError(
-                f"{other} and {name} have the same name in match files, which replace / by -: "
-                "rename one of them."
-            )
 
 
 def _digests(
@@ -242,10 +230,7 @@ class _Building:
             "images_contradicting_others": contradicting,
             "images_of_uncertain_position": uncertain,
             "points3D": sfm.num_points3D(),
-            "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
-            "sizes": sorted(cameras.sizes),
-            "camera_models": sorted(cameras.models),
-            "focal_lengths": cameras.focal_lengths,
+            **intrinsics.to_dict(cameras),
             "seconds": self.folder.seconds(),
         }
         provenance.write(self.folder.path / FINISHED, summary)

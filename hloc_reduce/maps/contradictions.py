@@ -1,6 +1,6 @@
 """Find photos of a map whose poses contradict the other photos."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import h5py
@@ -26,13 +26,10 @@ TURNED = 5.0  # degrees
 
 
 def find(sfm: pycolmap.Reconstruction, matches: Path) -> list[str]:
-    """Find the photos of a map whose poses contradict the other photos.
+    """Find the photos of a map whose poses contradict the other photos, see `judge`.
 
-    A photo whose pose agrees with less than half of its matches with points that at least two
-    other photos see is localized by these, with the intrinsics of the map. It contradicts the
-    others if that gives a pose elsewhere, with the confidence of a localized query. So do photos
-    that were given wrong poses or that the mapper placed wrongly, copies of a place that is in the
-    map twice, and sides of a place that were merged, see `mapping.copies`.
+    So do copies of a place that is in the map twice, and sides of a place that were merged, see
+    `mapping.copies`.
 
     Args:
         sfm: the map.
@@ -41,17 +38,37 @@ def find(sfm: pycolmap.Reconstruction, matches: Path) -> list[str]:
     Returns:
         Their names.
     """
+    names = [image.name for image in sfm.images.values()]
+    return sorted({*judge(sfm, matches, names), *copies.find(sfm)})
+
+
+def judge(sfm: pycolmap.Reconstruction, matches: Path, names: Collection[str]) -> list[str]:
+    """Find photos whose poses contradict the other photos of a map.
+
+    A photo whose pose agrees with less than half of its matches with points that at least two
+    other photos see is localized by these, with the intrinsics of the map. It contradicts the
+    others if that gives a pose elsewhere, with the confidence of a localized query. So do photos
+    that were given wrong poses or that the mapper placed wrongly.
+
+    Args:
+        sfm: the map.
+        matches: match file of its images.
+        names: the photos to judge.
+
+    Returns:
+        The names of those that contradict the others.
+    """
     reference, partners = SfmMap(sfm), _partners(sfm, matches)
     points = [np.unique(reference.point_rows(name)) for name in reference.images]
     seen = np.bincount(np.concatenate(points) + 1, minlength=len(reference.points) + 1)[1:]
 
-    def judge(name: str) -> str | None:
+    def work(name: str) -> str | None:
         with open_h5(matches) as file:
             return name if _contradicts(reference, name, partners[name], seen, file) else None
 
-    names = sorted(partners)
-    judged = progress(parallel.ordered("judge", judge, names), "Judging poses", "image", len(names))
-    return sorted({name for name in judged if name} | set(copies.find(sfm)))
+    names = sorted(names)
+    judged = progress(parallel.ordered("judge", work, names), "Judging poses", "image", len(names))
+    return [name for name in judged if name]
 
 
 def warn(names: list[str]) -> None:

@@ -89,10 +89,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
         "sfm": SFM,
         "images_with_pose": len(compact.names),
         "points3D": len(compact.points),
-        "cameras": {name: intrinsics.to_list(one) for name, one in cameras.known.items()},
-        "sizes": sorted(cameras.sizes),
-        "camera_models": sorted(cameras.models),
-        "focal_lengths": cameras.focal_lengths,
+        **intrinsics.to_dict(cameras),
     }
     provenance.write(folder / FINISHED, content)
 

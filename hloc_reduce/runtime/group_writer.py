@@ -4,7 +4,7 @@ import json
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -326,6 +326,31 @@ def _merge_piece(piece: h5py.File, merged: h5py.File) -> None:
     failed |= {name for name in again if name not in merged}
     _copy_missing(piece, merged)
     _set_failed(merged, failed)
+
+
+def merge(output: Path, sources: Sequence[Path], without: Collection[str] = ()) -> None:
+    """Write the groups of h5 files into one, with the header of the first file.
+
+    Args:
+        output: the new file, which may be one of the sources.
+        sources: the files; of groups with the same name the first counts.
+        without: names of groups of the first file that are left out.
+    """
+    with replacing(output) as temporary:
+        with open_h5(sources[0]) as first:
+            dropped = {name for name in without if name in first}
+            if not dropped:
+                shutil.copyfile(sources[0], temporary)
+            else:
+                with write_h5(temporary) as merged:
+                    for name in iterate_h5_names(first.id):
+                        if name not in dropped:
+                            first.copy(name, merged, name)
+                    merged.attrs.update(first.attrs)
+                    _set_failed(merged, _failed(first) - dropped)
+        for source in sources[1:]:
+            with open_h5(source) as file, write_h5(temporary) as merged:
+                _copy_missing(file, merged)
 
 
 def _copy_missing(source: h5py.Group, target: h5py.Group) -> None:

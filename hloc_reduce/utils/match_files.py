@@ -25,6 +25,18 @@ def name_in_pair(name: str) -> str:
     return name.replace("/", "-")
 
 
+def check_names(names: Iterable[str]) -> None:
+    """Raise an InputError for two images that have one name in match files, as in hloc's."""
+    known: dict[str, str] = {}
+    for name in names:
+        other = known.setdefault(name_in_pair(name), name)
+        if other != name:
+            raise InputError(
+                f"{other} and {name} have the same name in match files, which replace / by -: "
+                "rename one of them."
+            )
+
+
 def names_to_pair(name0: str, name1: str, separator: str = "/") -> str:
     """Return the name of a pair's group in a match file."""
     return separator.join((name_in_pair(name0), name_in_pair(name1)))

@@ -1,0 +1,195 @@
+"""Add images with poses to a COLMAP model: extend its points and triangulate new ones."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from ..utils import colmap
+from .epipolar import agreeing
+
+ROUNDS = 2  # of completing tracks, adjusting and filtering
+OPTIONS = pycolmap.IncrementalPipelineOptions({"num_threads": 1, "random_seed": 0})
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The pose of an image in the frame of a model.
+
+    Args:
+        cam_from_world: the pose.
+        camera: the intrinsics.
+        known: the intrinsics are exact: those of a camera of the map, or given.
+        fixed: the pose is given, so that it stays.
+    """
+
+    cam_from_world: pycolmap.Rigid3d
+    camera: pycolmap.Camera
+    known: bool
+    fixed: bool
+
+
+def extend(
+    model: pycolmap.Reconstruction,
+    placed: Mapping[str, Placed],
+    keypoints: Mapping[str, np.ndarray],
+    uncertainty: Mapping[str, float],
+    matches: Mapping[Pair, np.ndarray],
+    refine_map: bool = False,
+) -> None:
+    """Add images to a model.
+
+    The points that they see and the poses that are not given are adjusted; the other images and
+    their intrinsics stay, unless `refine_map`.
+
+    Args:
+        model: changed in place.
+        placed: the new images, by name.
+        keypoints: (N, 2) of all images that are matched, COLMAP's pixels.
+        uncertainty: of their keypoints in pixels.
+        matches: (M, 2) of pairs of new images, and of new images and those of the model; those that
+            contradict the poses are not used.
+        refine_map: adjust the poses of all images, but those that are given, and all points.
+    """
+    ids = _add_images(model, placed, keypoints)
+    graph = _graph(model, keypoints, uncertainty, matches)
+    observations = pycolmap.ObservationManager(model, graph)
+    triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
+    tracks, limits = OPTIONS.get_triangulation(), OPTIONS.get_mapper()
+    tracks.ignore_two_view_tracks = False  # they may extend points: the graph has new matches only
+    before = set(model.points3D)
+    for image_id in ids.values():
+        triangulator.triangulate_image(tracks, image_id)
+    free = {ids[name] for name, image in placed.items() if not image.fixed}
+    unknown = {model.images[ids[n]].camera_id for n, image in placed.items() if not image.known}
+    for _ in range(ROUNDS):
+        triangulator.complete_tracks(tracks, _points_of(model, ids.values()))
+        triangulator.merge_tracks(tracks, _points_of(model, ids.values()))
+        _adjust(model, ids.values(), free, unknown, refine_map)
+        observations.filter_points3D_in_images(
+            limits.filter_max_reproj_error, limits.filter_min_tri_angle, set(ids.values())
+        )
+    for point_id in set(model.points3D) - before:
+        track = model.points3D[point_id].track.elements
+        if all(graph.is_two_view_observation(one.image_id, one.point2D_idx) for one in track):
+            observations.delete_point3D(point_id)  # as COLMAP, which does not triangulate them
+    model.update_point_3d_errors()
+
+
+def remove(model: pycolmap.Reconstruction, names: Collection[str]) -> None:
+    """Take images away from a model, in place, with the points that fewer than two others see."""
+    for image in list(model.images.values()):
+        if image.name in names and image.has_pose:
+            model.deregister_frame(image.frame_id)
+
+
+def _add_images(
+    model: pycolmap.Reconstruction,
+    placed: Mapping[str, Placed],
+    keypoints: Mapping[str, np.ndarray],
+) -> dict[str, int]:
+    """Add images without points; equal known intrinsics are one camera. Returns their ids."""
+    cameras = {_values(camera): camera for camera in model.cameras.values()}
+    image_id, camera_id = (max(used, default=0) for used in (model.images, model.cameras))
+    ids = {}
+    for name, image in placed.items():
+        camera = cameras.get(_values(image.camera)) if image.known else None
+        if camera is None:
+            camera_id += 1
+            camera = pycolmap.Camera(image.camera.todict() | {"camera_id": camera_id})
+            if image.known:
+                cameras[_values(camera)] = camera
+        image_id += 1
+        ids[name] = image_id
+        new = pycolmap.Image(
+            name=name,
+            keypoints=keypoints[name].astype(np.float64),
+            camera_id=camera.camera_id,
+            image_id=image_id,
+        )
+        colmap.add_image(model, camera, new, image.cam_from_world)
+    return ids
+
+
+def _values(camera: pycolmap.Camera) -> tuple:
+    """Return what makes two cameras equal."""
+    return camera.model, camera.width, camera.height, *camera.params
+
+
+def _graph(
+    model: pycolmap.Reconstruction,
+    keypoints: Mapping[str, np.ndarray],
+    uncertainty: Mapping[str, float],
+    matches: Mapping[Pair, np.ndarray],
+) -> pycolmap.CorrespondenceGraph:
+    """Return the matches of images of a model that agree with their poses."""
+    graph, ids = pycolmap.CorrespondenceGraph(), {}
+    for image_id, image in model.images.items():
+        graph.add_image(image_id, image.num_points2D())
+        ids[image.name] = image_id
+    matched = [model.images[ids[name]] for name in keypoints]
+    for pair, valid in agreeing(matched, keypoints, matches, uncertainty).items():
+        rows, (first, second) = matches[pair][valid].astype(np.uint32), (ids[name] for name in pair)
+        if hasattr(graph, "add_correspondences"):  # pycolmap 3.13
+            graph.add_correspondences(first, second, rows)
+            continue
+        config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        geometry = pycolmap.TwoViewGeometry(config=config, inlier_matches=rows)
+        graph.add_two_view_geometry(first, second, geometry)
+    graph.finalize()
+    return graph
+
+
+def _points_of(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> set[int]:
+    """Return the ids of the points that images see."""
+    found = [colmap.point3D_ids(model.images[image_id]) for image_id in image_ids]
+    return {int(i) for i in np.unique(np.concatenate(found)) if i >= 0}
+
+
+def _adjust(
+    model: pycolmap.Reconstruction,
+    new: Collection[int],
+    free: Collection[int],
+    unknown: Collection[int],
+    refine_map: bool,
+) -> None:
+    """Adjust the points of new images with poses and intrinsics, COLMAP's local bundle adjustment.
+
+    Args:
+        model: the model.
+        new: ids of the new images.
+        free: of those whose poses are estimated.
+        unknown: ids of the cameras whose intrinsics are estimated.
+        refine_map: adjust the other images and points, too.
+    """
+    config = pycolmap.BundleAdjustmentConfig()
+    images = set(model.reg_image_ids()) if refine_map else set(new)
+    for image_id in images:
+        config.add_image(image_id)
+    stays = set(new) - set(free)
+    for frame_id in {model.images[image_id].frame_id for image_id in stays}:
+        config.set_constant_rig_from_world_pose(frame_id)
+    for camera_id in {model.images[image_id].camera_id for image_id in images} - set(unknown):
+        config.set_constant_cam_intrinsics(camera_id)
+    if refine_map:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    else:
+        for point_id in _points_of(model, new):
+            config.add_variable_point(point_id)  # also seen by images that stay
+    options = OPTIONS.get_local_bundle_adjustment()
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def count_shared(model: pycolmap.Reconstruction, names: Collection[str]) -> dict[str, int]:
+    """Count the points that images of a model share with others than `names`, from any of it."""
+    new = {image_id for image_id, image in model.images.items() if image.name in names}
+    found = {}
+    for image_id in new:
+        ids = colmap.point3D_ids(model.images[image_id])
+        tracks = [model.points3D[int(i)].track.elements for i in ids[ids >= 0]]
+        others = (any(one.image_id not in new for one in track) for track in tracks)
+        found[model.images[image_id].name] = sum(others)
+    return found

@@ -1,0 +1,47 @@
+"""Features and matches of the mirror images of queries, by which mirrored photos are told."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from .. import extract_features
+from ..localization.mirrored import MirrorImages
+from ..runtime.executors import SERIAL, Executor
+from ..utils.parsers import parse_retrieval, write_pairs
+
+
+def mirror_images(
+    conf: dict,
+    image_dir: Path,
+    pairs: Path,
+    features: Path,
+    match: Callable[[Path, Path], Path],
+    executor: Executor = SERIAL,
+) -> MirrorImages:
+    """Return what extracts and matches mirror images of queries, for a localization stage.
+
+    Args:
+        conf: configuration of the feature.
+        image_dir: folder of the queries.
+        pairs: pairs of all queries and map images; those of mirror images go beside it.
+        features: the feature file of mirror images.
+        match: matches a list of pairs by the feature file of their first images, with those of the
+            map, and returns the match file.
+        executor: runs the extraction.
+    """
+
+    def main(names: list[str]) -> tuple[Path, Path]:
+        listed = pairs.with_name(f"{pairs.stem}-mirrored.txt")
+        retrieved = parse_retrieval(pairs)
+        write_pairs([(name, other) for name in names for other in retrieved[name]], listed)
+        mirrored = extract_features.main(
+            {**conf, "preprocessing": {**conf["preprocessing"], "mirrored": True}},
+            image_dir,
+            feature_path=features,
+            image_list=names,
+            executor=executor,
+            strict=False,
+            queries=names,
+        )
+        return mirrored, match(listed, mirrored)
+
+    return main

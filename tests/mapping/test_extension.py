@@ -1,0 +1,119 @@
+"""Images that are added to a model, and taken away, of a scene whose points are known."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hloc_reduce.mapping import extension
+from hloc_reduce.mapping.extension import Placed
+from hloc_reduce.utils import colmap
+from hloc_reduce.utils.feature_files import get_colmap_keypoints
+from hloc_reduce.utils.h5 import open_h5
+
+OLD, NEW = [f"db/{i}.jpg" for i in range(4)], ["db/4.jpg", "query/6.jpg"]
+KNOWN = 200  # points that the model has before
+
+
+@pytest.fixture
+def model(scene) -> pycolmap.Reconstruction:
+    """A model of four images with two thirds of the points."""
+    scene.camera = scene.reference.cameras[1]
+    with open_h5(scene.features) as file:
+        scene.keypoints = {name: get_colmap_keypoints(file, name)[0] for name in OLD + NEW}
+    made = pycolmap.Reconstruction()
+    for i, name in enumerate(OLD):
+        arguments = {"keypoints": scene.keypoints[name], "camera_id": 1, "image_id": i + 1}
+        image = pycolmap.Image(name=name, **arguments)
+        colmap.add_image(made, scene.camera, image, scene.poses[name])
+    for point in range(KNOWN):
+        rows = [int(np.flatnonzero(scene.seen[name] == point)[0]) for name in OLD]
+        elements = [pycolmap.TrackElement(i + 1, row) for i, row in enumerate(rows)]
+        made.add_point3D(scene.points[point], pycolmap.Track(elements))
+    return made
+
+
+def matches(scene, pairs) -> dict:
+    """Return the true matches of pairs."""
+    order = {name: np.argsort(scene.seen[name]) for name in OLD + NEW}
+    return {(a, b): np.column_stack([order[a], order[b]]) for a, b in pairs}
+
+
+def extend(scene, model, names, pairs=None, known=True, fixed=False, move=0.0, **options) -> None:
+    placed = {}
+    for name in names:
+        pose = scene.poses[name]
+        pose = pycolmap.Rigid3d(pose.rotation, pose.translation + move)
+        placed[name] = Placed(pose, scene.camera, known, fixed)
+    if pairs is None:
+        pairs = [(name, other) for name in names for other in OLD]
+    used = {name for pair in pairs for name in pair}
+    keypoints = {name: scene.keypoints[name] for name in used}
+    uncertainty = dict.fromkeys(used, 1.0)
+    extension.extend(model, placed, keypoints, uncertainty, matches(scene, pairs), **options)
+
+
+def poses(model) -> dict[str, np.ndarray]:
+    return {image.name: image.cam_from_world().matrix() for image in model.images.values()}
+
+
+def test_points_are_extended_and_others_triangulated(scene, model):
+    before = poses(model)
+    extend(scene, model, NEW, move=0.003)
+    after = poses(model)
+    assert all(np.array_equal(after[name], before[name]) for name in OLD)
+    for name in NEW:  # they were 3 mm off
+        assert after[name] == pytest.approx(scene.poses[name].matrix(), abs=1e-4)
+    assert model.num_points3D() == len(scene.points)
+    lengths = [point.track.length() for point in model.points3D.values()]
+    assert set(lengths) == {len(OLD) + len(NEW)}
+    assert model.num_cameras() == 1  # their intrinsics are those of the map's camera
+    assert extension.count_shared(model, NEW) == dict.fromkeys(NEW, len(scene.points))
+
+
+def test_given_poses_stay(scene, model):
+    extend(scene, model, NEW, fixed=True, move=0.003)
+    moved = scene.poses[NEW[0]].matrix()[:, 3] + 0.003
+    assert np.array_equal(poses(model)[NEW[0]][:, 3], moved)
+
+
+def test_inexact_intrinsics_are_refined(scene, model):
+    focal_length = scene.camera.params[0]
+    scene.camera = pycolmap.Camera(scene.camera.todict())
+    scene.camera.params = [1.01 * focal_length, *scene.camera.params[1:]]
+    extend(scene, model, NEW, known=False)
+    assert model.num_cameras() == 3  # each photo has its own
+    for name in NEW:
+        camera = model.find_image_with_name(name).camera
+        assert camera.params[0] == pytest.approx(focal_length, rel=1e-3)
+    assert model.cameras[1].params[0] == focal_length
+
+
+def test_new_points_of_two_images_are_dropped(scene, model):
+    extend(scene, model, NEW[:1], pairs=[(NEW[0], OLD[0])])
+    assert model.num_points3D() == KNOWN
+    assert extension.count_shared(model, NEW[:1])[NEW[0]] >= 0.95 * KNOWN
+
+
+def test_matches_that_contradict_the_poses_are_not_used(scene, model):
+    scene.seen[NEW[0]] = np.random.default_rng(0).permutation(scene.seen[NEW[0]])  # wrong matches
+    extend(scene, model, NEW[:1], fixed=True)
+    assert extension.count_shared(model, NEW[:1])[NEW[0]] < 0.05 * KNOWN
+
+
+def test_the_map_is_refined_on_demand(scene, model):
+    for image in model.images.values():
+        frame, pose = model.frames[image.frame_id], image.cam_from_world()
+        noise = 0.003 * np.random.default_rng(image.image_id).standard_normal(3)
+        frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + noise)
+    extend(scene, model, NEW, fixed=True, refine_map=True)
+    for name in OLD:
+        assert poses(model)[name] == pytest.approx(scene.poses[name].matrix(), abs=1e-3)
+
+
+def test_removed_images_leave_the_points_of_the_others(scene, model):
+    extend(scene, model, NEW)
+    extension.remove(model, [*NEW, OLD[0]])
+    assert {image.name for image in model.images.values() if image.has_pose} == {*OLD[1:]}
+    assert {point.track.length() for point in model.points3D.values()} == {3}
+    extension.remove(model, OLD[1:3])
+    assert model.num_points3D() == 0

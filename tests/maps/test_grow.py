@@ -1,0 +1,182 @@
+"""Maps that grow and shrink: the same command goes on after a kill, and other photos stay."""
+
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from command import contents, write
+
+from hloc_reduce import Localizer, maps
+from hloc_reduce.maps import grow
+from hloc_reduce.utils import colmap
+from hloc_reduce.utils.h5 import list_h5_names
+from pipelines import localize
+
+PIPELINE = localize
+BASE, NEW = ["db/0.png", "db/1.png", "db/2.png"], "db/3.png"
+# where a change is killed
+STAGES = (
+    "extract_features.main",
+    "aggregate_features.main",
+    "match_features.main",
+    "extension.extend",
+    "contradictions.judge",
+    "_commit",
+    "_drop_left",
+)
+
+
+@pytest.fixture
+def grown(place, tmp_path, run):
+    """A map of three photos with poses; a folder with the fourth, and the model of all four."""
+    (_, model, _, images, _, outputs), _, _ = place
+    part = colmap.write_part(model, BASE, tmp_path / "part")
+    run("--map", part, "--map_images", images, "--outputs", outputs)
+    (tmp_path / "new/db").mkdir(parents=True)
+    shutil.copy(images / NEW, tmp_path / "new" / NEW)
+    return outputs / "map", tmp_path / "new", model
+
+
+def names(folder):
+    return maps.Map(folder).names()
+
+
+def poses(folder):
+    images = colmap.read_model(maps.Map(folder).sfm).images.values()
+    return {image.name: image.cam_from_world().matrix().tolist() for image in images}
+
+
+def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):
+    folder, new, model = grown
+    built, before, features = maps.Map(folder), poses(folder), contents(maps.Map(folder).features)
+    run("--map", folder, "--add_images", new, "--add_model", model)
+    assert "1 photos were added" in capsys.readouterr().out
+    after = maps.Map(folder)
+    assert after.names() == [*BASE, NEW] and after.num_images == 4
+    assert after.num_points3D > built.num_points3D and after.id != built.id
+    assert {name: poses(folder)[name] for name in BASE} == before
+    given = pycolmap.Reconstruction(model).find_image_with_name(NEW).cam_from_world()
+    assert poses(folder)[NEW] == given.matrix().tolist()
+    same = contents(after.features)
+    assert {key: same[key] for key in features} == features
+    assert list_h5_names(after.descriptors) == [*BASE, NEW]
+    assert {path.name for path in folder.glob("sfm*")} == {after.sfm.name}
+    assert not (folder / grow.GROWING).exists()
+
+    # as well as a map that was built at once
+    build, images, _ = place
+    run(*build[:-1], tmp_path / "at_once")
+    at_once = maps.Map(tmp_path / "at_once/map")
+    camera = next(iter(pycolmap.Reconstruction(model).cameras.values()))
+    found = [
+        Localizer(one.folder).localize(images / "query/day/a.png", camera)[1]["num_inliers"]
+        for one in (after, at_once)
+    ]
+    assert found[0] >= 0.95 * found[1] > 0
+
+    # the same command again changes nothing, and neither does the one that built the map
+    run("--map", folder, "--add_images", new, "--add_model", model)
+    run("--map", tmp_path / "part", "--map_images", images, "--outputs", folder.parent)
+    assert maps.Map(folder).id == after.id
+
+    removed = write(tmp_path / "removed.txt", f"{NEW}\n")
+    run("--map", folder, "--remove_images", removed)
+    assert names(folder) == BASE and poses(folder) == before
+    assert list_h5_names(maps.Map(folder).features) == BASE
+    assert contents(maps.Map(folder).features) == features
+    run("--map", folder, "--add_images", new, "--add_model", model)
+    assert names(folder) == [*BASE, NEW]
+
+
+def test_photos_that_are_localized(place, tmp_path, caplog, run, refused):
+    build, images, outputs = place
+    run(*build)
+    folder = outputs / "map"
+    before = poses(folder)
+    new = images / "query/day"  # one that the map shows, and a grey one
+    cv2.imwrite(str(new / "noise.png"), np.random.default_rng(0).integers(0, 255, (270, 360)))
+    (new / "broken.png").write_text("no photo")
+    run("--map", folder, "--add_images", new)
+    assert names(folder) == ["a.png", *sorted(before)]
+    assert {name: poses(folder)[name] for name in before} == before
+    assert "broken.png cannot be read" in caplog.text
+    assert "grey.png, noise.png cannot be localized in the map" in caplog.text
+    truth = (images.parent / "queries/ground_truth_poses.txt").read_text().split()
+    assert poses(folder)["a.png"][2][3] == pytest.approx(float(truth[7]), abs=0.1)
+    content = json.loads((folder / "map.json").read_text())
+    assert content["images_added"] == ["a.png"]
+
+    state = (folder / "map.json").read_bytes()
+    for name in ("a.png", "noise.png"):
+        (new / name).unlink()
+    message = refused("--map", folder, "--add_images", new)
+    assert "No photo was added" in message and "grey.png cannot be localized" in message
+    copied = tmp_path / "copied"
+    copied.mkdir()
+    shutil.copy(images / BASE[0], copied / "again.png")
+    assert "again.png are copies of db/0.png" in refused("--map", folder, "--add_images", copied)
+    shutil.copy(images / BASE[1], copied / "a.png")
+    assert "other photos that are called a.png" in refused("--map", folder, "--add_images", copied)
+    assert (folder / "map.json").read_bytes() == state and names(folder)[0] == "a.png"
+
+
+def test_a_pose_in_another_frame_is_refused(grown, tmp_path, refused):
+    folder, new, model = grown
+    moved = pycolmap.Reconstruction(model)
+    rotation = pycolmap.Rotation3d(np.array([0, 0, np.sin(0.2), np.cos(0.2)]))
+    moved.transform(pycolmap.Sim3d(1.5, rotation, np.array([0.3, 0, 0])))
+    (tmp_path / "moved").mkdir()
+    moved.write(tmp_path / "moved")
+    message = refused("--map", folder, "--add_images", new, "--add_model", tmp_path / "moved")
+    assert "No photo was added" in message and "the map" in message
+    assert names(folder) == BASE
+
+
+def _kill(stage: str, folder, new, model) -> None:
+    """Add photos in a process that is killed when a stage begins."""
+    target, (*where, name) = grow, stage.split(".")
+    for part in where:
+        target = getattr(target, part)
+    setattr(target, name, lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL))
+    maps.add(maps.Map(folder), new, model)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_killed_change_goes_on(grown, stage):
+    folder, new, model = grown
+    context = multiprocessing.get_context("fork")
+    process = context.Process(target=_kill, args=(stage, folder, new, model))
+    process.start()
+    process.join(120)
+    assert process.exitcode == -signal.SIGKILL
+    finished = stage == STAGES[-1]
+    assert names(folder) == ([*BASE, NEW] if finished else BASE)  # whole at any moment
+    maps.add(maps.Map(folder), new, model)
+    assert names(folder) == [*BASE, NEW]
+    assert not (folder / grow.GROWING).exists() and len(list(folder.glob("sfm*"))) == 1
+
+
+def test_wrong_options(grown, tmp_path, refused):
+    folder, new, model = grown
+    assert "a map that was built before" in refused("--map", model, "--add_images", new)
+    assert "a map that was built before" in refused("--add_images", new)
+    assert "--add_images." in refused("--map", folder, "--add_model", model, "--outputs", tmp_path)
+    assert "no photo x.png" in refused(
+        "--map", folder, "--remove_images", write(tmp_path / "list.txt", "x.png\n")
+    )
+    listed = write(tmp_path / "all.txt", "\n".join(BASE))
+    assert "No point" in refused("--map", folder, "--remove_images", listed)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    refused("--map", folder, "--add_images", empty)
+    refused("--map", folder, "--add_images", tmp_path / "absent")
+    other = colmap.write_part(model, BASE, tmp_path / "of_others")
+    message = refused("--map", folder, "--add_images", new, "--add_model", other)
+    assert "has a pose of no photo" in message
+    assert names(folder) == BASE
