@@ -1,8 +1,9 @@
 """Maps to localize in: built from photos, opened, and kept in memory."""
 
+from . import from_database
 from .build import main
 from .compact import is_compact
 from .map import Map, is_map
 from .unpack import main as unpack
 
-__all__ = ["Map", "is_compact", "is_map", "main", "unpack"]
+__all__ = ["Map", "from_database", "is_compact", "is_map", "main", "unpack"]
