@@ -87,7 +87,7 @@ def open_map(
                 "projection": projection,
                 "matcher": matcher,
                 "storage": storage or STORAGES[0],
-                "keypoints": keypoints or maps.from_database.KEYPOINTS,
+                "keypoints": keypoints or KEYPOINTS[0],
             },
         )
     if map_images is not None:

@@ -8,6 +8,7 @@ import pycolmap
 from .. import aggregate_features, extract_features, from_colmap, logger, triangulation
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..detectors.dog import KEYPOINTS
 from ..localization import intrinsics
 from ..mapping import copies
 from ..reduce import Reduction
@@ -23,8 +24,6 @@ from . import contradictions
 from .build import keep_projection, model_files
 from .map import FINGERPRINTS, FINISHED, PLACE, RETRIEVAL, SFM, Map, with_projection
 
-KEYPOINTS = "colmap"  # of queries: docs/results.md
-
 
 @strings_as_paths
 def main(
@@ -36,7 +35,7 @@ def main(
     matcher: str | None = None,
     overwrite: bool = False,
     storage: str = STORAGES[0],
-    keypoints: str = KEYPOINTS,
+    keypoints: str = KEYPOINTS[0],
     image_dir: Path | None = None,
 ) -> Map:
     """Build a map, or open the one that was made from the same.
