@@ -63,43 +63,91 @@ def main(
         InputError: when the input is missing or broken, has descriptors of another dimension, or
             both files are the same.
     """
-    name, conf = features_confs.get(feature, projection, storage)
-    levels = features_confs.levels(conf)
+    reduction = Reduction(feature, projection, storage)
+    name = reduction.name
     if output.resolve() == features.resolve():
         raise InputError(f"{output} cannot be reduced to itself: choose another --output.")
-    is_colmap = features_confs.descriptor_of(conf["model"]) == COLMAP
-    if normalization is not None and not is_colmap:
+    if normalization is not None and not reduction.of_colmap:
         raise InputError(f"--normalization is for features of {COLMAP}; {name} is none.")
     names = list_h5_names(features)
     with open_h5(features) as file:
-        if is_colmap:
+        if reduction.of_colmap:
             normalization = normalization or _normalization(file, names)
             cli.choose("normalization", normalization, NORMALIZATIONS)
         made_by = {
             "reduced": file_provenance(file),
-            "feature": name,
-            "storage": storage,
             "normalization": normalization,
+            **reduction.provenance,
         }
-        if given := conf["model"].get("projection"):
-            made_by["projection_sha256"] = projections.checksum(given)
-        project, dim = _projection(name, conf)
-        reduce = partial(_reduce, project, normalization, storage, levels)
+        reduce = partial(reduction.reduce, normalization)
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [image for image in names if image not in writer]
-            groups = parallel.ordered("reduce", reduce, _read(file, todo, name, dim))
+            groups = parallel.ordered("reduce", reduce, _read(file, todo, reduction))
             for group in progress(groups, "Reducing features", "image", len(todo)):
                 writer.add(*group)
     logger.info("%d images with %s, %s: %s", len(names), name, storage, output)
     return output
 
 
-def _projection(name: str, conf: dict) -> tuple["Projection | None", int | None]:
-    """Return the projection of a feature, if any, and the dimension of its base, if it is known."""
-    if given := conf["model"].get("projection"):
-        projection = projections.load(given)
-        return projection, projection.sizes[0]
-    return None, features_confs.dimension(name) if name in features_confs.confs else None
+class Reduction:
+    """What makes descriptors of a feature from those of its base.
+
+    Args:
+        feature: as in `confs.features.get`, like `projection` and `storage`.
+        projection: see `feature`.
+        storage: see `feature`.
+
+    Attributes:
+        name: of the feature.
+        conf: its configuration.
+        of_colmap: whether its base is COLMAP's SIFT.
+
+    Raises:
+        InputError: for an unknown feature, or a projection that is broken or has no levels.
+    """
+
+    def __init__(self, feature: str, projection: Path | None = None, storage: str = STORAGES[0]):
+        self.name, self.conf = features_confs.get(feature, projection, storage)
+        self.of_colmap = features_confs.descriptor_of(self.conf["model"]) == COLMAP
+        self._storage, self._levels = storage, features_confs.levels(self.conf)
+        self._project: Projection | None = None
+        self._dim = None
+        if given := self.conf["model"].get("projection"):
+            self._project = projections.load(given)
+            self._dim = self._project.sizes[0]
+        elif self.name in features_confs.confs:
+            self._dim = features_confs.dimension(self.name)
+
+    @property
+    def provenance(self) -> dict:
+        """What determines the descriptors, besides those of the base."""
+        made_by = {"feature": self.name, "storage": self._storage}
+        if given := self.conf["model"].get("projection"):
+            made_by["projection_sha256"] = projections.checksum(given)
+        return made_by
+
+    def check(self, dim: int, place: str) -> None:
+        """Raise an InputError if the descriptors of a place are not as long as the base's."""
+        if self._dim not in (None, dim):
+            raise InputError(f"{place} are {dim}-D, {self.name} needs {self._dim}-D.")
+
+    def reduce(self, normalization: str | None, described: Described) -> Group:
+        """Project the descriptors of an image, and return its group.
+
+        Args:
+            normalization: of COLMAP's SIFT descriptors, a key of `NORMALIZATIONS`; None of others.
+            described: of the image.
+        """
+        name, descriptors, (arrays, attrs) = described
+        if normalization is not None:
+            descriptors = to_colmap_sift(descriptors, normalization)
+        if self._project is not None:
+            import torch
+
+            with torch.no_grad():
+                descriptors = self._project(torch.from_numpy(descriptors)).numpy()
+        stored, own = store({"descriptors": descriptors.T}, self._storage, self._levels)
+        return name, arrays | stored, attrs | own
 
 
 def _normalization(file: h5py.File, names: list[str]) -> str:
@@ -108,44 +156,33 @@ def _normalization(file: h5py.File, names: list[str]) -> str:
     descriptors = [get_descriptors(file, name) for name in sampled]
     if len({part.shape[1] for part in descriptors}) != 1:
         raise InputError(f"{file.filename} has no descriptors, or they differ in size.")
+    return told_by(np.concatenate(descriptors), file.filename)
+
+
+def told_by(descriptors: np.ndarray, place: str) -> str:
+    """Tell how the descriptors of COLMAP's SIFT in a file are normalized, and log it.
+
+    Args:
+        descriptors: see `normalization.detect`.
+        place: name of the file.
+
+    Raises:
+        InputError: see `normalization.detect`.
+    """
     try:
-        found = detect(np.concatenate(descriptors))
+        found = detect(descriptors)
     except InputError as error:
-        raise InputError(f"{file.filename}: {error}") from None
-    logger.info("The descriptors of %s are normalized by %s.", file.filename, found)
+        raise InputError(f"{place}: {error}") from None
+    logger.info("The descriptors of %s are normalized by %s.", place, found)
     return found
 
 
-def _read(file: h5py.File, names: list[str], feature: str, dim: int | None) -> Iterator[Described]:
+def _read(file: h5py.File, names: list[str], reduction: Reduction) -> Iterator[Described]:
     """Read the features of images."""
     for name in names:
         descriptors = get_descriptors(file, name)
-        if dim not in (None, descriptors.shape[1]):
-            raise InputError(
-                f"{file.filename}: the descriptors of {name} are {descriptors.shape[1]}-D, "
-                f"{feature} needs {dim}-D."
-            )
+        reduction.check(descriptors.shape[1], f"{file.filename}: the descriptors of {name}")
         yield name, descriptors, read_others(file, name)
-
-
-def _reduce(
-    project: "Projection | None",
-    normalization: str | None,
-    storage: str,
-    levels: np.ndarray | None,
-    described: Described,
-) -> Group:
-    """Project the descriptors of an image."""
-    name, descriptors, (arrays, attrs) = described
-    if normalization is not None:
-        descriptors = to_colmap_sift(descriptors, normalization)
-    if project is not None:
-        import torch
-
-        with torch.no_grad():
-            descriptors = project(torch.from_numpy(descriptors)).numpy()
-    stored, own = store({"descriptors": descriptors.T}, storage, levels)
-    return name, arrays | stored, attrs | own
 
 
 def _main() -> None:

@@ -1,8 +1,9 @@
 """Localize photos in a map of your own.
 
-Builds the map once, from photos and a COLMAP model of them or from photos alone; later runs
-localize other photos in it. Without --query_images only the map is built. A new map has the feature
-colmap_sift_sv64 and its matcher unless you choose others. A map grows with --add_images.
+Builds the map once, from photos and a COLMAP model of them, from photos alone, or from a COLMAP
+model and its database; later runs localize other photos in it. Without --query_images only the map
+is built. A new map has the feature colmap_sift_sv64 and its matcher unless you choose others.
+--add_images adds photos to a map.
 """
 
 import hashlib
@@ -10,7 +11,7 @@ import re
 from collections import Counter
 from pathlib import Path
 
-from hloc_reduce import extract_features, localize_sfm, maps
+from hloc_reduce import compact, extract_features, localize_sfm, maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS
@@ -51,6 +52,7 @@ def open_map(
     keypoints: str | None = None,
     accept_partial: bool = False,
     camera_mode: str | None = None,
+    database: Path | None = None,
 ) -> Map:
     """Build a map, or open one that was built before.
 
@@ -71,6 +73,8 @@ def open_map(
         accept_partial: build the map without photos that are missing, unreadable or not
             reconstructed.
         camera_mode: which photos share a camera, as in COLMAP; default: auto.
+        database: COLMAP database that the model was made from: its keypoints and descriptors make
+            the map. Photos, if given, only tell more about the cameras.
 
     Raises:
         InputError: when an old map was built with other options, or something is missing or wrong.
@@ -78,6 +82,17 @@ def open_map(
     if camera_mode is not None and (map_images is None or model_or_map is not None):
         raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
     mode = colmap.camera_mode(camera_mode or "auto")
+    if database is not None:
+        return _of_database(
+            *(outputs, database, model_or_map, map_images, overwrite),
+            {
+                "feature": feature or features_confs.RECOMMENDED,
+                "projection": projection,
+                "matcher": matcher,
+                "storage": storage or STORAGES[0],
+                "keypoints": keypoints or KEYPOINTS[0],
+            },
+        )
     if map_images is not None:
         if model_or_map and (maps.is_map(model_or_map) or maps.is_compact(model_or_map)):
             raise InputError(
@@ -113,10 +128,33 @@ def open_map(
     return built
 
 
+def _of_database(
+    outputs: Path,
+    database: Path,
+    model: Path | None,
+    map_images: Path | None,
+    overwrite: bool,
+    options: dict,
+) -> Map:
+    """Build a map from a COLMAP database and its model."""
+    if model is None:
+        raise InputError(f"Give --map, the COLMAP model that was made from --database {database}.")
+    if maps.is_map(model) or maps.is_compact(model):
+        raise InputError(
+            f"--map {model} is a map that was built: leave out --database to localize in it, or "
+            "give the COLMAP model that was made from the database."
+        )
+    return maps.from_database.main(
+        outputs / "map", database, model, overwrite=overwrite, image_dir=map_images, **options
+    )
+
+
 def _open(model_or_map: Path, folder: Path, overwrite: bool) -> Map:
     """Open a map that was built before; unpack a compact one into a folder."""
     if any(model_or_map.glob("cameras.*")):
-        raise InputError(f"{model_or_map} is a COLMAP model: give its photos, --map_images, too.")
+        raise InputError(
+            f"{model_or_map} is a COLMAP model: give its photos, --map_images, or its --database."
+        )
     if maps.is_compact(model_or_map):
         return maps.unpack(model_or_map, folder, overwrite)
     return Map(model_or_map)
@@ -249,6 +287,15 @@ def _main() -> None:
     parser.add_argument(
         "--map_images", type=Path, help="photos of the map; without --map they are reconstructed"
     )
+    parser.add_argument(
+        "--database",
+        type=Path,
+        help="COLMAP database that --map was made from: its keypoints and descriptors make the "
+        "map, without photos",
+    )
+    parser.add_argument(
+        "--compact", type=Path, metavar="FILE.hlm", help="write the map into one small file, too"
+    )
     parser.add_argument("--query_images", type=Path, help="folder of the photos to localize")
     parser.add_argument(
         "--queries",
@@ -282,6 +329,11 @@ def _main() -> None:
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
+    small = given["compact"]
+    if small is not None:
+        compact.check_output(small)
+        if given["map"] is not None and maps.is_compact(given["map"]):
+            raise InputError(f"--map {given['map']} is a compact map: leave out --compact.")
     profiled = given.pop("profile") and given["outputs"] is not None
     trace_file = given["outputs"] / "trace.json" if profiled else None
     with trace.recording(trace_file):
@@ -289,6 +341,8 @@ def _main() -> None:
             _change(given["map"], given["map_images"], **changes)
         if given["outputs"] is not None:
             _run(given)
+        elif small is not None:
+            compact.main(small, given["map"])
 
 
 def _add_changes(parser: cli.Parser) -> None:
@@ -347,7 +401,10 @@ def _run(given: dict) -> None:
     """Build or open the map, and localize the queries in it."""
     outputs, query_images, queries = (given.pop(k) for k in ("outputs", "query_images", "queries"))
     of_queries = {name: given.pop(name) for name in ("num_loc", "ground_truth", "strict", "gate")}
+    small = given.pop("compact")
     built = open_map(outputs, model_or_map=given.pop("map"), **given)
+    if small is not None:
+        compact.main(small, built.folder)
     if query_images is None:
         print(f"The map {built.folder} is ready. Localize photos in it with --query_images.")
         return

@@ -70,6 +70,7 @@ COMMANDS = [
             "storage",
             "reduce",
             "to_colmap",
+            "from_colmap",
         )
     ),
 ]

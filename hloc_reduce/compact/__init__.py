@@ -68,8 +68,7 @@ def main(
         InputError: when something is missing or wrong, or the limit is below what the file needs
             without points.
     """
-    if output.suffix != compact.SUFFIX:
-        raise InputError(f"--output {output}: it must end in {compact.SUFFIX}.")
+    check_output(output)
     if max_mb is not None and not max_mb > 0:
         raise InputError(f"--max_mb {max_mb}: it must be above 0.")
     stages = sfm, features, global_descriptors, feature
@@ -124,6 +123,13 @@ def write(
         ", ".join(f"{part} {size:,}" for part, size in parts.items()),
     )
     return parts
+
+
+def check_output(output: Path) -> None:
+    """Raise an InputError unless a compact map can have the name `output`."""
+    if output.suffix != compact.SUFFIX:
+        raise InputError(f"{output}, a compact map, must end in {compact.SUFFIX}.")
+    cli.check_file(output)
 
 
 def matcher_of(matcher: str) -> str:

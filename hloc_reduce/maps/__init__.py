@@ -1,9 +1,10 @@
 """Maps to localize in: built from photos, changed, opened, and kept in memory."""
 
+from . import from_database
 from .build import main
 from .compact import is_compact
 from .grow import add, remove
 from .map import Map, is_map
 from .unpack import main as unpack
 
-__all__ = ["Map", "add", "is_compact", "is_map", "main", "remove", "unpack"]
+__all__ = ["Map", "add", "from_database", "is_compact", "is_map", "main", "remove", "unpack"]

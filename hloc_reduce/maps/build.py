@@ -161,7 +161,7 @@ def _digests(
     """Return the fingerprints of a map's images and model, and the digests of both by name."""
     groups = {
         "images": {name: image_dir / name for name in names},
-        "model": {path.name: path for path in _files_of(model)},
+        "model": {path.name: path for path in model_files(model)},
     }
     files = {f"{key}/{name}": file for key, part in groups.items() for name, file in part.items()}
     fingerprints = provenance.fingerprints(files, provenance.read(map_dir / FINGERPRINTS))
@@ -171,7 +171,7 @@ def _digests(
     }
 
 
-def _files_of(model: Path | None) -> list[Path]:
+def model_files(model: Path | None) -> list[Path]:
     """Return the files of a COLMAP model, if any."""
     paths = sorted(model.iterdir()) if model else []
     return [path for path in paths if path.stem in triangulation.PARTS and path.is_file()]
@@ -204,7 +204,7 @@ class _Building:
     ) -> Map:
         """Build the map with the name and the configuration of a feature, and a model, if any."""
         logger.info("Building the map %s of %d images.", self.folder.path, len(self.names))
-        conf = _keep_projection(conf, self.folder.path)
+        conf = keep_projection(conf, self.folder.path)
         if model is not None and reference is not None:
             folder, sfm = SFM, self._of_model(conf, model, reference)
         else:
@@ -361,7 +361,7 @@ def _drop_others(folder: RunFolder, built: Map) -> None:
     folder.delete({SFM, f"{SFM}{MORE}", f"{SFM}{FURTHER}"} - {built.sfm.name})
 
 
-def _keep_projection(conf: dict, folder: Path) -> dict:
+def keep_projection(conf: dict, folder: Path) -> dict:
     """Copy the projection of a feature to a folder and return the configuration with the copy."""
 
     def copy(projection: str) -> str:

@@ -194,7 +194,7 @@ class _Addition:
         self.inside = sorted(image.name for image in self.sfm.images.values())
 
     def begin(self, names: list[str], posed: bool) -> list[str]:
-        """Return the photos that are new; copy the features of the map, unless that was done."""
+        """Return the photos that are new; begin anew unless their addition was interrupted."""
         files = {f"{IMAGES}{name}": self.image_dir / name for name in names}
         known = provenance.read(self.built.folder / FINGERPRINTS)
         self.fingerprints = provenance.fingerprints(files, {})
@@ -206,9 +206,6 @@ class _Addition:
         if provenance.read(self.folder / CONF) != conf:
             announce(self.folder)
             delete(self.folder)
-            # photos that could not be reconstructed have features, of what they showed then
-            stale = {name for name in new if before.get(name) != digests[name]}
-            merge(self.features, [self.built.features], stale)
             provenance.write(self.folder / CONF, conf)
         return new
 
@@ -236,23 +233,21 @@ class _Addition:
 
     def describe(self, names: list[str]) -> list[str]:
         """Extract local and global descriptors of photos, and return those that could be read."""
-        extract_features.main(
-            *(self.built.conf, self.image_dir),
-            feature_path=self.features,
+        features = extract_features.main(
+            *(self.built.conf, self.image_dir, self.folder / "new"),
             image_list=names,
             strict=False,
         )
-        broken = failures(self.features)
+        broken = failures(features)
         self._leave_out("cannot be read", [name for name in names if name in broken])
         readable = [name for name in names if name not in broken]
         if readable:
-            described = aggregate_features.main(
-                *(RETRIEVAL, self.features),
-                export_dir=self.folder / "new",
-                vocabulary=self.built.vocabulary,
-                image_list=readable,
+            descriptors = aggregate_features.main(
+                RETRIEVAL, features, vocabulary=self.built.vocabulary, image_list=readable
             )
-            merge(self.descriptors, [self.built.descriptors, described], readable)
+            # photos that the map could not reconstruct have old features in its files
+            merge(self.features, [self.built.features, features], names)
+            merge(self.descriptors, [self.built.descriptors, descriptors], names)
         return readable
 
     def place(self, reference: pycolmap.Reconstruction, names: list[str]) -> None:

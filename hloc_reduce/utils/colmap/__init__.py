@@ -29,10 +29,13 @@ from .models import (
     write_part,
 )
 from .sift import check_dog_options, detect_dog
+from .stored import SIFT, StoredDatabase, open_stored, shapes
 
 pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
 
 __all__ = [
+    "SIFT",
+    "StoredDatabase",
     "add_camera_mode",
     "add_image",
     "cam_from_img",
@@ -46,10 +49,12 @@ __all__ = [
     "incremental_mapping",
     "infer_camera",
     "mapper_options",
+    "open_stored",
     "point3D_ids",
     "read_cameras",
     "read_model",
     "read_verified",
+    "shapes",
     "triangulate_points",
     "verify_matches",
     "write_matches",

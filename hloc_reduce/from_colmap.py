@@ -1,0 +1,252 @@
+"""Write the keypoints and descriptors of a COLMAP database into a feature file, without the photos.
+
+COLMAP's SIFT descriptors become those of a feature of colmap_sift. Keypoints keep their order, so
+that COLMAP's matches and models stay valid with the file.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from . import logger
+from .confs import features as features_confs
+from .descriptors import COLMAP
+from .descriptors.normalization import NORMALIZATIONS
+from .detectors.dog import NOISE
+from .reduce import SAMPLED, Described, Reduction, told_by
+from .runtime import parallel
+from .runtime.group_writer import GroupWriter
+from .utils import cli, colmap
+from .utils.cli import InputError
+from .utils.codes import STORAGES
+from .utils.colmap import SIFT, StoredDatabase
+from .utils.files import file_sha256
+from .utils.paths import strings_as_paths
+from .utils.progress import progress
+
+LARGEST = 3200  # pixels: COLMAP detects in smaller versions of larger photos, by default
+COMPARED = 50  # keypoints of each image whose positions are compared with those of a model
+NEAR = 0.05  # pixels: positions that differ by less are equal
+
+
+@strings_as_paths
+def main(
+    database: Path,
+    output: Path,
+    feature: str = features_confs.RECOMMENDED,
+    model: Path | pycolmap.Reconstruction | None = None,
+    projection: Path | None = None,
+    storage: str = STORAGES[0],
+    normalization: str | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write a feature file of the images of a COLMAP database.
+
+    Args:
+        database: of any version of COLMAP; it is only read.
+        output: the feature file. Images that it has already are skipped.
+        feature: key of `confs.features` of the base colmap_sift, or a YAML file.
+        model: COLMAP model made from the database: only its images are written, and their keypoints
+            are compared; None for all images that have descriptors.
+        projection: file of another projection of the same base.
+        storage: of the descriptors, one of `STORAGES`.
+        normalization: of COLMAP's SIFT descriptors, one of `NORMALIZATIONS`; default: told by
+            their numbers.
+        overwrite: write all images again.
+
+    Returns:
+        `output`.
+
+    Raises:
+        InputError: when the database is missing, broken or locked, has no descriptors or those of
+            another base, or is not the one that the model was made from.
+    """
+    if isinstance(model, Path):
+        model = colmap.read_model(model)
+    reduction = Reduction(feature, projection, storage)
+    with colmap.open_stored(database) as opened:
+        names = check(opened, reduction, model)
+        made_from = {path.name: file_sha256(path) for path in opened.files()}
+        write(opened, output, reduction, names, made_from, normalization, overwrite)
+    logger.info("%d images with %s, %s: %s", len(names), reduction.name, storage, output)
+    return output
+
+
+def check(
+    database: StoredDatabase, reduction: Reduction, model: pycolmap.Reconstruction | None
+) -> list[str]:
+    """Check that a database has descriptors for a feature, and is that of a model.
+
+    Args:
+        database: it.
+        reduction: to the feature.
+        model: the model, if there is one.
+
+    Returns:
+        The images to write: those of the model that have poses, or all that have descriptors.
+
+    Raises:
+        InputError: see `main`.
+    """
+    keypoints, described = database.num_keypoints(), database.num_descriptors()
+    if not described:
+        raise InputError(
+            f"{database.path} has no descriptors: give the database that COLMAP extracted the "
+            "features into."
+        )
+    _check_type(database, reduction)
+    if model is None:
+        names = sorted(described)
+    else:
+        names = sorted(model.images[i].name for i in model.reg_image_ids())
+        _check_model(database, model, keypoints)
+    lacking = [name for name in names if described.get(name, 0) != keypoints.get(name, 0)]
+    if lacking:
+        raise InputError(
+            f"{database.path} lacks the descriptors of {len(lacking)} of {len(names)} images, or "
+            f"has others than keypoints: {cli.some(lacking, 3)}. Extract the features again."
+        )
+    return names
+
+
+def write(
+    database: StoredDatabase,
+    output: Path,
+    reduction: Reduction,
+    names: list[str],
+    made_from: dict,
+    normalization: str | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write images of a database, as `check` returns them, into a feature file.
+
+    Args:
+        database: it.
+        output: see `main`, like `normalization` and `overwrite`.
+        reduction: to the feature.
+        names: the images.
+        made_from: what determines the content of the database.
+        normalization: see `output`.
+        overwrite: see `output`.
+    """
+    normalization = normalization or _normalization(database, names)
+    cli.choose("normalization", normalization, NORMALIZATIONS)
+    made_by = {"database": made_from, "normalization": normalization, **reduction.provenance}
+    with GroupWriter(output, made_by, overwrite) as writer:
+        todo = [name for name in names if name not in writer]
+        reduce = partial(reduction.reduce, normalization)
+        groups = parallel.ordered("reduce", reduce, _read(database, todo, reduction))
+        for group in progress(groups, "Reducing features", "image", len(todo)):
+            writer.add(*group)
+
+
+def _check_type(database: StoredDatabase, reduction: Reduction) -> None:
+    """Raise an InputError if the descriptors of a database are not those of a feature's base."""
+    found = database.descriptor_type()
+    if found != SIFT:
+        raise InputError(
+            f"{database.path} has descriptors of {found}, not of SIFT: nothing tells whether they "
+            "agree with those of this project's networks. Build the map from the photos instead."
+        )
+    if not reduction.of_colmap:
+        raise InputError(
+            f"{database.path} has descriptors of COLMAP's SIFT, not those of {reduction.name}: "
+            f"choose a feature of {COLMAP}, such as {features_confs.RECOMMENDED}."
+        )
+
+
+def _check_model(
+    database: StoredDatabase, model: pycolmap.Reconstruction, keypoints: dict[str, int]
+) -> None:
+    """Raise an InputError if a model was made from another database."""
+
+    def of_another(names: list[str], reason: str) -> InputError:
+        return InputError(
+            f"{database.path} is of another model: {reason} of {len(images)} images differ, such "
+            f"as those of {cli.some(names, 3)}. Give the database that the model was made from."
+        )
+
+    images = [model.images[i] for i in model.reg_image_ids()]
+    if missing := sorted(image.name for image in images if image.name not in database.images):
+        raise InputError(
+            f"{database.path} is of another model: it has no {len(missing)} of {len(images)} "
+            f"images: {cli.some(missing, 3)}."
+        )
+    others = [i.name for i in images if keypoints.get(i.name, 0) != i.num_points2D()]
+    if others:
+        raise of_another(sorted(others), f"the numbers of keypoints of {len(others)}")
+    moved = [i.name for i in images if not _agree(i, database.keypoints(i.name))]
+    if moved:
+        raise of_another(sorted(moved), f"the positions of keypoints of {len(moved)}")
+
+
+def _agree(image: pycolmap.Image, keypoints: np.ndarray) -> bool:
+    """Return whether keypoints of a database are where an image of a model has them."""
+    rows = np.unique(np.linspace(0, len(keypoints) - 1, COMPARED).astype(int))
+    if not len(keypoints):
+        return True
+    points2D = image.points2D
+    expected = np.array([points2D[i].xy for i in rows.tolist()])
+    return bool(np.abs(expected - keypoints[rows, :2]).max() < NEAR)
+
+
+def _normalization(database: StoredDatabase, names: list[str]) -> str:
+    """Tell how the descriptors of a database are normalized, by those of some images."""
+    sampled = names[:: -(-len(names) // SAMPLED)]
+    found = np.concatenate([_unit(database.descriptors(name)) for name in sampled])
+    return told_by(found, str(database.path))
+
+
+def _unit(descriptors: np.ndarray) -> np.ndarray:
+    """Return descriptors (N, D) float32 of unit norm."""
+    found = descriptors.astype(np.float32)
+    return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
+
+
+def _read(database: StoredDatabase, names: list[str], reduction: Reduction) -> Iterator[Described]:
+    """Read the features of images."""
+    for name in names:
+        keypoints, descriptors = database.keypoints(name), database.descriptors(name)
+        reduction.check(descriptors.shape[1], f"{database.path}: the descriptors of {name}")
+        size = np.array(database.image_size(name))
+        # hloc's pixels
+        arrays = {"keypoints": keypoints[:, :2] - np.float32(0.5), "image_size": size}
+        if (shapes := colmap.shapes(keypoints)) is not None:
+            scales, oris = (part.astype(np.float16) for part in shapes)
+            arrays |= {"scales": scales, "oris": oris, "scores": scales}  # as the extractor `dog`
+        noise = NOISE * max(1.0, size.max() / LARGEST)
+        yield name, descriptors.astype(np.float32), (arrays, {"keypoints": {"uncertainty": noise}})
+
+
+def _main() -> None:
+    parser = cli.Parser(
+        __doc__, "--database database.db --model sparse/0 --output outputs/feats-colmap.h5"
+    )
+    parser.add_argument("--database", type=Path, required=True, help="COLMAP database")
+    parser.add_argument("--output", type=Path, required=True, help="the new feature file")
+    parser.add_argument(
+        "--feature",
+        default=features_confs.RECOMMENDED,
+        help=f"feature of {COLMAP}, see pipelines.aachen --list_features",
+    )
+    parser.add_argument("--projection", type=Path, help="file of another projection of its base")
+    parser.add_argument(
+        "--model",
+        type=Path,
+        help="COLMAP model made from the database: only its images are written (default: all)",
+    )
+    features_confs.add_storage_option(parser)
+    parser.add_argument(
+        "--normalization",
+        help=f"of the descriptors, one of {', '.join(NORMALIZATIONS)} (default: told by their "
+        "numbers)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="write all images again")
+    main(**vars(parser.parse_args()))
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,201 @@
+"""Build a map from a COLMAP model and the database it was made from: no photo is read."""
+
+import uuid
+from pathlib import Path
+
+import pycolmap
+
+from .. import aggregate_features, extract_features, from_colmap, logger, triangulation
+from ..confs import features as features_confs
+from ..confs import matchers as matchers_confs
+from ..detectors.dog import KEYPOINTS
+from ..localization import intrinsics
+from ..mapping import copies
+from ..reduce import Reduction
+from ..runtime import provenance
+from ..runtime.outputs import CONF, RunFolder
+from ..utils import colmap
+from ..utils.cli import InputError, no_folder
+from ..utils.codes import STORAGES
+from ..utils.colmap import StoredDatabase
+from ..utils.files import replacing
+from ..utils.paths import strings_as_paths
+from . import contradictions
+from .build import keep_projection, model_files
+from .map import FINGERPRINTS, FINISHED, PLACE, RETRIEVAL, SFM, Map, with_projection
+
+
+@strings_as_paths
+def main(
+    map_dir: Path,
+    database: Path,
+    model: Path,
+    feature: str = features_confs.RECOMMENDED,
+    projection: Path | None = None,
+    matcher: str | None = None,
+    overwrite: bool = False,
+    storage: str = STORAGES[0],
+    keypoints: str = KEYPOINTS[0],
+    image_dir: Path | None = None,
+) -> Map:
+    """Build a map, or open the one that was made from the same.
+
+    Args:
+        map_dir: the folder of the map.
+        database: COLMAP database with keypoints and descriptors.
+        model: the COLMAP model that was made from it, with points.
+        feature: as in `from_colmap.main`, like `projection` and `storage`.
+        projection: see `feature`.
+        matcher: default: the feature's.
+        overwrite: rebuild the map.
+        storage: see `feature`.
+        keypoints: settings of DoG for queries, as in `confs.features.get`.
+        image_dir: folder of the images, whose EXIF data tell more about the cameras, and which the
+            report shows; None if there are none.
+
+    Returns:
+        The map.
+
+    Raises:
+        InputError: if the folder has a map that was made from something else, or something is
+            missing or wrong.
+    """
+    reduction = Reduction(feature, projection, storage)
+    name, conf = features_confs.get(feature, projection, storage, keypoints)
+    matcher = matcher or features_confs.matcher_of(conf)
+    if image_dir is not None and not image_dir.is_dir():
+        raise no_folder(image_dir)
+    reference = colmap.read_model(model)
+    if not reference.num_points3D():
+        raise InputError(f"The model {model} has no points: give one that COLMAP reconstructed.")
+    with colmap.open_stored(database) as opened:
+        names = from_colmap.check(opened, reduction, reference)
+        cameras = _cameras(reference, names, image_dir)
+        fingerprints, digests = _digests(map_dir, opened, model)
+        made_from = {
+            "feature": extract_features.provenance(conf),
+            "matcher": matchers_confs.confs[matcher]["model"],
+            **digests,
+            "cameras": {"known": _to_lists(cameras), "models": sorted(cameras.models)},
+        }
+        before = provenance.read(map_dir / CONF)
+        if before and before != made_from and not (map_dir / FINISHED).exists():
+            logger.info("Rebuilding the unfinished map %s.", map_dir)
+            overwrite = True
+        inputs = [path for path in (database, model, projection, image_dir) if path is not None]
+        kept = PLACE, FINGERPRINTS
+        with RunFolder(map_dir, made_from, overwrite, inputs, kept=kept) as folder:
+            if (map_dir / FINISHED).exists():
+                built = Map(map_dir)
+                contradictions.warn(built.contradicting)
+                return built
+            if not (map_dir / PLACE).exists():
+                with replacing(map_dir / PLACE) as temporary:
+                    temporary.write_text(uuid.uuid4().hex)
+            provenance.write(map_dir / FINGERPRINTS, fingerprints)
+            logger.info("Building the map %s of %d images of %s.", map_dir, len(names), database)
+            conf = keep_projection(conf, map_dir)
+            contradicting = _build(
+                *(folder, opened, reduction, conf, names, reference, model, digests)
+            )
+            about = {
+                "feature": name,
+                "matcher": matcher,
+                "image_dir": str((image_dir or map_dir / "images").resolve()),
+                "model": str(model.resolve()),
+                "database": str(database.resolve()),
+                "conf": with_projection(conf, lambda path: Path(path).name),
+                "keypoints": keypoints,
+                "images_contradicting_others": contradicting,
+            }
+            _finish(folder, about, reference, names, cameras)
+            return Map(map_dir)
+
+
+def _cameras(
+    reference: pycolmap.Reconstruction, names: list[str], image_dir: Path | None
+) -> intrinsics.MapCameras:
+    """Return what a map, and the EXIF data of its photos, if any, tell about intrinsics."""
+    if image_dir is None:
+        return intrinsics.of_cameras(reference.cameras.values())
+    if not any((image_dir / name).is_file() for name in names):
+        raise InputError(
+            f"{image_dir} has none of the {len(names)} images of the model, such as {names[0]}: "
+            "choose another --map_images, or leave it out."
+        )
+    return intrinsics.of_map(reference, image_dir)
+
+
+def _to_lists(cameras: intrinsics.MapCameras) -> dict[str, list]:
+    return {name: intrinsics.to_list(camera) for name, camera in cameras.known.items()}
+
+
+def _digests(
+    map_dir: Path, database: StoredDatabase, model: Path
+) -> tuple[dict, dict[str, dict[str, str]]]:
+    """Return the fingerprints of a database and a model, and the digests of both by name."""
+    groups = {"database": database.files(), "model": model_files(model)}
+    files = {f"{key}/{path.name}": path for key, part in groups.items() for path in part}
+    fingerprints = provenance.fingerprints(files, provenance.read(map_dir / FINGERPRINTS))
+    return fingerprints, {
+        key: {path.name: fingerprints[f"{key}/{path.name}"][2] for path in part}
+        for key, part in groups.items()
+    }
+
+
+def _build(
+    folder: RunFolder,
+    database: StoredDatabase,
+    reduction: Reduction,
+    conf: dict,
+    names: list[str],
+    reference: pycolmap.Reconstruction,
+    model: Path,
+    digests: dict[str, dict[str, str]],
+) -> list[str]:
+    """Write the features, global descriptors and model of a map.
+
+    Returns:
+        The images whose poses contradict the others.
+    """
+    with folder.stage("extract_features"):
+        features = folder.path / f"{conf['output']}.h5"
+        from_colmap.write(database, features, reduction, names, digests["database"])
+    with folder.stage("retrieval"):
+        aggregate_features.main(RETRIEVAL, features, names)
+    with (
+        folder.stage("triangulation"),
+        triangulation.replacing_map(folder.path / SFM, digests["model"], model) as written,
+    ):
+        reference.write_binary(written)
+    with folder.stage("judge_poses"):
+        contradicting = copies.find(reference)
+    contradictions.warn(contradicting)
+    return contradicting
+
+
+def _finish(
+    folder: RunFolder,
+    about: dict,
+    reference: pycolmap.Reconstruction,
+    names: list[str],
+    cameras: intrinsics.MapCameras,
+) -> None:
+    """Write map.json."""
+    summary = {
+        "id": uuid.uuid4().hex,
+        **about,
+        "camera_mode": None,
+        "sfm": SFM,
+        "images": len(names),
+        "images_with_pose": len(names),
+        "images_of_uncertain_position": {},
+        "points3D": reference.num_points3D(),
+        "cameras": _to_lists(cameras),
+        "sizes": sorted(cameras.sizes),
+        "camera_models": sorted(cameras.models),
+        "focal_lengths": cameras.focal_lengths,
+        "seconds": folder.seconds(),
+        "bytes": folder.bytes(),
+    }
+    provenance.write(folder.path / FINISHED, summary)

@@ -1,0 +1,202 @@
+"""COLMAP databases of a user, read by SQLite: pycolmap would upgrade old ones in place.
+
+Of all versions of COLMAP from 3.0 on: only tables and columns are read that all of them have, and
+the type of descriptors where there is one.
+"""
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from ..cli import InputError
+
+MAGIC = b"SQLite format 3\0"
+WAL = 2  # the value of the bytes 18 and 19 of a file that has a write-ahead log beside it
+PATIENCE = 2.0  # seconds in which another program may release a lock
+SIFT = "SIFT"
+# COLMAP's types of features; databases of versions before 4 have SIFT only
+TYPES = {-1: SIFT, 0: SIFT, 1: "ALIKED_N16ROT", 2: "ALIKED_N32", 3: "LOMA_B", 4: "LOMA_B128"}
+PAIR = 2**31 - 1  # the id of a pair of images is this times the smaller id plus the larger one
+
+
+def log_of(path: Path) -> Path:
+    """Return the write-ahead log of a database, which exists while a program writes to it."""
+    return path.with_name(f"{path.name}-wal")
+
+
+class StoredDatabase:
+    """A COLMAP database that is open for reading.
+
+    Args:
+        path: the file.
+        connection: to it.
+
+    Attributes:
+        images: id of each image by name.
+
+    Raises:
+        InputError: here and in all methods, if the file is broken or not a database of COLMAP.
+    """
+
+    def __init__(self, path: Path, connection: sqlite3.Connection):
+        self.path, self._connection = path, connection
+        self._has_types = any(
+            row[1] == "type" for row in self._rows("PRAGMA table_info(descriptors)")
+        )
+        rows = self._rows(
+            "SELECT name, image_id, width, height FROM images JOIN cameras USING (camera_id)"
+        )
+        self.images: dict[str, int] = {}
+        self._sizes: dict[str, tuple[int, int]] = {}
+        for name, image_id, width, height in rows:
+            self.images[str(name)] = int(image_id)
+            self._sizes[str(name)] = int(width), int(height)
+
+    def files(self) -> list[Path]:
+        """Return the files of the content: the database, and its log unless that is empty."""
+        log = log_of(self.path)
+        return [self.path, *([log] if log.exists() and log.stat().st_size else [])]
+
+    def image_size(self, name: str) -> tuple[int, int]:
+        """Return the width and height of an image."""
+        return self._sizes[name]
+
+    def num_keypoints(self) -> dict[str, int]:
+        """Return the number of keypoints of each image that has any."""
+        return self._numbers("keypoints")
+
+    def num_descriptors(self) -> dict[str, int]:
+        """Return the number of descriptors of each image that has any."""
+        return self._numbers("descriptors")
+
+    def descriptor_type(self) -> str:
+        """Return the type of all descriptors, a value of `TYPES`.
+
+        Raises:
+            InputError: if there are several types, or an unknown one.
+        """
+        if not self._has_types:
+            return SIFT
+        rows = self._rows("SELECT DISTINCT type FROM descriptors WHERE rows > 0")
+        found = {TYPES.get(number, f"type {number}") for (number,) in rows} or {SIFT}
+        if len(found) > 1:
+            raise InputError(
+                f"{self.path} has descriptors of several types: {', '.join(sorted(found))}."
+            )
+        return found.pop()
+
+    def keypoints(self, name: str) -> np.ndarray:
+        """Return the keypoints of an image (N, 2, 4 or 6) float32, see `shapes`."""
+        found = self._array("keypoints", name, np.float32)
+        if found.shape[1] not in (2, 4, 6):
+            raise InputError(f"{self.path}: the keypoints of {name} have {found.shape[1]} columns.")
+        return found
+
+    def descriptors(self, name: str) -> np.ndarray:
+        """Return the descriptors of an image (N, D), bytes: those of floats have four a number."""
+        return self._array("descriptors", name, np.uint8)
+
+    def pairs(self) -> dict[tuple[str, str], int]:
+        """Return the number of verified matches of each pair of images that has any."""
+        names = {image_id: name for name, image_id in self.images.items()}
+        rows = self._rows("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0")
+        ids = ((divmod(pair, PAIR), number) for pair, number in rows)
+        return {(names[a], names[b]): n for (a, b), n in ids if a in names and b in names}
+
+    def verified(self, name0: str, name1: str) -> np.ndarray:
+        """Return the verified matches of a pair of images (M, 2) int64."""
+        ids = self.images[name0], self.images[name1]
+        pair = PAIR * min(ids) + max(ids)
+        rows = self._rows(
+            "SELECT rows, cols, data FROM two_view_geometries WHERE pair_id = ?", pair
+        )
+        found = self._shaped(rows, f"the matches of {name0} and {name1}", np.uint32)
+        found = found.astype(np.int64)
+        return found if ids[0] <= ids[1] else found[:, ::-1]
+
+    def _numbers(self, table: str) -> dict[str, int]:
+        rows = dict(self._rows(f"SELECT image_id, rows FROM {table} WHERE rows > 0"))
+        return {name: rows[i] for name, i in self.images.items() if i in rows}
+
+    def _array(self, table: str, name: str, dtype: type) -> np.ndarray:
+        """Return the array of an image in a table."""
+        asked = f"SELECT rows, cols, data FROM {table} WHERE image_id = ?"
+        rows = self._rows(asked, self.images[name])
+        return self._shaped(rows, f"the {table} of {name}", dtype)
+
+    def _shaped(self, rows: list[tuple], what: str, dtype: type) -> np.ndarray:
+        """Return the only array among rows (number, width, data); an empty one if there is none."""
+        if not rows or not rows[0][0]:
+            return np.zeros((0, 2), dtype)
+        number, width, data = rows[0]
+        if number * width * np.dtype(dtype).itemsize != len(data or b""):
+            raise InputError(f"Cannot read the database {self.path} ({what} are truncated).")
+        return np.frombuffer(data, dtype).reshape(number, width)
+
+    def _rows(self, asked: str, *values: int) -> list[tuple]:
+        with _reading(self.path):
+            return self._connection.execute(asked, values).fetchall()
+
+
+@contextmanager
+def open_stored(path: Path) -> Iterator[StoredDatabase]:
+    """Open a COLMAP database of a user; nothing is written, not even beside it.
+
+    Raises:
+        InputError: when it is missing, not a database of COLMAP, or locked by another program.
+    """
+    if not path.is_file():
+        raise InputError(
+            f"{path} is a folder: name a COLMAP database in it."
+            if path.is_dir()
+            else f"There is no COLMAP database {path}."
+        )
+    with path.open("rb") as file:
+        header = file.read(20)
+    if header[:16] != MAGIC or len(header) < 20:
+        raise InputError(f"{path} is not a COLMAP database: it is not a file of SQLite.")
+    # without a log nobody is writing, and an immutable file needs no locks, for which SQLite would
+    # create files beside one that may have a log
+    alone = WAL in header[18:20] and not log_of(path).exists()
+    uri = f"{path.resolve().as_uri()}?{'immutable=1' if alone else 'mode=ro'}"
+    with _reading(path), closing(sqlite3.connect(uri, uri=True, timeout=PATIENCE)) as connection:
+        yield StoredDatabase(path, connection)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn errors of SQLite in a block into one that names the file."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # without its details
+        if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+            raise InputError(
+                f"{path} is locked by another program, such as COLMAP: wait until that has ended."
+            ) from None
+        if "no such" in str(error):
+            raise InputError(f"{path} is not a COLMAP database ({error}).") from None
+        raise InputError(f"Cannot read the database {path} ({error}).") from None
+
+
+def shapes(keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the scales in pixels and orientations in degrees of COLMAP's keypoints.
+
+    Args:
+        keypoints: (N, 6), x, y and the affine shape by rows; or (N, 4), x, y, scale and orientation
+            in radians; or (N, 2), which have neither.
+
+    Returns:
+        Both (N,) float32, or None.
+    """
+    columns = keypoints.T
+    if len(columns) == 2:
+        return None
+    if len(columns) == 4:
+        return columns[2], np.rad2deg(columns[3])
+    a11, a12, a21, a22 = columns[2:]
+    scales = (np.hypot(a11, a21) + np.hypot(a12, a22)) / 2
+    return scales, np.rad2deg(np.arctan2(a21, a11))
