@@ -59,8 +59,8 @@ def extend(
     observations = pycolmap.ObservationManager(model, graph)
     triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
     tracks, limits = OPTIONS.get_triangulation(), OPTIONS.get_mapper()
-    tracks.ignore_two_view_tracks = False  # they may extend points: the graph has new matches only
-    before = set(model.points3D)
+    # the graph has no matches of two images of the model, so that tracks of more look like these
+    tracks.ignore_two_view_tracks = False
     for image_id in ids.values():
         triangulator.triangulate_image(tracks, image_id)
     free = {ids[name] for name, image in placed.items() if not image.fixed}
@@ -72,10 +72,6 @@ def extend(
         observations.filter_points3D_in_images(
             limits.filter_max_reproj_error, limits.filter_min_tri_angle, set(ids.values())
         )
-    for point_id in set(model.points3D) - before:
-        track = model.points3D[point_id].track.elements
-        if all(graph.is_two_view_observation(one.image_id, one.point2D_idx) for one in track):
-            observations.delete_point3D(point_id)  # as COLMAP, which does not triangulate them
     model.update_point_3d_errors()
 
 
