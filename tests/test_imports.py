@@ -58,7 +58,10 @@ COMMANDS = [
     "pipelines.localize --outputs o --map no/such/map --query_images no/such/folder",
     "pipelines.batch no/such/jobs.yaml",
     "hloc_reduce.export --feature xfaet --output file.onnx",
-    *(f"pipelines.{name} --help" for name in ("aachen", "inloc", "localize", "batch", "compare")),
+    *(
+        f"pipelines.{name} --help"
+        for name in ("aachen", "inloc", "localize", "shrink", "batch", "compare")
+    ),
     *(
         f"hloc_reduce.{name} --help"
         for name in (

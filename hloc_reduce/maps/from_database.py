@@ -191,10 +191,7 @@ def _finish(
         "images_with_pose": len(names),
         "images_of_uncertain_position": {},
         "points3D": reference.num_points3D(),
-        "cameras": _to_lists(cameras),
-        "sizes": sorted(cameras.sizes),
-        "camera_models": sorted(cameras.models),
-        "focal_lengths": cameras.focal_lengths,
+        **intrinsics.to_dict(cameras),
         "seconds": folder.seconds(),
         "bytes": folder.bytes(),
     }

@@ -1,0 +1,234 @@
+"""Make a finished outputs folder of hloc small, and compare before and after.
+
+Reduces the feature file and packs the map into one small file. With --queries, localizes them with
+hloc's features, with the reduced ones, and in the small map. hloc's folder is not changed.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from hloc_reduce import aggregate_features, compact, localize_sfm, maps, match_features, reduce
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
+from hloc_reduce.evaluation.poses import FAILED, pose_error, recall
+from hloc_reduce.evaluation.summaries import map_bytes
+from hloc_reduce.localization.records import pose_of
+from hloc_reduce.localization.stage import read_queries
+from hloc_reduce.maps.compact import SUFFIX
+from hloc_reduce.maps.map import RETRIEVAL
+from hloc_reduce.runtime.outputs import RunFolder
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import get_keypoints
+from hloc_reduce.utils.files import MEGABYTE, write_csv
+from hloc_reduce.utils.h5 import iterate_h5_names, open_h5
+from hloc_reduce.utils.paths import strings_as_paths
+from hloc_reduce.utils.tables import aligned
+
+from . import retrieval
+
+FEATURE, STORAGE, NUM_LOC = "colmap_sift_sv32", "uint4", 50
+HLOC, REDUCED, COMPACT = "hloc's features and model", "reduced features", "compact map"
+COLUMNS = "map", "MB", "localized", "inliers", "recall [%]", "median error [cm]", "s a query"
+
+
+@strings_as_paths
+def main(
+    hloc_outputs: Path,
+    outputs: Path,
+    feature: str = FEATURE,
+    storage: str = STORAGE,
+    features: Path | None = None,
+    sfm: Path | None = None,
+    queries: Path | None = None,
+    ground_truth: Path | None = None,
+    num_loc: int = NUM_LOC,
+    max_mb: float | None = None,
+    overwrite: bool = False,
+) -> list[dict]:
+    """Reduce the features and the map of an outputs folder of hloc, and compare.
+
+    Args:
+        hloc_outputs: the folder, which is not changed.
+        outputs: folder of the reduced feature file, the compact map, and the table, shrink.csv.
+        feature: as in `reduce.main`, like `storage`.
+        storage: see `feature`.
+        features: hloc's feature file, with the queries; default: the only one in the folder.
+        sfm: COLMAP model of its keypoints; default: the only one in the folder.
+        queries: query list with intrinsics, or a glob of several.
+        ground_truth: true poses of the queries.
+        num_loc: retrieved map images per query, by VLAD.
+        max_mb: see `compact.main`.
+        overwrite: replace earlier results.
+
+    Returns:
+        A row of the table for hloc's files, for the reduced features with hloc's model, and for the
+        compact map. Without `queries` it has sizes only.
+
+    Raises:
+        InputError: when a file is missing or ambiguous, or is not of the feature.
+    """
+    if outputs.resolve() == hloc_outputs.resolve():
+        raise InputError(f"--outputs {outputs} is hloc's folder: choose another one.")
+    if ground_truth is not None and queries is None:
+        raise InputError("--ground_truth is of queries: give --queries, too.")
+    features = features or _only(_feature_files(hloc_outputs), hloc_outputs, "features")
+    sfm = sfm or _only(_models(hloc_outputs, features), hloc_outputs, "sfm")
+    map_names = sorted(image.name for image in colmap.read_model(sfm).images.values())
+    listed = [] if queries is None else read_queries(queries)
+    truth = true_poses([name for name, _ in listed], ground_truth, True) if ground_truth else {}
+    matcher = features_confs.matcher_of(features_confs.get(feature)[1])
+    conf = {"features": features, "sfm": sfm, "feature": feature, "storage": storage}
+    conf |= {"queries": queries, "num_loc": num_loc, "max_mb": max_mb}
+    inputs = [path for path in (hloc_outputs, features, sfm) if path is not None]
+    with RunFolder(
+        outputs, {key: value and str(value) for key, value in conf.items()}, overwrite, inputs
+    ) as folder:
+        small, packed = outputs / "features.h5", outputs / f"map{SUFFIX}"
+        with folder.stage("reduce"):
+            reduce.main(features, small, feature, storage=storage)
+        with folder.stage("compact"):
+            described = aggregate_features.main(RETRIEVAL, small, map_names)
+            compact.main(
+                *(packed, None, sfm, small, described, feature), storage=storage, max_mb=max_mb
+            )
+        built = maps.unpack(packed, outputs / "map", overwrite)
+        sizes = {
+            HLOC: map_bytes(sfm, map_names, [features]),
+            REDUCED: map_bytes(sfm, map_names, [small]),
+            COMPACT: packed.stat().st_size,
+        }
+        rows = [{COLUMNS[0]: name, COLUMNS[1]: size / MEGABYTE} for name, size in sizes.items()]
+        if listed:
+            pairs = outputs / "pairs-query.txt"
+            names = [name for name, _ in listed]
+            retrieval.retrieve_in_map(built, small, pairs, num_loc, names, map_names)
+            tried = (
+                (sfm, features, features, matcher),
+                (sfm, small, small, matcher),
+                (built.sfm, small, built.features, built.matcher),
+            )
+            for number, (row, files) in enumerate(zip(rows, tried, strict=True)):
+                with folder.stage(f"localization{number}"):
+                    row |= _localize(outputs / str(number), listed, pairs, *files, truth)
+        write_csv(rows, outputs / "shrink.csv")
+    return rows
+
+
+def _only(found: Sequence[Path], folder: Path, option: str) -> Path:
+    """Return the only file of its kind, or raise an InputError."""
+    if len(found) == 1:
+        return found[0]
+    which = f"several: {cli.some([path.name for path in found])}" if found else "none"
+    raise InputError(f"{folder} has no single --{option} to take, but {which}. Give --{option}.")
+
+
+def _feature_files(folder: Path) -> list[Path]:
+    """Return the feature files in a folder, by the keypoints and descriptors in them."""
+    found = []
+    for path in sorted(folder.glob("*.h5")):
+        with open_h5(path) as file:
+            first = next(iterate_h5_names(file.id), None)
+            if first is not None and {"keypoints", "descriptors"} <= file[first].keys():
+                found.append(path)
+    return found
+
+
+def _models(folder: Path, features: Path) -> list[Path]:
+    """Return the COLMAP models in a folder that have the keypoints of a feature file."""
+    found = []
+    with open_h5(features) as file:
+        for path in sorted(path.parent for path in folder.glob("*/points3D.*")):
+            images = colmap.read_model(path).images.values()
+            image = next(iter(images), None)
+            if image is not None and image.name in file:
+                keypoints, _ = get_keypoints(file, image.name)
+                if len(keypoints) == image.num_points2D():
+                    found.append(path)
+    return found
+
+
+def _localize(
+    results: Path,
+    queries: list[tuple[str, pycolmap.Camera]],
+    pairs: Path,
+    sfm: Path,
+    features: Path,
+    map_features: Path,
+    matcher: str,
+    truth: Mapping[str, pycolmap.Rigid3d],
+) -> dict:
+    """Localize queries and return the columns of a row.
+
+    Args:
+        results: begins the names of the files of results.
+        queries: names and intrinsics.
+        pairs: queries and map images.
+        sfm: the COLMAP model of the map.
+        features: feature file of the queries.
+        map_features: feature file of the map.
+        matcher: a key of `confs.matchers`.
+        truth: true poses.
+    """
+    start, conf = time.perf_counter(), matchers_confs.confs[matcher]
+    matches, poses = (results.with_name(f"{results.name}-{n}") for n in ("matches.h5", "poses.txt"))
+    match_features.main(
+        conf, pairs, features, matches=matches, features_ref=map_features, overwrite=True
+    )
+    given: list[tuple[str, pycolmap.Camera | None]] = [*queries]
+    records = localize_sfm.main(
+        sfm, given, pairs, features, matches, poses, full_names=True, overwrite=True
+    )
+    seconds = time.perf_counter() - start
+    localized = [record for record in records.values() if record["localized"]]
+    errors = [
+        pose_error(pose_of(records[name]), truth[name]) if records[name]["localized"] else FAILED
+        for name, _ in queries
+        if name in truth
+    ]
+    inliers = sum(record["num_inliers"] for record in localized)
+    row = {
+        "localized": f"{len(localized)} of {len(queries)}",
+        "inliers": round(inliers / len(queries), 1),
+        "recall [%]": "",
+        "median error [cm]": "",
+        "s a query": round(seconds / len(queries), 3),
+    }
+    if errors:
+        row["recall [%]"] = " / ".join(f"{one:.1f}" for one in recall(errors, DAY_THRESHOLDS))
+        row["median error [cm]"] = round(100 * float(np.median([error for error, _ in errors])), 2)
+    return row
+
+
+def _main() -> None:
+    parser = cli.Parser(__doc__, "--hloc_outputs outputs/aachen --outputs outputs/aachen_small")
+    parser.add_argument("--hloc_outputs", type=Path, required=True, help="hloc's outputs folder")
+    parser.add_argument("--outputs", type=Path, required=True, help="folder for the small files")
+    parser.add_argument("--feature", default=FEATURE, help="what to reduce hloc's descriptors to")
+    parser.add_argument("--storage", default=STORAGE, help="how descriptors are stored")
+    parser.add_argument(
+        "--features", type=Path, help="hloc's feature file (default: the only one in the folder)"
+    )
+    parser.add_argument(
+        "--sfm", type=Path, help="COLMAP model of its keypoints (default: the only one)"
+    )
+    parser.add_argument("--queries", type=Path, help="query list with intrinsics, or a glob")
+    parser.add_argument("--ground_truth", type=Path, help="true poses of the queries")
+    parser.add_argument("--num_loc", type=int, default=NUM_LOC, help="retrieved images per query")
+    parser.add_argument("--max_mb", type=float, help="size of the compact map in megabytes")
+    parser.add_argument("--overwrite", action="store_true", help="replace earlier results")
+    args = parser.parse_args()
+    rows = main(**vars(args))
+    columns = [column for column in COLUMNS if column in rows[0]]
+    lines = [[f"{row[c]:.3f}" if c == "MB" else str(row[c]) for c in columns] for row in rows]
+    print(aligned([columns, *lines]))
+    print(f"{args.outputs} has features.h5, map{SUFFIX} and shrink.csv.")
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,88 @@
+"""A finished outputs folder of hloc is made small, and compared before and after."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+from command import state, table
+from small_map import build
+
+from hloc_reduce import Localizer
+from hloc_reduce.utils.h5 import list_h5_names
+from pipelines import shrink
+
+PIPELINE = shrink
+
+
+@pytest.fixture
+def finished(scene):
+    """A folder as hloc leaves it: descriptors like its sift, matches and a model; and the scene."""
+    generator = np.random.default_rng(0)
+    described = generator.exponential(1, (len(scene.points), 128)) ** 2
+    described /= np.linalg.norm(described, axis=1, keepdims=True)
+    described = np.sqrt(described / described.sum(axis=1, keepdims=True))  # COLMAP's
+    described = np.sqrt(described / described.sum(axis=1, keepdims=True))  # hloc's second root
+    with h5py.File(scene.features, "a") as file:
+        for name, seen in scene.seen.items():
+            del file[name]["descriptors"]
+            file[name]["descriptors"] = described[seen].T.astype(np.float16)
+            file[name]["image_size"] = np.array([640, 480])
+    build(scene)
+    folder = scene.root / "hloc"
+    folder.mkdir()
+    shutil.copy(scene.features, folder / "feats-sift.h5")
+    shutil.copy(scene.matches, folder / "feats-sift_matches.h5")
+    shutil.copytree(scene.sfm, folder / "sfm_sift")
+    (folder / "pairs-db.txt").write_text(scene.pairs.read_text())
+    truth = scene.root / "truth.txt"
+    lines = []
+    for name in ("query/6.jpg", "query/7.jpg"):
+        x, y, z, w = scene.poses[name].rotation.quat
+        values = map(float, [w, x, y, z, *scene.poses[name].translation])
+        lines.append(f"{name} {' '.join(map(repr, values))}\n")
+    truth.write_text("".join(lines))
+    scene.folder, scene.truth = folder, truth
+    return scene
+
+
+def test_before_and_after(finished, capsys, run):
+    outputs = finished.root / "small"
+    given = ("--hloc_outputs", finished.folder, "--outputs", outputs)
+    queries = ("--queries", finished.queries, "--ground_truth", finished.truth)
+    before = state(finished.folder)
+    run(*given, *queries)
+    assert state(finished.folder) == before
+    printed = capsys.readouterr().out
+    rows = {row["map"]: row for row in table(outputs / "shrink.csv")}
+    assert list(rows) == [shrink.HLOC, shrink.REDUCED, shrink.COMPACT]
+    for name, row in rows.items():
+        assert name in printed
+        assert row["localized"] == "2 of 2" and row["recall [%]"] == "100.0 / 100.0 / 100.0"
+        assert float(row["inliers"]) > 250 and float(row["median error [cm]"]) < 1
+    sizes = [float(row["MB"]) for row in rows.values()]
+    assert sizes[0] > 2 * sizes[1] > 2 * sizes[2]
+    assert list_h5_names(outputs / "features.h5") == sorted(finished.seen)
+    assert len(Localizer(outputs / "map.hlm").names) == 6
+
+    run(*given, *queries)  # resumes
+    run(*given, "--overwrite")  # sizes only
+    assert "localized" not in table(outputs / "shrink.csv")[0]
+
+
+def test_wrong_input(finished, tmp_path, refused):
+    given = ("--hloc_outputs", finished.folder, "--outputs", tmp_path / "small")
+    assert "is hloc's folder" in refused(*given[:3], finished.folder)
+    assert "give --queries" in refused(*given, "--ground_truth", finished.truth)
+    shutil.copy(finished.folder / "feats-sift.h5", finished.folder / "feats-2.h5")
+    message = refused(*given)
+    assert "several: feats-2.h5, feats-sift.h5" in message and "Give --features" in message
+    for path in finished.folder.glob("feats-*.h5"):
+        path.unlink()
+    assert "none. Give --features" in refused(*given)
+    chosen = ("--features", finished.features)
+    shutil.copytree(finished.folder / "sfm_sift", finished.folder / "sfm_2")
+    assert "several: sfm_2, sfm_sift. Give --sfm" in refused(*given, *chosen)
+    message = refused(*given, *chosen, "--sfm", finished.sfm, "--feature", "xfeat_sv32")
+    assert "128-D" in message
+    assert not (tmp_path / "small/shrink.csv").exists()
