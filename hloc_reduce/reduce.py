@@ -179,9 +179,15 @@ def told_by(descriptors: np.ndarray, place: str) -> str:
 
 def _read(file: h5py.File, names: list[str], reduction: Reduction) -> Iterator[Described]:
     """Read the features of images."""
+    of_network = features_confs.network_of(reduction.conf["model"]) is not None
     for name in names:
         descriptors = get_descriptors(file, name)
         reduction.check(descriptors.shape[1], f"{file.filename}: the descriptors of {name}")
+        if of_network and len(descriptors) and (descriptors >= 0).all():
+            raise InputError(
+                f"{file.filename}: the descriptors of {name} have no negative number, like those "
+                f"of SIFT. {reduction.name} needs those of its network."
+            )
         yield name, descriptors, read_others(file, name)
 
 

@@ -381,7 +381,7 @@ def _change(
         raise InputError(
             "--add_model and --refine_map are for photos that are added: --add_images."
         )
-    if folder is None or map_images is not None or not maps.is_map(folder):
+    if folder is None or map_images is not None or maps.is_compact(folder):
         raise InputError(
             "--add_images and --remove_images change a map that was built before: give its folder, "
             "--map, without --map_images."

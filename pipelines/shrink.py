@@ -21,7 +21,8 @@ from hloc_reduce.localization.records import pose_of
 from hloc_reduce.localization.stage import read_queries
 from hloc_reduce.maps.compact import SUFFIX
 from hloc_reduce.maps.map import RETRIEVAL
-from hloc_reduce.runtime.outputs import RunFolder
+from hloc_reduce.runtime import provenance
+from hloc_reduce.runtime.outputs import CONF, RunFolder
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.feature_files import get_keypoints
@@ -33,6 +34,7 @@ from hloc_reduce.utils.tables import aligned
 from . import retrieval
 
 FEATURE, STORAGE, NUM_LOC = "colmap_sift_sv32", "uint4", 50
+TABLE = "shrink.csv"
 HLOC, REDUCED, COMPACT = "hloc's features and model", "reduced features", "compact map"
 COLUMNS = "map", "MB", "localized", "inliers", "recall [%]", "median error [cm]", "s a query"
 
@@ -73,6 +75,10 @@ def main(
     Raises:
         InputError: when a file is missing or ambiguous, or is not of the feature.
     """
+    if not hloc_outputs.is_dir():
+        raise cli.no_folder(hloc_outputs)
+    if max_mb is not None and not max_mb > 0:
+        raise InputError(f"--max_mb {max_mb:g}: it must be above 0.")
     if outputs.resolve() == hloc_outputs.resolve():
         raise InputError(f"--outputs {outputs} is hloc's folder: choose another one.")
     if ground_truth is not None and queries is None:
@@ -83,12 +89,13 @@ def main(
     listed = [] if queries is None else read_queries(queries)
     truth = true_poses([name for name, _ in listed], ground_truth, True) if ground_truth else {}
     matcher = features_confs.matcher_of(features_confs.get(feature)[1])
-    conf = {"features": features, "sfm": sfm, "feature": feature, "storage": storage}
-    conf |= {"queries": queries, "num_loc": num_loc, "max_mb": max_mb}
-    inputs = [path for path in (hloc_outputs, features, sfm) if path is not None]
-    with RunFolder(
-        outputs, {key: value and str(value) for key, value in conf.items()}, overwrite, inputs
-    ) as folder:
+    paths = {"hloc_outputs": hloc_outputs, "features": features, "sfm": sfm, "queries": queries}
+    conf: dict[str, object] = {name: path and str(path.resolve()) for name, path in paths.items()}
+    conf |= {"feature": feature, "storage": storage, "num_loc": num_loc, "max_mb": max_mb}
+    before = provenance.read(outputs / CONF)
+    if before.keys() == conf.keys() and before != conf and not (outputs / TABLE).exists():
+        overwrite = True  # an unfinished run with other options
+    with RunFolder(outputs, conf, overwrite, [hloc_outputs, features, sfm]) as folder:
         small, packed = outputs / "features.h5", outputs / f"map{SUFFIX}"
         with folder.stage("reduce"):
             reduce.main(features, small, feature, storage=storage)
@@ -105,18 +112,19 @@ def main(
         }
         rows = [{COLUMNS[0]: name, COLUMNS[1]: size / MEGABYTE} for name, size in sizes.items()]
         if listed:
-            pairs = outputs / "pairs-query.txt"
-            names = [name for name, _ in listed]
-            retrieval.retrieve_in_map(built, small, pairs, num_loc, names, map_names)
             tried = (
                 (sfm, features, features, matcher),
                 (sfm, small, small, matcher),
                 (built.sfm, small, built.features, built.matcher),
             )
-            for number, (row, files) in enumerate(zip(rows, tried, strict=True)):
-                with folder.stage(f"localization{number}"):
-                    row |= _localize(outputs / str(number), listed, pairs, *files, truth)
-        write_csv(rows, outputs / "shrink.csv")
+            pairs = outputs / "pairs-query.txt"
+            names = [name for name, _ in listed]
+            retrieval.retrieve_in_map(built, small, pairs, num_loc, names, map_names)
+            stages = "localize-hloc", "localize-reduced", "localize-compact"
+            for name, row, files in zip(stages, rows, tried, strict=True):
+                with folder.stage(name):
+                    row |= _localize(outputs / name, listed, pairs, *files, truth)
+        write_csv(rows, outputs / TABLE)
     return rows
 
 
@@ -227,7 +235,7 @@ def _main() -> None:
     columns = [column for column in COLUMNS if column in rows[0]]
     lines = [[f"{row[c]:.3f}" if c == "MB" else str(row[c]) for c in columns] for row in rows]
     print(aligned([columns, *lines]))
-    print(f"{args.outputs} has features.h5, map{SUFFIX} and shrink.csv.")
+    print(f"{args.outputs} has features.h5, map{SUFFIX} and {TABLE}.")
 
 
 if __name__ == "__main__":

@@ -86,6 +86,7 @@ def add(
         if not names:
             raise InputError(f"{model} has a pose of no photo in {image_dir}.")
     with _opened(built) as folder, folder.stage("add_images"):
+        built = Map(built.folder)  # another run may have changed it before it was locked
         addition = _Addition(built, colmap.read_model(built.sfm), image_dir, num_loc, refine_map)
         new = addition.begin(names, posed=reference is not None)
         if not new:
@@ -118,11 +119,13 @@ def remove(built: Map, names: Iterable[str]) -> Map:
         InputError: if a photo is not in the map, or not enough are left.
     """
     _check_whole(built)
-    removed, sfm = set(names), colmap.read_model(built.sfm)
-    inside = {image.name for image in sfm.images.values()}
-    if unknown := removed - inside:
-        raise InputError(f"The map {built.folder} has no photo {cli.some(sorted(unknown))}.")
+    removed = set(names)
     with _opened(built) as folder, folder.stage("remove_images"):
+        built = Map(built.folder)
+        sfm = colmap.read_model(built.sfm)
+        inside = {image.name for image in sfm.images.values()}
+        if unknown := removed - inside:
+            raise InputError(f"The map {built.folder} has no photo {cli.some(sorted(unknown))}.")
         extension.remove(sfm, removed)
         if not sfm.num_points3D():
             raise InputError(f"No point of the map {built.folder} would be left.")

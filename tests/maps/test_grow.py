@@ -164,7 +164,7 @@ def test_a_killed_change_goes_on(grown, stage):
 
 def test_wrong_options(grown, tmp_path, refused):
     folder, new, model = grown
-    assert "a map that was built before" in refused("--map", model, "--add_images", new)
+    assert "is not a map" in refused("--map", model, "--add_images", new)
     assert "a map that was built before" in refused("--add_images", new)
     assert "--add_images." in refused("--map", folder, "--add_model", model, "--outputs", tmp_path)
     assert "no photo x.png" in refused(

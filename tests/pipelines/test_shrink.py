@@ -73,6 +73,9 @@ def test_before_and_after(finished, capsys, run):
 def test_wrong_input(finished, tmp_path, refused):
     given = ("--hloc_outputs", finished.folder, "--outputs", tmp_path / "small")
     assert "is hloc's folder" in refused(*given[:3], finished.folder)
+    assert "There is no folder" in refused("--hloc_outputs", tmp_path / "no", *given[2:])
+    assert "above 0" in refused(*given, "--max_mb", 0)
+    assert "like those of SIFT" in refused(*given, "--feature", "aliked_sv32")
     assert "give --queries" in refused(*given, "--ground_truth", finished.truth)
     shutil.copy(finished.folder / "feats-sift.h5", finished.folder / "feats-2.h5")
     message = refused(*given)
