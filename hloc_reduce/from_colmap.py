@@ -24,6 +24,7 @@ from .utils.cli import InputError
 from .utils.codes import STORAGES
 from .utils.colmap import SIFT, StoredDatabase
 from .utils.files import file_sha256
+from .utils.parsers import check_names
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
@@ -67,6 +68,8 @@ def main(
     if isinstance(model, Path):
         model = colmap.read_model(model)
     reduction = Reduction(feature, projection, storage)
+    if output.resolve() == database.resolve():
+        raise InputError(f"{output} is the database: choose another --output.")
     with colmap.open_stored(database) as opened:
         names = check(opened, reduction, model)
         made_from = {path.name: file_sha256(path) for path in opened.files()}
@@ -99,10 +102,12 @@ def check(
         )
     _check_type(database, reduction)
     if model is None:
-        names = sorted(described)
+        names = check_names(sorted(described), database.path)
     else:
         names = sorted(model.images[i].name for i in model.reg_image_ids())
         _check_model(database, model, keypoints)
+    if not names:
+        raise InputError("The model has no image with a pose.")
     lacking = [name for name in names if described.get(name, 0) != keypoints.get(name, 0)]
     if lacking:
         raise InputError(

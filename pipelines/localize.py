@@ -338,7 +338,8 @@ def _main() -> None:
     trace_file = given["outputs"] / "trace.json" if profiled else None
     with trace.recording(trace_file):
         if any(changes.values()):
-            _change(given["map"], given["map_images"], **changes)
+            _check_changed(given, **changes)
+            _change(given["map"], **changes)
         if given["outputs"] is not None:
             _run(given)
         elif small is not None:
@@ -368,33 +369,44 @@ def _add_changes(parser: cli.Parser) -> None:
     )
 
 
+def _check_changed(
+    given: dict, add_images: Path | None, add_model: Path | None, refine_map: bool, **_: object
+) -> None:
+    """Refuse options that do not go together before a map is changed."""
+    if add_images is None and (add_model is not None or refine_map):
+        raise InputError(
+            "--add_model and --refine_map are for photos that are added: --add_images."
+        )
+    folder, others = given["map"], (given["map_images"], given["database"])
+    if folder is None or any(others) or maps.is_compact(folder):
+        raise InputError(
+            "--add_images and --remove_images change a map that was built before: give its folder, "
+            "--map, without --map_images and --database."
+        )
+    names = "feature", "projection", "matcher", "storage", "keypoints", "camera_mode"
+    open_map(folder, model_or_map=folder, **{name: given[name] for name in names})
+
+
 def _change(
-    folder: Path | None,
-    map_images: Path | None,
+    folder: Path,
     add_images: Path | None,
     add_model: Path | None,
     refine_map: bool,
     remove_images: Path | None,
 ) -> None:
     """Remove photos from a map that was built before, and add others."""
-    if add_images is None and (add_model is not None or refine_map):
-        raise InputError(
-            "--add_model and --refine_map are for photos that are added: --add_images."
-        )
-    if folder is None or map_images is not None or maps.is_compact(folder):
-        raise InputError(
-            "--add_images and --remove_images change a map that was built before: give its folder, "
-            "--map, without --map_images."
-        )
     built = Map(folder)
     if remove_images is not None:
-        built = maps.remove(built, image_names(remove_images))
-        print(f"{built.num_images} photos are left in the map {folder}.")
+        names = image_names(remove_images)
+        # if a run that adds others is repeated, they are gone
+        if add_images is None or not {*names}.isdisjoint(built.names()):
+            built = maps.remove(built, names)
+            print(f"{built.num_images} photos are left in the map {folder}.")
     if add_images is not None:
         before = built.num_images
         built = maps.add(built, add_images, add_model, refine_map=refine_map)
         added = built.num_images - before
-        print(f"{added} photos were added to the map {folder}, which has {built.num_images} now.")
+        print(f"Photos added to the map {folder}: {added}. It has {built.num_images} now.")
 
 
 def _run(given: dict) -> None:

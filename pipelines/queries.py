@@ -13,7 +13,6 @@ from hloc_reduce.localization import intrinsics
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance
 from hloc_reduce.utils import cli
-from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.parsers import parse_query_lists
 
@@ -61,7 +60,7 @@ class Queries:
             check_queries(query_images, listed.names, strict)
             return listed
         names = list_images(query_images)
-        inferred = _infer(query_images, names, built.cameras, strict)
+        inferred = intrinsics.infer_all(query_images, names, built.cameras, strict)
         refinements = {
             name: intrinsics.refinement(*found, built.cameras) for name, found in inferred.items()
         }
@@ -127,17 +126,3 @@ class Photos:
         for name in unreadable:
             self._photos.pop(name, None)
         self.write()
-
-
-def _infer(
-    query_images: Path, names: list[str], of_map: intrinsics.MapCameras, strict: bool
-) -> dict[str, tuple[pycolmap.Camera, str]]:
-    """Infer the intrinsics of photos; skip unreadable ones unless `strict`."""
-    cameras = {}
-    for name in names:
-        try:
-            cameras[name] = intrinsics.infer(query_images / name, of_map)
-        except InputError:
-            if strict:
-                raise
-    return cameras

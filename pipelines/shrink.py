@@ -27,7 +27,7 @@ from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.feature_files import get_keypoints
 from hloc_reduce.utils.files import MEGABYTE, write_csv
-from hloc_reduce.utils.h5 import iterate_h5_names, open_h5
+from hloc_reduce.utils.h5 import iterate_h5_names, list_h5_names, open_h5
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned
 
@@ -92,6 +92,11 @@ def main(
     paths = {"hloc_outputs": hloc_outputs, "features": features, "sfm": sfm, "queries": queries}
     conf: dict[str, object] = {name: path and str(path.resolve()) for name, path in paths.items()}
     conf |= {"feature": feature, "storage": storage, "num_loc": num_loc, "max_mb": max_mb}
+    made_from = [features, *sorted(sfm.glob("*.*"))]
+    conf["made_from"] = provenance.of_inputs({}, made_from)["inputs"]
+    absent = {name for name, _ in listed}.difference(list_h5_names(features))
+    if absent:
+        raise InputError(f"{features} lacks {len(absent)} queries: {cli.some(sorted(absent))}.")
     before = provenance.read(outputs / CONF)
     if before.keys() == conf.keys() and before != conf and not (outputs / TABLE).exists():
         overwrite = True  # an unfinished run with other options
@@ -151,7 +156,7 @@ def _models(folder: Path, features: Path) -> list[Path]:
     """Return the COLMAP models in a folder that have the keypoints of a feature file."""
     found = []
     with open_h5(features) as file:
-        for path in sorted(path.parent for path in folder.glob("*/points3D.*")):
+        for path in sorted({path.parent for path in folder.glob("*/points3D.???")}):
             images = colmap.read_model(path).images.values()
             image = next(iter(images), None)
             if image is not None and image.name in file:

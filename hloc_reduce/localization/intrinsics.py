@@ -9,6 +9,7 @@ import pycolmap
 from PIL import Image
 
 from ..utils import colmap
+from ..utils.cli import InputError
 from ..utils.files import replacing
 from ..utils.parsers import to_line
 
@@ -114,6 +115,24 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         return camera, "EXIF"
     camera.has_prior_focal_length = False
     return camera, "guess" if has_size and not is_cut else "unknown"
+
+
+def infer_all(
+    image_dir: Path, names: Iterable[str], of_map: MapCameras, strict: bool = False
+) -> dict[str, tuple[pycolmap.Camera, str]]:
+    """Infer the intrinsics of the photos of a folder, see `infer`; skip unreadable ones.
+
+    Raises:
+        InputError: if `strict` and an image cannot be read.
+    """
+    inferred = {}
+    for name in names:
+        try:
+            inferred[name] = infer(image_dir / name, of_map)
+        except InputError:
+            if strict:
+                raise
+    return inferred
 
 
 def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict:

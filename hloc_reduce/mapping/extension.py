@@ -88,8 +88,15 @@ def _add_images(
     keypoints: Mapping[str, np.ndarray],
 ) -> dict[str, int]:
     """Add images without points; equal known intrinsics are one camera. Returns their ids."""
-    cameras = {_values(camera): camera for camera in model.cameras.values()}
-    image_id, camera_id = (max(used, default=0) for used in (model.images, model.cameras))
+    # cameras with a rig of their own; an added image gets ids that no frame and rig has
+    own = {
+        rig.rig_id
+        for rig in model.rigs.values()
+        if rig.num_sensors() == 1 and rig.ref_sensor_id.id == rig.rig_id
+    }
+    cameras = {_values(camera): camera for id, camera in model.cameras.items() if id in own}
+    image_id = max([*model.images, *model.frames], default=0)
+    camera_id = max([*model.cameras, *model.rigs], default=0)
     ids = {}
     for name, image in placed.items():
         camera = cameras.get(_values(image.camera)) if image.known else None
@@ -180,7 +187,7 @@ def _adjust(
 
 
 def count_shared(model: pycolmap.Reconstruction, names: Collection[str]) -> dict[str, int]:
-    """Count the points that images of a model share with others than `names`, from any of it."""
+    """Return how many points each of `names` shares with images that are not among them."""
     new = {image_id for image_id, image in model.images.items() if image.name in names}
     found = {}
     for image_id in new:

@@ -19,6 +19,7 @@ from ..utils.cli import InputError, no_folder
 from ..utils.codes import STORAGES
 from ..utils.colmap import StoredDatabase
 from ..utils.files import replacing
+from ..utils.match_files import check_names
 from ..utils.paths import strings_as_paths
 from . import contradictions
 from .build import keep_projection, model_files
@@ -70,6 +71,7 @@ def main(
         raise InputError(f"The model {model} has no points: give one that COLMAP reconstructed.")
     with colmap.open_stored(database) as opened:
         names = from_colmap.check(opened, reduction, reference)
+        check_names(names)
         cameras = _cameras(reference, names, image_dir)
         fingerprints, digests = _digests(map_dir, opened, model)
         made_from = {

@@ -6,6 +6,7 @@ resumes the change.
 """
 
 import json
+import os
 import uuid
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -35,6 +36,7 @@ from ..triangulation import read_matches
 from ..utils import cli, colmap
 from ..utils.cli import InputError
 from ..utils.files import announce, delete
+from ..utils.h5 import list_h5_names
 from ..utils.images import list_images
 from ..utils.match_files import check_names
 from ..utils.parsers import parse_pairs
@@ -94,9 +96,9 @@ def add(
             _drop_left(folder, built)
             return built
         new = addition.describe(new)
-        if reference is not None:
+        if reference is not None and new:
             addition.place(reference, new)
-        else:
+        elif new:
             addition.localize(new)
         addition.report()
         addition.commit()
@@ -110,7 +112,7 @@ def remove(built: Map, names: Iterable[str]) -> Map:
 
     Args:
         built: the map.
-        names: the photos.
+        names: the photos; those that could not be reconstructed only lose their features.
 
     Returns:
         The map without them.
@@ -124,12 +126,15 @@ def remove(built: Map, names: Iterable[str]) -> Map:
         built = Map(built.folder)
         sfm = colmap.read_model(built.sfm)
         inside = {image.name for image in sfm.images.values()}
-        if unknown := removed - inside:
+        # also of a removal that was interrupted after map.json was written
+        if unknown := removed - inside - {*list_h5_names(built.features)}:
             raise InputError(f"The map {built.folder} has no photo {cli.some(sorted(unknown))}.")
-        extension.remove(sfm, removed)
-        if not sfm.num_points3D():
-            raise InputError(f"No point of the map {built.folder} would be left.")
-        _commit(built, sfm, [], removed)
+        _check_rigs(sfm, removed)
+        if removed & inside:
+            extension.remove(sfm, removed)
+            if not sfm.num_points3D():
+                raise InputError(f"No point of the map {built.folder} would be left.")
+            _commit(built, sfm, -len(removed), removed=removed)
         for path in (built.features, built.descriptors):
             merge(path, [path], removed)
         known = provenance.read(built.folder / FINGERPRINTS)
@@ -146,6 +151,22 @@ def _check_whole(built: Map) -> None:
             f"The map {built.folder} is an unpacked compact one, to which no photo can be added: "
             "change the map that it was made from, and compact that again."
         )
+
+
+def _check_rigs(sfm: pycolmap.Reconstruction, names: Collection[str]) -> None:
+    """Refuse to remove photos without those that a rig took together with them."""
+    images = sfm.images.values()
+    frames = {image.frame_id for image in images if image.name in names}
+    others = {image.name for image in images if image.frame_id in frames} - {*names}
+    if others:
+        raise InputError(
+            f"A rig of cameras took {cli.some(sorted(others))} together with photos to remove: "
+            "remove them, too."
+        )
+
+
+def _is_readable(path: Path) -> bool:
+    return path.is_file() and os.access(path, os.R_OK)
 
 
 def _opened(built: Map) -> RunFolder:
@@ -178,7 +199,7 @@ class _Addition:
 
     Attributes:
         added: names of the photos that are in the model now.
-        left_out: names of the others, by what they do instead.
+        left_out: names of the photos that are not added, by reason.
     """
 
     built: Map
@@ -199,10 +220,13 @@ class _Addition:
     def begin(self, names: list[str], posed: bool) -> list[str]:
         """Return the photos that are new; begin anew unless their addition was interrupted."""
         files = {f"{IMAGES}{name}": self.image_dir / name for name in names}
+        broken = [key for key, path in files.items() if not _is_readable(path)]
+        self._leave_out("not readable", [key.removeprefix(IMAGES) for key in broken])
+        files = {key: path for key, path in files.items() if key not in broken}
         known = provenance.read(self.built.folder / FINGERPRINTS)
         self.fingerprints = provenance.fingerprints(files, {})
         digests, before = _digests(self.fingerprints), _digests(known)
-        new = self._new(digests, {before[n]: n for n in self.inside if n in before})
+        new = self._new(digests, {name: before.get(name) for name in self.inside})
         check_names([*self.inside, *new])
         images = {name: digests[name] for name in new}
         conf = {"map": self.built.id, "images": images, "num_loc": self.num_loc, "posed": posed}
@@ -212,19 +236,25 @@ class _Addition:
             provenance.write(self.folder / CONF, conf)
         return new
 
-    def _new(self, digests: Mapping[str, str], of_map: dict[str, str]) -> list[str]:
-        """Return the photos that are not in the map, by digests of their content."""
+    def _new(self, digests: Mapping[str, str], inside: Mapping[str, str | None]) -> list[str]:
+        """Return the photos that are not in the map.
+
+        Args:
+            digests: of the content of photos, by name.
+            inside: the same of those in the map; None in a map of a database, which had no photos.
+        """
         new, taken, same = [], [], 0
+        first = {digest: name for name, digest in inside.items() if digest is not None}
         for name, digest in digests.items():
-            if digest in of_map:
-                same += of_map[digest] == name
-                if of_map[digest] != name:
-                    self._leave_out(f"are copies of {of_map[digest]}", [name])
-            elif name in self.inside:
-                taken.append(name)
+            if name in inside:
+                same += inside[name] in (None, digest)
+                if inside[name] not in (None, digest):
+                    taken.append(name)
+            elif digest in first:
+                self._leave_out(f"copies of {first[digest]}", [name])
             else:
+                first[digest] = name
                 new.append(name)
-            of_map.setdefault(digest, name)
         if taken:
             raise InputError(
                 f"The map has other photos that are called {cli.some(taken)}: rename those in "
@@ -242,7 +272,7 @@ class _Addition:
             strict=False,
         )
         broken = failures(features)
-        self._leave_out("cannot be read", [name for name in names if name in broken])
+        self._leave_out("not readable", [name for name in names if name in broken])
         readable = [name for name in names if name not in broken]
         if readable:
             descriptors = aggregate_features.main(
@@ -269,8 +299,9 @@ class _Addition:
     def localize(self, names: list[str]) -> None:
         """Localize photos in the map and add them; then those that are left, in the new map."""
         known = self.built.cameras
-        inferred = {name: intrinsics.infer(self.image_dir / name, known) for name in names}
-        left, number = names, 0
+        inferred = intrinsics.infer_all(self.image_dir, names, known)
+        self._leave_out("not readable", [name for name in names if name not in inferred])
+        left, number = list(inferred), 0
         while left:
             number += 1
             pairs = self._pairs(left, sorted([*self.inside, *self.added]), f"round{number}")
@@ -298,7 +329,7 @@ class _Addition:
             found = sorted(placed)
             among = self._pairs(found, found, f"new{number}") if len(found) > 1 else None
             self._extend(placed, [pairs, *([among] if among else [])])
-        self._leave_out("cannot be localized in the map", left)
+        self._leave_out("not localized in the map", left)
 
     def _pairs(self, names: list[str], others: list[str], what: str) -> Path:
         """Pair photos with the most similar ones of others."""
@@ -335,12 +366,12 @@ class _Addition:
         extension.extend(self.sfm, placed, keypoints, uncertainty, matches, self.refine_map)
         shared = extension.count_shared(self.sfm, placed)
         self._drop(
-            "share too few points with the map",
+            "sharing too few points with the map",
             [name for name in placed if shared[name] < DEFAULT_GATE.min_inliers],
         )
         left = [name for name in placed if shared[name] >= DEFAULT_GATE.min_inliers]
         wrong = contradictions.judge(self.sfm, self.matches, left)
-        self._drop("contradict the map", wrong)
+        self._drop("contradicting the map", wrong)
         self.added += [name for name in left if name not in wrong]
 
     def _drop(self, reason: str, names: list[str]) -> None:
@@ -350,7 +381,7 @@ class _Addition:
 
     def report(self) -> None:
         """Say which photos are not added, and why; raise an InputError if that is all."""
-        found = [f"{cli.some(names)} {reason}" for reason, names in self.left_out.items()]
+        found = [f"{reason}: {cli.some(names)}" for reason, names in self.left_out.items()]
         if found and not self.added:
             raise InputError(f"No photo was added to {self.built.folder}: {'; '.join(found)}.")
         if found:
@@ -369,22 +400,24 @@ class _Addition:
         new = {f"{IMAGES}{name}": self.fingerprints[f"{IMAGES}{name}"] for name in self.added}
         provenance.write(built.folder / FINGERPRINTS, known | new)
         cameras = intrinsics.of_map(self.sfm, self.image_dir, self.added)
-        _commit(built, self.sfm, self.added, set(), cameras)
+        _commit(built, self.sfm, len(new.keys() - known.keys()), self.added, cameras=cameras)
         logger.info("%d photos were added to the map %s.", len(self.added), built.folder)
 
 
 def _commit(
     built: Map,
     sfm: pycolmap.Reconstruction,
-    added: Collection[str],
-    removed: Collection[str],
+    more: int,
+    added: Collection[str] = (),
+    removed: Collection[str] = (),
     cameras: intrinsics.MapCameras | None = None,
 ) -> None:
-    """Write a changed model and the map.json that names it, and delete what it replaces.
+    """Write a changed model and the map.json that names it.
 
     Args:
         built: the map.
         sfm: its changed model.
+        more: the number of photos that it is made from grows by this.
         added: names of its new photos.
         removed: names of the photos that it lost.
         cameras: what the new photos tell about intrinsics.
@@ -405,7 +438,7 @@ def _commit(
     content |= {
         "id": uuid.uuid4().hex,
         "sfm": folder.name,
-        "images": content["images"] + len(added) - len(removed),
+        "images": content.get("images", built.num_images) + more,
         "images_with_pose": sfm.num_reg_images(),
         "images_added": sorted(({*content.get("images_added", ())} | {*added}) - {*removed}),
         "images_contradicting_others": contradicting,

@@ -118,3 +118,16 @@ def test_removed_images_leave_the_points_of_the_others(scene, model):
     assert {point.track.length() for point in model.points3D.values()} == {3}
     extension.remove(model, OLD[1:3])
     assert model.num_points3D() == 0
+
+
+def test_a_model_with_a_rig(scene, model):
+    """A photo by a camera of a rig, which has no rig of its own, gets another camera."""
+    other = pycolmap.Camera({**scene.camera.todict(), "camera_id": 7})
+    other.params = [501.0, *scene.camera.params[1:]]
+    model.add_camera(other)
+    rig = model.rigs[1]
+    rig.add_sensor(other.sensor_id, pycolmap.Rigid3d())
+    scene.camera = other
+    extend(scene, model, NEW[:1])
+    image = model.find_image_with_name(NEW[0])
+    assert image.camera_id == 8 and image.frame_id not in range(1, len(OLD) + 1)

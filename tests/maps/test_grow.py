@@ -56,7 +56,7 @@ def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):
     folder, new, model = grown
     built, before, features = maps.Map(folder), poses(folder), contents(maps.Map(folder).features)
     run("--map", folder, "--add_images", new, "--add_model", model)
-    assert "1 photos were added" in capsys.readouterr().out
+    assert ": 1. It has 4 now." in capsys.readouterr().out
     after = maps.Map(folder)
     assert after.names() == [*BASE, NEW] and after.num_images == 4
     assert after.num_points3D > built.num_points3D and after.id != built.id
@@ -105,8 +105,8 @@ def test_photos_that_are_localized(place, tmp_path, caplog, run, refused):
     run("--map", folder, "--add_images", new)
     assert names(folder) == ["a.png", *sorted(before)]
     assert {name: poses(folder)[name] for name in before} == before
-    assert "broken.png cannot be read" in caplog.text
-    assert "grey.png, noise.png cannot be localized in the map" in caplog.text
+    assert "not readable: broken.png" in caplog.text
+    assert "not localized in the map: grey.png, noise.png" in caplog.text
     truth = (images.parent / "queries/ground_truth_poses.txt").read_text().split()
     assert poses(folder)["a.png"][2][3] == pytest.approx(float(truth[7]), abs=0.1)
     content = json.loads((folder / "map.json").read_text())
@@ -116,11 +116,11 @@ def test_photos_that_are_localized(place, tmp_path, caplog, run, refused):
     for name in ("a.png", "noise.png"):
         (new / name).unlink()
     message = refused("--map", folder, "--add_images", new)
-    assert "No photo was added" in message and "grey.png cannot be localized" in message
+    assert "No photo was added" in message and "not localized in the map: grey.png" in message
     copied = tmp_path / "copied"
     copied.mkdir()
     shutil.copy(images / BASE[0], copied / "again.png")
-    assert "again.png are copies of db/0.png" in refused("--map", folder, "--add_images", copied)
+    assert "copies of db/0.png: again.png" in refused("--map", folder, "--add_images", copied)
     cv2.imwrite(str(copied / "a.png"), cv2.imread(str(images / BASE[1]))[:, :-1])
     assert "other photos that are called a.png" in refused("--map", folder, "--add_images", copied)
     assert (folder / "map.json").read_bytes() == state and names(folder)[0] == "a.png"
@@ -162,9 +162,45 @@ def test_a_killed_change_goes_on(grown, stage):
     assert not (folder / grow.GROWING).exists() and len(list(folder.glob("sfm*"))) == 1
 
 
+def test_copies_in_the_map_keep_their_features(place, tmp_path, run):
+    (_, model, _, images, _, outputs), _, _ = place
+    folder, photos = outputs / "map", tmp_path / "photos/db"
+    shutil.copytree(images / "db", photos)
+    shutil.copy(photos / "0.png", photos / "1.png")  # the model has poses of both
+    run(
+        "--map",
+        colmap.write_part(model, BASE, tmp_path / "part"),
+        "--map_images",
+        photos.parent,
+        "--outputs",
+        outputs,
+    )
+    run("--map", folder, "--add_images", photos.parent, "--add_model", model)
+    assert names(folder) == [*BASE, NEW]
+    assert list_h5_names(maps.Map(folder).features) == [*BASE, NEW]
+    assert list_h5_names(maps.Map(folder).descriptors) == [*BASE, NEW]
+
+
+def _kill_removal(folder) -> None:
+    grow.merge = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+    maps.remove(maps.Map(folder), BASE[:1])
+
+
+def test_a_killed_removal_goes_on(grown):
+    folder, _, _ = grown
+    process = multiprocessing.get_context("fork").Process(target=_kill_removal, args=(folder,))
+    process.start()
+    process.join(120)
+    assert process.exitcode == -signal.SIGKILL
+    assert names(folder) == BASE[1:]
+    maps.remove(maps.Map(folder), BASE[:1])
+    assert list_h5_names(maps.Map(folder).features) == BASE[1:]
+    assert len(list(folder.glob("sfm*"))) == 1
+
+
 def test_wrong_options(grown, tmp_path, refused):
     folder, new, model = grown
-    assert "is not a map" in refused("--map", model, "--add_images", new)
+    assert "is a COLMAP model" in refused("--map", model, "--add_images", new)
     assert "a map that was built before" in refused("--add_images", new)
     assert "--add_images." in refused("--map", folder, "--add_model", model, "--outputs", tmp_path)
     assert "no photo x.png" in refused(

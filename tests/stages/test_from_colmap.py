@@ -77,20 +77,6 @@ def test_a_log_beside_the_database_is_read(found, tmp_path):
     connection.close()
 
 
-def test_verified_matches(found, tmp_path):
-    database = tmp_path / "database.db"
-    write_old(database, {"a.jpg": found, "b.jpg": found})
-    matches = np.array([[1, 2], [3, 4]], np.uint32)
-    with sqlite3.connect(database) as connection:
-        row = (2**31 - 1 + 2, 2, 2, matches.tobytes())
-        connection.execute("INSERT INTO two_view_geometries VALUES (?, ?, ?, ?)", row)
-    connection.close()
-    with colmap.open_stored(database) as opened:
-        assert opened.pairs() == {("a.jpg", "b.jpg"): 2}
-        np.testing.assert_array_equal(opened.verified("a.jpg", "b.jpg"), matches)
-        np.testing.assert_array_equal(opened.verified("b.jpg", "a.jpg"), matches[:, ::-1])
-
-
 @pytest.mark.parametrize(
     "change, message",
     [

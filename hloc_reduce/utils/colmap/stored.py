@@ -19,7 +19,6 @@ PATIENCE = 2.0  # seconds in which another program may release a lock
 SIFT = "SIFT"
 # COLMAP's types of features; databases of versions before 4 have SIFT only
 TYPES = {-1: SIFT, 0: SIFT, 1: "ALIKED_N16ROT", 2: "ALIKED_N32", 3: "LOMA_B", 4: "LOMA_B128"}
-PAIR = 2**31 - 1  # the id of a pair of images is this times the smaller id plus the larger one
 
 
 def log_of(path: Path) -> Path:
@@ -97,25 +96,8 @@ class StoredDatabase:
 
     def descriptors(self, name: str) -> np.ndarray:
         """Return the descriptors of an image (N, D), bytes: those of floats have four a number."""
-        return self._array("descriptors", name, np.uint8)
-
-    def pairs(self) -> dict[tuple[str, str], int]:
-        """Return the number of verified matches of each pair of images that has any."""
-        names = {image_id: name for name, image_id in self.images.items()}
-        rows = self._rows("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0")
-        ids = ((divmod(pair, PAIR), number) for pair, number in rows)
-        return {(names[a], names[b]): n for (a, b), n in ids if a in names and b in names}
-
-    def verified(self, name0: str, name1: str) -> np.ndarray:
-        """Return the verified matches of a pair of images (M, 2) int64."""
-        ids = self.images[name0], self.images[name1]
-        pair = PAIR * min(ids) + max(ids)
-        rows = self._rows(
-            "SELECT rows, cols, data FROM two_view_geometries WHERE pair_id = ?", pair
-        )
-        found = self._shaped(rows, f"the matches of {name0} and {name1}", np.uint32)
-        found = found.astype(np.int64)
-        return found if ids[0] <= ids[1] else found[:, ::-1]
+        found = self._array("descriptors", name, np.uint8)
+        return found if len(found) else np.zeros((0, 128), np.uint8)
 
     def _numbers(self, table: str) -> dict[str, int]:
         rows = dict(self._rows(f"SELECT image_id, rows FROM {table} WHERE rows > 0"))
@@ -143,7 +125,9 @@ class StoredDatabase:
 
 @contextmanager
 def open_stored(path: Path) -> Iterator[StoredDatabase]:
-    """Open a COLMAP database of a user; nothing is written, not even beside it.
+    """Open a COLMAP database of a user, which is not changed.
+
+    SQLite may write a -shm file beside one with a write-ahead log that COLMAP left.
 
     Raises:
         InputError: when it is missing, not a database of COLMAP, or locked by another program.
