@@ -24,17 +24,16 @@ from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES
-from hloc_reduce.utils.parsers import image_names
 from hloc_reduce.utils.paths import strings_as_paths
 
-from . import options
+from . import changes, options
 from .queries import Photos, Queries
 from .retrieval import retrieve_in_map
 from .run import Run, readable
 
 MADE_FROM = "made_from.json"  # the map and the photos of the queries
 LISTED = "queries_with_intrinsics.txt"  # written for a folder of queries
-CHANGES = "add_images", "add_model", "refine_map", "remove_images"  # options
+OF_MAP = "feature", "projection", "matcher", "storage", "keypoints", "camera_mode"  # options
 NOT_IN_NAMES = r"[^\w.-]+"  # characters of a glob
 
 
@@ -312,7 +311,7 @@ def _main() -> None:
     parser.add_argument(
         "--num_covis", type=int, default=20, help="other images that each map image is matched with"
     )
-    _add_changes(parser)
+    changes.add_options(parser)
     colmap.add_camera_mode(parser)
     options.add_feature_options(parser)
     options.add_localization_options(parser, "none", 50)
@@ -322,10 +321,8 @@ def _main() -> None:
     for name, names in (("storage", STORAGES), ("keypoints", KEYPOINTS)):
         if given[name] is not None:
             cli.choose(name, given[name], names)
-    changes = {name: given.pop(name) for name in CHANGES}
-    if given["outputs"] is None and (
-        given["query_images"] is not None or not any(changes.values())
-    ):
+    change = {name: given.pop(name) for name in changes.NAMES}
+    if given["outputs"] is None and (given["query_images"] is not None or not any(change.values())):
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
@@ -337,76 +334,15 @@ def _main() -> None:
     profiled = given.pop("profile") and given["outputs"] is not None
     trace_file = given["outputs"] / "trace.json" if profiled else None
     with trace.recording(trace_file):
-        if any(changes.values()):
-            _check_changed(given, **changes)
-            _change(given["map"], **changes)
+        if any(change.values()):
+            folder = given["map"]
+            changes.check(given, **change)
+            open_map(folder, model_or_map=folder, **{name: given[name] for name in OF_MAP})
+            changes.main(folder, **change)
         if given["outputs"] is not None:
             _run(given)
         elif small is not None:
             compact.main(small, given["map"])
-
-
-def _add_changes(parser: cli.Parser) -> None:
-    """Add the options that change a map."""
-    parser.add_argument(
-        "--add_images",
-        type=Path,
-        help="folder of photos to add to --map, a map that was built before",
-    )
-    parser.add_argument(
-        "--add_model",
-        type=Path,
-        help="COLMAP model with the poses of --add_images in the frame of the map, which are kept "
-        "(default: the photos are localized in the map)",
-    )
-    parser.add_argument(
-        "--refine_map",
-        action="store_true",
-        help="adjust the poses of all photos of the map to those of --add_images",
-    )
-    parser.add_argument(
-        "--remove_images", type=Path, help="text file of the names of photos to remove from --map"
-    )
-
-
-def _check_changed(
-    given: dict, add_images: Path | None, add_model: Path | None, refine_map: bool, **_: object
-) -> None:
-    """Refuse options that do not go together before a map is changed."""
-    if add_images is None and (add_model is not None or refine_map):
-        raise InputError(
-            "--add_model and --refine_map are for photos that are added: --add_images."
-        )
-    folder, others = given["map"], (given["map_images"], given["database"])
-    if folder is None or any(others) or maps.is_compact(folder):
-        raise InputError(
-            "--add_images and --remove_images change a map that was built before: give its folder, "
-            "--map, without --map_images and --database."
-        )
-    names = "feature", "projection", "matcher", "storage", "keypoints", "camera_mode"
-    open_map(folder, model_or_map=folder, **{name: given[name] for name in names})
-
-
-def _change(
-    folder: Path,
-    add_images: Path | None,
-    add_model: Path | None,
-    refine_map: bool,
-    remove_images: Path | None,
-) -> None:
-    """Remove photos from a map that was built before, and add others."""
-    built = Map(folder)
-    if remove_images is not None:
-        names = image_names(remove_images)
-        # if a run that adds others is repeated, they are gone
-        if add_images is None or not {*names}.isdisjoint(built.names()):
-            built = maps.remove(built, names)
-            print(f"{built.num_images} photos are left in the map {folder}.")
-    if add_images is not None:
-        before = built.num_images
-        built = maps.add(built, add_images, add_model, refine_map=refine_map)
-        added = built.num_images - before
-        print(f"Photos added to the map {folder}: {added}. It has {built.num_images} now.")
 
 
 def _run(given: dict) -> None:

@@ -13,7 +13,7 @@ import pytest
 from command import contents, write
 
 from hloc_reduce import Localizer, maps
-from hloc_reduce.maps import grow
+from hloc_reduce.maps import addition, grow
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.h5 import list_h5_names
 from pipelines import localize
@@ -27,6 +27,7 @@ STAGES = (
     "match_features.main",
     "extension.extend",
     "contradictions.judge",
+    "_commit_addition",
     "_commit",
     "_drop_left",
 )
@@ -67,7 +68,7 @@ def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):
     assert {key: same[key] for key in features} == features
     assert list_h5_names(after.descriptors) == [*BASE, NEW]
     assert {path.name for path in folder.glob("sfm*")} == {after.sfm.name}
-    assert not (folder / grow.GROWING).exists()
+    assert not (folder / addition.GROWING).exists()
 
     # as well as a map that was built at once
     build, images, _ = place
@@ -140,9 +141,8 @@ def test_a_pose_in_another_frame_is_refused(grown, tmp_path, refused):
 
 def _kill(stage: str, folder, new, model) -> None:
     """Add photos in a process that is killed when a stage begins."""
-    target, (*where, name) = grow, stage.split(".")
-    for part in where:
-        target = getattr(target, part)
+    module, _, name = stage.rpartition(".")
+    target = getattr(addition, module) if module else grow
     setattr(target, name, lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL))
     maps.add(maps.Map(folder), new, model)
 
@@ -159,7 +159,7 @@ def test_a_killed_change_goes_on(grown, stage):
     assert names(folder) == ([*BASE, NEW] if finished else BASE)  # whole at any moment
     maps.add(maps.Map(folder), new, model)
     assert names(folder) == [*BASE, NEW]
-    assert not (folder / grow.GROWING).exists() and len(list(folder.glob("sfm*"))) == 1
+    assert not (folder / addition.GROWING).exists() and len(list(folder.glob("sfm*"))) == 1
 
 
 def test_copies_in_the_map_keep_their_features(place, tmp_path, run):

@@ -1,0 +1,90 @@
+"""Options of pipelines.localize that change a map: photos to add and to remove."""
+
+from pathlib import Path
+
+from hloc_reduce import maps
+from hloc_reduce.maps.map import Map
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.parsers import image_names
+
+NAMES = "add_images", "add_model", "refine_map", "remove_images"
+
+
+def add_options(parser: cli.Parser) -> None:
+    """Add the options that change a map."""
+    parser.add_argument(
+        "--add_images",
+        type=Path,
+        help="folder of photos to add to --map, a map that was built before",
+    )
+    parser.add_argument(
+        "--add_model",
+        type=Path,
+        help="COLMAP model with the poses of --add_images in the frame of the map, which are kept "
+        "(default: the photos are localized in the map)",
+    )
+    parser.add_argument(
+        "--refine_map",
+        action="store_true",
+        help="adjust the poses of all photos of the map to those of --add_images",
+    )
+    parser.add_argument(
+        "--remove_images", type=Path, help="text file of the names of photos to remove from --map"
+    )
+
+
+def check(
+    given: dict, add_images: Path | None, add_model: Path | None, refine_map: bool, **_: object
+) -> None:
+    """Raise an InputError for options that do not go together.
+
+    Args:
+        given: the other options of `pipelines.localize`.
+        add_images: see `main`, like `add_model` and `refine_map`.
+        add_model: see `add_images`.
+        refine_map: see `add_images`.
+    """
+    if add_images is None and (add_model is not None or refine_map):
+        raise InputError(
+            "--add_model and --refine_map are for photos that are added: --add_images."
+        )
+    folder, others = given["map"], (given["map_images"], given["database"])
+    if folder is None or any(others) or maps.is_compact(folder):
+        raise InputError(
+            "--add_images and --remove_images change a map that was built before: give its folder, "
+            "--map, without --map_images and --database."
+        )
+
+
+def main(
+    folder: Path,
+    add_images: Path | None,
+    add_model: Path | None,
+    refine_map: bool,
+    remove_images: Path | None,
+) -> None:
+    """Remove photos from a map, and add others.
+
+    Args:
+        folder: of the map.
+        add_images: folder of photos to add.
+        add_model: COLMAP model of their poses, see `maps.add`.
+        refine_map: see `maps.add`.
+        remove_images: text file of the names of photos to remove.
+
+    Raises:
+        InputError: see `maps.add` and `maps.remove`.
+    """
+    built = Map(folder)
+    if remove_images is not None:
+        names = image_names(remove_images)
+        # if a run that adds others is repeated, they are gone
+        if add_images is None or not {*names}.isdisjoint(built.names()):
+            built = maps.remove(built, names)
+            print(f"{built.num_images} photos are left in the map {folder}.")
+    if add_images is not None:
+        before = built.num_images
+        built = maps.add(built, add_images, add_model, refine_map=refine_map)
+        added = built.num_images - before
+        print(f"Photos added to the map {folder}: {added}. It has {built.num_images} now.")
