@@ -16,9 +16,7 @@ from .confs import features as features_confs
 from .descriptors import COLMAP
 from .descriptors.normalization import NORMALIZATIONS
 from .detectors.dog import NOISE
-from .reduce import SAMPLED, Described, Reduction, told_by
-from .runtime import parallel
-from .runtime.group_writer import GroupWriter
+from .reduce import Described, Reduction, add_options, sampled, told_by
 from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.codes import STORAGES
@@ -26,7 +24,6 @@ from .utils.colmap import SIFT, StoredDatabase
 from .utils.files import file_sha256
 from .utils.parsers import check_names
 from .utils.paths import strings_as_paths
-from .utils.progress import progress
 
 LARGEST = 3200  # pixels: COLMAP detects in smaller versions of larger photos, by default
 COMPARED = 50  # keypoints of each image whose positions are compared with those of a model
@@ -140,12 +137,8 @@ def write(
     normalization = normalization or _normalization(database, names)
     cli.choose("normalization", normalization, NORMALIZATIONS)
     made_by = {"database": made_from, "normalization": normalization, **reduction.provenance}
-    with GroupWriter(output, made_by, overwrite) as writer:
-        todo = [name for name in names if name not in writer]
-        reduce = partial(reduction.reduce, normalization)
-        groups = parallel.ordered("reduce", reduce, _read(database, todo, reduction))
-        for group in progress(groups, "Reducing features", "image", len(todo)):
-            writer.add(*group)
+    read = partial(_read, database, reduction)
+    reduction.write(output, made_by, overwrite, names, read, normalization)
 
 
 def _check_type(database: StoredDatabase, reduction: Reduction) -> None:
@@ -200,8 +193,7 @@ def _agree(image: pycolmap.Image, keypoints: np.ndarray) -> bool:
 
 def _normalization(database: StoredDatabase, names: list[str]) -> str:
     """Tell how the descriptors of a database are normalized, by those of some images."""
-    sampled = names[:: -(-len(names) // SAMPLED)]
-    found = np.concatenate([_unit(database.descriptors(name)) for name in sampled])
+    found = np.concatenate([_unit(database.descriptors(name)) for name in sampled(names)])
     return told_by(found, str(database.path))
 
 
@@ -211,7 +203,7 @@ def _unit(descriptors: np.ndarray) -> np.ndarray:
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
 
 
-def _read(database: StoredDatabase, names: list[str], reduction: Reduction) -> Iterator[Described]:
+def _read(database: StoredDatabase, reduction: Reduction, names: list[str]) -> Iterator[Described]:
     """Read the features of images."""
     for name in names:
         keypoints, descriptors = database.keypoints(name), database.descriptors(name)
@@ -237,19 +229,12 @@ def _main() -> None:
         default=features_confs.RECOMMENDED,
         help=f"feature of {COLMAP}, see pipelines.aachen --list_features",
     )
-    parser.add_argument("--projection", type=Path, help="file of another projection of its base")
     parser.add_argument(
         "--model",
         type=Path,
         help="COLMAP model made from the database: only its images are written (default: all)",
     )
-    features_confs.add_storage_option(parser)
-    parser.add_argument(
-        "--normalization",
-        help=f"of the descriptors, one of {', '.join(NORMALIZATIONS)} (default: told by their "
-        "numbers)",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="write all images again")
+    add_options(parser)
     main(**vars(parser.parse_args()))
 
 

@@ -5,7 +5,7 @@ scores and all else are copied, so that pairs, matches and models made with the 
 the new one.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -79,12 +79,8 @@ def main(
             "normalization": normalization,
             **reduction.provenance,
         }
-        reduce = partial(reduction.reduce, normalization)
-        with GroupWriter(output, made_by, overwrite) as writer:
-            todo = [image for image in names if image not in writer]
-            groups = parallel.ordered("reduce", reduce, _read(file, todo, reduction))
-            for group in progress(groups, "Reducing features", "image", len(todo)):
-                writer.add(*group)
+        read = partial(_read, file, reduction)
+        reduction.write(output, made_by, overwrite, names, read, normalization)
     logger.info("%d images with %s, %s: %s", len(names), name, storage, output)
     return output
 
@@ -149,14 +145,44 @@ class Reduction:
         stored, own = store({"descriptors": descriptors.T}, self._storage, self._levels)
         return name, arrays | stored, attrs | own
 
+    def write(
+        self,
+        output: Path,
+        made_by: dict,
+        overwrite: bool,
+        names: list[str],
+        read: Callable[[list[str]], Iterable[Described]],
+        normalization: str | None,
+    ) -> None:
+        """Write the reduced descriptors of those images that a feature file lacks.
+
+        Args:
+            output: the feature file.
+            made_by: its provenance.
+            overwrite: reduce all images again.
+            names: the images.
+            read: reads images.
+            normalization: as in `reduce`.
+        """
+        reduce = partial(self.reduce, normalization)
+        with GroupWriter(output, made_by, overwrite) as writer:
+            todo = [name for name in names if name not in writer]
+            groups = parallel.ordered("reduce", reduce, read(todo))
+            for group in progress(groups, "Reducing features", "image", len(todo)):
+                writer.add(*group)
+
 
 def _normalization(file: h5py.File, names: list[str]) -> str:
     """Tell how the descriptors of a file are normalized, by those of some images."""
-    sampled = names[:: -(-len(names) // SAMPLED)]
-    descriptors = [get_descriptors(file, name) for name in sampled]
+    descriptors = [get_descriptors(file, name) for name in sampled(names)]
     if len({part.shape[1] for part in descriptors}) != 1:
         raise InputError(f"{file.filename} has no descriptors, or they differ in size.")
     return told_by(np.concatenate(descriptors), file.filename)
+
+
+def sampled(names: list[str]) -> list[str]:
+    """Return an even share of images, whose descriptors tell how all are normalized."""
+    return names[:: max(1, -(-len(names) // SAMPLED))]
 
 
 def told_by(descriptors: np.ndarray, place: str) -> str:
@@ -177,7 +203,7 @@ def told_by(descriptors: np.ndarray, place: str) -> str:
     return found
 
 
-def _read(file: h5py.File, names: list[str], reduction: Reduction) -> Iterator[Described]:
+def _read(file: h5py.File, reduction: Reduction, names: list[str]) -> Iterator[Described]:
     """Read the features of images."""
     of_network = features_confs.network_of(reduction.conf["model"]) is not None
     for name in names:
@@ -204,6 +230,12 @@ def _main() -> None:
         help="what to reduce to: colmap_sift_sv32 for SIFT of hloc or COLMAP, aliked_sv32 for "
         "hloc's aliked-n16, and others of pipelines.aachen --list_features",
     )
+    add_options(parser)
+    main(**vars(parser.parse_args()))
+
+
+def add_options(parser: cli.Parser) -> None:
+    """Add the options of what descriptors are reduced to, and how."""
     parser.add_argument("--projection", type=Path, help="file of another projection of its base")
     features_confs.add_storage_option(parser)
     parser.add_argument(
@@ -212,7 +244,6 @@ def _main() -> None:
         "rootsift for hloc's (default: told by their numbers)",
     )
     parser.add_argument("--overwrite", action="store_true", help="reduce all images again")
-    main(**vars(parser.parse_args()))
 
 
 if __name__ == "__main__":

@@ -233,7 +233,9 @@ def _main() -> None:
     parser.add_argument("--queries", type=Path, help="query list with intrinsics, or a glob")
     parser.add_argument("--ground_truth", type=Path, help="true poses of the queries")
     parser.add_argument("--num_loc", type=int, default=NUM_LOC, help="retrieved images per query")
-    parser.add_argument("--max_mb", type=float, help="size of the compact map in megabytes")
+    parser.add_argument(
+        "--max_mb", type=float, help="size of the compact map in megabytes (default: all points)"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace earlier results")
     args = parser.parse_args()
     rows = main(**vars(args))

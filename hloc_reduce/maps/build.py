@@ -28,7 +28,7 @@ from ..extract_features import keep_present, keep_readable
 from ..localization import intrinsics
 from ..mapping import mapper, plausibility, registration
 from ..runtime import provenance
-from ..runtime.outputs import RunFolder
+from ..runtime.outputs import CONF, RunFolder
 from ..utils import colmap
 from ..utils.cli import InputError
 from ..utils.codes import STORAGES
@@ -98,33 +98,20 @@ def main(
     exhaustive = not has_points and len(names) <= MAX_EXHAUSTIVE
     if overwrite or not (map_dir / "conf.json").exists():
         extract_features.check_model(conf)
-    fingerprints, digests = _digests(map_dir, image_dir, names, model)
+    fingerprints, found = _digests(map_dir, image_dir, names, model)
     made_from = {
         "feature": extract_features.provenance(conf),
         "matcher": matchers_confs.confs[matcher]["model"],
         "num_covis": num_covis,
-        **digests,
+        **found,
     }
     if exhaustive:
         made_from |= {"num_covis": None, "pairs": "exhaustive"}
     elif model is None:
         made_from |= {"pairs": f"retrieval, {ROUNDS} rounds of verification"}
-    before = provenance.read(map_dir / "conf.json")
-    if before and before != made_from and not (map_dir / FINISHED).exists():
-        logger.info("Rebuilding the unfinished map %s.", map_dir)
-        overwrite = True
-    with RunFolder(
-        map_dir,
-        made_from,
-        overwrite,
-        inputs=[path for path in (image_dir, model, projection) if path is not None],
-        kept=(PLACE, FINGERPRINTS),
-    ) as folder:
+    with claim(map_dir, made_from, overwrite, image_dir, model, projection) as folder:
         if not (map_dir / FINISHED).exists():
-            if not (map_dir / PLACE).exists():
-                with replacing(map_dir / PLACE) as temporary:
-                    temporary.write_text(uuid.uuid4().hex)
-            provenance.write(map_dir / FINGERPRINTS, fingerprints)
+            begin(map_dir, fingerprints)
             building = _Building(
                 *(folder, image_dir, names, matcher, num_covis, exhaustive),
                 *(accept_partial, camera_mode),
@@ -140,6 +127,31 @@ def main(
         contradictions.warn(built.contradicting)
         precision.warn(built.uncertain)
         return built
+
+
+def claim(map_dir: Path, made_from: dict, overwrite: bool, *inputs: Path | None) -> RunFolder:
+    """Lock the folder of a map, whose unfinished map of something else is replaced.
+
+    Args:
+        map_dir: the folder.
+        made_from: what the map is made from.
+        overwrite: rebuild the map.
+        inputs: files and folders that the map is made from, if given.
+    """
+    before = provenance.read(map_dir / CONF)
+    if before and before != made_from and not (map_dir / FINISHED).exists():
+        logger.info("Rebuilding the unfinished map %s.", map_dir)
+        overwrite = True
+    given = [path for path in inputs if path is not None]
+    return RunFolder(map_dir, made_from, overwrite, given, kept=(PLACE, FINGERPRINTS))
+
+
+def begin(map_dir: Path, fingerprints: dict[str, list]) -> None:
+    """Write what a map has before it is built: the id of its place, and fingerprints."""
+    if not (map_dir / PLACE).exists():
+        with replacing(map_dir / PLACE) as temporary:
+            temporary.write_text(uuid.uuid4().hex)
+    provenance.write(map_dir / FINGERPRINTS, fingerprints)
 
 
 def _list(
@@ -163,6 +175,13 @@ def _digests(
         "images": {name: image_dir / name for name in names},
         "model": {path.name: path for path in model_files(model)},
     }
+    return digests(map_dir, groups)
+
+
+def digests(
+    map_dir: Path, groups: dict[str, dict[str, Path]]
+) -> tuple[dict, dict[str, dict[str, str]]]:
+    """Return the fingerprints of groups of files by name, and the digests of each group."""
     files = {f"{key}/{name}": file for key, part in groups.items() for name, file in part.items()}
     fingerprints = provenance.fingerprints(files, provenance.read(map_dir / FINGERPRINTS))
     return fingerprints, {

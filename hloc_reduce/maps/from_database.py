@@ -13,17 +13,16 @@ from ..localization import intrinsics
 from ..mapping import copies
 from ..reduce import Reduction
 from ..runtime import provenance
-from ..runtime.outputs import CONF, RunFolder
+from ..runtime.outputs import RunFolder
 from ..utils import colmap
 from ..utils.cli import InputError, no_folder
 from ..utils.codes import STORAGES
 from ..utils.colmap import StoredDatabase
-from ..utils.files import replacing
 from ..utils.match_files import check_names
 from ..utils.paths import strings_as_paths
 from . import contradictions
-from .build import keep_projection, model_files
-from .map import FINGERPRINTS, FINISHED, PLACE, RETRIEVAL, SFM, Map, with_projection
+from .build import begin, claim, digests, keep_projection, model_files
+from .map import FINISHED, RETRIEVAL, SFM, Map, with_projection
 
 
 @strings_as_paths
@@ -73,32 +72,26 @@ def main(
         names = from_colmap.check(opened, reduction, reference)
         check_names(names)
         cameras = _cameras(reference, names, image_dir)
-        fingerprints, digests = _digests(map_dir, opened, model)
+        groups = {"database": opened.files(), "model": model_files(model)}
+        named = {key: {path.name: path for path in part} for key, part in groups.items()}
+        fingerprints, found = digests(map_dir, named)
         made_from = {
             "feature": extract_features.provenance(conf),
             "matcher": matchers_confs.confs[matcher]["model"],
-            **digests,
+            **found,
             "cameras": {"known": _to_lists(cameras), "models": sorted(cameras.models)},
         }
-        before = provenance.read(map_dir / CONF)
-        if before and before != made_from and not (map_dir / FINISHED).exists():
-            logger.info("Rebuilding the unfinished map %s.", map_dir)
-            overwrite = True
-        inputs = [path for path in (database, model, projection, image_dir) if path is not None]
-        kept = PLACE, FINGERPRINTS
-        with RunFolder(map_dir, made_from, overwrite, inputs, kept=kept) as folder:
+        inputs = database, model, projection, image_dir
+        with claim(map_dir, made_from, overwrite, *inputs) as folder:
             if (map_dir / FINISHED).exists():
                 built = Map(map_dir)
                 contradictions.warn(built.contradicting)
                 return built
-            if not (map_dir / PLACE).exists():
-                with replacing(map_dir / PLACE) as temporary:
-                    temporary.write_text(uuid.uuid4().hex)
-            provenance.write(map_dir / FINGERPRINTS, fingerprints)
+            begin(map_dir, fingerprints)
             logger.info("Building the map %s of %d images of %s.", map_dir, len(names), database)
             conf = keep_projection(conf, map_dir)
             contradicting = _build(
-                *(folder, opened, reduction, conf, names, reference, model, digests)
+                *(folder, opened, reduction, conf, names, reference, model, found)
             )
             about = {
                 "feature": name,
@@ -132,19 +125,6 @@ def _to_lists(cameras: intrinsics.MapCameras) -> dict[str, list]:
     return {name: intrinsics.to_list(camera) for name, camera in cameras.known.items()}
 
 
-def _digests(
-    map_dir: Path, database: StoredDatabase, model: Path
-) -> tuple[dict, dict[str, dict[str, str]]]:
-    """Return the fingerprints of a database and a model, and the digests of both by name."""
-    groups = {"database": database.files(), "model": model_files(model)}
-    files = {f"{key}/{path.name}": path for key, part in groups.items() for path in part}
-    fingerprints = provenance.fingerprints(files, provenance.read(map_dir / FINGERPRINTS))
-    return fingerprints, {
-        key: {path.name: fingerprints[f"{key}/{path.name}"][2] for path in part}
-        for key, part in groups.items()
-    }
-
-
 def _build(
     folder: RunFolder,
     database: StoredDatabase,
@@ -153,7 +133,7 @@ def _build(
     names: list[str],
     reference: pycolmap.Reconstruction,
     model: Path,
-    digests: dict[str, dict[str, str]],
+    found: dict[str, dict[str, str]],
 ) -> list[str]:
     """Write the features, global descriptors and model of a map.
 
@@ -162,12 +142,12 @@ def _build(
     """
     with folder.stage("extract_features"):
         features = folder.path / f"{conf['output']}.h5"
-        from_colmap.write(database, features, reduction, names, digests["database"])
+        from_colmap.write(database, features, reduction, names, found["database"])
     with folder.stage("retrieval"):
         aggregate_features.main(RETRIEVAL, features, names)
     with (
         folder.stage("triangulation"),
-        triangulation.replacing_map(folder.path / SFM, digests["model"], model) as written,
+        triangulation.replacing_map(folder.path / SFM, found["model"], model) as written,
     ):
         reference.write_binary(written)
     with folder.stage("judge_poses"):
