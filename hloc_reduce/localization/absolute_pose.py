@@ -29,6 +29,7 @@ LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 ROUNDS = 3  # of estimation from the inliers among all matches
+RIVAL_SAMPLE = 1000  # matches from which a rival is estimated
 # poses that differ by more are rivals
 SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the median depth of the inliers
@@ -145,7 +146,8 @@ def estimate(
     if len(others) >= RIVAL * best.num_inliers > 0:
         # half as many inliers as a rival of this confidence is expected to have
         least = RIVAL / 2 * best.num_inliers / len(others)
-        poses.append(_estimate(matches, others, max(LEAST_RATIO, least)))
+        sample = others[:: -(-len(others) // RIVAL_SAMPLE)]
+        poses.append(_estimate(matches, sample, max(LEAST_RATIO, least)))
     return replace(best, refusal=_refusal(matches, best, poses, gate, doubt))
 
 

@@ -1,5 +1,7 @@
 """Poses that can be trusted, and those that cannot: chance, precision, ambiguity."""
 
+import re
+
 import numpy as np
 import pycolmap
 import pytest
@@ -275,6 +277,15 @@ def test_a_rival_is_looked_for_where_many_matches_disagree(number):
     keypoints, points = (np.concatenate(part) for part in zip(first, second, strict=True))
     found = solve(keypoints, points, [np.arange(0, 100, 2), np.arange(1, 100, 2)])
     assert found.refusal == f"ambiguous: another pose has {other} inliers, this one {number}"
+
+
+def test_a_rival_is_found_in_a_sample_of_many_matches():
+    first = matches(800, 0)
+    second = matches(300, 1900, seed=1, pose=pose_of(0, (50, 0, 8)))
+    keypoints, points = (np.concatenate(part) for part in zip(first, second, strict=True))
+    found = solve(keypoints, points, [np.arange(800), np.arange(800, 3000)])
+    assert found.refusal is not None
+    assert re.fullmatch("ambiguous: another pose has 3.. inliers, this one 8..", found.refusal)
 
 
 def test_a_gate_of_ones_own_is_kept():
