@@ -8,6 +8,7 @@ import numpy as np
 
 from . import logger
 from .confs import retrieval as retrieval_confs
+from .runtime import parallel
 from .runtime.group_writer import failures, resume_or_replace
 from .utils import cli, colmap
 from .utils.cli import InputError
@@ -83,13 +84,20 @@ def main(
                 elif not vocabulary.exists():
                     raise InputError(f"The vocabulary {vocabulary} of {output} is gone: overwrite.")
             model.vocabulary = read_vocabulary(vocabulary)
-            for name in progress(todo, "Aggregating", "image"):
-                local = torch.from_numpy(get_descriptors(file, name).T)
+
+            def aggregate(described: tuple[str, np.ndarray]) -> dict[str, np.ndarray]:
+                name, local = described
                 try:
-                    descriptor = model({"descriptors": local[None]})["global_descriptor"][0]
+                    found = model({"descriptors": torch.from_numpy(local.T)[None]})
                 except InputError as error:
                     raise InputError(f"{features}, {name}: {error}") from None
-                writer.add(name, {"global_descriptor": descriptor.half().numpy()})
+                return {"global_descriptor": found["global_descriptor"][0].half().numpy()}
+
+            described = ((name, get_descriptors(file, name)) for name in todo)
+            found = parallel.ordered("aggregate", aggregate, described)
+            bar = progress(found, "Aggregating", "image", len(todo))
+            for name, group in zip(todo, bar, strict=True):
+                writer.add(name, group)
     logger.info("Global descriptors are in %s.", output)
     return output
 

@@ -15,6 +15,8 @@ from . import groups
 # a point is expected in a photo if another photo sees it from a direction that differs by at most
 # as many degrees, and from a distance that differs by at most this factor
 ANGLE, DISTANCE = 15.0, 1.5
+# so that the two photos are at most as many of the distances from the first one to the point apart
+REACH = np.sqrt(1 + DISTANCE**2 - 2 * DISTANCE * np.cos(np.radians(ANGLE)))
 # Two groups of photos that share less of the expected points contradict each other, if a photo of
 # one expects enough of them in one of the other, on average. Sound maps share a quarter and more,
 # the two that were merged by mistake 1 and 10 % (docs/results.md).
@@ -67,13 +69,18 @@ def _count(
     expected, shared = np.zeros((2, number, number))
     for i in range(number):
         its = np.flatnonzero(seen[i])
-        rays = xyz[its] - centres[:, None]
+        own = xyz[its] - centres[i]
+        own_distance = np.maximum(np.linalg.norm(own, axis=1), np.finfo(float).tiny)
+        moved = np.linalg.norm(centres - centres[i], axis=1)
+        near = np.flatnonzero(moved <= REACH * own_distance.max(initial=0))
+        rays = xyz[its] - centres[near, None]
         distance = np.maximum(np.linalg.norm(rays, axis=2), np.finfo(float).tiny)
-        cosine = np.einsum("jnd,nd->jn", rays, rays[i]) / distance / distance[i]
-        ratio = distance / distance[i]
+        cosine = np.einsum("jnd,nd->jn", rays, own) / distance / own_distance
+        ratio = distance / own_distance
         alike = (cosine > np.cos(np.radians(ANGLE))) & (np.abs(np.log(ratio)) < np.log(DISTANCE))
-        wanted = alike & inside[:, its]
-        expected[i], shared[i] = wanted.sum(axis=1), (wanted & seen[:, its]).sum(axis=1)
+        wanted = alike & inside[np.ix_(near, its)]
+        expected[i, near] = wanted.sum(axis=1)
+        shared[i, near] = (wanted & seen[np.ix_(near, its)]).sum(axis=1)
     np.fill_diagonal(expected, 0)
     np.fill_diagonal(shared, 0)
     return expected + expected.T, shared + shared.T, used

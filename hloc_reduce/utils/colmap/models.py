@@ -150,7 +150,10 @@ def add_image(
 
 def point3D_ids(image: pycolmap.Image) -> np.ndarray:
     """Return the 3D point ids of an image's keypoints (N,) int64, -1 for none."""
-    return np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
+    found = np.full(image.num_points2D(), -1, np.int64)
+    for i in image.get_observation_point2D_idxs():
+        found[i] = image.point2D(i).point3D_id
+    return found
 
 
 def cam_from_img(camera: pycolmap.Camera, points2D: np.ndarray) -> np.ndarray:
