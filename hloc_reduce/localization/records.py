@@ -12,7 +12,7 @@ from . import mirrored
 from .intrinsics import from_list, to_list
 from .references import Reference
 
-RECORDS = 18  # the version of the content of records, and of the gate
+RECORDS = 19  # the version of the content of records, and of the gate
 NUMBERS = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
 
 

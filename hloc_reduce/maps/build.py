@@ -36,7 +36,7 @@ from ..utils.files import replacing
 from ..utils.images import list_images
 from ..utils.match_files import check_names
 from ..utils.paths import strings_as_paths
-from . import contradictions, precision
+from . import contradictions, cropping, precision
 from .map import FINGERPRINTS, FINISHED, FURTHER, MORE, PLACE, RETRIEVAL, SFM, Map, with_projection
 
 MAX_EXHAUSTIVE = 100  # photos without covisibility that are all paired with each other
@@ -126,6 +126,7 @@ def main(
         _drop_others(folder, built)  # a killed run may have left some
         contradictions.warn(built.contradicting)
         precision.warn(built.uncertain)
+        cropping.warn(built.cropping_gain)
         return built
 
 
@@ -233,6 +234,8 @@ class _Building:
         contradictions.warn(contradicting)
         uncertain = precision.find(sfm) if model is None else {}
         precision.warn(uncertain)
+        gained = cropping.gain(sfm) if model is None else 0.0
+        cropping.warn(gained)
         cameras = intrinsics.of_map(sfm, self.image_dir)
         summary = {
             "id": uuid.uuid4().hex,
@@ -248,6 +251,7 @@ class _Building:
             "images_with_pose": sfm.num_reg_images(),
             "images_contradicting_others": contradicting,
             "images_of_uncertain_position": uncertain,
+            "gain_of_free_principal_points": gained,
             "points3D": sfm.num_points3D(),
             **intrinsics.to_dict(cameras),
             "seconds": self.folder.seconds(),

@@ -172,6 +172,7 @@ def _finish(
         "images": len(names),
         "images_with_pose": len(names),
         "images_of_uncertain_position": {},
+        "gain_of_free_principal_points": 0.0,
         "points3D": reference.num_points3D(),
         **intrinsics.to_dict(cameras),
         "seconds": folder.seconds(),

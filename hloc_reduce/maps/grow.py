@@ -12,9 +12,7 @@ from pathlib import Path
 
 import pycolmap
 
-from .. import (
-    logger,
-)
+from .. import logger
 from ..localization import intrinsics
 from ..mapping import copies, extension
 from ..runtime import provenance
@@ -26,7 +24,7 @@ from ..utils.files import announce, delete
 from ..utils.h5 import list_h5_names
 from ..utils.images import list_images
 from ..utils.paths import strings_as_paths
-from . import precision
+from . import cropping, precision
 from .addition import GROWING, IMAGES, Addition, photo_of
 from .map import FINGERPRINTS, FINISHED, PLACE, SFM, Map
 
@@ -198,8 +196,11 @@ def _commit(
     sfm.write_binary(folder)
     sfm = colmap.read_model(folder)  # without images that were removed
     contradicting = sorted(({*built.contradicting} - {*removed}) | {*copies.find(sfm)})
-    uncertain = precision.find(sfm) if content.get("model") is None else built.uncertain
+    uncertain, gained = built.uncertain, built.cropping_gain
+    if content.get("model") is None:
+        uncertain, gained = precision.find(sfm), cropping.gain(sfm)
     precision.warn({name: share for name, share in uncertain.items() if name in added})
+    cropping.warn(gained)
     content |= {
         "id": uuid.uuid4().hex,
         "sfm": folder.name,
@@ -208,6 +209,7 @@ def _commit(
         "images_added": sorted(({*content.get("images_added", ())} | {*added}) - {*removed}),
         "images_contradicting_others": contradicting,
         "images_of_uncertain_position": uncertain,
+        "gain_of_free_principal_points": gained,
         "points3D": sfm.num_points3D(),
     }
     if cameras is not None:

@@ -43,6 +43,7 @@ class Map:
         num_images: images with a pose.
         contradicting: images whose poses contradict the others.
         uncertain: images whose positions are uncertain, see `precision.find`.
+        cropping_gain: how much better the images fit if they are cropped, see `cropping.gain`.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
         cameras: what the map tells about the intrinsics of other photos.
@@ -80,6 +81,7 @@ class Map:
         self.contradicting = list(content.get("images_contradicting_others", []))
         found = content.get("images_of_uncertain_position", {}).items()
         self.uncertain = {str(name): float(share) for name, share in found}
+        self.cropping_gain = float(content.get("gain_of_free_principal_points", 0))
         self.num_points3D = int(content["points3D"])
         self.camera_mode = content.get("camera_mode")
         known = content.get("cameras", {}).items()

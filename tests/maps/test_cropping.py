@@ -1,0 +1,67 @@
+"""Maps whose photos were cropped: their principal points are not in their centres."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hloc_reduce.maps import cropping
+from hloc_reduce.utils import colmap
+
+SIZE = np.array([1000, 800])
+
+
+def reconstructed(shift: float) -> pycolmap.Reconstruction:
+    """Adjust a map of photos with principal points that are assumed in their centres.
+
+    Args:
+        shift: distance of the true ones from there, as a share of the size.
+    """
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-1, 1, (300, 3))
+    model = pycolmap.Reconstruction()
+    tracks = [pycolmap.Track() for _ in points]
+    for i in range(8):
+        signs = generator.choice([-1, 1], 2)
+        true = pycolmap.Camera(
+            model="PINHOLE", width=1000, height=800, params=[1100, 1100, *SIZE / 2], camera_id=i + 1
+        )
+        centred = pycolmap.Camera(
+            model="SIMPLE_RADIAL",
+            width=1000,
+            height=800,
+            params=[1100, *SIZE / 2, 0],
+            camera_id=i + 1,
+        )
+        turn = pycolmap.Rotation3d(np.array([generator.uniform(-0.3, 0.3), 0.2 * (i - 4), 0]))
+        pose = pycolmap.Rigid3d(turn, [*generator.uniform(-0.3, 0.3, 2), 4])
+        pixels = true.img_from_cam(pose * points) + generator.normal(0, 0.5, (300, 2))
+        image = pycolmap.Image(
+            name=f"{i}.jpg",
+            keypoints=pixels + signs * shift * SIZE,
+            camera_id=i + 1,
+            image_id=i + 1,
+        )
+        colmap.add_image(model, centred, image, pose)
+        for row, track in enumerate(tracks):
+            track.add_element(i + 1, row)
+    for at, track in zip(points, tracks, strict=True):
+        model.add_point3D(at, track)
+    pycolmap.bundle_adjustment(model)
+    model.update_point_3d_errors()
+    return model
+
+
+@pytest.mark.parametrize(("shift", "is_cropped"), [(0.0, False), (0.2, True)])
+def test_cropped_photos_fit_better_with_free_principal_points(shift, is_cropped, caplog):
+    model = reconstructed(shift)
+    before = model.compute_mean_reprojection_error()
+    gained = cropping.gain(model)
+    assert model.compute_mean_reprojection_error() == before
+    assert gained > 0.3 if is_cropped else abs(gained) < 0.02
+    cropping.warn(gained)
+    assert ("they may be cropped" in caplog.text) == is_cropped
+
+
+def test_large_maps_are_not_judged(monkeypatch):
+    monkeypatch.setattr(cropping, "LARGEST", 7)
+    assert cropping.gain(reconstructed(0.2)) == 0
