@@ -16,7 +16,6 @@ from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
-from hloc_reduce.maps import contradictions
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance, trace
 from hloc_reduce.runtime.group_writer import failures
@@ -115,7 +114,7 @@ def open_map(
     if model_or_map is None:
         raise InputError("Give --map_images, the folder of the photos to build a map of.")
     built = _open(model_or_map, outputs / "map", overwrite)
-    contradictions.warn(built.contradicting)
+    built.warn()
     if feature or projection:
         built.check_feature(feature or features_confs.RECOMMENDED, projection)
     given = {"storage": storage, "keypoints": keypoints, "matcher": matcher}

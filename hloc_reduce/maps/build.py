@@ -124,9 +124,7 @@ def main(
                 "again, choose other --outputs, or --overwrite."
             )
         _drop_others(folder, built)  # a killed run may have left some
-        contradictions.warn(built.contradicting)
-        precision.warn(built.uncertain)
-        cropping.warn(built.cropping_gain)
+        built.warn()
         return built
 
 
@@ -231,11 +229,8 @@ class _Building:
             folder, conf, sfm = self._of_photos_alone(conf)
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
-        contradictions.warn(contradicting)
         uncertain = precision.find(sfm) if model is None else {}
-        precision.warn(uncertain)
         gained = cropping.gain(sfm) if model is None else 0.0
-        cropping.warn(gained)
         cameras = intrinsics.of_map(sfm, self.image_dir)
         summary = {
             "id": uuid.uuid4().hex,
@@ -258,6 +253,7 @@ class _Building:
         }
         provenance.write(self.folder.path / FINISHED, summary)
         built = Map(self.folder.path)
+        built.warn()
         _drop_others(self.folder, built)
         provenance.write(self.folder.path / FINISHED, {**summary, "bytes": self.folder.bytes()})
         return built

@@ -20,7 +20,6 @@ from ..utils.codes import STORAGES
 from ..utils.colmap import StoredDatabase
 from ..utils.match_files import check_names
 from ..utils.paths import strings_as_paths
-from . import contradictions
 from .build import begin, claim, digests, keep_projection, model_files
 from .map import FINISHED, RETRIEVAL, SFM, Map, with_projection
 
@@ -83,28 +82,27 @@ def main(
         }
         inputs = database, model, projection, image_dir
         with claim(map_dir, made_from, overwrite, *inputs) as folder:
-            if (map_dir / FINISHED).exists():
-                built = Map(map_dir)
-                contradictions.warn(built.contradicting)
-                return built
-            begin(map_dir, fingerprints)
-            logger.info("Building the map %s of %d images of %s.", map_dir, len(names), database)
-            conf = keep_projection(conf, map_dir)
-            contradicting = _build(
-                *(folder, opened, reduction, conf, names, reference, model, found)
-            )
-            about = {
-                "feature": name,
-                "matcher": matcher,
-                "image_dir": str((image_dir or map_dir / "images").resolve()),
-                "model": str(model.resolve()),
-                "database": str(database.resolve()),
-                "conf": with_projection(conf, lambda path: Path(path).name),
-                "keypoints": keypoints,
-                "images_contradicting_others": contradicting,
-            }
-            _finish(folder, about, reference, names, cameras)
-            return Map(map_dir)
+            if not (map_dir / FINISHED).exists():
+                begin(map_dir, fingerprints)
+                logger.info("Building the map %s of %d images.", map_dir, len(names))
+                conf = keep_projection(conf, map_dir)
+                contradicting = _build(
+                    *(folder, opened, reduction, conf, names, reference, model, found)
+                )
+                about = {
+                    "feature": name,
+                    "matcher": matcher,
+                    "image_dir": str((image_dir or map_dir / "images").resolve()),
+                    "model": str(model.resolve()),
+                    "database": str(database.resolve()),
+                    "conf": with_projection(conf, lambda path: Path(path).name),
+                    "keypoints": keypoints,
+                    "images_contradicting_others": contradicting,
+                }
+                _finish(folder, about, reference, names, cameras)
+            built = Map(map_dir)
+            built.warn()
+            return built
 
 
 def _cameras(
@@ -152,7 +150,6 @@ def _build(
         reference.write_binary(written)
     with folder.stage("judge_poses"):
         contradicting = copies.find(reference)
-    contradictions.warn(contradicting)
     return contradicting
 
 

@@ -14,6 +14,7 @@ from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import STORAGES
 from ..utils.h5 import file_provenance, open_h5
 from ..utils.paths import strings_as_paths
+from . import contradictions, cropping, precision
 
 FINISHED = "map.json"  # is written last
 FINGERPRINTS = "fingerprints.json"
@@ -155,6 +156,12 @@ class Map:
                 f"The map {self.folder} is of --feature {self.feature}{other}. "
                 "Leave it out to localize in this map."
             )
+
+    def warn(self) -> None:
+        """Warn of what may be wrong with the map, as was found when it was built."""
+        contradictions.warn(self.contradicting)
+        precision.warn(self.uncertain)
+        cropping.warn(self.cropping_gain)
 
     def names(self) -> list[str]:
         """List the images that have a pose."""
