@@ -1,6 +1,7 @@
 """Aggregate local features into global descriptors, for retrieval without trained weights."""
 
 import hashlib
+from contextlib import closing
 from pathlib import Path
 
 import h5py
@@ -94,10 +95,10 @@ def main(
                 return {"global_descriptor": found["global_descriptor"][0].half().numpy()}
 
             described = ((name, get_descriptors(file, name)) for name in todo)
-            found = parallel.ordered("aggregate", aggregate, described)
-            bar = progress(found, "Aggregating", "image", len(todo))
-            for name, group in zip(todo, bar, strict=True):
-                writer.add(name, group)
+            with closing(parallel.ordered("aggregate", aggregate, described)) as found:
+                bar = progress(found, "Aggregating", "image", len(todo))
+                for name, group in zip(todo, bar, strict=True):
+                    writer.add(name, group)
     logger.info("Global descriptors are in %s.", output)
     return output
 

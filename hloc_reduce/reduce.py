@@ -6,6 +6,7 @@ the new one.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -167,9 +168,9 @@ class Reduction:
         reduce = partial(self.reduce, normalization)
         with GroupWriter(output, made_by, overwrite) as writer:
             todo = [name for name in names if name not in writer]
-            groups = parallel.ordered("reduce", reduce, read(todo))
-            for group in progress(groups, "Reducing features", "image", len(todo)):
-                writer.add(*group)
+            with closing(parallel.ordered("reduce", reduce, read(todo))) as groups:
+                for group in progress(groups, "Reducing features", "image", len(todo)):
+                    writer.add(*group)
 
 
 def _normalization(file: h5py.File, names: list[str]) -> str:

@@ -29,7 +29,7 @@ LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 ROUNDS = 3  # of estimation from the inliers among all matches
-RIVAL_SAMPLE = 1000  # matches from which a rival is estimated
+RIVAL_SAMPLE = 1000  # matches, at most, from which a rival is estimated
 # poses that differ by more are rivals
 SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the median depth of the inliers
@@ -38,7 +38,7 @@ DISTORTED = 1.02  # above it, the lens has a radial distortion
 UNCLEAR = 1.05  # above it, the other intrinsics may be right; 1 if the photo may be cropped
 RIGHT = 1.1  # above it, the other intrinsics are right
 # multiples of MAX_POSITION and MAX_ROTATION
-PRECISE = 0.6, 1.0  # uncertainty of a pose: errors are twice as large and more in one of 15
+PRECISE = 0.6, 1.0  # uncertainty of a pose; one error in ten is more than 1.9 times as large
 TOLERANT = 1.2  # between poses with listed and other focal lengths: many lists are 5 % off
 CROPPED = 3.0, 2.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
 ZOOMED = 1.2  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
@@ -147,7 +147,7 @@ def estimate(
     if len(others) >= RIVAL * best.num_inliers > 0:
         # half as many inliers as a rival of this confidence is expected to have
         least = RIVAL / 2 * best.num_inliers / len(others)
-        sample = others[:: -(-len(others) // RIVAL_SAMPLE)]
+        sample = np.random.default_rng(SEED).permutation(others)[:RIVAL_SAMPLE]
         poses.append(_estimate(matches, sample, max(LEAST_RATIO, least)))
     return replace(best, refusal=_refusal(matches, best, poses, gate, doubt))
 

@@ -8,8 +8,8 @@ from .. import logger
 from ..mapping.extension import OPTIONS
 
 LARGEST = 200  # images: adjusting more takes minutes, and more photos bend a map less
-# Cropped photos, and others with wrong focal lengths, gain 14 % and more, those of sound maps at
-# most 9 % (docs/results.md)
+# cropped photos, and others with wrong focal lengths, gain 18 % and more, those of sound maps at
+# most 9 % (docs/localize.md)
 GAIN = 0.12
 
 
@@ -20,29 +20,35 @@ def gain(sfm: pycolmap.Reconstruction) -> float:
     and points of all photos, so that every single one still fits.
 
     Args:
-        sfm: the map, whose intrinsics were estimated with its poses.
+        sfm: the map, all of whose poses and intrinsics may be wrong.
 
     Returns:
         The share by which the mean reprojection error falls, beyond that which so many parameters
         more explain; 0 for more than LARGEST images.
     """
-    cameras, images = len(sfm.cameras), sfm.num_reg_images()
-    residuals = 2 * sfm.compute_num_observations() - 3 * sfm.num_points3D() - 6 * images
-    if images > LARGEST or residuals <= 4 * cameras:
+    images = [sfm.images[i] for i in sfm.reg_image_ids()]
+    cameras = len({image.camera_id for image in images})
+    residuals = 2 * sfm.compute_num_observations() - 3 * sfm.num_points3D() - 6 * len(images)
+    if len(images) > LARGEST or residuals <= 4 * cameras:
         return 0.0
-    error = sfm.compute_mean_reprojection_error()
     freed = copy.deepcopy(sfm)
+    error = _adjusted_error(freed, refine_principal_point=False)
+    by_chance = (1 - 2 * cameras / residuals) ** 0.5
+    return 1 - _adjusted_error(freed, refine_principal_point=True) / (error * by_chance or 1.0)
+
+
+def _adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool) -> float:
+    """Adjust a map, in place, and return its mean reprojection error in pixels."""
     options = OPTIONS.get_global_bundle_adjustment()
-    options.refine_principal_point = True
+    options.refine_principal_point = refine_principal_point
     options.print_summary = False
     config = pycolmap.BundleAdjustmentConfig()
-    for image_id in freed.reg_image_ids():
+    for image_id in sfm.reg_image_ids():
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, freed).solve()
-    freed.update_point_3d_errors()
-    by_chance = (1 - 2 * cameras / residuals) ** 0.5
-    return 1 - freed.compute_mean_reprojection_error() / (error * by_chance) if error else 0.0
+    pycolmap.create_default_bundle_adjuster(options, config, sfm).solve()
+    sfm.update_point_3d_errors()
+    return sfm.compute_mean_reprojection_error()
 
 
 def warn(gained: float) -> None:

@@ -198,9 +198,12 @@ def _commit(
     contradicting = sorted(({*built.contradicting} - {*removed}) | {*copies.find(sfm)})
     uncertain, gained = built.uncertain, built.cropping_gain
     if content.get("model") is None:
-        uncertain, gained = precision.find(sfm), cropping.gain(sfm)
+        uncertain = precision.find(sfm)
+        if sfm.num_reg_images() <= cropping.LARGEST:
+            gained = cropping.gain(sfm)
     precision.warn({name: share for name, share in uncertain.items() if name in added})
-    cropping.warn(gained)
+    if built.cropping_gain <= cropping.GAIN:
+        cropping.warn(gained)
     content |= {
         "id": uuid.uuid4().hex,
         "sfm": folder.name,

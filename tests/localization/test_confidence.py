@@ -164,6 +164,16 @@ def test_inliers_that_do_not_fix_the_pose_are_refused():
     assert uncertainty(keypoints[:3], points[:3], TRUE, CAMERA) == (np.inf, np.inf)
 
 
+@pytest.mark.parametrize(("uncertain", "is_refused"), [(0.029, False), (0.031, True)])
+def test_a_position_is_certain_to_3_percent(monkeypatch, uncertain, is_refused):
+    keypoints, points = matches(20, 0)
+    found = solve(keypoints, points)
+    monkeypatch.setattr(absolute_pose, "uncertainty", lambda *_: (uncertain, 0.1))
+    its_matches = absolute_pose._Matches(keypoints, points, CAMERA, {})
+    reason = absolute_pose._imprecision(its_matches, found, TRUE)
+    assert ("at most 3 % and 2 degrees are accepted" in (reason or "")) == is_refused
+
+
 def test_a_focal_length_that_no_lens_has_is_refused():
     """Seen from close by with a fisheye's focal length, and from afar with a telescope's."""
     for focal_length in (150, 20_000):
@@ -279,11 +289,20 @@ def test_a_rival_is_looked_for_where_many_matches_disagree(number):
     assert found.refusal == f"ambiguous: another pose has {other} inliers, this one {number}"
 
 
-def test_a_rival_is_found_in_a_sample_of_many_matches():
+def test_a_rival_is_found_in_a_sample_of_many_matches(monkeypatch):
     first = matches(800, 0)
-    second = matches(300, 1900, seed=1, pose=pose_of(0, (50, 0, 8)))
+    # the right ones come last
+    second = (part[::-1] for part in matches(300, 1900, seed=1, pose=pose_of(0, (50, 0, 8))))
     keypoints, points = (np.concatenate(part) for part in zip(first, second, strict=True))
+    estimate, numbers = absolute_pose._estimate, []
+
+    def counted(its_matches, chosen, *options):
+        numbers.append(len(chosen))
+        return estimate(its_matches, chosen, *options)
+
+    monkeypatch.setattr(absolute_pose, "_estimate", counted)
     found = solve(keypoints, points, [np.arange(800), np.arange(800, 3000)])
+    assert numbers[-1] == absolute_pose.RIVAL_SAMPLE
     assert found.refusal is not None
     assert re.fullmatch("ambiguous: another pose has 3.. inliers, this one 8..", found.refusal)
 

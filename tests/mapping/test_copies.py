@@ -54,6 +54,21 @@ def test_sides_that_share_too_few_points(common, turn, is_found):
     assert set(found) in SIDES if is_found else found == []
 
 
+def test_photos_that_are_too_far_away_are_not_compared(monkeypatch):
+    """What is left out expects no points, here of photos all around some near and far points."""
+    model = two_sides(100, turn=120.0)
+    generator = np.random.default_rng(0)
+    for image in model.images.values():
+        nearer = pycolmap.Rigid3d(pycolmap.Rotation3d(), [0, 0, generator.uniform(-4, 6)])
+        model.frames[image.frame_id].rig_from_world = nearer * image.cam_from_world()
+    images = list(model.images.values())
+    expected, shared, _ = copies._count(model, images)
+    assert 0 < (expected > 0).sum() < len(images) ** 2 / 2
+    monkeypatch.setattr(copies, "REACH", np.inf)
+    for part, whole in zip((expected, shared), copies._count(model, images), strict=False):
+        assert np.array_equal(part, whole)
+
+
 def test_some_of_the_points_are_enough(monkeypatch):
     monkeypatch.setattr(copies, "WORK", 2e4)
     assert set(copies.find(two_sides(12))) in SIDES

@@ -4,6 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from hloc_reduce.mapping import extension
 from hloc_reduce.maps import cropping
 from hloc_reduce.utils import colmap
 
@@ -55,11 +56,23 @@ def reconstructed(shift: float) -> pycolmap.Reconstruction:
 def test_cropped_photos_fit_better_with_free_principal_points(shift, is_cropped, caplog):
     model = reconstructed(shift)
     before = model.compute_mean_reprojection_error()
+    poses = {i: image.cam_from_world() for i, image in model.images.items()}
     gained = cropping.gain(model)
     assert model.compute_mean_reprojection_error() == before
+    assert all(image.cam_from_world() == poses[i] for i, image in model.images.items())
     assert gained > 0.3 if is_cropped else abs(gained) < 0.02
     cropping.warn(gained)
     assert ("they may be cropped" in caplog.text) == is_cropped
+
+
+def test_photos_that_were_removed_do_not_count():
+    model = reconstructed(0.0)
+    worst = model.images[1]
+    for point in worst.points2D:
+        point.xy += 3.0
+    model.update_point_3d_errors()
+    extension.remove(model, [worst.name])
+    assert abs(cropping.gain(model)) < 0.02
 
 
 def test_large_maps_are_not_judged(monkeypatch):

@@ -19,7 +19,7 @@ from pipelines import localize
 PIPELINE = localize
 
 
-def test_a_map_is_built_once(place, capsys, run, refused):
+def test_a_map_is_built_once(place, capsys, caplog, run, refused):
     build, images, outputs = place
     run(*build)
     assert "Localize photos in it with --query_images" in capsys.readouterr().out
@@ -52,6 +52,14 @@ def test_a_map_is_built_once(place, capsys, run, refused):
     assert "was built with --matcher NN-ratio." in message
     message = refused("--map", moved, "--outputs", outputs, "--map_images", images)
     assert "leave out --map_images" in message
+
+    # what was found when it was built is said again; older maps do not have it
+    content = json.loads((moved / "map.json").read_text())
+    assert content.pop("gain_of_free_principal_points") == 0 and "may be cropped" not in caplog.text
+    for more in ({}, {"gain_of_free_principal_points": 0.2}):
+        (moved / "map.json").write_text(json.dumps(content | more))
+        run(*given)
+        assert ("may be cropped" in caplog.text) == bool(more)
 
 
 def test_what_has_changed_is_noticed(place, aachen_layout, run, refused):
