@@ -15,7 +15,7 @@ from . import groups
 # a point is expected in a photo if another photo sees it from a direction that differs by at most
 # as many degrees, and from a distance that differs by at most this factor
 ANGLE, DISTANCE = 15.0, 1.5
-# so that the two photos are at most as many of the distances from the first one to the point apart
+# the largest distance between two such photos, in distances from the first one to the point
 REACH = np.sqrt(1 + DISTANCE**2 - 2 * DISTANCE * np.cos(np.radians(ANGLE)))
 # Two groups of photos that share less of the expected points contradict each other, if a photo of
 # one expects enough of them in one of the other, on average. Sound maps share a quarter and more,

@@ -23,8 +23,8 @@ def gain(sfm: pycolmap.Reconstruction) -> float:
         sfm: the map, all of whose poses and intrinsics may be wrong.
 
     Returns:
-        The share by which the mean reprojection error falls, beyond that which so many parameters
-        more explain; 0 for more than LARGEST images.
+        The share by which the mean reprojection error falls, less the part that the additional
+        parameters alone explain; 0 for more than LARGEST images.
     """
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     cameras = len({image.camera_id for image in images})

@@ -13,7 +13,7 @@ from ..utils import cli
 
 
 def find(sfm: pycolmap.Reconstruction) -> dict[str, float]:
-    """Find photos whose positions are less certain than to MAX_POSITION.
+    """Find photos whose positions are less certain than `MAX_POSITION`.
 
     A distant photo of a nearly flat scene hardly tells a longer focal length from a larger
     distance. The intrinsics of a camera that took several photos are taken for known.

@@ -19,7 +19,7 @@ def symmetric() -> float:
     return 0.7
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def as_certain_as_right_ones(monkeypatch):
     """Without intrinsics the wrong pose is uncertain by 3.3 %, for which it would be refused."""
     monkeypatch.setattr(absolute_pose, "PRECISE", (1.0, 1.0))
@@ -37,6 +37,7 @@ def mirror_images(outputs):
     return {name: record["mirror_image"] for name, record in records.items()}
 
 
+@pytest.mark.usefixtures("as_certain_as_right_ones")
 def test_photos_of_ones_own(place, tmp_path, monkeypatch):
     """The mirrored photo is refused by the pipeline and in memory, and would not be otherwise."""
     build, images, outputs = place
@@ -68,6 +69,7 @@ def test_photos_of_ones_own(place, tmp_path, monkeypatch):
     assert pose is not None and "mirror_image" in info["seconds"]
 
 
+@pytest.mark.usefixtures("as_certain_as_right_ones")
 def test_a_run_that_stops_before_the_mirror_images_resumes(place, tmp_path, monkeypatch):
     """Its records say localized, but no poses are written."""
     build, images, outputs = place
