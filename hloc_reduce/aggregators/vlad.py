@@ -19,6 +19,7 @@ class VLAD(Aggregator):
     def fit(self, descriptors: np.ndarray) -> None:
         """Learn the vocabulary from local descriptors (N, D), N > 0."""
         from sklearn.cluster import MiniBatchKMeans  # takes a second to import
+        from threadpoolctl import threadpool_limits
 
         generator = np.random.default_rng(self.conf["seed"])
         if len(descriptors) > self.conf["max_samples"]:
@@ -29,7 +30,9 @@ class VLAD(Aggregator):
             batch_size=4096,
             n_init=3,
             random_state=self.conf["seed"],
-        ).fit(descriptors.astype(np.float32))
+        )
+        with threadpool_limits(1):  # more wait for each other in such small batches
+            kmeans.fit(descriptors.astype(np.float32))
         self.vocabulary = kmeans.cluster_centers_
 
     def _forward(self, data: dict) -> dict:

@@ -11,6 +11,7 @@ from ..localization.confidence import DEFAULT_GATE, Gate
 from ..localization.query import merged
 from ..localize_sfm import RANSAC_THRESH
 from ..pairs_from_retrieval import rank
+from ..runtime import parallel
 from ..utils.cli import InputError
 from ..utils.codes import FLOATS
 from ..utils.feature_files import to_colmap
@@ -128,6 +129,7 @@ class Localizer:
         keypoints = to_colmap(features["keypoints"])
         return {**features, "descriptors": descriptors, "keypoints": keypoints}
 
+    @parallel.one_thread()
     def _estimate(
         self,
         features: dict,
@@ -145,6 +147,7 @@ class Localizer:
             thorough,
         )
 
+    @parallel.one_thread()
     def _retrieve(self, descriptors: np.ndarray) -> list[str]:
         """Return the names of the map images most similar to local descriptors (N, D)."""
         # rounded as in the map

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from threading import Lock
 from typing import TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from .trace import span
 
 Item = TypeVar("Item")
@@ -16,8 +18,9 @@ Result = TypeVar("Result")
 BACKLOG = 4  # results per worker that may wait to be taken
 
 _lock = Lock()
-_running = 0  # active blocks of `_one_thread_each`, in all threads
-_threads = 1  # torch's threads before the first of them
+_running = 0  # active blocks of `one_thread`, in all threads
+_threads: int | None = None  # torch's threads before the first of them that found it loaded
+_blas: threadpool_limits  # ends the limit of the first of them on NumPy's threads
 
 
 def cores() -> int:
@@ -26,28 +29,35 @@ def cores() -> int:
     if torch is None:  # nothing here imports it for this alone
         return int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
     with _lock:
-        return _threads if _running else torch.get_num_threads()
+        return _threads or torch.get_num_threads()
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Let torch, if it is loaded, compute in the calling thread only; such blocks may overlap."""
-    global _running, _threads
+def one_thread() -> Iterator[None]:
+    """Let NumPy and torch compute in the calling thread only; such blocks may overlap.
+
+    Several threads of BLAS wait for each other, for much longer than they compute, where matrices
+    are small, other programs use the cores, or several threads of Python call it.
+    """
+    global _running, _threads, _blas
     torch = sys.modules.get("torch")
-    if torch is None:
-        yield
-        return
     with _lock:
         if not _running:
-            _threads = torch.get_num_threads()
+            _blas = threadpool_limits(1, "blas")
         _running += 1
-        torch.set_num_threads(1)
+        if torch is not None:
+            _threads = _threads or torch.get_num_threads()
+            torch.set_num_threads(1)  # of this thread; another one may have begun with more
     try:
         yield
     finally:
         with _lock:
             _running -= 1
-            torch.set_num_threads(1 if _running else _threads)
+            if torch is not None and _threads is not None:
+                torch.set_num_threads(1 if _running else _threads)
+            if not _running:
+                _blas.restore_original_limits()
+                _threads = None
 
 
 def ordered(
@@ -59,9 +69,9 @@ def ordered(
     """Apply a function to items in threads and yield the results in the order of the items.
 
     The calling thread draws the items, so whatever reads them runs in it, while the workers go on.
-    Few items and results are held at once. Torch computes in one thread of each worker, so that
-    results do not depend on the number of workers. If drawing an item fails, the results of the
-    items before it are yielded first.
+    Few items and results are held at once. NumPy and torch compute in one thread of each worker, so
+    that results do not depend on the number of workers. If drawing an item fails, the results of
+    the items before it are yielded first.
 
     Args:
         name: of the work, in a trace.
@@ -76,7 +86,7 @@ def ordered(
         with span(name):
             return function(item)
 
-    with _one_thread_each():
+    with one_thread():
         pool = ThreadPoolExecutor(workers)
         iterator, failure, is_over = iter(items), None, False
         try:

@@ -39,8 +39,9 @@ def features(tmp_path):
     return path
 
 
-def test_similar_places_have_similar_descriptors(features, tmp_path):
+def test_similar_places_have_similar_descriptors(features, tmp_path, monkeypatch):
     names = [f"db/{i}.jpg" for i in range(8)]
+    monkeypatch.setattr(aggregate_features.parallel, "cores", lambda: 1)
     output = aggregate_features.main(CONF, features, names)
     assert output == tmp_path / "vlad_feats.h5"
     with h5py.File(output) as file:
@@ -49,6 +50,7 @@ def test_similar_places_have_similar_descriptors(features, tmp_path):
     np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, atol=1e-3)
     similarity = rows @ rows.T
     assert similarity[:4, :4].min() > similarity[:4, 4:].max()
+    monkeypatch.setattr(aggregate_features.parallel, "cores", lambda: 3)  # the same by any number
     aggregate_features.main(CONF, features, names, overwrite=True)
     with h5py.File(output) as file:
         again = np.stack([file[name]["global_descriptor"][()] for name in names])

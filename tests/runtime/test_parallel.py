@@ -9,6 +9,7 @@ from concurrent.futures import BrokenExecutor
 
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from hloc_reduce.runtime import parallel, processes, trace
 
@@ -38,6 +39,22 @@ def test_one_thread_of_torch_in_each_worker():
     before = torch.get_num_threads()
     threads = list(parallel.ordered("test", lambda _: torch.get_num_threads(), range(4), 2))
     assert threads == [1] * 4 and torch.get_num_threads() == before
+
+
+def test_one_thread_of_numpy_in_each_worker():
+    def threads(_=None):
+        return {library["num_threads"] for library in threadpool_info() if is_blas(library)}
+
+    def is_blas(library):
+        return library["user_api"] == "blas"
+
+    with threadpool_limits(3, "blas"):
+        first = parallel.ordered("one", threads, range(4), 2)
+        assert next(first) == {1}
+        assert list(parallel.ordered("two", threads, range(4), 2)) == [{1}] * 4
+        assert threads() == {1}  # the first goes on
+        first.close()
+        assert threads() == {3}
 
 
 def test_an_error_ends_it():

@@ -132,7 +132,7 @@ SMALL = [(1, 1), (1, 300), (300, 1), (2, 2), (12_000, 40)]
     "size, feature",
     [
         *((size, feature) for size in SMALL for feature in ("sift_sv16", "colmap_sift")),
-        ((9_000, 12_000), "sift_sv16"),
+        ((3_000, 12_000), "sift_sv16"),
     ],
 )
 def test_photos_of_any_size(size, feature, tmp_path):
