@@ -81,6 +81,7 @@ class Place:
         metric: whether units are metres.
         base: the name of the base feature.
         extent: norm of the standard deviations of the positions of the images.
+        cameras: what the images of the map tell about guessed intrinsics.
     """
 
     name: str
@@ -92,6 +93,7 @@ class Place:
     metric: bool
     base: str
     extent: float
+    cameras: intrinsics.MapCameras
 
 
 def split(name: str, images: Path, model: Path, output: Path, seed: int, base: str) -> Place:
@@ -138,7 +140,8 @@ def _of_model(
     features = _extract(images, output, [*names, *(query for query, _, _ in queries)], base)
     centres = [image.projection_center() for image in reference.images.values()]
     extent = float(np.linalg.norm(np.std(centres, axis=0)))
-    return Place(name, images, queries, reference, names, features, metric, base, extent)
+    cameras = intrinsics.of_cameras(image.camera for image in reference.images.values())
+    return Place(name, images, queries, reference, names, features, metric, base, extent, cameras)
 
 
 def _of_scans(place: InLoc, output: Path, base: str) -> Place:
@@ -150,8 +153,10 @@ def _of_scans(place: InLoc, output: Path, base: str) -> Place:
     poses = {name: scans.read_pose(place.root, name) for name in names}
     reference = ScanMap(h5py.File(points), h5py.File(features), poses)
     extent = float(np.linalg.norm(np.std([pose[:3, 3] for pose in poses.values()], axis=0)))
-    name = place.root.name
-    return Place(name, place.root, queries, reference, names, features, True, base, extent)
+    with open_h5(features) as file:
+        cameras = intrinsics.MapCameras({}, {get_image_size(file, name) for name in names})
+    about = place.root.name, place.root, queries, reference, names, features
+    return Place(*about, True, base, extent, cameras)
 
 
 def _extract(images: Path, output: Path, names: list[str], base: str) -> Path:
@@ -264,7 +269,6 @@ def run(
     shown, rows = {}, []
     with open_h5(place.features) as file:
         described = {name: describe(file, name) for name in place.names}
-        sizes = {get_image_size(file, name) for name in place.names}
     for name, descriptors in described.items():
         ids, _ = place.reference.lift(name, np.arange(len(descriptors)))
         shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
@@ -291,7 +295,7 @@ def run(
         matched, flipped = match(path, name), None
         known = ("given", "off", "guess") if kind == "own" else ("given", "guess")
         for given in known if camera else ("guess",):
-            its_camera, refinement = intrinsics_of(camera, size, given, sizes)
+            its_camera, refinement = intrinsics_of(camera, size, given, place.cameras)
             row = localize(place, matched, its_camera, refinement)
             if mirrored.is_doubtful(not row["refusal"], row["agreement"], row["confidence"]):
                 flipped = flipped or match(*mirror(images, output, name, place.base))
@@ -318,7 +322,7 @@ def intrinsics_of(
     camera: pycolmap.Camera | None,
     size: tuple[int, int],
     given: str,
-    sizes: set[tuple[int, int]],
+    of_map: intrinsics.MapCameras,
 ) -> tuple[pycolmap.Camera, dict]:
     """Return the intrinsics to try a photo with, and the configuration that refines them.
 
@@ -326,13 +330,12 @@ def intrinsics_of(
         camera: its true intrinsics.
         size: its width and height.
         given: "given", the true ones; "off", with a wrong focal length; or "guess".
-        sizes: widths and heights of the images of the map.
+        of_map: what the map tells about guessed ones.
     """
     if given == "guess":
         width, height = size
-        of_map = intrinsics.MapCameras({}, sizes)
         guess, source = intrinsics.infer(np.empty((height, width), np.uint8), of_map)
-        return guess, intrinsics.REFINEMENTS[source]
+        return guess, intrinsics.refinement(guess, source, of_map)
     camera = copy.deepcopy(camera)
     if given == "off":
         params = camera.params.copy()
