@@ -29,7 +29,7 @@ LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 ROUNDS = 3  # of estimation from the inliers among all matches
-RIVAL_SAMPLE = 1000  # matches, at most, from which a rival is estimated
+RIVAL_SAMPLE = 500  # matches, at most, from which a rival is estimated
 # poses that differ by more are rivals
 SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the median depth of the inliers
