@@ -99,7 +99,7 @@ def confidence(
 
 def _different(numbers: np.ndarray) -> int:
     """Count the different ones of small numbers (N,)."""
-    return np.count_nonzero(np.bincount(numbers))
+    return int(np.count_nonzero(np.bincount(numbers)))
 
 
 def _density(points2D: np.ndarray, projected: np.ndarray, camera: pycolmap.Camera) -> np.ndarray:
