@@ -218,7 +218,7 @@ def _calibrate(matches: _Matches, pose: Pose) -> tuple[Pose, str | None]:
     likelier = max(assumed, other or assumed, key=_quality)
     fits = skewed is not None and skewed.confidence > RIGHT * likelier.confidence
     if skewed and fits and differ(skewed, likelier, points3D, MAX_POSITION, MAX_ROTATION):
-        reason = "it may be warped or a photo of a picture: a skew, which no lens has, fits much better"
+        reason = "it may be warped, or a photo of a picture: a skew fits much better"
         return likelier if free else pose, reason
     if not free:
         centred = resection.centred(pose.cam_from_world, pose.camera)
