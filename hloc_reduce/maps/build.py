@@ -230,7 +230,7 @@ class _Building:
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
-        gained = cropping.gain(sfm) if model is None else 0.0
+        fit = cropping.find(sfm) if model is None else cropping.AS_ASSUMED
         cameras = intrinsics.of_map(sfm, self.image_dir)
         summary = {
             "id": uuid.uuid4().hex,
@@ -246,7 +246,8 @@ class _Building:
             "images_with_pose": sfm.num_reg_images(),
             "images_contradicting_others": contradicting,
             "images_of_uncertain_position": uncertain,
-            "gain_of_free_principal_points": gained,
+            "gain_of_free_principal_points": fit.gain,
+            "images_altered": fit.altered,
             "points3D": sfm.num_points3D(),
             **intrinsics.to_dict(cameras),
             "seconds": self.folder.seconds(),

@@ -1,40 +1,119 @@
-"""Tell whether a map of photos alone fits much better if the photos were cropped."""
+"""Tell whether a map of photos alone fits much better with intrinsics of each photo's own."""
 
 import copy
+from typing import NamedTuple
 
+import numpy as np
 import pycolmap
 
 from .. import logger
 from ..mapping.extension import OPTIONS
+from ..utils import cli, colmap
 
 LARGEST = 200  # images: adjusting more takes minutes, and more photos bend a map less
 # cropped photos, and others with wrong focal lengths, gain 18 % and more, those of sound maps at
 # most 9 % (docs/localize.md)
 GAIN = 0.12
+# a photo is altered if its intrinsics differ by more from those of the others
+ZOOMED = 1.1  # ratio of focal lengths
+OFF_CENTRE = 0.1  # of the longer side, between principal points
+OBSERVATIONS = 100  # fewer do not determine intrinsics
 
 
-def gain(sfm: pycolmap.Reconstruction) -> float:
-    """Measure how much better the photos of a map fit with free principal points.
+class Fit(NamedTuple):
+    """How much better the photos of a map fit with other intrinsics.
+
+    Attributes:
+        gain: the share by which the mean reprojection error falls with free principal points, less
+            the part that the additional parameters alone explain.
+        altered: the photos that were probably cropped or zoomed.
+    """
+
+    gain: float
+    altered: list[str]
+
+
+AS_ASSUMED = Fit(0.0, [])
+
+
+def find(sfm: pycolmap.Reconstruction) -> Fit:
+    """Adjust a copy of a map with free principal points, then with a camera for each photo.
 
     A principal point that is assumed in the centre, although a photo was cropped, bends the poses
-    and points of all photos, so that every single one still fits.
+    and points of all photos, so that every single one still fits. So does a focal length that a
+    photo shares with others by its EXIF data, although it was enlarged.
 
     Args:
         sfm: the map, all of whose poses and intrinsics may be wrong.
 
     Returns:
-        The share by which the mean reprojection error falls, less the part that the additional
-        parameters alone explain; 0 for more than LARGEST images.
+        AS_ASSUMED for more than LARGEST images.
     """
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
-    cameras = len({image.camera_id for image in images})
+    cameras = {i: len(sfm.cameras[i].params) for i in {image.camera_id for image in images}}
+    own = sum(cameras[image.camera_id] for image in images)
     residuals = 2 * sfm.compute_num_observations() - 3 * sfm.num_points3D() - 6 * len(images)
-    if len(images) > LARGEST or residuals <= 4 * cameras:
-        return 0.0
-    freed = copy.deepcopy(sfm)
-    error = _adjusted_error(freed, refine_principal_point=False)
-    by_chance = (1 - 2 * cameras / residuals) ** 0.5
-    return 1 - _adjusted_error(freed, refine_principal_point=True) / (error * by_chance or 1.0)
+    if len(images) > LARGEST or residuals <= 2 * own:
+        return AS_ASSUMED
+    adjusted = copy.deepcopy(sfm)
+    error = _adjusted_error(adjusted, refine_principal_point=False)
+
+    def gain(freed: pycolmap.Reconstruction, parameters: int) -> float:
+        by_chance = (1 - parameters / residuals) ** 0.5
+        return 1 - _adjusted_error(freed, refine_principal_point=True) / (error * by_chance or 1.0)
+
+    separate = _with_own_cameras(adjusted)
+    if len(cameras) < len(images):
+        _adjusted_error(separate, refine_principal_point=False)
+    of_own = gain(separate, own - sum(cameras.values()) + 2 * len(cameras))
+    if of_own > GAIN and (altered := _altered(separate, _focal_lengths(adjusted))):
+        return Fit(of_own, altered)
+    return Fit(gain(adjusted, 2 * len(cameras)), [])
+
+
+def _focal_lengths(sfm: pycolmap.Reconstruction) -> dict[str, float]:
+    images = [sfm.images[i] for i in sfm.reg_image_ids()]
+    return {image.name: sfm.cameras[image.camera_id].mean_focal_length() for image in images}
+
+
+def _with_own_cameras(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Copy the images, points and tracks of a map, with a camera for each image."""
+    made = pycolmap.Reconstruction()
+    for image_id in sfm.reg_image_ids():
+        image = sfm.images[image_id]
+        camera = copy.deepcopy(sfm.cameras[image.camera_id])
+        camera.camera_id = image_id
+        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        copied = pycolmap.Image(image.name, keypoints, camera_id=image_id, image_id=image_id)
+        colmap.add_image(made, camera, copied, image.cam_from_world())
+    for point in sfm.points3D.values():
+        made.add_point3D(point.xyz, point.track)
+    return made
+
+
+def _altered(sfm: pycolmap.Reconstruction, assumed: dict[str, float]) -> list[str]:
+    """Return the photos whose intrinsics differ from those of the others.
+
+    Args:
+        sfm: the map with free intrinsics.
+        assumed: the focal length of each photo in the map as it was.
+    """
+    found = _focal_lengths(sfm)
+    images = sorted((sfm.images[i] for i in sfm.reg_image_ids()), key=lambda image: image.name)
+    zoom = np.array([np.log(found[image.name] / assumed[image.name]) for image in images])
+    centre = np.array([_off_centre(sfm.cameras[image.camera_id]) for image in images])
+    zoomed = np.abs(zoom - np.median(zoom)) > np.log(ZOOMED)
+    moved = np.abs(centre - np.median(centre, axis=0)).max(axis=1) > OFF_CENTRE
+    seen = np.array([image.num_points3D for image in images]) >= OBSERVATIONS
+    differs = (zoomed | moved) & seen
+    return [image.name for image, one in zip(images, differs, strict=True) if one]
+
+
+def _off_centre(camera: pycolmap.Camera) -> np.ndarray:
+    """Return where the principal point is, from the centre, in longer sides: (2,)."""
+    principal_point = np.array([camera.principal_point_x, camera.principal_point_y])
+    size = np.array([camera.width, camera.height])
+    return (principal_point - size / 2) / size.max()
 
 
 def _adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool) -> float:
@@ -51,13 +130,21 @@ def _adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool) 
     return sfm.compute_mean_reprojection_error()
 
 
-def warn(gained: float) -> None:
+def warn(fit: Fit) -> None:
     """Warn that the photos of a map may be cropped if they fit much better so."""
-    if gained > GAIN:
+    if fit.altered:
+        logger.warning(
+            "The map may be wrong: %s seem to be cropped or enlarged, and are probably misplaced. "
+            "With intrinsics of their own, all photos fit %.0f %% better. Use the original photos, "
+            "or --camera_mode per_image, or build the map without these. map.json lists all.",
+            cli.some(fit.altered),
+            100 * fit.gain,
+        )
+    elif fit.gain > GAIN:
         logger.warning(
             "The photos fit %.0f %% better if their principal points are not in their centres: "
             "they may be cropped, or have wrong focal lengths, and positions may be off by a tenth "
             "of the distance and more. Uncropped photos, a COLMAP model with known intrinsics, or "
             "--camera_mode single for photos of one camera help.",
-            100 * gained,
+            100 * fit.gain,
         )

@@ -170,6 +170,7 @@ def _finish(
         "images_with_pose": len(names),
         "images_of_uncertain_position": {},
         "gain_of_free_principal_points": 0.0,
+        "images_altered": [],
         "points3D": reference.num_points3D(),
         **intrinsics.to_dict(cameras),
         "seconds": folder.seconds(),

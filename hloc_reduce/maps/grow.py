@@ -196,14 +196,14 @@ def _commit(
     sfm.write_binary(folder)
     sfm = colmap.read_model(folder)  # without images that were removed
     contradicting = sorted(({*built.contradicting} - {*removed}) | {*copies.find(sfm)})
-    uncertain, gained = built.uncertain, built.cropping_gain
+    uncertain, fit = built.uncertain, built.cropping
     if content.get("model") is None:
         uncertain = precision.find(sfm)
         if sfm.num_reg_images() <= cropping.LARGEST:
-            gained = cropping.gain(sfm)
+            fit = cropping.find(sfm)
     precision.warn({name: share for name, share in uncertain.items() if name in added})
-    if built.cropping_gain <= cropping.GAIN:
-        cropping.warn(gained)
+    if built.cropping.gain <= cropping.GAIN:
+        cropping.warn(fit)
     content |= {
         "id": uuid.uuid4().hex,
         "sfm": folder.name,
@@ -212,7 +212,8 @@ def _commit(
         "images_added": sorted(({*content.get("images_added", ())} | {*added}) - {*removed}),
         "images_contradicting_others": contradicting,
         "images_of_uncertain_position": uncertain,
-        "gain_of_free_principal_points": gained,
+        "gain_of_free_principal_points": fit.gain,
+        "images_altered": fit.altered,
         "points3D": sfm.num_points3D(),
     }
     if cameras is not None:

@@ -44,7 +44,7 @@ class Map:
         num_images: images with a pose.
         contradicting: images whose poses contradict the others.
         uncertain: images whose positions are uncertain, see `precision.find`.
-        cropping_gain: how much better the images fit if they are cropped, see `cropping.gain`.
+        cropping: how much better the images fit with other intrinsics.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
         cameras: what the map tells about the intrinsics of other photos.
@@ -82,7 +82,11 @@ class Map:
         self.contradicting = list(content.get("images_contradicting_others", []))
         found = content.get("images_of_uncertain_position", {}).items()
         self.uncertain = {str(name): float(share) for name, share in found}
-        self.cropping_gain = float(content.get("gain_of_free_principal_points", 0))
+        gain, altered = (
+            content.get("gain_of_free_principal_points", 0),
+            content.get("images_altered", []),
+        )
+        self.cropping = cropping.Fit(float(gain), list(altered))
         self.num_points3D = int(content["points3D"])
         self.camera_mode = content.get("camera_mode")
         known = content.get("cameras", {}).items()
@@ -161,7 +165,7 @@ class Map:
         """Warn of what may be wrong with the map, as was found when it was built."""
         contradictions.warn(self.contradicting)
         precision.warn(self.uncertain)
-        cropping.warn(self.cropping_gain)
+        cropping.warn(self.cropping)
 
     def names(self) -> list[str]:
         """List the images that have a pose."""

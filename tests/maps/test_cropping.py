@@ -11,35 +11,39 @@ from hloc_reduce.utils import colmap
 SIZE = np.array([1000, 800])
 
 
-def reconstructed(shift: float) -> pycolmap.Reconstruction:
+def reconstructed(
+    shift: float = 0.0, zoomed: tuple[int, ...] = (), is_shared: bool = False
+) -> pycolmap.Reconstruction:
     """Adjust a map of photos with principal points that are assumed in their centres.
 
     Args:
         shift: distance of the true ones from there, as a share of the size.
+        zoomed: photos that were enlarged by a quarter.
+        is_shared: whether all photos share a camera.
     """
     generator = np.random.default_rng(0)
     points = generator.uniform(-1, 1, (300, 3))
     model = pycolmap.Reconstruction()
     tracks = [pycolmap.Track() for _ in points]
+    true = pycolmap.Camera(model="PINHOLE", width=1000, height=800, params=[1100, 1100, *SIZE / 2])
     for i in range(8):
         signs = generator.choice([-1, 1], 2)
-        true = pycolmap.Camera(
-            model="PINHOLE", width=1000, height=800, params=[1100, 1100, *SIZE / 2], camera_id=i + 1
-        )
         centred = pycolmap.Camera(
             model="SIMPLE_RADIAL",
             width=1000,
             height=800,
             params=[1100, *SIZE / 2, 0],
-            camera_id=i + 1,
+            camera_id=1 if is_shared else i + 1,
         )
         turn = pycolmap.Rotation3d(np.array([generator.uniform(-0.3, 0.3), 0.2 * (i - 4), 0]))
         pose = pycolmap.Rigid3d(turn, [*generator.uniform(-0.3, 0.3, 2), 4])
         pixels = true.img_from_cam(pose * points) + generator.normal(0, 0.5, (300, 2))
+        if i in zoomed:
+            pixels = 1.25 * (pixels - SIZE / 2) + SIZE / 2
         image = pycolmap.Image(
             name=f"{i}.jpg",
             keypoints=pixels + signs * shift * SIZE,
-            camera_id=i + 1,
+            camera_id=centred.camera_id,
             image_id=i + 1,
         )
         colmap.add_image(model, centred, image, pose)
@@ -57,12 +61,23 @@ def test_cropped_photos_fit_better_with_free_principal_points(shift, is_cropped,
     model = reconstructed(shift)
     before = model.compute_mean_reprojection_error()
     poses = {i: image.cam_from_world() for i, image in model.images.items()}
-    gained = cropping.gain(model)
+    fit = cropping.find(model)
     assert model.compute_mean_reprojection_error() == before
     assert all(image.cam_from_world() == poses[i] for i, image in model.images.items())
-    assert gained > 0.3 if is_cropped else abs(gained) < 0.02
-    cropping.warn(gained)
-    assert ("they may be cropped" in caplog.text) == is_cropped
+    assert fit.gain > 0.3 if is_cropped else abs(fit.gain) < 0.02
+    cropping.warn(fit)
+    assert ("cropped or enlarged" in caplog.text) == is_cropped
+
+
+@pytest.mark.parametrize("zoomed", [(), (2,), (1, 4, 6)])
+def test_enlarged_photos_of_a_shared_camera_are_named(zoomed, caplog):
+    """As photos whose EXIF data do not say that they were enlarged."""
+    fit = cropping.find(reconstructed(zoomed=zoomed, is_shared=True))
+    assert fit.altered == [f"{i}.jpg" for i in zoomed]
+    assert fit.gain > 0.3 if zoomed else abs(fit.gain) < 0.02
+    cropping.warn(fit)
+    assert all(f"{i}.jpg" in caplog.text for i in zoomed)
+    assert ("probably misplaced" in caplog.text) == bool(zoomed)
 
 
 def test_photos_that_were_removed_do_not_count():
@@ -72,9 +87,9 @@ def test_photos_that_were_removed_do_not_count():
         point.xy += 3.0
     model.update_point_3d_errors()
     extension.remove(model, [worst.name])
-    assert abs(cropping.gain(model)) < 0.02
+    assert abs(cropping.find(model).gain) < 0.02
 
 
 def test_large_maps_are_not_judged(monkeypatch):
     monkeypatch.setattr(cropping, "LARGEST", 7)
-    assert cropping.gain(reconstructed(0.2)) == 0
+    assert cropping.find(reconstructed(0.2)) == cropping.AS_ASSUMED

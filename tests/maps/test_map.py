@@ -56,10 +56,17 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
     # what was found when it was built is said again; older maps do not have it
     content = json.loads((moved / "map.json").read_text())
     assert content.pop("gain_of_free_principal_points") == 0 and "may be cropped" not in caplog.text
-    for more in ({}, {"gain_of_free_principal_points": 0.2}):
+    assert content.pop("images_altered") == []
+    gain = {"gain_of_free_principal_points": 0.2}
+    for more, said in (
+        ({}, ""),
+        (gain, "may be cropped"),
+        (gain | {"images_altered": ["db/2.png"]}, "db/2.png seem to be cropped"),
+    ):
+        caplog.clear()
         (moved / "map.json").write_text(json.dumps(content | more))
         run(*given)
-        assert ("may be cropped" in caplog.text) == bool(more)
+        assert said in caplog.text and ("cropped" in caplog.text) == bool(said)
 
 
 def test_what_has_changed_is_noticed(place, aachen_layout, run, refused):
