@@ -26,7 +26,8 @@ class Fit(NamedTuple):
     Attributes:
         gain: the share by which the mean reprojection error falls with free principal points, less
             the part that the additional parameters alone explain.
-        altered: the photos that were probably cropped or zoomed.
+        altered: photos with other intrinsics than most: these, or the others, were cropped or
+            enlarged.
     """
 
     gain: float
@@ -134,9 +135,10 @@ def warn(fit: Fit) -> None:
     """Warn that the photos of a map may be cropped if they fit much better so."""
     if fit.altered:
         logger.warning(
-            "The map may be wrong: %s seem to be cropped or enlarged, and are probably misplaced. "
-            "With intrinsics of their own, all photos fit %.0f %% better. Use the original photos, "
-            "or --camera_mode per_image, or build the map without these. map.json lists all.",
+            "The map may be wrong: %s have another focal length or principal point than the others, "
+            "and with intrinsics of their own all photos fit %.0f %% better. Either these photos or "
+            "the others were cropped or enlarged, and are misplaced. Use the original photos, or "
+            "--camera_mode per_image. map.json lists all of them.",
             cli.some(fit.altered),
             100 * fit.gain,
         )

@@ -77,7 +77,7 @@ def test_enlarged_photos_of_a_shared_camera_are_named(zoomed, caplog):
     assert fit.gain > 0.3 if zoomed else abs(fit.gain) < 0.02
     cropping.warn(fit)
     assert all(f"{i}.jpg" in caplog.text for i in zoomed)
-    assert ("probably misplaced" in caplog.text) == bool(zoomed)
+    assert ("are misplaced" in caplog.text) == bool(zoomed)
 
 
 def test_photos_that_were_removed_do_not_count():
