@@ -135,9 +135,9 @@ def warn(fit: Fit) -> None:
     """Warn that the photos of a map may be cropped if they fit much better so."""
     if fit.altered:
         logger.warning(
-            "The map may be wrong: %s have another focal length or principal point than the others, "
-            "and with intrinsics of their own all photos fit %.0f %% better. Either these photos or "
-            "the others were cropped or enlarged, and are misplaced. Use the original photos, or "
+            "The map may be wrong: %s have another focal length or principal point than others. "
+            "With intrinsics of their own, all photos fit %.0f %% better. Either these or the others "
+            "were cropped or enlarged, and are misplaced. Use the original photos, or "
             "--camera_mode per_image. map.json lists all of them.",
             cli.some(fit.altered),
             100 * fit.gain,
