@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 
 from . import logger
+from .mapping.database import import_images
 from .pairs_from_retrieval import rank, read_global, similarity
 from .runtime import provenance
 from .triangulation import Pair, Verified, read_matches
@@ -189,7 +190,7 @@ def _verify(
             database, listed = Path(folder, "database.db"), Path(folder, "pairs.txt")
             write_pairs(todo, listed)
             images = sorted({name for pair in todo for name in pair})
-            colmap.import_images(database, image_dir, images, camera_mode, {})
+            import_images(database, image_dir, images, camera_mode)
             keypoints, _, found = read_matches(images, listed, features, matches, None)
             found = drop_overlays(keypoints, found)
             unverified: Verified = {pair: (indices, None) for pair, indices in found.items()}

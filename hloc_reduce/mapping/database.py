@@ -5,7 +5,52 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from ..localization.intrinsics import GUESSED_FOCAL, exif_camera
 from ..utils import colmap
+
+
+def import_images(
+    database: Path,
+    image_dir: Path,
+    names: list[str],
+    camera_mode: pycolmap.CameraMode,
+    image_options: dict | None = None,
+) -> None:
+    """Create a COLMAP database with images, and cameras guessed from their EXIF data.
+
+    In the mode AUTO, images with a digital zoom get guessed cameras of their own: their focal
+    lengths in EXIF data may be those without the zoom. Not if `image_options` give parameters.
+
+    Args:
+        database: the file.
+        image_dir: folder of the images.
+        names: of the images.
+        camera_mode: which images share a camera.
+        image_options: of pycolmap's ImageReaderOptions.
+
+    Raises:
+        InputError: for an unknown option, or an image that COLMAP skips.
+    """
+    options, zoomed = image_options or {}, []
+    if camera_mode == pycolmap.CameraMode.AUTO and not options.get("camera_params"):
+        found = {name: exif_camera(image_dir / name) for name in names}
+        zoomed = [name for name, camera in found.items() if camera is not None and camera.zoomed]
+    if rest := [name for name in names if name not in zoomed]:
+        colmap.import_images(database, image_dir, rest, camera_mode, options)
+    if not zoomed:
+        return
+    colmap.import_images(database, image_dir, zoomed, pycolmap.CameraMode.PER_IMAGE, options)
+    with colmap.open_database(database) as opened:
+        for image in opened.read_all_images():
+            if image.name in zoomed:
+                camera = opened.read_camera(image.camera_id)
+                params = camera.params.copy()
+                params[camera.focal_length_idxs()] = GUESSED_FOCAL * max(
+                    camera.width, camera.height
+                )
+                camera.params = params.tolist()
+                camera.has_prior_focal_length = False
+                opened.update_camera(camera)
 
 
 def write(
@@ -34,7 +79,7 @@ def write(
     Raises:
         InputError: for an unknown option, or an image that COLMAP skips.
     """
-    colmap.import_images(database, image_dir, list(keypoints), camera_mode, image_options or {})
+    import_images(database, image_dir, list(keypoints), camera_mode, image_options)
     verified = {pair: (rows, None if unverified else rows) for pair, rows in matches.items()}
     colmap.write_matches(database, keypoints, verified)
     if unverified:

@@ -1,0 +1,51 @@
+"""Cameras of a new COLMAP database."""
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from hloc_reduce.mapping import database
+from hloc_reduce.utils import colmap
+
+ZOOMS = {"a.jpg": None, "b.jpg": 1.0, "c.jpg": 2.0, "d.jpg": 2.0}
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """Photos by one camera, two of them with a digital zoom."""
+    for name, zoom in ZOOMS.items():
+        exif = Image.Exif()
+        exif[0x010F], exif[0x0110] = "Maker", "Model"
+        exif.get_ifd(0x8769)[0xA405] = 36
+        if zoom is not None:
+            exif.get_ifd(0x8769)[0xA404] = zoom
+        pixels = np.full((30, 40, 3), 128, np.uint8)
+        Image.fromarray(pixels).save(tmp_path / name, exif=exif)
+    return tmp_path
+
+
+def cameras(path):
+    with colmap.open_database(path) as opened:
+        images = opened.read_all_images()
+        return {image.name: opened.read_camera(image.camera_id) for image in images}
+
+
+def test_digital_zooms_have_cameras_of_their_own(photos):
+    path = photos / "database.db"
+    database.import_images(path, photos, [*ZOOMS], pycolmap.CameraMode.AUTO)
+    found = cameras(path)
+    ids = [found[name].camera_id for name in ZOOMS]
+    assert ids[0] == ids[1] and len({*ids}) == 3
+    assert [found[name].has_prior_focal_length for name in ZOOMS] == [True, True, False, False]
+    assert found["c.jpg"].mean_focal_length() == 48 != found["a.jpg"].mean_focal_length()
+
+
+@pytest.mark.parametrize(
+    ("mode", "options", "number"),
+    [("SINGLE", {}, 1), ("PER_IMAGE", {}, 4), ("AUTO", {"camera_params": "50,20,15,0"}, 1)],
+)
+def test_what_is_asked_for_comes_first(photos, mode, options, number):
+    path = photos / "database.db"
+    database.import_images(path, photos, [*ZOOMS], pycolmap.CameraMode.__members__[mode], options)
+    assert len({camera.camera_id for camera in cameras(path).values()}) == number
