@@ -37,7 +37,18 @@ from ..utils.images import list_images
 from ..utils.match_files import check_names
 from ..utils.paths import strings_as_paths
 from . import contradictions, cropping, precision
-from .map import FINGERPRINTS, FINISHED, FURTHER, MORE, PLACE, RETRIEVAL, SFM, Map, with_projection
+from .map import (
+    FINGERPRINTS,
+    FINISHED,
+    FURTHER,
+    MORE,
+    OWN,
+    PLACE,
+    RETRIEVAL,
+    SFM,
+    Map,
+    with_projection,
+)
 
 MAX_EXHAUSTIVE = 100  # photos without covisibility that are all paired with each other
 ROUNDS = 3  # of additional pairs, in which larger sets of photos get connected
@@ -224,13 +235,13 @@ class _Building:
         logger.info("Building the map %s of %d images.", self.folder.path, len(self.names))
         conf = keep_projection(conf, self.folder.path)
         if model is not None and reference is not None:
-            folder, sfm = SFM, self._of_model(conf, model, reference)
+            folder, sfm, fit = SFM, self._of_model(conf, model, reference), cropping.AS_ASSUMED
         else:
             folder, conf, sfm = self._of_photos_alone(conf)
+            folder, sfm, fit = self._fitting(conf, folder, sfm)
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
-        fit = cropping.find(sfm) if model is None else cropping.AS_ASSUMED
         cameras = intrinsics.of_map(sfm, self.image_dir)
         summary = {
             "id": uuid.uuid4().hex,
@@ -315,7 +326,42 @@ class _Building:
         registration.check(self.folder.path / found[0][0], self.accept_partial)
         return found[0]
 
-    def _reconstruct(self, conf: dict, sfm: str, once: bool = False) -> pycolmap.Reconstruction:
+    def _fitting(
+        self, conf: dict, folder: str, sfm: pycolmap.Reconstruction
+    ) -> tuple[str, pycolmap.Reconstruction, cropping.Fit]:
+        """Reconstruct again with a camera for each photo, if some do not fit to those they share.
+
+        Args:
+            conf: configuration of the features.
+            folder: of the model.
+            sfm: the model.
+
+        Returns:
+            The folder, the model and its fit: the new ones if they have as many photos, all of
+            which fit.
+        """
+        fit = cropping.find(sfm)
+        cameras = {sfm.images[i].camera_id for i in sfm.reg_image_ids()}
+        is_shared = len(cameras) < sfm.num_reg_images()
+        if not (fit.altered and is_shared and self.camera_mode == pycolmap.CameraMode.AUTO):
+            return folder, sfm, fit
+        logger.info("Trying again with a camera for each photo.")
+        with suppress(registration.NoModelError):
+            other, mode = f"{SFM}{OWN}", pycolmap.CameraMode.PER_IMAGE
+            found = self._reconstruct(conf, other, camera_mode=mode)
+            its_fit = cropping.find(found)
+            if found.num_reg_images() >= sfm.num_reg_images() and not its_fit.altered:
+                registration.check(self.folder.path / other, self.accept_partial)
+                return other, found, its_fit
+        return folder, sfm, fit
+
+    def _reconstruct(
+        self,
+        conf: dict,
+        sfm: str,
+        once: bool = False,
+        camera_mode: pycolmap.CameraMode | None = None,
+    ) -> pycolmap.Reconstruction:
         features, descriptors = self._describe(conf)
         pairs = self._pairs(descriptors)
         matches = self._match(pairs, features)
@@ -331,7 +377,7 @@ class _Building:
         with self.folder.stage("reconstruction"):
             return reconstruction.main(
                 *(self.folder.path / sfm, self.image_dir, pairs, features, matches),
-                camera_mode=self.camera_mode,
+                camera_mode=camera_mode or self.camera_mode,
                 image_list=self.names,
                 once=once,
                 checked=False,
@@ -378,7 +424,7 @@ def _drop_others(folder: RunFolder, built: Map) -> None:
     for name in {plain, f"{plain}{MORE}"} - {kept}:
         begins = f"{name}.h5", f"{name}_matches", f"{RETRIEVAL['output']}_{name}."
         folder.delete(other for other in folder.written if other.startswith(begins))
-    folder.delete({SFM, f"{SFM}{MORE}", f"{SFM}{FURTHER}"} - {built.sfm.name})
+    folder.delete({SFM, *(f"{SFM}{suffix}" for suffix in (MORE, FURTHER, OWN))} - {built.sfm.name})
 
 
 def keep_projection(conf: dict, folder: Path) -> dict:

@@ -137,8 +137,8 @@ def warn(fit: Fit) -> None:
         logger.warning(
             "The map may be wrong: %s have another focal length or principal point than others. "
             "With intrinsics of their own, all photos fit %.0f %% better. Either these or the "
-            "others were cropped or enlarged, and are misplaced. Use the original photos, or "
-            "--camera_mode per_image. map.json lists all of them.",
+            "others were cropped or enlarged, and are misplaced: use the original photos. map.json "
+            "lists all of them.",
             cli.some(fit.altered),
             100 * fit.gain,
         )

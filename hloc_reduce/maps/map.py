@@ -19,8 +19,9 @@ from . import contradictions, cropping, precision
 FINISHED = "map.json"  # is written last
 FINGERPRINTS = "fingerprints.json"
 SFM = "sfm"  # the folder of the COLMAP model
-# suffixes of the files of later attempts: with more keypoints, and without
-MORE, FURTHER = "-keypoints_colmap", "-further"
+# suffixes of the files of later attempts: with more keypoints, without, and with a camera for each
+# photo
+MORE, FURTHER, OWN = "-keypoints_colmap", "-further", "-per_image"
 PLACE = "place.txt"  # stays when the map is rebuilt
 RETRIEVAL = aggregate_features.confs["vlad"]
 

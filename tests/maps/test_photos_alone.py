@@ -8,6 +8,8 @@ import numpy as np
 import pycolmap
 from alignment import similarity
 from command import outcome, state
+from conftest import FOCAL
+from PIL import Image
 
 from hloc_reduce import Localizer, maps
 from hloc_reduce.confs import features as features_confs
@@ -192,3 +194,31 @@ def test_a_map_of_other_pairs_is_refused(plane, tmp_path, monkeypatch, run, refu
     assert (
         re.search(r"differs: num_covis( \(.*\))? and pairs", message) and "--overwrite" in message
     )
+
+
+def test_enlarged_photos_get_cameras_of_their_own(plane, tmp_path, caplog, run):
+    """Although EXIF data say that one camera took all photos with the same zoom."""
+    caplog.set_level("INFO")
+    images = tmp_path / "photos"
+    images.mkdir()
+    for number in range(5):
+        photo = Image.open(plane / f"images/{number}.png").convert("RGB")
+        width, height = photo.size
+        if number == 3:  # its middle
+            box = [round(share * side) for share in (0.1, 0.9) for side in photo.size]
+            photo = photo.crop(box).resize((width, height), Image.Resampling.BICUBIC)
+        exif = Image.Exif()
+        exif[0x010F], exif[0x0110] = "Maker", "Model"
+        exif.get_ifd(0x8769)[0xA405] = round(35 * FOCAL / max(photo.size))
+        photo.save(images / f"{number}.jpg", quality=97, exif=exif)
+    run("--map_images", images, "--outputs", tmp_path / "outputs")
+    built = maps.Map(tmp_path / "outputs/map")
+    assert "Trying again with a camera for each photo." in caplog.text
+    assert built.sfm.name == "sfm-per_image" and built.cropping.altered == []
+    assert not (built.folder / "sfm").exists()
+    model = colmap.read_model(built.sfm)
+    focal_lengths = {i.name: i.camera.mean_focal_length() for i in model.images.values()}
+    assert focal_lengths["3.jpg"] > 1.15 * np.median(list(focal_lengths.values()))
+    caplog.clear()
+    run("--map_images", images, "--outputs", tmp_path / "outputs")  # opens it
+    assert "Trying again" not in caplog.text
