@@ -350,7 +350,7 @@ class _Building:
             other, mode = f"{SFM}{OWN}", pycolmap.CameraMode.PER_IMAGE
             found = self._reconstruct(conf, other, camera_mode=mode)
             its_fit = cropping.find(found)
-            if found.num_reg_images() >= sfm.num_reg_images() and not its_fit.altered:
+            if found.num_reg_images() >= sfm.num_reg_images() and its_fit.gain <= cropping.GAIN:
                 registration.check(self.folder.path / other, self.accept_partial)
                 return other, found, its_fit
         return folder, sfm, fit
