@@ -196,7 +196,10 @@ def _check_source(images: Path, model: Path, path: Path) -> None:
     if is_map(model.parent):  # it may have been rebuilt from other photos
         source["map"] = Map(model.parent).id
     if path.exists() and not provenance.is_current(path, source):
-        raise InputError(f"{path.parent} holds the tracks of another map. Choose another folder.")
+        raise InputError(
+            f"{path.parent} holds the tracks of another map, or of an earlier one. Delete it, or "
+            "choose another folder: --cache."
+        )
     provenance.write(path, source)
 
 
