@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from ..light.vlad import aggregate
+from ..runtime import parallel
 from . import Aggregator
 
 
@@ -31,7 +32,8 @@ class VLAD(Aggregator):
             n_init=3,
             random_state=self.conf["seed"],
         )
-        with threadpool_limits(1):  # more wait for each other in such small batches
+        # more threads wait for each other in such small batches
+        with parallel.one_thread(), threadpool_limits(1, "openmp"):
             kmeans.fit(descriptors.astype(np.float32))
         self.vocabulary = kmeans.cluster_centers_
 

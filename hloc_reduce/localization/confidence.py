@@ -98,7 +98,7 @@ def confidence(
 
 
 def _different(numbers: np.ndarray) -> int:
-    """Count the different ones of small numbers (N,)."""
+    """Count the distinct values of small integers (N,)."""
     return int(np.count_nonzero(np.bincount(numbers)))
 
 

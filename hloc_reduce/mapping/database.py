@@ -31,23 +31,22 @@ def import_images(
     Raises:
         InputError: for an unknown option, or an image that COLMAP skips.
     """
-    options, zoomed = image_options or {}, []
+    options, zoomed = image_options or {}, set()
     if camera_mode == pycolmap.CameraMode.AUTO and not options.get("camera_params"):
         found = {name: exif_camera(image_dir / name) for name in names}
-        zoomed = [name for name, camera in found.items() if camera is not None and camera.zoomed]
+        zoomed = {name for name, camera in found.items() if camera is not None and camera.zoomed}
     if rest := [name for name in names if name not in zoomed]:
         colmap.import_images(database, image_dir, rest, camera_mode, options)
     if not zoomed:
         return
-    colmap.import_images(database, image_dir, zoomed, pycolmap.CameraMode.PER_IMAGE, options)
+    mode, factor = pycolmap.CameraMode.PER_IMAGE, options.get("default_focal_length_factor")
+    colmap.import_images(database, image_dir, sorted(zoomed), mode, options)
     with colmap.open_database(database) as opened:
         for image in opened.read_all_images():
             if image.name in zoomed:
                 camera = opened.read_camera(image.camera_id)
-                params = camera.params.copy()
-                params[camera.focal_length_idxs()] = GUESSED_FOCAL * max(
-                    camera.width, camera.height
-                )
+                params, side = camera.params.copy(), max(camera.width, camera.height)
+                params[camera.focal_length_idxs()] = (factor or GUESSED_FOCAL) * side
                 camera.params = params.tolist()
                 camera.has_prior_focal_length = False
                 opened.update_camera(camera)

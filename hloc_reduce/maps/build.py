@@ -239,6 +239,7 @@ class _Building:
         else:
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
+            registration.check(self.folder.path / folder, self.accept_partial)
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
@@ -300,9 +301,7 @@ class _Building:
         """
         adaptive = features_confs.keypoints_of(conf["model"]) == "adaptive"
         if not adaptive or len(self.names) > mapper.VERY_FEW:
-            sfm = self._reconstruct(conf, SFM)
-            registration.check(self.folder.path / SFM, self.accept_partial)
-            return SFM, conf, sfm
+            return SFM, conf, self._reconstruct(conf, SFM)
         model = features_confs.with_keypoints(conf["model"], "colmap")
         more = {**conf, "output": f"{conf['output']}{MORE}", "model": model}
         found: list[tuple[str, dict, pycolmap.Reconstruction]] = []
@@ -323,7 +322,6 @@ class _Building:
                 attempt(f"{SFM}{FURTHER}", conf)
         if not found:
             raise registration.NoModelError(registration.nothing(self.image_dir))
-        registration.check(self.folder.path / found[0][0], self.accept_partial)
         return found[0]
 
     def _fitting(
@@ -351,7 +349,6 @@ class _Building:
             found = self._reconstruct(conf, other, camera_mode=mode)
             its_fit = cropping.find(found)
             if found.num_reg_images() >= sfm.num_reg_images() and its_fit.gain <= cropping.GAIN:
-                registration.check(self.folder.path / other, self.accept_partial)
                 return other, found, its_fit
         return folder, sfm, fit
 

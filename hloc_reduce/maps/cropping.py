@@ -38,7 +38,7 @@ AS_ASSUMED = Fit(0.0, [])
 
 
 def find(sfm: pycolmap.Reconstruction) -> Fit:
-    """Adjust a copy of a map with free principal points, then with a camera for each photo.
+    """Adjust copies of a map with a camera for each photo and free principal points, and as it is.
 
     A principal point that is assumed in the centre, although a photo was cropped, bends the poses
     and points of all photos, so that every single one still fits. So does a focal length that a
@@ -69,7 +69,8 @@ def find(sfm: pycolmap.Reconstruction) -> Fit:
     of_own = gain(separate, own - sum(cameras.values()) + 2 * len(cameras))
     if of_own > GAIN and (altered := _altered(separate, _focal_lengths(adjusted))):
         return Fit(of_own, altered)
-    return Fit(gain(adjusted, 2 * len(cameras)), [])
+    is_shared = len(cameras) < len(images)
+    return Fit(gain(adjusted, 2 * len(cameras)) if is_shared else of_own, [])
 
 
 def _focal_lengths(sfm: pycolmap.Reconstruction) -> dict[str, float]:
@@ -93,7 +94,7 @@ def _with_own_cameras(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 
 
 def _altered(sfm: pycolmap.Reconstruction, assumed: dict[str, float]) -> list[str]:
-    """Return the photos whose intrinsics differ from those of the others.
+    """Return the photos whose intrinsics differ from those of the largest group of photos.
 
     Args:
         sfm: the map with free intrinsics.
@@ -103,11 +104,12 @@ def _altered(sfm: pycolmap.Reconstruction, assumed: dict[str, float]) -> list[st
     images = sorted((sfm.images[i] for i in sfm.reg_image_ids()), key=lambda image: image.name)
     zoom = np.array([np.log(found[image.name] / assumed[image.name]) for image in images])
     centre = np.array([_off_centre(sfm.cameras[image.camera_id]) for image in images])
-    zoomed = np.abs(zoom - np.median(zoom)) > np.log(ZOOMED)
-    moved = np.abs(centre - np.median(centre, axis=0)).max(axis=1) > OFF_CENTRE
+    zoomed = np.abs(zoom[:, None] - zoom) > np.log(ZOOMED)
+    moved = np.abs(centre[:, None] - centre).max(axis=2) > OFF_CENTRE
     seen = np.array([image.num_points3D for image in images]) >= OBSERVATIONS
-    differs = (zoomed | moved) & seen
-    return [image.name for image, one in zip(images, differs, strict=True) if one]
+    differs = (zoomed | moved) & seen & seen[:, None]
+    like_most = differs[differs.sum(axis=1).argmin()]  # a photo that differs from the fewest
+    return [image.name for image, differs in zip(images, like_most, strict=True) if differs]
 
 
 def _off_centre(camera: pycolmap.Camera) -> np.ndarray:
@@ -135,8 +137,8 @@ def warn(fit: Fit) -> None:
     """Warn that the photos of a map may be cropped if they fit much better so."""
     if fit.altered:
         logger.warning(
-            "The map may be wrong: %s have another focal length or principal point than others. "
-            "With intrinsics of their own, all photos fit %.0f %% better. Either these or the "
+            "The map may be wrong. Photos with another focal length or principal point than the "
+            "others: %s. With other intrinsics, all photos fit %.0f %% better. Either these or the "
             "others were cropped or enlarged, and are misplaced: use the original photos. map.json "
             "lists all of them.",
             cli.some(fit.altered),

@@ -196,13 +196,14 @@ def _commit(
     sfm.write_binary(folder)
     sfm = colmap.read_model(folder)  # without images that were removed
     contradicting = sorted(({*built.contradicting} - {*removed}) | {*copies.find(sfm)})
-    uncertain, fit = built.uncertain, built.cropping
+    uncertain = built.uncertain
+    fit = built.cropping._replace(altered=sorted({*built.cropping.altered} - {*removed}))
     if content.get("model") is None:
         uncertain = precision.find(sfm)
         if sfm.num_reg_images() <= cropping.LARGEST:
             fit = cropping.find(sfm)
     precision.warn({name: share for name, share in uncertain.items() if name in added})
-    if built.cropping.gain <= cropping.GAIN:
+    if built.cropping.gain <= cropping.GAIN or {*fit.altered} - {*built.cropping.altered}:
         cropping.warn(fit)
     content |= {
         "id": uuid.uuid4().hex,

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from threading import Lock
+from threading import Lock, local
 from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -17,10 +17,19 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 BACKLOG = 4  # results per worker that may wait to be taken
 
+
+class _OfThread(local):
+    """Of each thread, its blocks of `one_thread`, and torch's threads before the first of them."""
+
+    blocks = 0
+    before: int | None = None
+
+
 _lock = Lock()
-_running = 0  # active blocks of `one_thread`, in all threads
-_threads: int | None = None  # torch's threads before the first of them that found it loaded
-_blas: threadpool_limits  # ends the limit of the first of them on NumPy's threads
+_of_thread = _OfThread()
+_running = 0  # blocks of `one_thread` in all threads
+_threads: int | None = None  # torch's threads before the first of these
+_blas: threadpool_limits  # ends the limit on BLAS that the first of these has set
 
 
 def cores() -> int:
@@ -36,25 +45,30 @@ def cores() -> int:
 def one_thread() -> Iterator[None]:
     """Let NumPy and torch compute in the calling thread only; such blocks may overlap.
 
-    Several threads of BLAS wait for each other, for much longer than they compute, where matrices
-    are small, other programs use the cores, or several threads of Python call it.
+    With several threads, BLAS waits much longer than it computes if matrices are small, if other
+    programs use the cores, or if several threads of Python call it.
     """
     global _running, _threads, _blas
-    torch = sys.modules.get("torch")
     with _lock:
         if not _running:
             _blas = threadpool_limits(1, "blas")
         _running += 1
-        if torch is not None:
-            _threads = _threads or torch.get_num_threads()
-            torch.set_num_threads(1)  # of this thread; another one may have begun with more
+        _of_thread.blocks += 1
+        torch = sys.modules.get("torch")
+        if torch is not None and _of_thread.before is None:
+            # torch gives a new thread the number that was set last, perhaps by such a block
+            _of_thread.before = max(torch.get_num_threads(), _threads or 1)
+            _threads = _threads or _of_thread.before
+            torch.set_num_threads(1)
     try:
         yield
     finally:
         with _lock:
             _running -= 1
-            if torch is not None and _threads is not None:
-                torch.set_num_threads(1 if _running else _threads)
+            _of_thread.blocks -= 1
+            if not _of_thread.blocks and _of_thread.before is not None:
+                sys.modules["torch"].set_num_threads(_of_thread.before)
+                _of_thread.before = None
             if not _running:
                 _blas.restore_original_limits()
                 _threads = None

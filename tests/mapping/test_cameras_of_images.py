@@ -41,6 +41,13 @@ def test_digital_zooms_have_cameras_of_their_own(photos):
     assert found["c.jpg"].mean_focal_length() == 48 != found["a.jpg"].mean_focal_length()
 
 
+def test_all_are_zoomed(photos):
+    path, options = photos / "database.db", {"default_focal_length_factor": 2.0}
+    names = ["c.jpg", "d.jpg"]
+    database.import_images(path, photos, names, pycolmap.CameraMode.AUTO, options)
+    assert [camera.mean_focal_length() for camera in cameras(path).values()] == [80, 80]
+
+
 @pytest.mark.parametrize(
     ("mode", "options", "number"),
     [("SINGLE", {}, 1), ("PER_IMAGE", {}, 4), ("AUTO", {"camera_params": "50,20,15,0"}, 1)],

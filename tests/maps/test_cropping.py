@@ -80,6 +80,12 @@ def test_enlarged_photos_of_a_shared_camera_are_named(zoomed, caplog):
     assert ("are misplaced" in caplog.text) == bool(zoomed)
 
 
+def test_one_half_is_named_if_the_other_was_enlarged():
+    fit = cropping.find(reconstructed(zoomed=(0, 3, 5, 6), is_shared=True))
+    halves = [["0.jpg", "3.jpg", "5.jpg", "6.jpg"], ["1.jpg", "2.jpg", "4.jpg", "7.jpg"]]
+    assert fit.altered in halves and fit.gain > 0.3
+
+
 def test_photos_that_were_removed_do_not_count():
     model = reconstructed(0.0)
     worst = model.images[1]

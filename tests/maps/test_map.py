@@ -61,7 +61,7 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
     for more, said in (
         ({}, ""),
         (gain, "may be cropped"),
-        (gain | {"images_altered": ["db/2.png"]}, "db/2.png have another focal length"),
+        (gain | {"images_altered": ["db/2.png"]}, "than the others: db/2.png"),
     ):
         caplog.clear()
         (moved / "map.json").write_text(json.dumps(content | more))

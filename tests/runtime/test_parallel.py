@@ -41,6 +41,50 @@ def test_one_thread_of_torch_in_each_worker():
     assert threads == [1] * 4 and torch.get_num_threads() == before
 
 
+def test_threads_are_as_before_whoever_ends_first():
+    """Blocks of two threads overlap; the first one to begin is the first to end."""
+    begun, ended = threading.Event(), threading.Event()
+
+    def second():
+        torch.set_num_threads(2)
+        with parallel.one_thread():
+            begun.set()
+            ended.wait(10)
+            numbers.append(torch.get_num_threads())
+        numbers.append(torch.get_num_threads())
+
+    before, numbers = torch.get_num_threads(), []
+    torch.set_num_threads(3)
+    try:
+        with pytest.raises(ZeroDivisionError), parallel.one_thread():
+            thread = threading.Thread(target=second)
+            thread.start()
+            begun.wait(10)
+            raise ZeroDivisionError
+        assert torch.get_num_threads() == 3
+        ended.set()
+        thread.join()
+        assert numbers[0] == 1 and numbers[1] > 1
+        assert parallel.cores() == torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_torch_is_imported_within_a_block():
+    """As by a network's first photo."""
+    code = (
+        "from hloc_reduce.runtime import parallel\n"
+        "with parallel.one_thread():\n"
+        "    import torch\n"
+        "    torch.set_num_threads(3)\n"
+        "    with parallel.one_thread():\n"
+        "        print(torch.get_num_threads())\n"
+        "print(torch.get_num_threads())\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["1", "3"]
+
+
 def test_one_thread_of_numpy_in_each_worker():
     def threads(_=None):
         return {library["num_threads"] for library in threadpool_info() if is_blas(library)}

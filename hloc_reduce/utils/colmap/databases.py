@@ -67,7 +67,7 @@ def add_camera_mode(parser: Parser) -> None:
     parser.add_argument(
         "--camera_mode",
         default="auto",
-        help=f"which photos share a camera, as in COLMAP: {modes}; auto, COLMAP's default: those "
+        help=f"which photos share a camera, as in COLMAP: {modes}; auto: those "
         "of the same make, model, focal length and size by EXIF data, without a digital zoom",
     )
 
