@@ -80,8 +80,8 @@ def main() -> None:
         seconds = time.perf_counter() - start
         children = resource.getrusage(resource.RUSAGE_CHILDREN)
         cpu = time.process_time() - cpu + children.ru_utime + children.ru_stime
-        print(f"{args.images} images, {built.num_points3D} points: {seconds:.1f} s on")
-        print(f"{os.cpu_count()} cores, {cpu:.1f} s of them computing; stages:")
+        print(f"{args.images} images, {built.num_points3D} points: {seconds:.1f} s,")
+        print(f"{cpu:.1f} s of CPU time on {os.cpu_count()} cores; seconds of the stages:")
         print(json.loads((built.folder / FINISHED).read_text())["seconds"])
         print(f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
 
