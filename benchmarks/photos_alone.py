@@ -169,7 +169,9 @@ def _main() -> None:
     parser = cli.Parser(
         __doc__, "--map fox/images:fox/sparse --subset 10 --stock --output outputs/photos_alone"
     )
-    parser.add_argument("--map", nargs="+", required=True, metavar="IMAGES:MODEL")
+    parser.add_argument(
+        "--map", action="append", required=True, metavar="IMAGES:MODEL", help="may be repeated"
+    )
     parser.add_argument("--output", type=Path, required=True, help="folder of the maps")
     parser.add_argument("--feature", default=features_confs.RECOMMENDED, help="name or YAML file")
     features_confs.add_keypoints_option(parser)
