@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from . import logger
-from .mapping.database import import_images
+from .mapping.database import ZOOMED, import_images
 from .pairs_from_retrieval import rank, read_global, similarity
 from .runtime import provenance
 from .triangulation import Pair, Verified, read_matches
@@ -180,6 +180,7 @@ def _verify(
             "features": file_provenance(feature_file),
             "matches": file_provenance(match_file),
             "camera_mode": camera_mode.name,
+            "zoomed": ZOOMED,
         }
     before = provenance.read(path)
     known = before.get("pairs", {}) if before.get("made_from") == made_from else {}

@@ -86,7 +86,7 @@ def confidence(
         if number <= sample:
             return np.inf
         agree = errors <= threshold
-        inliers = min(_different(place[agree]), _different(point[agree]))
+        inliers = min(_num_distinct(place[agree]), _num_distinct(point[agree]))
         chances = np.bincount(place)
         by_chance = np.minimum(1, chances * np.pi * threshold**2 * density[first]).mean()
         tail = _log10_tail(inliers - sample, number - sample, by_chance)
@@ -97,7 +97,7 @@ def confidence(
     return float(-min(map(log10_false_alarms, thresholds)))
 
 
-def _different(numbers: np.ndarray) -> int:
+def _num_distinct(numbers: np.ndarray) -> int:
     """Count the distinct values of small integers (N,)."""
     return int(np.count_nonzero(np.bincount(numbers)))
 

@@ -8,6 +8,9 @@ import pycolmap
 from ..localization.intrinsics import GUESSED_FOCAL, exif_camera
 from ..utils import colmap
 
+# what the provenance of what is made from such a database says of its cameras
+ZOOMED = "cameras of their own"
+
 
 def import_images(
     database: Path,

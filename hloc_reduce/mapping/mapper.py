@@ -35,7 +35,7 @@ SEEDS = (1, 2, 3)
 MORE = 1.5  # times as many images show that one camera took all
 # what the provenance of a model says of how it was chosen
 RULES = {
-    "zoomed": "cameras of their own",
+    "zoomed": databases.ZOOMED,
     "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
     "points": f"{MORE} times as many where focal lengths differ",
     "spread": SPREAD,

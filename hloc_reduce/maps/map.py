@@ -83,11 +83,8 @@ class Map:
         self.contradicting = list(content.get("images_contradicting_others", []))
         found = content.get("images_of_uncertain_position", {}).items()
         self.uncertain = {str(name): float(share) for name, share in found}
-        gain, altered = (
-            content.get("gain_of_free_principal_points", 0),
-            content.get("images_altered", []),
-        )
-        self.cropping = cropping.Fit(float(gain), list(altered))
+        gain = float(content.get("gain_of_free_principal_points", 0))
+        self.cropping = cropping.Fit(gain, list(content.get("images_altered", [])))
         self.num_points3D = int(content["points3D"])
         self.camera_mode = content.get("camera_mode")
         known = content.get("cameras", {}).items()
