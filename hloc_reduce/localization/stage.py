@@ -90,7 +90,7 @@ def main(
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
     if mirror_images:
         header["mirror_images"] = True
-    solve = partial(_localized, load_reference, config, skip_matches, gate, executor)
+    solve = partial(localize_all, load_reference, config, skip_matches, gate, executor)
     with Log(log_file(results), header, overwrite) as log:
         todo = [(name, camera) for name, camera in queries if name not in log.records]
         for name, record in _refuse(load_reference, features, todo, retrieved):
@@ -191,7 +191,7 @@ def _may_be_mirrored(record: dict) -> bool:
     return record["mirror_image"] is None and is_doubtful(*known)
 
 
-def _localized(
+def localize_all(
     load_reference: Callable[[], Reference],
     config: Callable[[str, pycolmap.Camera], dict],
     skip_matches: int,
@@ -202,17 +202,29 @@ def _localized(
     tasks: list[tuple[str, pycolmap.Camera | None, list[str]]],
     thorough: bool,
 ) -> Iterator[tuple[str, dict]]:
-    """Yield the names and the records of queries, or, if not `thorough`, of mirror images."""
+    """Yield the names and the records of queries, or, if not `thorough`, of mirror images.
+
+    Args:
+        load_reference: as in `main`, like `config` to `matches`.
+        config: see `load_reference`.
+        skip_matches: see `load_reference`.
+        gate: see `load_reference`.
+        executor: see `load_reference`.
+        features: see `load_reference`.
+        matches: see `load_reference`.
+        tasks: names and intrinsics of the queries, with the images that are retrieved for each.
+        thorough: also try matches of single images, as `absolute_pose.estimate` does.
+    """
     with open_h5(matches) as file:
         gate = gate.of_matches(get_matcher(file), dimension(features))
     files = features, matches
-    work = partial(_localize_all, load_reference, *files, config, skip_matches, gate, thorough)
+    work = partial(_localize_chunk, load_reference, *files, config, skip_matches, gate, thorough)
     said = "Localizing" if thorough else "Trying mirror images"
     with closing(executor.map(work, tasks, CHUNK)) as found:
         yield from progress(found, said, "query", len(tasks))
 
 
-def _localize_all(
+def _localize_chunk(
     load_reference: Callable[[], Reference],
     features: Path,
     matches: Path,

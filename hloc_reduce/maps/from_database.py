@@ -20,7 +20,8 @@ from ..utils.codes import STORAGES
 from ..utils.colmap import StoredDatabase
 from ..utils.match_files import check_names
 from ..utils.paths import strings_as_paths
-from .build import begin, claim, digests, keep_projection, model_files
+from .build import begin, claim, digests, model_files
+from .building import keep_projection
 from .map import FINISHED, RETRIEVAL, SFM, Map, with_projection
 
 
@@ -171,6 +172,7 @@ def _finish(
         "images_of_uncertain_position": {},
         "gain_of_free_principal_points": 0.0,
         "images_altered": [],
+        "images_mirrored": [],
         "points3D": reference.num_points3D(),
         **intrinsics.to_dict(cameras),
         "seconds": folder.seconds(),

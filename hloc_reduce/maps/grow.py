@@ -215,6 +215,7 @@ def _commit(
         "images_of_uncertain_position": uncertain,
         "gain_of_free_principal_points": fit.gain,
         "images_altered": fit.altered,
+        "images_mirrored": sorted({*built.mirrored} - {*added}),
         "points3D": sfm.num_points3D(),
     }
     if cameras is not None:

@@ -14,14 +14,11 @@ from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import STORAGES
 from ..utils.h5 import file_provenance, open_h5
 from ..utils.paths import strings_as_paths
-from . import contradictions, cropping, precision
+from . import contradictions, cropping, mirrored_photos, precision
 
 FINISHED = "map.json"  # is written last
 FINGERPRINTS = "fingerprints.json"
 SFM = "sfm"  # the folder of the COLMAP model
-# suffixes of the files of later attempts: with more keypoints, without, and with a camera for each
-# photo
-MORE, FURTHER, OWN = "-keypoints_colmap", "-further", "-per_image"
 PLACE = "place.txt"  # stays when the map is rebuilt
 RETRIEVAL = aggregate_features.confs["vlad"]
 
@@ -46,6 +43,7 @@ class Map:
         contradicting: images whose poses contradict the others.
         uncertain: images whose positions are uncertain, see `precision.find`.
         cropping: how much better the images fit with other intrinsics.
+        mirrored: images without a pose, as they are mirrored.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
         cameras: what the map tells about the intrinsics of other photos.
@@ -85,6 +83,7 @@ class Map:
         self.uncertain = {str(name): float(share) for name, share in found}
         gain = float(content.get("gain_of_free_principal_points", 0))
         self.cropping = cropping.Fit(gain, list(content.get("images_altered", [])))
+        self.mirrored = list(content.get("images_mirrored", []))
         self.num_points3D = int(content["points3D"])
         self.camera_mode = content.get("camera_mode")
         known = content.get("cameras", {}).items()
@@ -164,6 +163,7 @@ class Map:
         contradictions.warn(self.contradicting)
         precision.warn(self.uncertain)
         cropping.warn(self.cropping)
+        mirrored_photos.warn(self.mirrored)
 
     def names(self) -> list[str]:
         """List the images that have a pose."""

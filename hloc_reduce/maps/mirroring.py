@@ -33,15 +33,22 @@ def mirror_images(
         listed = pairs.with_name(f"{pairs.stem}-mirrored.txt")
         retrieved = parse_retrieval(pairs)
         write_pairs([(name, other) for name in names for other in retrieved[name]], listed)
-        mirrored = extract_features.main(
-            {**conf, "preprocessing": {**conf["preprocessing"], "mirrored": True}},
-            image_dir,
-            feature_path=features,
-            image_list=names,
-            executor=executor,
-            strict=False,
-            queries=names,
-        )
+        mirrored = extract(conf, image_dir, names, features, executor)
         return mirrored, match(listed, mirrored)
 
     return main
+
+
+def extract(
+    conf: dict, image_dir: Path, names: list[str], features: Path, executor: Executor = SERIAL
+) -> Path:
+    """Extract the features of the mirror images of photos; arguments as in `mirror_images`."""
+    return extract_features.main(
+        {**conf, "preprocessing": {**conf["preprocessing"], "mirrored": True}},
+        image_dir,
+        feature_path=features,
+        image_list=names,
+        executor=executor,
+        strict=False,
+        queries=names,
+    )

@@ -14,6 +14,7 @@ from command import contents, write
 
 from hloc_reduce import Localizer, maps
 from hloc_reduce.maps import addition, grow
+from hloc_reduce.runtime import provenance
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.h5 import list_h5_names
 from pipelines import localize
@@ -51,6 +52,14 @@ def names(folder):
 def poses(folder):
     images = colmap.read_model(maps.Map(folder).sfm).images.values()
     return {image.name: image.cam_from_world().matrix().tolist() for image in images}
+
+
+def test_a_photo_that_was_mirrored_is_added(grown, run):
+    folder, new, model = grown
+    content = provenance.read(folder / "map.json")
+    provenance.write(folder / "map.json", {**content, "images_mirrored": ["left.jpg", NEW]})
+    run("--map", folder, "--add_images", new, "--add_model", model)
+    assert maps.Map(folder).mirrored == ["left.jpg"] and NEW in names(folder)
 
 
 def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):

@@ -13,6 +13,7 @@ from PIL import Image
 
 from hloc_reduce import Localizer, maps
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.mapping import registration
 from hloc_reduce.utils import colmap, parsers
 from pipelines import localize
 
@@ -94,14 +95,14 @@ def files_of(folder, keypoints):
 def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeypatch, caplog, run):
     """And queries get them, too; the map is the same command's."""
     caplog.set_level("INFO")
-    reconstruct = maps.build.reconstruction.main
+    reconstruct = maps.building.reconstruction.main
 
     def fails_once(*args, once, **options):
         if once:
-            raise maps.build.registration.NoModelError("COLMAP could not reconstruct the images.")
+            raise registration.NoModelError("COLMAP could not reconstruct the images.")
         return reconstruct(*args, once=once, **options)
 
-    monkeypatch.setattr(maps.build.reconstruction, "main", fails_once)
+    monkeypatch.setattr(maps.building.reconstruction, "main", fails_once)
     outputs = tmp_path / "outputs"
     build = ("--map_images", plane / "images", "--outputs", outputs)
     run(*build)
@@ -139,14 +140,14 @@ def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatc
     """As is said of a photo that matches no other; most of them are a map."""
     caplog.set_level("INFO")
     draw_noise(plane / "images", ["other"])
-    reconstruct = maps.build.reconstruction.main
+    reconstruct = maps.building.reconstruction.main
 
     def fails_again(*args, once, **options):
         if once:
             return reconstruct(*args, once=once, **options)
-        raise maps.build.registration.NoModelError("COLMAP could not reconstruct the images.")
+        raise registration.NoModelError("COLMAP could not reconstruct the images.")
 
-    monkeypatch.setattr(maps.build.reconstruction, "main", fails_again)
+    monkeypatch.setattr(maps.building.reconstruction, "main", fails_again)
     outputs = tmp_path / "outputs"
     run("--map_images", plane / "images", "--outputs", outputs)
     assert caplog.text.count("5 of 6 photos are in the map.") == 3
@@ -169,7 +170,7 @@ def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch, ru
     def apart(descriptors, output, num_matched):
         parsers.write_pairs([("0.png", "1.png"), ("1.png", "2.png"), ("3.png", "4.png")], output)
 
-    monkeypatch.setattr(maps.build.pairs_from_retrieval, "main", apart)
+    monkeypatch.setattr(maps.building.pairs_from_retrieval, "main", apart)
     run(*build)
     built = maps.Map(outputs / "map")
     assert len(built.names()) == 5
