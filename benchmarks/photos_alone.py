@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from PIL import Image, ImageOps
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
@@ -34,10 +35,29 @@ def choose_photos(names: list[str], size: int, number: int) -> list[list[str]]:
     return [names[start : start + size] for start in starts]
 
 
-def ours(images: Path, folder: Path, feature: str, options: dict) -> pycolmap.Reconstruction:
+def collect(images: Path, names: list[str], mirrored: list[str], folder: Path) -> Path:
+    """Link the photos of a subset from a new folder, and write mirrored ones into it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for name in names:
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if name in mirrored:
+            with Image.open(images / name) as photo:
+                ImageOps.mirror(photo).save(target, quality=95, exif=photo.getexif().tobytes())
+        else:
+            target.symlink_to((images / name).resolve())
+    return folder
+
+
+def spread(names: list[str], number: int) -> list[str]:
+    """Choose names that are spread evenly over a list, neither the first nor the last one."""
+    chosen = np.linspace(1, len(names) - 2, number).round().astype(int) if number else []
+    return [names[i] for i in chosen]
+
+
+def ours(images: Path, folder: Path, feature: str, options: dict) -> maps.Map:
     """Build a map of photos without poses."""
-    built = maps.main(folder, images, feature=feature, accept_partial=True, **options)
-    return colmap.read_model(built.sfm)
+    return maps.main(folder, images, feature=feature, accept_partial=True, **options)
 
 
 def stock(images: Path, folder: Path) -> pycolmap.Reconstruction:
@@ -128,29 +148,31 @@ def main(
     subset: int = 0,
     subsets: int = 1,
     with_stock: bool = False,
+    num_mirrored: int = 0,
     options: dict | None = None,
 ) -> None:
     """Print a row for each place, subset and method."""
     print(f"| place | method | {' | '.join(COLUMNS)} |")
     print(f"| --- | --- |{' ---: |' * len(COLUMNS)}", flush=True)
-    registered = {}
+    registered: dict[str, int] = {}
+    outcomes: dict[str, int] = {}
     for place, (images, model) in places.items():
         reference = colmap.read_model(model)
         names = sorted(image.name for image in reference.images.values())
         for number, chosen in enumerate(choose_photos(names, subset, subsets)):
             title = f"{place} {len(chosen)}" + (f" ({number + 1})" if subsets > 1 else "")
             folder = output / title.replace(" ", "-")
-            shutil.rmtree(folder / "photos", ignore_errors=True)
-            for name in chosen:
-                target = folder / "photos" / name
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.symlink_to((images / name).resolve())
-            photos = folder / "photos"
+            mirrored = spread(chosen, num_mirrored)
+            photos = collect(images, chosen, mirrored, folder / "photos")
             for method in ("ours", "stock") if with_stock else ("ours",):
                 start = time.perf_counter()
                 try:
                     if method == "ours":
-                        found = ours(photos, folder / "map", feature, options or {})
+                        built = ours(photos, folder / "map", feature, options or {})
+                        found = colmap.read_model(built.sfm)
+                        for name in chosen:
+                            outcome = _outcome(built, name, name in mirrored)
+                            outcomes[outcome] = outcomes.get(outcome, 0) + 1
                     else:
                         found = stock(photos, folder / "stock")
                     cells = row(found, reference, len(chosen))
@@ -163,6 +185,15 @@ def main(
     print()
     for method, total in registered.items():
         print(f"{method}: {total} photos registered in all")
+    if num_mirrored:
+        print(", ".join(f"{outcome}: {outcomes[outcome]}" for outcome in sorted(outcomes)))
+
+
+def _outcome(built: maps.Map, name: str, is_mirrored: bool) -> str:
+    """Return what became of a photo of a map."""
+    named = name in built.mirrored
+    place = "named" if named else "in the map" if name in built.names() else "missing"
+    return f"{'mirrored' if is_mirrored else 'others'} {place}"
 
 
 def _main() -> None:
@@ -178,6 +209,7 @@ def _main() -> None:
     parser.add_argument("--subset", type=int, default=0, help="photos per subset; 0: all")
     parser.add_argument("--subsets", type=int, default=1, help="subsets of each place")
     parser.add_argument("--stock", action="store_true", help="also run stock pycolmap")
+    parser.add_argument("--mirrored", type=int, default=0, help="mirrored photos in each subset")
     colmap.add_camera_mode(parser)
     parser.add_argument(
         "--num_covis", type=int, default=20, help="pairs of each photo, unless all are matched"
@@ -197,6 +229,7 @@ def _main() -> None:
         args.subset,
         args.subsets,
         args.stock,
+        args.mirrored,
         {
             "num_covis": args.num_covis,
             "keypoints": args.keypoints,

@@ -154,11 +154,16 @@ class Building:
             logger.info("%d of %d photos are in the map.", registered, number)
             return registered == number
 
+        def attempt_without_mirrored(conf: dict, once: bool = False) -> bool:
+            """Try again if photos are mirrored; return whether all are in the best model so far."""
+            if found and self._find_mirrored(conf, found[0][2]):
+                logger.info("Trying again without mirrored photos.")
+                found.clear()
+                return attempt(f"{SFM}{OTHERS}", conf, once)
+            return complete
+
         complete = attempt(SFM, conf, once=several)
-        if found and self._find_mirrored(conf, found[0][2]):
-            logger.info("Trying again without mirrored photos.")
-            found.clear()
-            complete = attempt(f"{SFM}{OTHERS}", conf, once=several)
+        complete = attempt_without_mirrored(conf, once=several)
         if several and not complete:
             logger.info("Trying again with more keypoints.")
             model = features_confs.with_keypoints(conf["model"], "colmap")
@@ -166,19 +171,22 @@ class Building:
             attempt(f"{SFM}{MORE}", more)
             if not found or found[0][1] is conf:
                 attempt(f"{SFM}{FURTHER}", conf)
+            if found:
+                attempt_without_mirrored(found[0][1])
         if not found:
             raise errors[-1]
         return found[0]
 
     def _find_mirrored(self, conf: dict, sfm: pycolmap.Reconstruction) -> bool:
-        """Set which photos are mirrored, and return whether there are any."""
+        """Find mirrored photos, and return whether there are any that were not known before."""
         features, descriptors = self._describe(conf)
         with self.folder.stage("mirror_images"):
-            self.mirrored = mirrored_photos.find(
-                *(sfm, self.names, conf, self.matcher, self.image_dir),
-                *(features, descriptors, self.folder.path / MIRRORED),
+            found = mirrored_photos.find(
+                *(sfm, {*self.names} - {*self.mirrored}, conf, self.matcher, self.image_dir),
+                *(features, descriptors, self.folder.path / MIRRORED / features.stem),
             )
-        return bool(self.mirrored)
+        self.mirrored = sorted([*self.mirrored, *found])
+        return bool(found)
 
     def _fitting(
         self, conf: dict, folder: str, sfm: pycolmap.Reconstruction
