@@ -9,6 +9,10 @@ BIN := $(VENV)/bin
 OLDEST := 3.13.0
 OLD := $(VENV)/pycolmap-$(OLDEST)
 
+# stages that use pycolmap
+STAGES_OF_COLMAP := from_colmap localize_sfm more_pairs pairs_from_covisibility \
+	pairs_from_verification paths_in_stages reconstruction to_colmap triangulation
+
 # two workers take files in alphabetical order; in pytest-xdist's own order the slowest come last
 TWO := -n 2 --dist loadfile --no-loadscope-reorder
 
@@ -25,8 +29,7 @@ test: $(VENV)/installed $(OLD)/installed
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO)
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
 	OMP_NUM_THREADS=1 PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest $(TWO) \
-		tests/models/test_dog.py tests/mapping tests/stages --ignore tests/stages/test_stages_bad_input.py \
-		--ignore tests/stages/test_export.py \
+		tests/models/test_dog.py tests/mapping $(STAGES_OF_COLMAP:%=tests/stages/test_%.py) \
 		tests/maps/test_localizer.py tests/maps/test_compact.py \
 		tests/maps/test_photos_alone.py::test_photos_alone \
 		tests/pipelines/test_aachen.py::test_plane tests/pipelines/test_inloc.py::test_plane

@@ -211,10 +211,19 @@ def test_files_of_stages(built, tmp_path):
         compact.main(tmp_path / "a.hlm", sfm=known.sfm, features=other, feature="colmap_sift_sv64")
 
 
+@pytest.fixture(scope="module")
+def packed() -> list[bytes]:
+    return []
+
+
 @pytest.fixture
-def file(built, tmp_path):
+def file(packed, request, tmp_path):
+    """The compact map of the plane, which only the first test builds."""
     path = tmp_path / "place.hlm"
-    compact.main(path, built[0])
+    if not packed:
+        compact.main(path, request.getfixturevalue("built")[0])
+        packed.append(path.read_bytes())
+    path.write_bytes(packed[0])
     return path
 
 
