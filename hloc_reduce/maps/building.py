@@ -72,7 +72,7 @@ class Building:
         logger.info("Building the map %s of %d images.", self.folder.path, len(self.names))
         conf = keep_projection(conf, self.folder.path)
         if model is not None and reference is not None:
-            folder, sfm, fit = SFM, self._of_model(conf, model, reference), cropping.AS_ASSUMED
+            folder, sfm, fit = SFM, self._of_model(conf, model, reference), cropping.NOT_TRIED
         else:
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
@@ -202,7 +202,7 @@ class Building:
             The folder, the model and its fit: the new ones if they have as many photos, all of
             which fit.
         """
-        fit = cropping.find(sfm)
+        fit = self._fit(sfm)
         cameras = {sfm.images[i].camera_id for i in sfm.reg_image_ids()}
         is_shared = len(cameras) < sfm.num_reg_images()
         auto = self.camera_mode == pycolmap.CameraMode.AUTO
@@ -212,10 +212,15 @@ class Building:
         with suppress(registration.NoModelError):
             other, mode = f"{SFM}{OWN}", pycolmap.CameraMode.PER_IMAGE
             found = self._reconstruct(conf, other, camera_mode=mode)
-            its_fit = cropping.find(found)
-            if found.num_reg_images() >= sfm.num_reg_images() and its_fit.gain <= cropping.GAIN:
+            its_fit = self._fit(found)
+            fits = its_fit is not cropping.NOT_TRIED and its_fit.gain <= cropping.GAIN
+            if fits and found.num_reg_images() >= sfm.num_reg_images():
                 return other, found, its_fit
         return folder, sfm, fit
+
+    def _fit(self, sfm: pycolmap.Reconstruction) -> cropping.Fit:
+        with self.folder.stage("judge_intrinsics"):
+            return cropping.find(sfm)
 
     def _reconstruct(
         self,

@@ -34,7 +34,7 @@ class Fit(NamedTuple):
     altered: list[str]
 
 
-AS_ASSUMED = Fit(0.0, [])
+NOT_TRIED = Fit(0.0, [])
 
 
 def find(sfm: pycolmap.Reconstruction) -> Fit:
@@ -48,14 +48,14 @@ def find(sfm: pycolmap.Reconstruction) -> Fit:
         sfm: the map, all of whose poses and intrinsics may be wrong.
 
     Returns:
-        AS_ASSUMED for more than LARGEST images.
+        NOT_TRIED for more than LARGEST images, or too few points to tell.
     """
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     cameras = {i: len(sfm.cameras[i].params) for i in {image.camera_id for image in images}}
     own = sum(cameras[image.camera_id] for image in images)
     residuals = 2 * sfm.compute_num_observations() - 3 * sfm.num_points3D() - 6 * len(images)
     if len(images) > LARGEST or residuals <= 2 * own:
-        return AS_ASSUMED
+        return NOT_TRIED
     adjusted = copy.deepcopy(sfm)
     error = _adjusted_error(adjusted, refine_principal_point=False)
 

@@ -98,4 +98,4 @@ def test_photos_that_were_removed_do_not_count():
 
 def test_large_maps_are_not_judged(monkeypatch):
     monkeypatch.setattr(cropping, "LARGEST", 7)
-    assert cropping.find(reconstructed(0.2)) == cropping.AS_ASSUMED
+    assert cropping.find(reconstructed(0.2)) == cropping.NOT_TRIED
