@@ -92,6 +92,12 @@ def _main() -> None:
         "(default --dataset: datasets/demo_town)",
     )
     parser.add_argument(
+        "--demo_photos",
+        type=int,
+        help="number of map photos that --demo renders, with a query for each four "
+        "(default: 32, with 20 queries)",
+    )
+    parser.add_argument(
         "--num_covis",
         type=int,
         default=NUMBERS["num_covis"],
@@ -109,12 +115,15 @@ def _main() -> None:
         help="with --compact: size of the file in 1,000,000 bytes; the folder is compact-<size>MB",
     )
     given = options.parse(parser)
-    is_demo = given.pop("demo")
-    default = "datasets/demo_town" if is_demo else "datasets/aachen_v1.1"
+    is_demo, num_photos = given.pop("demo"), given.pop("demo_photos")
+    if num_photos and not is_demo:
+        parser.error("--demo_photos needs --demo")
+    town = f"datasets/demo_town{f'-{num_photos}' if num_photos else ''}"
+    default = town if is_demo else "datasets/aachen_v1.1"
     dataset = given.pop("dataset") or Path(default)
     if is_demo:
         features_confs.get(given["feature"], given["projection"])  # fails before the rendering
-        demo.main(dataset)
+        demo.main(dataset, **({"num_photos": num_photos} if num_photos else {}))
     options.run_on_dataset(main, dataset, given)
 
 

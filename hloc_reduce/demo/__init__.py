@@ -21,7 +21,7 @@ from ..utils.cli import InputError
 from ..utils.files import replacing
 from ..utils.parsers import to_line, write_poses
 from ..utils.progress import progress
-from .cameras import DAY, MAP, NIGHT, Photo, list_photos
+from .cameras import DAY, MAP, NIGHT, WALK, Photo, list_photos
 from .model import Buffers, write_model
 from .photo import take
 from .render import rasterize
@@ -35,25 +35,34 @@ MAX_WORKERS = 16  # each takes about half a gigabyte
 DONE, PARTIAL = "town.json", "town.json.partial"
 
 
-def main(dataset: Path, seed: int = 0, overwrite: bool = False) -> Path:
+def main(
+    dataset: Path, seed: int = 0, overwrite: bool = False, num_photos: int = len(WALK)
+) -> Path:
     """Render the town, unless it is complete; resume an interrupted run.
 
     Args:
         dataset: folder of the data set, in the layout of Aachen Day-Night v1.1.
         seed: of everything random; the same seed gives the same files.
-        overwrite: render again a town that is complete, or of another seed or version.
+        overwrite: render again a town that is complete, or of another seed, version or number.
+        num_photos: number of map photos, with one query by day and one by night for each eight,
+            but at least ten of each; 400 photos take about 2 GB of memory.
 
     Returns:
         `dataset`.
 
     Raises:
-        InputError: if the folder holds another data set, or a town of another seed or version
-            and `overwrite` is not set.
+        InputError: if the folder holds another data set, or a town of another seed,
+            version or number and `overwrite` is not set, or the number is too small.
     """
     dataset = Path(dataset)
-    if not _start(dataset, {"seed": seed, "version": VERSION}, overwrite):
+    if num_photos < len(WALK):
+        raise InputError(f"The demo town has at least {len(WALK)} photos, not {num_photos}.")
+    state = {"seed": seed, "version": VERSION}
+    if num_photos > len(WALK):
+        state["photos"] = num_photos
+    if not _start(dataset, state, overwrite):
         return dataset
-    photos = list_photos(seed)
+    photos = list_photos(seed, num_photos)
     missing = [photo for photo in photos if not (dataset / IMAGES / photo.name).exists()]
     logger.info("Rendering %d photos of the demo town into %s", len(missing), dataset)
     threads = cv2.getNumThreads()

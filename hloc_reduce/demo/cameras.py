@@ -8,7 +8,7 @@ import pycolmap
 from .town import OBSTACLES, OPEN_GROUND
 
 MAP, DAY, NIGHT = range(3)  # kinds of photos, which seed them
-QUERIES = 10  # of each kind
+QUERIES = 10  # of each kind, and of more than 80 map photos one for each eight
 
 # Positions of the camera and of its target, (x, y, x, y) in metres.
 WALK = [
@@ -36,19 +36,27 @@ class Photo:
     cam_from_world: pycolmap.Rigid3d
 
 
-def list_photos(seed: int) -> list[Photo]:
-    """List all photos of the data set: the map, then the queries by day, then by night."""
-    photos = [_map_photo(seed, index) for index in range(len(WALK))]
-    return photos + [_query(seed, kind, i) for kind in (DAY, NIGHT) for i in range(QUERIES)]
+def list_photos(seed: int, num_map: int = len(WALK)) -> list[Photo]:
+    """List all photos of the data set: the map, then the queries by day, then by night.
+
+    Map photos after those of the walk are taken anywhere, as queries are.
+    """
+    photos = [_map_photo(seed, index) for index in range(num_map)]
+    number = max(QUERIES, num_map // 8)
+    return photos + [_query(seed, kind, i) for kind in (DAY, NIGHT) for i in range(number)]
 
 
 def _map_photo(seed: int, index: int) -> Photo:
     rng = np.random.default_rng([seed, 10 + MAP, index])
-    x, y, x_target, y_target = WALK[index] + rng.uniform(-0.35, 0.35, 4)
-    position = np.array([x, y, WINDOWS.get(index, rng.uniform(1.6, 1.9))])
-    target = np.array([x_target, y_target, rng.uniform(2.8, 4.2)])
-    ahead, aside, up = target - position
-    yaw, pitch = np.arctan2(aside, ahead), np.arctan(up / np.hypot(ahead, aside))
+    if index < len(WALK):
+        x, y, x_target, y_target = WALK[index] + rng.uniform(-0.35, 0.35, 4)
+        position = np.array([x, y, WINDOWS.get(index, rng.uniform(1.6, 1.9))])
+        target = np.array([x_target, y_target, rng.uniform(2.8, 4.2)])
+        ahead, aside, up = target - position
+        yaw, pitch = np.arctan2(aside, ahead), np.arctan(up / np.hypot(ahead, aside))
+    else:
+        x, y, yaw = _anywhere(rng)
+        position, pitch = np.array([x, y, rng.uniform(1.6, 1.9)]), rng.uniform(0.03, 0.2)
     if index % 3:
         camera = _pinhole(1, (845.0, 846.0, 508.5, 387.0))
     else:
@@ -59,6 +67,17 @@ def _map_photo(seed: int, index: int) -> Photo:
 
 def _query(seed: int, kind: int, index: int) -> Photo:
     rng = np.random.default_rng([seed, 10 + kind, index])
+    x, y, yaw = _anywhere(rng)
+    position = np.array([x, y, rng.uniform(1.5, 1.9)])
+    camera = (951.0, 949.0, 514.0, 380.0) if rng.random() < 0.5 else (752.0, 751.0, 509.0, 386.5)
+    pitch, roll = rng.uniform(0.03, 0.2), np.radians(rng.normal(0, 2))
+    name = f"query/{'night' if kind == NIGHT else 'day'}/phone/{index:04}.jpg"
+    pose = look(position, yaw, pitch, roll)
+    return Photo(kind, index, name, _pinhole(3, camera), pose)
+
+
+def _anywhere(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Draw a position and a yaw beside the walk, from where something can be seen."""
     while True:
         x, y, x_target, y_target = WALK[rng.integers(len(WALK))]
         yaw = np.arctan2(y_target - y, x_target - x)
@@ -66,13 +85,7 @@ def _query(seed: int, kind: int, index: int) -> Photo:
         x, y = x + step * np.cos(heading), y + step * np.sin(heading)
         yaw += np.radians(rng.uniform(-25, 25))
         if _free_view(x, y, yaw):
-            break
-    position = np.array([x, y, rng.uniform(1.5, 1.9)])
-    camera = (951.0, 949.0, 514.0, 380.0) if rng.random() < 0.5 else (752.0, 751.0, 509.0, 386.5)
-    pitch, roll = rng.uniform(0.03, 0.2), np.radians(rng.normal(0, 2))
-    name = f"query/{'night' if kind == NIGHT else 'day'}/phone/{index:04}.jpg"
-    pose = look(position, yaw, pitch, roll)
-    return Photo(kind, index, name, _pinhole(3, camera), pose)
+            return x, y, yaw
 
 
 def _pinhole(camera_id: int, params: tuple[float, ...]) -> pycolmap.Camera:

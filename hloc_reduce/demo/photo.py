@@ -17,7 +17,7 @@ def take(scene: Scene, photo: Photo, seed: int) -> bytes:
     if photo.kind == NIGHT:
         # Every degree of difficulty occurs once, whatever the seed.
         ranks = np.random.default_rng([seed, 30]).permutation(QUERIES)
-        rank = (ranks[photo.index] + rng.uniform(0.2, 0.8)) / QUERIES
+        rank = (ranks[photo.index % QUERIES] + rng.uniform(0.2, 0.8)) / QUERIES
         difficulty = 0.2 + 0.75 * rank
         image = _night(rng, downsample(render(scene, view, _moonlight(rng))), difficulty)
     else:

@@ -28,7 +28,7 @@ def small(tmp_path_factory):
     town.build_town.cache_clear()
 
 
-def small_photos(seed):
+def small_photos(seed, _=None):
     photos = cameras.list_photos(seed)
     chosen = photos[:7] + photos[-20:-18] + photos[-2:]
     return [scaled(photo, 256, 192) for photo in chosen]
@@ -118,6 +118,30 @@ def test_leftovers_of_another_seed_are_dropped(tmp_path):
         assert demo._start(tmp_path, state, overwrite)
         assert not leftover.exists() and not (tmp_path / "town.json").exists()
         assert json.loads((tmp_path / "town.json.partial").read_text()) == state
+
+
+def test_a_larger_town_has_the_same_first_photos():
+    """And more of them elsewhere, where one can stand, with a query for each four."""
+    photos, more = cameras.list_photos(0), cameras.list_photos(0, 100)
+    sizes = [[photo.kind for photo in more].count(kind) for kind in range(3)]
+    assert sizes == [100, 12, 12]
+    names = {photo.name: photo.cam_from_world.matrix().tolist() for photo in more}
+    assert len(names) == 124
+    assert all(names[p.name] == p.cam_from_world.matrix().tolist() for p in photos)
+    centres = [p.cam_from_world.inverse().translation for p in more[len(cameras.WALK) : 100]]
+    assert len(centres) == 100 - len(cameras.WALK)
+    inside = [
+        any(x0 < x < x1 and y0 < y < y1 for x0, y0, x1, y1 in town.OPEN_GROUND)
+        for x, y, _ in centres
+    ]
+    assert all(inside)
+
+
+def test_wrong_sizes_of_the_town(small, tmp_path):
+    with pytest.raises(InputError, match="at least 32 photos"):
+        demo.main(tmp_path / "town", num_photos=5)
+    with pytest.raises(InputError, match="'photos': 40"):
+        demo.main(small, num_photos=40)
 
 
 def test_all_photos_have_their_own_names_and_kinds():

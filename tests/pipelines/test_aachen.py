@@ -165,7 +165,7 @@ def test_demo(width, step, least, tmp_path, monkeypatch, run):
     photos = [photo for photo in listed if photo.kind == MAP]
     photos += [photo for photo in listed if photo.kind != MAP][::step]
     photos = [scaled(photo, width, width * 3 // 4) for photo in photos]
-    monkeypatch.setattr(demo, "list_photos", lambda seed: photos)
+    monkeypatch.setattr(demo, "list_photos", lambda *_: photos)
     monkeypatch.chdir(tmp_path)
     run("--demo", "--feature", "colmap_sift_sv64")
     summary, rows = outcome(tmp_path / "outputs/demo_town/colmap_sift_sv64")
