@@ -12,7 +12,11 @@ SIZE = np.array([1000, 800])
 
 
 def reconstructed(
-    shift: float = 0.0, zoomed: tuple[int, ...] = (), is_shared: bool = False
+    shift: float = 0.0,
+    zoomed: tuple[int, ...] = (),
+    is_shared: bool = False,
+    number: int = 300,
+    noise: float = 0.5,
 ) -> pycolmap.Reconstruction:
     """Adjust a map of photos with principal points that are assumed in their centres.
 
@@ -20,9 +24,11 @@ def reconstructed(
         shift: distance of the true ones from there, as a share of the size.
         zoomed: photos that were enlarged by a quarter.
         is_shared: whether all photos share a camera.
+        number: of points.
+        noise: of keypoints, in pixels.
     """
     generator = np.random.default_rng(0)
-    points = generator.uniform(-1, 1, (300, 3))
+    points = generator.uniform(-1, 1, (number, 3))
     model = pycolmap.Reconstruction()
     tracks = [pycolmap.Track() for _ in points]
     true = pycolmap.Camera(model="PINHOLE", width=1000, height=800, params=[1100, 1100, *SIZE / 2])
@@ -37,7 +43,7 @@ def reconstructed(
         )
         turn = pycolmap.Rotation3d(np.array([generator.uniform(-0.3, 0.3), 0.2 * (i - 4), 0]))
         pose = pycolmap.Rigid3d(turn, [*generator.uniform(-0.3, 0.3, 2), 4])
-        pixels = true.img_from_cam(pose * points) + generator.normal(0, 0.5, (300, 2))
+        pixels = true.img_from_cam(pose * points) + generator.normal(0, noise, (number, 2))
         if i in zoomed:
             pixels = 1.25 * (pixels - SIZE / 2) + SIZE / 2
         image = pycolmap.Image(
@@ -67,6 +73,14 @@ def test_cropped_photos_fit_better_with_free_principal_points(shift, is_cropped,
     assert fit.gain > 0.3 if is_cropped else abs(fit.gain) < 0.02
     cropping.warn(fit)
     assert ("cropped or enlarged" in caplog.text) == is_cropped
+
+
+@pytest.mark.parametrize(("shift", "gain"), [(0.0, 0.0), (0.1, 0.9)])
+def test_few_points_are_adjusted_to_the_end(shift, gain):
+    """Their gradient is small from the start."""
+    assert cropping.find(reconstructed(shift, number=40, noise=0.1)).gain == pytest.approx(
+        gain, abs=0.05
+    )
 
 
 @pytest.mark.parametrize("zoomed", [(), (2,), (1, 4, 6)])

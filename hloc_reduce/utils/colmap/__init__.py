@@ -17,6 +17,7 @@ from .estimators import (
     estimate_pose,
     incremental_mapping,
     mapper_options,
+    solver_options,
     triangulate_points,
     verify_matches,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "read_model",
     "read_verified",
     "shapes",
+    "solver_options",
     "triangulate_points",
     "verify_matches",
     "write_matches",

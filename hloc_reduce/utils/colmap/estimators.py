@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -24,6 +25,12 @@ def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
     except (AttributeError, TypeError, RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"The mapper options {options} cannot be used ({reason}).") from None
+
+
+def solver_options(options: pycolmap.BundleAdjustmentOptions) -> Any:
+    """Return Ceres's options in those of a bundle adjustment; versions keep them elsewhere."""
+    holder: Any = getattr(options, "ceres", options)
+    return holder.solver_options
 
 
 def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
