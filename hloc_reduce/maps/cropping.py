@@ -12,7 +12,7 @@ from ..utils import cli, colmap
 
 LARGEST = 200  # images: adjusting more takes minutes, and more photos bend a map less
 # cropped photos, and others with wrong focal lengths, gain 18 % and more, those of sound maps at
-# most 9 % (docs/localize.md)
+# most 10 % (docs/localize.md)
 GAIN = 0.12
 # a photo is altered if its intrinsics differ by more from those of the others
 ZOOMED = 1.1  # ratio of focal lengths
