@@ -1,8 +1,9 @@
-"""Make a data set with strongly darkened queries from a map, in the layout of Aachen Day-Night.
+"""Make a data set with held-out, strongly darkened queries from a map, in the layout of Aachen.
 
 Every third photo of the map becomes a query; the others stay in the map. Each query is multiplied
 by a gain, blurred, made noisy and rounded to 8 bits again, with parameters that are drawn from a
-seed. Run pipelines.aachen on the data set; benchmarks/summaries.py then prints the table.
+seed. With --as_they_are, queries are not altered. Run pipelines.aachen on the data set;
+benchmarks/summaries.py then prints the table.
 """
 
 import shutil
@@ -52,14 +53,14 @@ def darken(
     return np.round(255 * view.clip(0, 1)).astype(np.uint8)
 
 
-def main(images: Path, model: Path, output: Path, vary: Vary, scale: float = 1.0) -> None:
-    """Write a data set with altered queries.
+def main(images: Path, model: Path, output: Path, vary: Vary | None, scale: float = 1.0) -> None:
+    """Write a data set with altered queries, or with queries by day as they are.
 
     Args:
         images: folder of the photos.
         model: COLMAP model of them.
         output: new folder of the data set.
-        vary: returns the query for an 8-bit photo, given a random generator.
+        vary: returns the query for an 8-bit photo, given a random generator; None for the photo.
         scale: factor of the size of all photos, map and queries.
     """
     reconstruction = colmap.read_model(model)
@@ -71,7 +72,8 @@ def main(images: Path, model: Path, output: Path, vary: Vary, scale: float = 1.0
         target = output / "images_upright" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         generator = np.random.default_rng(number)
-        view = vary(resize(read_image(images / photo.name), scale), generator)
+        view = resize(read_image(images / photo.name), scale)
+        view = view if vary is None else vary(view, generator)
         cv2.imwrite(str(target), view[..., ::-1])
         camera, pose = photo.camera, photo.cam_from_world()
         fit(camera, view)
@@ -97,7 +99,8 @@ def main(images: Path, model: Path, output: Path, vary: Vary, scale: float = 1.0
     folder.mkdir(parents=True, exist_ok=True)
     reconstruction.write_binary(folder)
     (output / "queries").mkdir(exist_ok=True)
-    listed = output / "queries/night_time_queries_with_intrinsics.txt"
+    light = "day" if vary is None else "night"
+    listed = output / f"queries/{light}_time_queries_with_intrinsics.txt"
     listed.write_text("".join(lines))
     (output / "queries/ground_truth_poses.txt").write_text("".join(poses))
     place = Aachen(output)
@@ -115,12 +118,16 @@ def _main() -> None:
         metavar=("LEAST", "MOST"),
         help="range of the gain of the queries",
     )
+    parser.add_argument(
+        "--as_they_are", action="store_true", help="do not alter the queries, and list them by day"
+    )
     parser.add_argument("--output", type=Path, required=True, help="new folder of the data set")
     args = parser.parse_args()
     if not 0 < args.gain[0] <= args.gain[1]:
         raise InputError("--gain: give two numbers above 0, the smaller first.")
     [(images, model)] = parse_maps([args.map]).values()
-    main(images, model, args.output, partial(darken, gain=tuple(args.gain)))
+    vary = None if args.as_they_are else partial(darken, gain=tuple(args.gain))
+    main(images, model, args.output, vary)
 
 
 if __name__ == "__main__":
