@@ -10,35 +10,45 @@ from hloc_reduce.utils import colmap
 from pipelines import localize
 
 PIPELINE = localize
+OTHERS = [f"{i}.png" for i in (0, 2, 3, 4)]
 
 
 def mirror(path):
     cv2.imwrite(str(path), cv2.imread(str(path))[:, ::-1])
 
 
-@pytest.mark.parametrize("symmetric", [0.0, 0.25])
-def test_mirrored_photos_are_left_out(plane, symmetric, tmp_path, caplog, run):
-    """Also one that the mapper places, because a part of the place is symmetric."""
+def build_with_one_mirrored(plane, outputs, run):
+    """Build a map with a mirrored photo, which it must leave out; return the arguments."""
     mirror(plane / "images/1.png")
-    outputs = tmp_path / "outputs"
-    build = "--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single"
-    run(*build)
+    arguments = "--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single"
+    run(*arguments)
     built = maps.Map(outputs / "map")
-    others = [f"{i}.png" for i in (0, 2, 3, 4)]
-    assert built.mirrored == ["1.png"] and built.names() == others
-    assert built.sfm.name == "sfm-others"
+    assert built.mirrored == ["1.png"] and built.names() == OTHERS
     assert [path.name for path in built.folder.glob("sfm*")] == ["sfm-others"]
     assert not (built.folder / "mirrored").exists()
+    return arguments
+
+
+def test_a_mirrored_photo_is_named(plane, tmp_path, caplog, run):
+    build_with_one_mirrored(plane, tmp_path / "outputs", run)
     assert "Mirrored photos are not in the map: 1.png." in caplog.text
-    written = state(built.folder)
+    assert "images are not in the map" not in caplog.text
+
+
+@pytest.mark.parametrize("symmetric", [0.25])
+def test_one_that_the_mapper_places_is_left_out(plane, symmetric, tmp_path, caplog, run):
+    """As it may where a part of the place is symmetric; also after an interruption."""
+    folder = tmp_path / "outputs/map"
+    arguments = build_with_one_mirrored(plane, tmp_path / "outputs", run)
+    written = state(folder)
     caplog.clear()
-    run(*build)
-    assert state(built.folder) == written
+    run(*arguments)
+    assert state(folder) == written
     assert "Mirrored photos are not in the map: 1.png." in caplog.text
-    (built.folder / "map.json").unlink()  # as after an interruption
-    run(*build)
-    again = maps.Map(built.folder)
-    assert again.mirrored == ["1.png"] and again.names() == others
+    (folder / "map.json").unlink()
+    run(*arguments)
+    again = maps.Map(folder)
+    assert again.mirrored == ["1.png"] and again.names() == OTHERS
 
 
 @pytest.mark.parametrize("symmetric", [0.0, 1.0])
