@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 OLDEST := 3.13.0
 OLD := $(VENV)/pycolmap-$(OLDEST)
 
-# stages that use pycolmap
+# tests of stages that read or write models and databases, or estimate
 STAGES_OF_COLMAP := from_colmap localize_sfm more_pairs pairs_from_covisibility \
 	pairs_from_verification paths_in_stages reconstruction to_colmap triangulation
 

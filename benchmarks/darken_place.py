@@ -60,7 +60,7 @@ def main(images: Path, model: Path, output: Path, vary: Vary | None, scale: floa
         images: folder of the photos.
         model: COLMAP model of them.
         output: new folder of the data set.
-        vary: returns the query for an 8-bit photo, given a random generator; None for the photo.
+        vary: returns the query for an 8-bit photo, given a random generator; None: as it is.
         scale: factor of the size of all photos, map and queries.
     """
     reconstruction = colmap.read_model(model)
@@ -110,7 +110,8 @@ def main(images: Path, model: Path, output: Path, vary: Vary | None, scale: floa
 def _main() -> None:
     parser = cli.Parser(__doc__, "--map sceaux/images:sceaux/sparse --output datasets/sceaux_dark")
     parser.add_argument("--map", required=True, metavar="IMAGES:MODEL")
-    parser.add_argument(
+    changed = parser.add_mutually_exclusive_group()
+    changed.add_argument(
         "--gain",
         type=float,
         nargs=2,
@@ -118,7 +119,7 @@ def _main() -> None:
         metavar=("LEAST", "MOST"),
         help="range of the gain of the queries",
     )
-    parser.add_argument(
+    changed.add_argument(
         "--as_they_are", action="store_true", help="do not alter the queries, and list them by day"
     )
     parser.add_argument("--output", type=Path, required=True, help="new folder of the data set")

@@ -50,7 +50,13 @@ def collect(images: Path, names: list[str], mirrored: list[str], folder: Path) -
 
 
 def spread(names: list[str], number: int) -> list[str]:
-    """Choose names that are spread evenly over a list, neither the first nor the last one."""
+    """Choose names that are spread evenly over a list, neither the first nor the last one.
+
+    Raises:
+        InputError: if there are not as many.
+    """
+    if number > max(0, len(names) - 2):
+        raise InputError(f"--mirrored {number}: at most {max(0, len(names) - 2)} of {len(names)}.")
     chosen = np.linspace(1, len(names) - 2, number).round().astype(int) if number else []
     return [names[i] for i in chosen]
 
@@ -161,8 +167,9 @@ def main(
         names = sorted(image.name for image in reference.images.values())
         for number, chosen in enumerate(choose_photos(names, subset, subsets)):
             title = f"{place} {len(chosen)}" + (f" ({number + 1})" if subsets > 1 else "")
-            folder = output / title.replace(" ", "-")
             mirrored = spread(chosen, num_mirrored)
+            suffix = f"-mirrored{num_mirrored}" if mirrored else ""
+            folder = output / f"{title.replace(' ', '-')}{suffix}"
             photos = collect(images, chosen, mirrored, folder / "photos")
             for method in ("ours", "stock") if with_stock else ("ours",):
                 start = time.perf_counter()

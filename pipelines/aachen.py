@@ -94,8 +94,8 @@ def _main() -> None:
     parser.add_argument(
         "--demo_photos",
         type=int,
-        help="number of map photos that --demo renders, with a query for each four "
-        "(default: 32, with 20 queries)",
+        help="number of map photos that --demo renders, with a query by day and one by night for "
+        "each eight, but at least ten (default: 32)",
     )
     parser.add_argument(
         "--num_covis",
@@ -116,14 +116,14 @@ def _main() -> None:
     )
     given = options.parse(parser)
     is_demo, num_photos = given.pop("demo"), given.pop("demo_photos")
-    if num_photos and not is_demo:
+    if num_photos is not None and not is_demo:
         parser.error("--demo_photos needs --demo")
-    town = f"datasets/demo_town{f'-{num_photos}' if num_photos else ''}"
+    town = "datasets/demo_town" if num_photos is None else f"datasets/demo_town-{num_photos}"
     default = town if is_demo else "datasets/aachen_v1.1"
     dataset = given.pop("dataset") or Path(default)
     if is_demo:
         features_confs.get(given["feature"], given["projection"])  # fails before the rendering
-        demo.main(dataset, **({"num_photos": num_photos} if num_photos else {}))
+        demo.main(dataset, num_photos=num_photos)
     options.run_on_dataset(main, dataset, given)
 
 

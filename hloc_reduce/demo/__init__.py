@@ -36,7 +36,7 @@ DONE, PARTIAL = "town.json", "town.json.partial"
 
 
 def main(
-    dataset: Path, seed: int = 0, overwrite: bool = False, num_photos: int = len(WALK)
+    dataset: Path, seed: int = 0, overwrite: bool = False, num_photos: int | None = None
 ) -> Path:
     """Render the town, unless it is complete; resume an interrupted run.
 
@@ -45,7 +45,7 @@ def main(
         seed: of everything random; the same seed gives the same files.
         overwrite: render again a town that is complete, or of another seed, version or number.
         num_photos: number of map photos, with one query by day and one by night for each eight,
-            but at least ten of each; 400 photos take about 2 GB of memory.
+            but at least ten of each; default: 32. 400 photos take about 2 GB of memory.
 
     Returns:
         `dataset`.
@@ -55,6 +55,7 @@ def main(
             version or number and `overwrite` is not set, or the number is too small.
     """
     dataset = Path(dataset)
+    num_photos = len(WALK) if num_photos is None else num_photos
     if num_photos < len(WALK):
         raise InputError(f"The demo town has at least {len(WALK)} photos, not {num_photos}.")
     state = {"seed": seed, "version": VERSION}

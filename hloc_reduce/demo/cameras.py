@@ -8,7 +8,8 @@ import pycolmap
 from .town import OBSTACLES, OPEN_GROUND
 
 MAP, DAY, NIGHT = range(3)  # kinds of photos, which seed them
-QUERIES = 10  # of each kind, and of more than 80 map photos one for each eight
+# of each kind, and one for each eight map photos if these are more
+QUERIES = 10
 
 # Positions of the camera and of its target, (x, y, x, y) in metres.
 WALK = [

@@ -102,7 +102,7 @@ def main(
         ]
         if tasks:
             _check_some_matched(matches, [name for name, _ in queries], retrieved)
-            for name, record in solve(features, matches, tasks, True):
+            for name, record in solve(features, matches, tasks, True, "Localizing"):
                 log.add(name, record)
         tasks = [
             (name, mirror(camera), retrieved.get(name, []))
@@ -111,7 +111,7 @@ def main(
         ]
         if mirror_images and tasks:
             files, reference = mirror_images([name for name, _, _ in tasks]), load_reference()
-            for name, record in solve(*files, tasks, False):
+            for name, record in solve(*files, tasks, False, "Trying mirror images"):
                 names = [other for other in retrieved.get(name, []) if other in reference]
                 log.add(name, with_mirror_image(log.records[name], record, reference, names))
     records = {name: log.records[name] for name, _ in queries}
@@ -201,8 +201,9 @@ def localize_all(
     matches: Path,
     tasks: list[tuple[str, pycolmap.Camera | None, list[str]]],
     thorough: bool,
+    said: str,
 ) -> Iterator[tuple[str, dict]]:
-    """Yield the names and the records of queries, or, if not `thorough`, of mirror images.
+    """Yield the names and the records of queries.
 
     Args:
         load_reference: as in `main`, like `config` to `matches`.
@@ -214,12 +215,12 @@ def localize_all(
         matches: see `load_reference`.
         tasks: names and intrinsics of the queries, with the images that are retrieved for each.
         thorough: also try matches of single images, as `absolute_pose.estimate` does.
+        said: what the progress bar says.
     """
     with open_h5(matches) as file:
         gate = gate.of_matches(get_matcher(file), dimension(features))
     files = features, matches
     work = partial(_localize_chunk, load_reference, *files, config, skip_matches, gate, thorough)
-    said = "Localizing" if thorough else "Trying mirror images"
     with closing(executor.map(work, tasks, CHUNK)) as found:
         yield from progress(found, said, "query", len(tasks))
 

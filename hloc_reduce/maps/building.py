@@ -28,15 +28,17 @@ from ..localization import intrinsics
 from ..mapping import mapper, plausibility, registration
 from ..runtime import provenance
 from ..runtime.outputs import RunFolder
-from ..utils import colmap
+from ..utils import cli, colmap
 from ..utils.files import replacing
 from ..utils.parsers import parse_pairs, write_pairs
 from . import contradictions, cropping, mirrored_photos, precision
 from .map import FINISHED, RETRIEVAL, SFM, Map, with_projection
 
-# suffixes of the files of later attempts: with more keypoints, without, without mirrored photos,
-# with a camera for each photo
-ATTEMPTS = MORE, FURTHER, OTHERS, OWN = "-keypoints_colmap", "-further", "-others", "-per_image"
+# suffixes of the models of later attempts
+MORE = "-keypoints_colmap"  # also of its features
+FURTHER = "-further"  # with the same keypoints as the first one
+UNMIRRORED = "-unmirrored"  # without the mirrored photos of another attempt
+OWN = "-per_image"  # with a camera for each photo
 MIRRORED = "mirrored"  # folder of what is known of mirror images
 ROUNDS = 3  # of additional pairs, in which larger sets of photos get connected
 
@@ -154,16 +156,18 @@ class Building:
             logger.info("%d of %d photos are in the map.", registered, number)
             return registered == number
 
-        def attempt_without_mirrored(conf: dict, once: bool = False) -> bool:
+        def attempt_without_mirrored(complete: bool, once: bool = False) -> bool:
             """Try again if photos are mirrored; return whether all are in the best model so far."""
-            if found and self._find_mirrored(conf, found[0][2]):
-                logger.info("Trying again without mirrored photos.")
-                found.clear()
-                return attempt(f"{SFM}{OTHERS}", conf, once)
-            return complete
+            if not found:
+                return complete
+            folder, conf, sfm = found[0]
+            if not self._find_mirrored(conf, sfm):
+                return complete
+            found.clear()
+            return attempt(f"{folder}{UNMIRRORED}", conf, once)
 
         complete = attempt(SFM, conf, once=several)
-        complete = attempt_without_mirrored(conf, once=several)
+        complete = attempt_without_mirrored(complete, once=several)
         if several and not complete:
             logger.info("Trying again with more keypoints.")
             model = features_confs.with_keypoints(conf["model"], "colmap")
@@ -171,9 +175,9 @@ class Building:
             attempt(f"{SFM}{MORE}", more)
             if not found or found[0][1] is conf:
                 attempt(f"{SFM}{FURTHER}", conf)
-            if found:
-                attempt_without_mirrored(found[0][1])
+            attempt_without_mirrored(False)
         if not found:
+            mirrored_photos.warn(self.mirrored)
             raise errors[-1]
         return found[0]
 
@@ -185,13 +189,15 @@ class Building:
                 *(sfm, {*self.names} - {*self.mirrored}, conf, self.matcher, self.image_dir),
                 *(features, descriptors, self.folder.path / MIRRORED / features.stem),
             )
-        self.mirrored = sorted([*self.mirrored, *found])
+        if found:
+            self.mirrored = sorted([*self.mirrored, *found])
+            logger.info("Trying again without mirrored photos: %s.", cli.some(self.mirrored))
         return bool(found)
 
     def _fitting(
         self, conf: dict, folder: str, sfm: pycolmap.Reconstruction
     ) -> tuple[str, pycolmap.Reconstruction, cropping.Fit]:
-        """Reconstruct again with a camera for each photo, if some do not fit to those they share.
+        """Reconstruct again with a camera for each photo, if those that they share do not fit.
 
         Args:
             conf: configuration of the features.
@@ -244,7 +250,7 @@ class Building:
         names = [name for name in self.names if name not in self.mirrored]
         if self.mirrored:
             kept = [pair for pair in parse_pairs(pairs) if {*pair}.isdisjoint(self.mirrored)]
-            pairs = self.folder.path / f"{pairs.stem}{OTHERS}.txt"
+            pairs = self.folder.path / f"{pairs.stem}{sfm.removeprefix(SFM)}.txt"
             write_pairs(kept, pairs)
         with self.folder.stage("reconstruction"):
             return reconstruction.main(
@@ -296,8 +302,8 @@ def drop_others(folder: RunFolder, built: Map) -> None:
     for name in {plain, f"{plain}{MORE}"} - {kept}:
         begins = f"{name}.h5", f"{name}_matches", f"{RETRIEVAL['output']}_{name}."
         folder.delete(other for other in folder.written if other.startswith(begins))
-    folder.delete({SFM, *(f"{SFM}{suffix}" for suffix in ATTEMPTS)} - {built.sfm.name})
-    folder.delete({MIRRORED})
+    models = {name for name in folder.written if name == SFM or name.startswith(f"{SFM}-")}
+    folder.delete({MIRRORED, *models} - {built.sfm.name})
 
 
 def keep_projection(conf: dict, folder: Path) -> dict:

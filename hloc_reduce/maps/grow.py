@@ -115,6 +115,7 @@ def remove(built: Map, names: Iterable[str]) -> Map:
             extension.remove(sfm, removed)
             if not sfm.num_points3D():
                 raise InputError(f"No point of the map {built.folder} would be left.")
+        if removed & {*inside, *built.mirrored}:
             _commit(built, sfm, -len(removed), removed=removed)
         for path in (built.features, built.descriptors):
             merge(path, [path], removed)
@@ -215,7 +216,7 @@ def _commit(
         "images_of_uncertain_position": uncertain,
         "gain_of_free_principal_points": fit.gain,
         "images_altered": fit.altered,
-        "images_mirrored": sorted({*built.mirrored} - {*added}),
+        "images_mirrored": sorted({*built.mirrored} - {*added} - {*removed}),
         "points3D": sfm.num_points3D(),
     }
     if cameras is not None:

@@ -21,13 +21,14 @@ from ..mapping import extension
 from ..runtime.executors import SERIAL
 from ..utils import cli
 from ..utils.colmap import point3D_ids
-from ..utils.parsers import parse_pairs, parse_retrieval, write_pairs
+from ..utils.parsers import parse_retrieval, write_pairs
 from . import mirroring
 
 # photos show the same part of a place if they share as many points, of the median number that a
 # photo of the map has
 SHARED = 0.5
 SIMILAR = 20  # photos by which one is localized
+FEWEST = 3  # photos that may tell whether others are mirrored
 CONFIG = {"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}
 
 
@@ -48,6 +49,7 @@ def find(
     that share few points with most others, and those without a pose, are localized by the others,
     as they are and mirrored. If the mirror image fits beyond doubt, with a higher confidence, they
     were mirrored before, or all others were. If there are any, all other photos are tried, too.
+    This takes up to as long as the extraction of the photos that are tried, and their matching.
 
     Args:
         sfm: the map.
@@ -75,8 +77,8 @@ def warn(names: list[str]) -> None:
     """Warn of mirrored photos, if there are any."""
     if names:
         logger.warning(
-            "Mirrored photos are not in the map: %s. Their mirror images fit to the other photos: "
-            "use the photos as the camera took them.",
+            "Mirrored photos are not in the map: %s. Their mirror images fit to the other photos. "
+            "Either these were mirrored, or all others: use photos as the camera took them.",
             cli.some(names),
         )
 
@@ -91,8 +93,10 @@ def _largest_group(sfm: pycolmap.Reconstruction) -> set[str]:
     rows = np.repeat(np.arange(len(images)), [len(ids) for ids in points])
     columns = np.unique(np.concatenate(points), return_inverse=True)[1].reshape(-1)
     shows = coo_array((np.ones(len(rows), np.int64), (rows, columns))).tocsr()
-    shared = (shows @ shows.T).toarray()
-    _, group = connected_components(shared >= SHARED * np.median(shared.diagonal()))
+    shared = (shows @ shows.T).tocoo()
+    many = shared.data >= SHARED * np.median(shared.diagonal())
+    pairs = shared.row[many], shared.col[many]
+    _, group = connected_components(coo_array((shared.data[many], pairs), shared.shape))
     largest = np.bincount(group).argmax()
     return {image.name for image, its in zip(images, group, strict=True) if its == largest}
 
@@ -113,10 +117,12 @@ class _Judge:
         """Return the mirrored ones of some photos, each of which is localized by some others."""
         known = intrinsics.of_map(self.sfm, self.image_dir, by)
         inferred = intrinsics.infer_all(self.image_dir, sorted(names), known)
-        if not inferred:
+        if not inferred or len(by) < FEWEST:
             return set()
         others = copy.deepcopy(self.sfm)
         extension.remove(others, {image.name for image in others.images.values()} - by)
+        if not others.num_points3D():
+            return set()
         reference = SfmMap(others)
         mirrored = mirroring.extract(
             self.conf, self.image_dir, [*inferred], self.folder / self.features.name
@@ -161,19 +167,22 @@ class _Judge:
             db_list=sorted(by),
             db_descriptors=self.descriptors,
         )
-        # a mirror image must not be localized by the photo itself
-        write_pairs([pair for pair in [*parse_pairs(pairs)] if pair[0] != pair[1]], pairs)
+        retrieved = {  # a mirror image must not be localized by the photo itself
+            name: [other for other in others if other != name][:SIMILAR]
+            for name, others in parse_retrieval(pairs).items()
+        }
+        write_pairs([(name, other) for name in retrieved for other in retrieved[name]], pairs)
         matches = match_features.main(
             *(matchers_confs[self.matcher], pairs, features),
             matches=self.folder / f"matches-{what}.h5",
             features_ref=self.features,
         )
-        retrieved = parse_retrieval(pairs)
         return dict(
             stage.localize_all(
                 *(lambda: reference, lambda name, _: options[name], 0, DEFAULT_GATE, SERIAL),
                 *(features, matches),
                 [(name, camera, retrieved.get(name, [])) for name, camera in cameras.items()],
                 thorough=False,
+                said="Looking for mirrored photos",
             )
         )

@@ -42,7 +42,18 @@ def mirror_images(
 def extract(
     conf: dict, image_dir: Path, names: list[str], features: Path, executor: Executor = SERIAL
 ) -> Path:
-    """Extract the features of the mirror images of photos; arguments as in `mirror_images`."""
+    """Extract the features of the mirror images of some photos.
+
+    Args:
+        conf: as in `mirror_images`, like `image_dir`, `features` and `executor`.
+        image_dir: see `conf`.
+        names: the photos.
+        features: see `conf`.
+        executor: see `conf`.
+
+    Returns:
+        The feature file.
+    """
     return extract_features.main(
         {**conf, "preprocessing": {**conf["preprocessing"], "mirrored": True}},
         image_dir,

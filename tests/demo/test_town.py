@@ -121,7 +121,7 @@ def test_leftovers_of_another_seed_are_dropped(tmp_path):
 
 
 def test_a_larger_town_has_the_same_first_photos():
-    """And more of them elsewhere, where one can stand, with a query for each four."""
+    """And more of them elsewhere, where one can stand, with two queries for each eight."""
     photos, more = cameras.list_photos(0), cameras.list_photos(0, 100)
     sizes = [[photo.kind for photo in more].count(kind) for kind in range(3)]
     assert sizes == [100, 12, 12]

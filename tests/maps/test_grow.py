@@ -62,6 +62,15 @@ def test_a_photo_that_was_mirrored_is_added(grown, run):
     assert maps.Map(folder).mirrored == ["left.jpg"] and NEW in names(folder)
 
 
+def test_a_mirrored_photo_is_removed(grown, tmp_path, run):
+    folder, new, model = grown
+    run("--map", folder, "--add_images", new, "--add_model", model)
+    content = provenance.read(folder / "map.json")
+    provenance.write(folder / "map.json", {**content, "images_mirrored": ["left.jpg", NEW]})
+    run("--map", folder, "--remove_images", write(tmp_path / "list.txt", f"{NEW}\n"))
+    assert maps.Map(folder).mirrored == ["left.jpg"]
+
+
 def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):
     folder, new, model = grown
     built, before, features = maps.Map(folder), poses(folder), contents(maps.Map(folder).features)

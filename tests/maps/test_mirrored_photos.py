@@ -1,12 +1,18 @@
 """Mirrored photos among those of a map."""
 
+import itertools
+
 import cv2
+import numpy as np
+import pycolmap
 import pytest
 from command import state
 
 from hloc_reduce import maps
+from hloc_reduce.confs import features as features_confs
 from hloc_reduce.maps import mirrored_photos
 from hloc_reduce.utils import colmap
+from hloc_reduce.utils.cli import InputError
 from pipelines import localize
 
 PIPELINE = localize
@@ -24,7 +30,8 @@ def build_with_one_mirrored(plane, outputs, run):
     run(*arguments)
     built = maps.Map(outputs / "map")
     assert built.mirrored == ["1.png"] and built.names() == OTHERS
-    assert [path.name for path in built.folder.glob("sfm*")] == ["sfm-others"]
+    [sfm] = [path.name for path in built.folder.glob("sfm*")]
+    assert sfm.endswith("-unmirrored")
     assert not (built.folder / "mirrored").exists()
     return arguments
 
@@ -38,17 +45,99 @@ def test_a_mirrored_photo_is_named(plane, tmp_path, caplog, run):
 @pytest.mark.parametrize("symmetric", [0.25])
 def test_one_that_the_mapper_places_is_left_out(plane, symmetric, tmp_path, caplog, run):
     """As it may where a part of the place is symmetric; also after an interruption."""
+    caplog.set_level("INFO")
     folder = tmp_path / "outputs/map"
     arguments = build_with_one_mirrored(plane, tmp_path / "outputs", run)
+    assert "5 of 5 photos are in the map." in caplog.text
     written = state(folder)
     caplog.clear()
     run(*arguments)
     assert state(folder) == written
     assert "Mirrored photos are not in the map: 1.png." in caplog.text
-    (folder / "map.json").unlink()
+
+
+@pytest.mark.parametrize("symmetric", [0.25])
+def test_the_others_are_tried_when_one_is_mirrored(plane, symmetric, tmp_path, monkeypatch, run):
+    """Also one that seemed to be sound; a run that was stopped after it leaves nothing behind."""
+    for name in ("1.png", "3.png"):
+        mirror(plane / "images" / name)
+    sound = {"0.png", "1.png", "2.png", "4.png"}
+    monkeypatch.setattr(mirrored_photos, "_largest_group", lambda _: sound)
+    folder = tmp_path / "outputs/map"
+    arguments = "--map_images", plane / "images", "--outputs", folder.parent
+    arguments += "--camera_mode", "single"
+
+    def stops(*_):
+        raise InputError("stopped")
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(maps.building.contradictions, "find", stops)
+        run(*arguments)
+    assert (folder / "mirrored").exists() and len(list(folder.glob("sfm*"))) > 1
     run(*arguments)
-    again = maps.Map(folder)
-    assert again.mirrored == ["1.png"] and again.names() == OTHERS
+    built = maps.Map(folder)
+    assert built.mirrored == ["1.png", "3.png"] and built.names() == ["0.png", "2.png", "4.png"]
+    assert not (folder / "mirrored").exists() and len(list(folder.glob("sfm*"))) == 1
+
+
+def test_more_keypoints_reveal_a_mirrored_photo(plane, tmp_path, monkeypatch, run):
+    find = mirrored_photos.find
+
+    def later(sfm, names, conf, *others):
+        more = features_confs.keypoints_of(conf["model"]) == "colmap"
+        return find(sfm, names, conf, *others) if more else []
+
+    monkeypatch.setattr(mirrored_photos, "find", later)
+    build_with_one_mirrored(plane, tmp_path / "outputs", run)
+
+
+@pytest.mark.parametrize(
+    "as_it_is, mirrored, agreement, named",
+    [
+        (20.0, 400.0, 0.95, True),
+        (500.0, 400.0, 0.95, False),
+        (20.0, 200.0, 0.95, False),  # such confidences and agreements are those of symmetric places
+        (20.0, 400.0, 0.8, False),
+    ],
+)
+def test_only_what_is_beyond_doubt_is_named(
+    as_it_is, mirrored, agreement, named, plane, tmp_path, monkeypatch
+):
+    built = maps.main(tmp_path / "map", plane / "images", camera_mode=pycolmap.CameraMode.SINGLE)
+
+    def localize(self, reference, by, what, features, descriptors, cameras, options):
+        confidence = mirrored if what == "mirrored" else as_it_is
+        return {name: {"confidence": confidence, "agreement": agreement} for name in cameras}
+
+    monkeypatch.setattr(mirrored_photos._Judge, "_localize", localize)
+    judge = mirrored_photos._Judge(
+        *(colmap.read_model(built.sfm), built.conf, built.matcher, built.images),
+        *(built.features, built.descriptors, tmp_path / "mirrored"),
+    )
+    found = judge.find({"0.png"}, {*OTHERS})
+    assert found == ({"0.png"} if named else set())
+
+
+def test_photos_that_share_little_are_not_judged(tmp_path):
+    """Five photos, each pair of which sees other points: no group tells anything."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=100, height=100, params=[100, 50, 50], camera_id=1
+    )
+    pairs = [pair for pair in itertools.combinations(range(1, 6), 2) for _ in range(60)]
+    seen = {i: [row for row, pair in enumerate(pairs) if i in pair] for i in range(1, 6)}
+    for i, rows in seen.items():
+        image = pycolmap.Image(
+            name=f"{i}.png", keypoints=np.full((len(rows), 2), 50.0), camera_id=1, image_id=i
+        )
+        colmap.add_image(model, camera, image, pycolmap.Rigid3d())
+    for row, pair in enumerate(pairs):
+        elements = [pycolmap.TrackElement(i, seen[i].index(row)) for i in pair]
+        model.add_point3D(np.array([0, 0, 1.0 + row]), pycolmap.Track(elements))
+    for i in seen:
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((100, 100), np.uint8))
+    names = [f"{i}.png" for i in seen]
+    assert not mirrored_photos.find(model, names, {}, "", tmp_path, *3 * [tmp_path / "none"])
 
 
 @pytest.mark.parametrize("symmetric", [0.0, 1.0])

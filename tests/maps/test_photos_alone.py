@@ -6,6 +6,7 @@ import shutil
 import cv2
 import numpy as np
 import pycolmap
+import pytest
 from alignment import similarity
 from command import outcome, state
 from conftest import FOCAL
@@ -14,6 +15,7 @@ from PIL import Image
 from hloc_reduce import Localizer, maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.mapping import registration
+from hloc_reduce.maps import cropping
 from hloc_reduce.utils import colmap, parsers
 from pipelines import localize
 
@@ -197,9 +199,13 @@ def test_a_map_of_other_pairs_is_refused(plane, tmp_path, monkeypatch, run, refu
     )
 
 
-def test_enlarged_photos_get_cameras_of_their_own(plane, tmp_path, caplog, run):
-    """Although EXIF data say that one camera took all photos with the same zoom."""
+@pytest.mark.parametrize("named", [True, False])
+def test_enlarged_photos_get_cameras_of_their_own(named, plane, tmp_path, monkeypatch, caplog, run):
+    """Although EXIF data say that one camera took all photos; whichever they are, if not named."""
     caplog.set_level("INFO")
+    find = cropping.find
+    if not named:
+        monkeypatch.setattr(cropping, "find", lambda sfm: find(sfm)._replace(altered=[]))
     images = tmp_path / "photos"
     images.mkdir()
     for number in range(5):
