@@ -345,11 +345,16 @@ def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d
         hint = "; known intrinsics would help" if matches.is_focal_length_free else ""
         if position > far * MAX_POSITION or rotation > turned * MAX_ROTATION:
             return (
-                f"{reason} position is uncertain by {100 * position:.1f} % of the distance, its "
-                f"rotation by {rotation:.1f} degrees; at most {100 * far * MAX_POSITION:.0f} % and "
-                f"{turned * MAX_ROTATION:.0f} degrees are accepted{hint}"
+                f"{reason} position is uncertain by {_up(100 * position):.1f} % of the distance "
+                f"(at most {100 * far * MAX_POSITION:.0f} %), its rotation by "
+                f"{_up(rotation):.1f} degrees (at most {turned * MAX_ROTATION:.0f}){hint}"
             )
     return None
+
+
+def _up(value: float) -> float:
+    """Round up to tenths: what is above a limit is not to be printed as the limit."""
+    return np.ceil(10 * value) / 10
 
 
 def _is_off_centre(camera: pycolmap.Camera) -> bool:

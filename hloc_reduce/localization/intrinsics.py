@@ -38,20 +38,27 @@ class ExifCamera(NamedTuple):
 
     Args:
         model: make and model.
-        name: make, model, focal length and size of the photo, which determine its intrinsics.
+        lens: make, model and focal length.
+        size: (width, height) of the photo, which determines its intrinsics together with the lens.
         zoomed: digitally, which changes the intrinsics but not always the focal length in EXIF.
     """
 
     model: str
-    name: str
+    lens: str
+    size: tuple[int, int]
     zoomed: bool
+
+    @property
+    def name(self) -> str:
+        """The lens and the size."""
+        return f"{self.lens} {self.size[0]}x{self.size[1]}"
 
 
 def exif_camera(image: Path) -> ExifCamera | None:
     """Return the camera that took a photo, None if EXIF data do not tell."""
     try:
         with Image.open(image) as opened:
-            (width, height), exif = opened.size, opened.getexif()
+            size, exif = opened.size, opened.getexif()
         more = exif.get_ifd(EXIF)
         make, model = (str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL))
         focal_length = float(more.get(FOCAL_35MM) or more.get(FOCAL_LENGTH) or 0)
@@ -61,7 +68,7 @@ def exif_camera(image: Path) -> ExifCamera | None:
     if not (model and focal_length > 0):
         return None
     name = f"{make} {model}"
-    return ExifCamera(name, f"{name} {focal_length:g} mm {width}x{height}", zoom > MAX_ZOOM)
+    return ExifCamera(name, f"{name} {focal_length:g} mm", size, zoom > MAX_ZOOM)
 
 
 class MapCameras(NamedTuple):
@@ -133,6 +140,29 @@ def infer_all(
             if strict:
                 raise
     return inferred
+
+
+def of_another_size(image_dir: Path, names: Iterable[str]) -> list[str]:
+    """Return photos whose longer side is not that of most photos of the same lens.
+
+    They are smaller copies or were cropped: EXIF data, which they keep, do not tell. Several photos
+    of an equal size are another setting of the camera.
+
+    Args:
+        image_dir: the folder of the photos.
+        names: the photos.
+    """
+    lenses: dict[str, dict[int, list[str]]] = {}
+    for name in names:
+        if (exif := exif_camera(image_dir / name)) is not None:
+            lenses.setdefault(exif.lens, {}).setdefault(max(exif.size), []).append(name)
+    return sorted(
+        name
+        for sides in lenses.values()
+        for named in sides.values()
+        if len(named) < WELL_KNOWN <= max(map(len, sides.values()))
+        for name in named
+    )
 
 
 def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict:

@@ -82,7 +82,9 @@ class Building:
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
-        cameras = intrinsics.of_map(sfm, self.image_dir)
+        names = {sfm.images[i].name for i in sfm.reg_image_ids()}
+        resized = intrinsics.of_another_size(self.image_dir, names) if model is None else []
+        cameras = intrinsics.of_map(sfm, self.image_dir, names - {*resized})
         summary = {
             "id": uuid.uuid4().hex,
             "feature": feature,
@@ -100,6 +102,7 @@ class Building:
             "gain_of_free_principal_points": fit.gain,
             "images_altered": fit.altered,
             "images_mirrored": self.mirrored,
+            "images_of_another_size": resized,
             "points3D": sfm.num_points3D(),
             **intrinsics.to_dict(cameras),
             "seconds": self.folder.seconds(),

@@ -136,14 +136,26 @@ def _adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool) 
     return sfm.compute_mean_reprojection_error()
 
 
-def warn(fit: Fit) -> None:
-    """Warn that the photos of a map may be cropped if they fit much better so."""
+def warn(fit: Fit, resized: list[str]) -> None:
+    """Warn of photos of a map that may be cropped.
+
+    Args:
+        fit: from `find`.
+        resized: from `intrinsics.of_another_size`.
+    """
+    if others := [name for name in resized if name not in fit.altered]:
+        logger.warning(
+            "Photos of another size than the others by the same camera: %s. They are right if they "
+            "are smaller copies, but misplaced if they were cropped: use photos as the camera took "
+            "them. map.json lists all of them.",
+            cli.some(others),
+        )
     if fit.altered:
         logger.warning(
             "The map may be wrong. Photos with another focal length or principal point than the "
             "others: %s. With other intrinsics, all photos fit %.0f %% better. Either these or the "
-            "others were cropped or enlarged, and are misplaced: use the original photos. map.json "
-            "lists all of them.",
+            "others were cropped or enlarged, and are misplaced, or the place is flat: use the "
+            "original photos. map.json lists all of them.",
             cli.some(fit.altered),
             100 * fit.gain,
         )

@@ -205,7 +205,7 @@ def _commit(
             fit = cropping.find(sfm)
     precision.warn({name: share for name, share in uncertain.items() if name in added})
     if built.cropping.gain <= cropping.GAIN or {*fit.altered} - {*built.cropping.altered}:
-        cropping.warn(fit)
+        cropping.warn(fit, [])
     content |= {
         "id": uuid.uuid4().hex,
         "sfm": folder.name,
@@ -217,6 +217,7 @@ def _commit(
         "gain_of_free_principal_points": fit.gain,
         "images_altered": fit.altered,
         "images_mirrored": sorted({*built.mirrored} - {*added} - {*removed}),
+        "images_of_another_size": sorted({*built.resized} - {*removed}),
         "points3D": sfm.num_points3D(),
     }
     if cameras is not None:

@@ -43,6 +43,7 @@ class Map:
         contradicting: images whose poses contradict the others.
         uncertain: images whose positions are uncertain, see `precision.find`.
         cropping: how much better the images fit with other intrinsics.
+        resized: images of another size than others by the same camera.
         mirrored: images without a pose, as they are mirrored.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
@@ -83,6 +84,7 @@ class Map:
         self.uncertain = {str(name): float(share) for name, share in found}
         gain = float(content.get("gain_of_free_principal_points", 0))
         self.cropping = cropping.Fit(gain, list(content.get("images_altered", [])))
+        self.resized = list(content.get("images_of_another_size", []))
         self.mirrored = list(content.get("images_mirrored", []))
         self.num_points3D = int(content["points3D"])
         self.camera_mode = content.get("camera_mode")
@@ -162,7 +164,7 @@ class Map:
         """Warn of what may be wrong with the map, as was found when it was built."""
         contradictions.warn(self.contradicting)
         precision.warn(self.uncertain)
-        cropping.warn(self.cropping)
+        cropping.warn(self.cropping, self.resized)
         mirrored_photos.warn(self.mirrored)
 
     def names(self) -> list[str]:

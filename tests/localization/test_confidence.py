@@ -171,7 +171,7 @@ def test_a_position_is_certain_to_3_percent(monkeypatch, uncertain, is_refused):
     monkeypatch.setattr(absolute_pose, "uncertainty", lambda *_: (uncertain, 0.1))
     its_matches = absolute_pose._Matches(keypoints, points, CAMERA, {})
     reason = absolute_pose._imprecision(its_matches, found, TRUE)
-    assert ("at most 3 % and 2 degrees are accepted" in (reason or "")) == is_refused
+    assert ("% of the distance (at most 3 %)" in (reason or "")) == is_refused
 
 
 def test_a_focal_length_that_no_lens_has_is_refused():

@@ -98,6 +98,22 @@ def test_a_photo_of_the_size_of_the_map_is_hardly_cropped():
         assert camera.params.tolist() == [576, 240, 180, 0] and found == source
 
 
+def test_photos_of_another_size_by_the_same_lens(tmp_path):
+    """As crops whose EXIF data stay; three of a size are a setting, and a turn is none."""
+    for i in range(4):
+        write_photo(tmp_path / f"{i}.jpg", size=(360, 480) if i == 3 else (480, 360))
+    write_photo(tmp_path / "crop.jpg", size=(336, 252))
+    write_photo(tmp_path / "wide.jpg", size=(480, 270))
+    write_photo(tmp_path / "tele.jpg", focal_35mm=90, size=(240, 180))
+    names = [path.name for path in tmp_path.iterdir()]
+    assert intrinsics.of_another_size(tmp_path, names) == ["crop.jpg"]
+    assert intrinsics.of_another_size(tmp_path, ["0.jpg", "1.jpg", "crop.jpg"]) == []
+    for i in range(3):
+        write_photo(tmp_path / f"half{i}.jpg", size=(240, 180))
+    names = [path.name for path in tmp_path.iterdir()]
+    assert intrinsics.of_another_size(tmp_path, names) == ["crop.jpg"]
+
+
 def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):
     """A crop that was enlarged has the size of the map's photos, but a longer focal length."""
     known = intrinsics.of_map(map_of([1, 2]), tmp_path)

@@ -71,7 +71,7 @@ def test_cropped_photos_fit_better_with_free_principal_points(shift, is_cropped,
     assert model.compute_mean_reprojection_error() == before
     assert all(image.cam_from_world() == poses[i] for i, image in model.images.items())
     assert fit.gain > 0.3 if is_cropped else abs(fit.gain) < 0.02
-    cropping.warn(fit)
+    cropping.warn(fit, [])
     assert ("cropped or enlarged" in caplog.text) == is_cropped
 
 
@@ -89,7 +89,7 @@ def test_enlarged_photos_of_a_shared_camera_are_named(zoomed, caplog):
     fit = cropping.find(reconstructed(zoomed=zoomed, is_shared=True))
     assert fit.altered == [f"{i}.jpg" for i in zoomed]
     assert fit.gain > 0.3 if zoomed else abs(fit.gain) < 0.02
-    cropping.warn(fit)
+    cropping.warn(fit, [])
     assert all(f"{i}.jpg" in caplog.text for i in zoomed)
     assert ("are misplaced" in caplog.text) == bool(zoomed)
 
@@ -113,3 +113,8 @@ def test_photos_that_were_removed_do_not_count():
 def test_large_maps_are_not_judged(monkeypatch):
     monkeypatch.setattr(cropping, "LARGEST", 7)
     assert cropping.find(reconstructed(0.2)) == cropping.NOT_TRIED
+
+
+def test_a_photo_of_another_size_is_named_once(caplog):
+    cropping.warn(cropping.Fit(0.4, ["crop.jpg"]), ["crop.jpg", "other.jpg"])
+    assert "by the same camera: other.jpg." in caplog.text and caplog.text.count("crop.jpg") == 1
