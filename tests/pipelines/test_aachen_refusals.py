@@ -133,3 +133,13 @@ def test_a_wrong_feature_is_found_before_the_demo_is_rendered(tmp_path, monkeypa
     monkeypatch.setattr(demo, "main", lambda dataset: pytest.fail("rendered"))
     given = ("--demo", "--dataset", tmp_path / "town", "--feature", "edgepoint2_m33")
     assert "Unknown feature 'edgepoint2_m33'" in refused(*given)
+
+
+def test_a_number_of_demo_photos(tmp_path, monkeypatch, capsys, run, refused):
+    monkeypatch.setattr(demo, "take", None)  # nothing is rendered
+    town = ("--demo", "--dataset", tmp_path / "town", "--demo_photos", "5")
+    assert "at least 32 photos, not 5" in refused(*town)
+    assert not (tmp_path / "town").exists()
+    with pytest.raises(SystemExit) as exit:
+        run("--demo_photos", "40")
+    assert exit.value.code == 2 and "--demo_photos needs --demo" in capsys.readouterr().err
