@@ -115,13 +115,13 @@ class _Judge:
 
     def find(self, names: set[str], by: set[str]) -> set[str]:
         """Return the mirrored ones of some photos, each of which is localized by some others."""
+        if len(by) < FEWEST:
+            return set()
         known = intrinsics.of_map(self.sfm, self.image_dir, by)
         inferred = intrinsics.infer_all(self.image_dir, sorted(names), known)
-        if not inferred or len(by) < FEWEST:
-            return set()
         others = copy.deepcopy(self.sfm)
         extension.remove(others, {image.name for image in others.images.values()} - by)
-        if not others.num_points3D():
+        if not inferred or not others.num_points3D():
             return set()
         reference = SfmMap(others)
         mirrored = mirroring.extract(

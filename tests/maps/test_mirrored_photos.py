@@ -80,6 +80,14 @@ def test_the_others_are_tried_when_one_is_mirrored(plane, symmetric, tmp_path, m
     assert not (folder / "mirrored").exists() and len(list(folder.glob("sfm*"))) == 1
 
 
+def test_photos_without_keypoints(plane, tmp_path, run):
+    cv2.imwrite(str(plane / "images/black.png"), np.zeros((270, 360), np.uint8))
+    outputs = tmp_path / "outputs"
+    run("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
+    built = maps.Map(outputs / "map")
+    assert not built.mirrored and built.names() == [f"{i}.png" for i in range(5)]
+
+
 def test_more_keypoints_reveal_a_mirrored_photo(plane, tmp_path, monkeypatch, run):
     find = mirrored_photos.find
 
