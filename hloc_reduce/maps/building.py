@@ -136,7 +136,7 @@ class Building:
         return sfm
 
     def _of_photos_alone(self, conf: dict) -> tuple[str, dict, pycolmap.Reconstruction]:
-        """Reconstruct poses and points, again without mirrored photos, and with more keypoints.
+        """Reconstruct poses and points: also with more keypoints, and without mirrored photos.
 
         Returns:
             The folder of the model with the most images, the configuration of its features, and
@@ -159,43 +159,33 @@ class Building:
             logger.info("%d of %d photos are in the map.", registered, number)
             return registered == number
 
-        def attempt_without_mirrored(complete: bool, once: bool = False) -> bool:
-            """Try again if photos are mirrored; return whether all are in the best model so far."""
-            if not found:
-                return complete
-            folder, conf, sfm = found[0]
-            if not self._find_mirrored(conf, sfm):
-                return complete
-            found.clear()
-            return attempt(f"{folder}{UNMIRRORED}", conf, once)
-
-        complete = attempt(SFM, conf, once=several)
-        complete = attempt_without_mirrored(complete, once=several)
-        if several and not complete:
+        if not attempt(SFM, conf, once=several) and several:
             logger.info("Trying again with more keypoints.")
             model = features_confs.with_keypoints(conf["model"], "colmap")
             more = {**conf, "output": f"{conf['output']}{MORE}", "model": model}
             attempt(f"{SFM}{MORE}", more)
             if not found or found[0][1] is conf:
                 attempt(f"{SFM}{FURTHER}", conf)
-            attempt_without_mirrored(False)
+        if found:
+            folder, conf, sfm = found[0]
+            self.mirrored = self._find_mirrored(conf, sfm)
+            if self.mirrored:
+                named = cli.some(self.mirrored)
+                logger.info("Trying again without mirrored photos: %s.", named)
+                found.clear()
+                attempt(f"{folder}{UNMIRRORED}", conf)
         if not found:
             mirrored_photos.warn(self.mirrored)
             raise errors[-1]
         return found[0]
 
-    def _find_mirrored(self, conf: dict, sfm: pycolmap.Reconstruction) -> bool:
-        """Find mirrored photos, and return whether there are any that were not known before."""
+    def _find_mirrored(self, conf: dict, sfm: pycolmap.Reconstruction) -> list[str]:
         features, descriptors = self._describe(conf)
         with self.folder.stage("mirror_images"):
-            found = mirrored_photos.find(
-                *(sfm, {*self.names} - {*self.mirrored}, conf, self.matcher, self.image_dir),
-                *(features, descriptors, self.folder.path / MIRRORED / features.stem),
+            return mirrored_photos.find(
+                *(sfm, self.names, conf, self.matcher, self.image_dir),
+                *(features, descriptors, self.folder.path / MIRRORED),
             )
-        if found:
-            self.mirrored = sorted([*self.mirrored, *found])
-            logger.info("Trying again without mirrored photos: %s.", cli.some(self.mirrored))
-        return bool(found)
 
     def _fitting(
         self, conf: dict, folder: str, sfm: pycolmap.Reconstruction
