@@ -11,7 +11,7 @@ OLD := $(VENV)/pycolmap-$(OLDEST)
 
 # tests of stages that read or write models and databases, or estimate
 STAGES_OF_COLMAP := from_colmap localize_sfm more_pairs pairs_from_covisibility \
-	pairs_from_verification paths_in_stages reconstruction to_colmap triangulation
+	pairs_from_verification reconstruction to_colmap triangulation
 
 # two workers take files in alphabetical order; in pytest-xdist's own order the slowest come last
 TWO := -n 2 --dist loadfile --no-loadscope-reorder
@@ -30,7 +30,9 @@ test: $(VENV)/installed $(OLD)/installed
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
 	OMP_NUM_THREADS=1 PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest $(TWO) \
 		tests/models/test_dog.py tests/mapping $(STAGES_OF_COLMAP:%=tests/stages/test_%.py) \
-		tests/maps/test_localizer.py tests/maps/test_compact.py \
+		tests/maps/test_localizer.py \
+		tests/maps/test_compact.py::test_a_file_localizes_as_its_map \
+		tests/maps/test_compact.py::test_files_of_stages \
 		tests/maps/test_photos_alone.py::test_photos_alone \
 		tests/pipelines/test_aachen.py::test_plane tests/pipelines/test_inloc.py::test_plane
 

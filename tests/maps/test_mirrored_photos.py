@@ -9,7 +9,6 @@ import pytest
 from command import state
 
 from hloc_reduce import maps
-from hloc_reduce.confs import features as features_confs
 from hloc_reduce.maps import mirrored_photos
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
@@ -88,42 +87,26 @@ def test_photos_without_keypoints(plane, tmp_path, run):
     assert not built.mirrored and built.names() == [f"{i}.png" for i in range(5)]
 
 
-def test_more_keypoints_reveal_a_mirrored_photo(plane, tmp_path, monkeypatch, run):
-    find = mirrored_photos.find
-
-    def later(sfm, names, conf, *others):
-        more = features_confs.keypoints_of(conf["model"]) == "colmap"
-        return find(sfm, names, conf, *others) if more else []
-
-    monkeypatch.setattr(mirrored_photos, "find", later)
-    build_with_one_mirrored(plane, tmp_path / "outputs", run)
-
-
-@pytest.mark.parametrize(
-    "as_it_is, mirrored, agreement, named",
-    [
-        (20.0, 400.0, 0.95, True),
-        (500.0, 400.0, 0.95, False),
-        (20.0, 200.0, 0.95, False),  # such confidences and agreements are those of symmetric places
-        (20.0, 400.0, 0.8, False),
-    ],
-)
-def test_only_what_is_beyond_doubt_is_named(
-    as_it_is, mirrored, agreement, named, plane, tmp_path, monkeypatch
-):
+def test_only_what_is_beyond_doubt_is_named(plane, tmp_path, monkeypatch):
+    """Lower confidences and agreements of mirror images are those of symmetric places."""
     built = maps.main(tmp_path / "map", plane / "images", camera_mode=pycolmap.CameraMode.SINGLE)
-
-    def localize(self, reference, by, what, features, descriptors, cameras, options):
-        confidence = mirrored if what == "mirrored" else as_it_is
-        return {name: {"confidence": confidence, "agreement": agreement} for name in cameras}
-
-    monkeypatch.setattr(mirrored_photos._Judge, "_localize", localize)
     judge = mirrored_photos._Judge(
         *(colmap.read_model(built.sfm), built.conf, built.matcher, built.images),
         *(built.features, built.descriptors, tmp_path / "mirrored"),
     )
-    found = judge.find({"0.png"}, {*OTHERS})
-    assert found == ({"0.png"} if named else set())
+    for as_it_is, mirrored, agreement, named in (
+        (20.0, 400.0, 0.95, True),
+        (500.0, 400.0, 0.95, False),
+        (20.0, 200.0, 0.95, False),
+        (20.0, 400.0, 0.8, False),
+    ):
+        confidences = {"photos": as_it_is, "mirrored": mirrored}
+
+        def localize(judge, reference, by, what, *files, at=agreement, known=confidences):
+            return {"0.png": {"confidence": known[what], "agreement": at}}
+
+        monkeypatch.setattr(mirrored_photos._Judge, "_localize", localize)
+        assert judge.find({"0.png"}, {*OTHERS}) == ({"0.png"} if named else set())
 
 
 def test_photos_that_share_little_are_not_judged(tmp_path):
