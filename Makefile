@@ -16,7 +16,7 @@ STAGES_OF_COLMAP := from_colmap localize_sfm more_pairs pairs_from_covisibility 
 # two workers take files in alphabetical order; in pytest-xdist's own order the slowest come last
 TWO := -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-long lint clean
+.PHONY: demo test types suite test-long lint clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed
@@ -25,7 +25,12 @@ demo: $(VENV)/installed
 test: $(VENV)/installed $(OLD)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(MAKE) --jobs 2 types suite
+
+types: $(VENV)/installed
 	$(BIN)/mypy
+
+suite: $(VENV)/installed $(OLD)/installed
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO)
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
 	OMP_NUM_THREADS=1 PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest $(TWO) \
