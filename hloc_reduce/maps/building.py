@@ -32,7 +32,7 @@ from ..utils import cli, colmap
 from ..utils.files import replacing
 from ..utils.parsers import parse_pairs, write_pairs
 from . import contradictions, cropping, mirrored_photos, precision
-from .map import FINISHED, RETRIEVAL, SFM, Map, with_projection
+from .map import FINISHED, RETRIEVAL, SFM, Map, models, with_projection
 
 # suffixes of the models of later attempts
 MORE = "-keypoints_colmap"  # also of its features
@@ -295,8 +295,7 @@ def drop_others(folder: RunFolder, built: Map) -> None:
     for name in {plain, f"{plain}{MORE}"} - {kept}:
         begins = f"{name}.h5", f"{name}_matches", f"{RETRIEVAL['output']}_{name}."
         folder.delete(other for other in folder.written if other.startswith(begins))
-    models = {name for name in folder.written if name == SFM or name.startswith(f"{SFM}-")}
-    folder.delete({MIRRORED, *models} - {built.sfm.name})
+    folder.delete({MIRRORED, *models(folder.written)} - {built.sfm.name})
 
 
 def keep_projection(conf: dict, folder: Path) -> dict:

@@ -26,7 +26,7 @@ from ..utils.images import list_images
 from ..utils.paths import strings_as_paths
 from . import cropping, precision
 from .addition import GROWING, IMAGES, Addition, photo_of
-from .map import FINGERPRINTS, FINISHED, PLACE, SFM, Map
+from .map import FINGERPRINTS, FINISHED, PLACE, SFM, Map, models
 
 NUM_LOC = 20  # images of the map that a new photo is matched with
 
@@ -227,5 +227,4 @@ def _commit(
 
 def _drop_left(folder: RunFolder, built: Map) -> None:
     """Delete what finished changes leave: their folder, and models that were replaced."""
-    models = {name for name in folder.written if name == SFM or name.startswith(f"{SFM}-")}
-    folder.delete({GROWING, *models} - {built.sfm.name})
+    folder.delete({GROWING, *models(folder.written)} - {built.sfm.name})

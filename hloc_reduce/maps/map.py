@@ -1,7 +1,7 @@
 """Maps to localize in: the points, features and global descriptors of photos, kept in a folder."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from .. import aggregate_features, extract_features, projections
@@ -170,6 +170,11 @@ class Map:
     def names(self) -> list[str]:
         """List the images that have a pose."""
         return sorted(image.name for image in colmap.read_model(self.sfm).images.values())
+
+
+def models(names: Iterable[str]) -> set[str]:
+    """Return the names of folders of COLMAP models, of any attempt to build a map."""
+    return {name for name in names if name == SFM or name.startswith(f"{SFM}-")}
 
 
 def _file_name(name: str) -> str:
