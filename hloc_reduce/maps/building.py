@@ -38,6 +38,7 @@ from .map import FINISHED, RETRIEVAL, SFM, Map, models, with_projection
 MORE = "-keypoints_colmap"  # also of its features
 FURTHER = "-further"  # with the same keypoints as the first one
 UNMIRRORED = "-unmirrored"  # without the mirrored photos of another attempt
+UNCROPPED = "-uncropped"  # without the photos whose intrinsics do not fit those of the others
 OWN = "-per_image"  # with a camera for each photo
 MIRRORED = "mirrored"  # folder of what is known of mirror images
 ROUNDS = 3  # of additional pairs, in which larger sets of photos get connected
@@ -47,8 +48,8 @@ ROUNDS = 3  # of additional pairs, in which larger sets of photos get connected
 class Building:
     """A map that is being built; `names` loses images that cannot be read.
 
-    `matches` are its match files by the names of their feature files, and `mirrored` are images
-    that are left out.
+    `matches` are its match files by the names of their feature files. `mirrored` and `cropped` are
+    images that are left out.
     """
 
     folder: RunFolder
@@ -61,6 +62,7 @@ class Building:
     camera_mode: pycolmap.CameraMode
     matches: dict[str, Path] = field(default_factory=dict)
     mirrored: list[str] = field(default_factory=list)
+    cropped: list[str] = field(default_factory=list)
 
     def build(
         self,
@@ -76,6 +78,9 @@ class Building:
         if model is not None and reference is not None:
             folder, sfm, fit = SFM, self._of_model(conf, model, reference), cropping.NOT_TRIED
         else:
+            self.cropped = intrinsics.of_another_size(self.image_dir, self.names)
+            if self.cropped:
+                logger.info("Left out, as of another size: %s.", cli.some(self.cropped))
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
             registration.check(self.folder.path / folder, self.accept_partial)
@@ -83,8 +88,7 @@ class Building:
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
         names = {sfm.images[i].name for i in sfm.reg_image_ids()}
-        resized = intrinsics.of_another_size(self.image_dir, names) if model is None else []
-        cameras = intrinsics.of_map(sfm, self.image_dir, names - {*resized})
+        cameras = intrinsics.of_map(sfm, self.image_dir, names)
         summary = {
             "id": uuid.uuid4().hex,
             "feature": feature,
@@ -102,7 +106,7 @@ class Building:
             "gain_of_free_principal_points": fit.gain,
             "images_altered": fit.altered,
             "images_mirrored": self.mirrored,
-            "images_of_another_size": resized,
+            "images_cropped": self.cropped,
             "points3D": sfm.num_points3D(),
             **intrinsics.to_dict(cameras),
             "seconds": self.folder.seconds(),
@@ -135,6 +139,12 @@ class Building:
         shutil.rmtree(self.folder.path / "sfm_reference", ignore_errors=True)
         return sfm
 
+    @property
+    def _kept(self) -> list[str]:
+        """The images that are not left out."""
+        left_out = {*self.mirrored, *self.cropped}
+        return [name for name in self.names if name not in left_out]
+
     def _of_photos_alone(self, conf: dict) -> tuple[str, dict, pycolmap.Reconstruction]:
         """Reconstruct poses and points: also with more keypoints, and without mirrored photos.
 
@@ -155,7 +165,7 @@ class Building:
                 errors.append(error)
             found.sort(key=lambda one: plausibility.size(one[2]), reverse=True)
             registered = found[0][2].num_reg_images() if found else 0
-            number = len(self.names) - len(self.mirrored)
+            number = len(self._kept)
             logger.info("%d of %d photos are in the map.", registered, number)
             return registered == number
 
@@ -183,14 +193,17 @@ class Building:
         features, descriptors = self._describe(conf)
         with self.folder.stage("mirror_images"):
             return mirrored_photos.find(
-                *(sfm, self.names, conf, self.matcher, self.image_dir),
+                *(sfm, self._kept, conf, self.matcher, self.image_dir),
                 *(features, descriptors, self.folder.path / MIRRORED),
             )
 
     def _fitting(
         self, conf: dict, folder: str, sfm: pycolmap.Reconstruction
     ) -> tuple[str, pycolmap.Reconstruction, cropping.Fit]:
-        """Reconstruct again with a camera for each photo, if those that they share do not fit.
+        """Reconstruct again if the photos do not fit.
+
+        First with a camera for each photo, if they share some; then without those whose intrinsics
+        are not like the others'.
 
         Args:
             conf: configuration of the features.
@@ -198,23 +211,37 @@ class Building:
             sfm: the model.
 
         Returns:
-            The folder, the model and its fit: the new ones if they have as many photos, all of
-            which fit.
+            The folder, the model and its fit: the new ones if they have all other photos, which
+            fit.
         """
         fit = self._fit(sfm)
         cameras = {sfm.images[i].camera_id for i in sfm.reg_image_ids()}
         is_shared = len(cameras) < sfm.num_reg_images()
         auto = self.camera_mode == pycolmap.CameraMode.AUTO
-        if not (fit.gain > cropping.GAIN and is_shared and auto):
-            return folder, sfm, fit
-        logger.info("Trying again with a camera for each photo.")
-        with suppress(registration.NoModelError):
-            other, mode = f"{SFM}{OWN}", pycolmap.CameraMode.PER_IMAGE
-            found = self._reconstruct(conf, other, camera_mode=mode)
-            its_fit = self._fit(found)
-            fits = its_fit is not cropping.NOT_TRIED and its_fit.gain <= cropping.GAIN
-            if fits and found.num_reg_images() >= sfm.num_reg_images():
-                return other, found, its_fit
+
+        def attempt(
+            suffix: str, camera_mode: pycolmap.CameraMode
+        ) -> tuple[str, pycolmap.Reconstruction, cropping.Fit] | None:
+            with suppress(registration.NoModelError):
+                found = self._reconstruct(conf, f"{SFM}{suffix}", camera_mode=camera_mode)
+                its_fit = self._fit(found)
+                fits = its_fit is not cropping.NOT_TRIED and its_fit.gain <= cropping.GAIN
+                wanted = {sfm.images[i].name for i in sfm.reg_image_ids()} & {*self._kept}
+                if fits and found.num_reg_images() >= len(wanted):
+                    return f"{SFM}{suffix}", found, its_fit
+            return None
+
+        if fit.gain > cropping.GAIN and is_shared and auto:
+            logger.info("Trying again with a camera for each photo.")
+            if found := attempt(OWN, pycolmap.CameraMode.PER_IMAGE):
+                return found
+        if fit.altered:
+            logger.info("Trying again without %s.", cli.some(fit.altered))
+            before = self.cropped
+            self.cropped = sorted([*before, *fit.altered])
+            if found := attempt(UNCROPPED, self.camera_mode):
+                return found
+            self.cropped = before
         return folder, sfm, fit
 
     def _fit(self, sfm: pycolmap.Reconstruction) -> cropping.Fit:
@@ -240,10 +267,10 @@ class Building:
                     *(self.camera_mode, self.names),
                 )
             self._match(pairs, features, matches)
-        names = [name for name in self.names if name not in self.mirrored]
-        if self.mirrored:
-            kept = [pair for pair in parse_pairs(pairs) if {*pair}.isdisjoint(self.mirrored)]
-            pairs = self.folder.path / f"{pairs.stem}{sfm.removeprefix(SFM)}.txt"
+        names = self._kept
+        if len(names) < len(self.names):
+            kept = [pair for pair in parse_pairs(pairs) if {*pair} <= {*names}]
+            pairs = self.folder.path / f"{pairs.stem}{sfm.removeprefix(SFM)}-kept.txt"
             write_pairs(kept, pairs)
         with self.folder.stage("reconstruction"):
             return reconstruction.main(

@@ -136,19 +136,19 @@ def _adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool) 
     return sfm.compute_mean_reprojection_error()
 
 
-def warn(fit: Fit, resized: list[str]) -> None:
-    """Warn of photos of a map that may be cropped.
+def warn(fit: Fit, cropped: list[str]) -> None:
+    """Warn of photos that may be cropped.
 
     Args:
-        fit: from `find`.
-        resized: from `intrinsics.of_another_size`.
+        fit: of the map, from `find`.
+        cropped: photos that were left out of it.
     """
-    if others := [name for name in resized if name not in fit.altered]:
+    if cropped:
         logger.warning(
-            "Photos of another size than the others by the same camera: %s. They are right if they "
-            "are smaller copies, but misplaced if they were cropped: use photos as the camera took "
-            "them. map.json lists all of them.",
-            cli.some(others),
+            "Photos that were cropped or enlarged, or are smaller copies, are not in the map: %s. "
+            "Their size, focal length or principal point is not that of the others. Use photos as "
+            "the camera took them. map.json lists all of them.",
+            cli.some(cropped),
         )
     if fit.altered:
         logger.warning(

@@ -217,7 +217,7 @@ def _commit(
         "gain_of_free_principal_points": fit.gain,
         "images_altered": fit.altered,
         "images_mirrored": sorted({*built.mirrored} - {*added} - {*removed}),
-        "images_of_another_size": sorted({*built.resized} - {*removed}),
+        "images_cropped": sorted({*built.cropped} - {*added} - {*removed}),
         "points3D": sfm.num_points3D(),
     }
     if cameras is not None:

@@ -113,8 +113,3 @@ def test_photos_that_were_removed_do_not_count():
 def test_large_maps_are_not_judged(monkeypatch):
     monkeypatch.setattr(cropping, "LARGEST", 7)
     assert cropping.find(reconstructed(0.2)) == cropping.NOT_TRIED
-
-
-def test_a_photo_of_another_size_is_named_once(caplog):
-    cropping.warn(cropping.Fit(0.4, ["crop.jpg"]), ["crop.jpg", "other.jpg"])
-    assert "by the same camera: other.jpg." in caplog.text and caplog.text.count("crop.jpg") == 1
