@@ -69,18 +69,18 @@ def _count(
     expected, shared = np.zeros((2, number, number))
     for i in range(number):
         its = np.flatnonzero(seen[i])
-        own = xyz[its] - centres[i]
-        own_distance = np.maximum(np.linalg.norm(own, axis=1), np.finfo(float).tiny)
-        moved = np.linalg.norm(centres - centres[i], axis=1)
-        near = np.flatnonzero(moved <= REACH * own_distance.max(initial=0))
-        rays = xyz[its] - centres[near, None]
-        distance = np.maximum(np.linalg.norm(rays, axis=2), np.finfo(float).tiny)
-        cosine = np.einsum("jnd,nd->jn", rays, own) / distance / own_distance
-        ratio = distance / own_distance
-        alike = (cosine > np.cos(np.radians(ANGLE))) & (np.abs(np.log(ratio)) < np.log(DISTANCE))
+        ray, moved = xyz[its] - centres[i], centres - centres[i]
+        squared = (ray**2).sum(axis=1)
+        near = np.flatnonzero((moved**2).sum(axis=1) <= REACH**2 * squared.max(initial=0))
+        # from the centres that are near: the ray to each point is `ray - moved`
+        along = moved[near] @ ray.T
+        cosine = squared - along  # times both distances, like this the following
+        others = np.maximum(squared - 2 * along + (moved[near] ** 2).sum(axis=1)[:, None], 0)
+        alike = (cosine > 0) & (cosine**2 > np.cos(np.radians(ANGLE)) ** 2 * squared * others)
+        alike &= (others > squared / DISTANCE**2) & (others < squared * DISTANCE**2)
         wanted = alike & inside[np.ix_(near, its)]
-        expected[i, near] = wanted.sum(axis=1)
-        shared[i, near] = (wanted & seen[np.ix_(near, its)]).sum(axis=1)
+        expected[i, near] = np.count_nonzero(wanted, axis=1)
+        shared[i, near] = np.count_nonzero(wanted & seen[np.ix_(near, its)], axis=1)
     np.fill_diagonal(expected, 0)
     np.fill_diagonal(shared, 0)
     return expected + expected.T, shared + shared.T, used
