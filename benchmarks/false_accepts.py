@@ -297,7 +297,8 @@ def run(
         for given in known if camera else ("guess",):
             its_camera, refinement = intrinsics_of(camera, size, given, place.cameras)
             row = localize(place, matched, its_camera, refinement)
-            if mirrored.is_doubtful(not row["refusal"], row["agreement"], row["confidence"]):
+            found = row["agreement"], row["confidence"]
+            if not row["refusal"] and mirrored.is_doubtful(*found):
                 flipped = flipped or match(*mirror(images, output, name, place.base))
                 its_camera = mirrored.mirror(its_camera)
                 other_row = localize(place, flipped, its_camera, refinement, thorough=False)

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from .confidence import (
     uncertainty,
 )
 from .projection import ALL, FOCAL, POSE, RADIAL, SKEW, reprojection_errors
-from .resection import Resection
+from .resection import Resection, View
 
 SEED = 0
 MAX_ERROR = 12.0  # pixels, pycolmap's default
@@ -45,8 +46,6 @@ ZOOMED = 1.2  # times the map's focal lengths: beyond, a photo may be cropped an
 LISTED = 0.1, 50.0  # range of listed focal lengths, in longer sides
 # distances of the principal point from the centre, as shares of the size
 OFF_CENTRE, CENTRED = 0.15, 0.02
-
-View = tuple[pycolmap.Rigid3d, pycolmap.Camera]
 
 
 @dataclass(frozen=True)
@@ -118,6 +117,7 @@ def estimate(
     config: dict,
     gate: Gate,
     thorough: bool = True,
+    workers: int = 1,
 ) -> Pose:
     """Estimate an absolute pose and judge it.
 
@@ -134,22 +134,32 @@ def estimate(
             "photo", whether it may be "cropped", or the range of the map's "focal_lengths".
         gate: what a pose must have to be trusted.
         thorough: try the matches of single images, too.
+        workers: threads that estimate poses; the result does not depend on their number.
     """
     matches = _Matches(points2D, points3D, camera, config)
     number = len(matches)
-    poses = [_estimate(matches, np.arange(number))]
-    if thorough and poses[0].num_inliers < CLEAR * number:
-        tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
-        poses += [_estimate(matches, chosen[:MOST_SIMILAR]) for chosen in tried]
-    best, doubt = _calibrate(matches, max(poses, key=_quality))
+    with ThreadPoolExecutor(workers) as pool:
+        poses = [_estimate(matches, np.arange(number))]
+        if thorough and poses[0].num_inliers < CLEAR * number:
+            tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
+            poses += pool.map(lambda chosen: _estimate(matches, chosen[:MOST_SIMILAR]), tried)
+        first = max(poses, key=_quality)
+        rivals = pool.submit(_rivals, matches, first) if workers > 1 else None
+        best, doubt = _calibrate(matches, first)
+        poses += rivals.result() if rivals and best is first else _rivals(matches, best)
     best = replace(best, agreement=agreement(best.inliers, images))
-    others = np.flatnonzero(~best.inliers)
-    if len(others) >= RIVAL * best.num_inliers > 0:
-        # half as many inliers as a rival of this confidence is expected to have
-        least = RIVAL / 2 * best.num_inliers / len(others)
-        sample = np.random.default_rng(SEED).permutation(others)[:RIVAL_SAMPLE]
-        poses.append(_estimate(matches, sample, max(LEAST_RATIO, least)))
     return replace(best, refusal=_refusal(matches, best, poses, gate, doubt))
+
+
+def _rivals(matches: _Matches, pose: Pose) -> list[Pose]:
+    """Return the pose that the other matches than the inliers of a pose give, if there are some."""
+    others = np.flatnonzero(~pose.inliers)
+    if not len(others) >= RIVAL * pose.num_inliers > 0:
+        return []
+    # half as many inliers as a rival of this confidence is expected to have
+    least = RIVAL / 2 * pose.num_inliers / len(others)
+    sample = np.random.default_rng(SEED).permutation(others)[:RIVAL_SAMPLE]
+    return [_estimate(matches, sample, max(LEAST_RATIO, least))]
 
 
 def _quality(pose: Pose) -> tuple[float, int]:

@@ -22,9 +22,9 @@ SIDED = ("p2", "sx1", "sx2")  # parameters
 MirrorImages = Callable[[list[str]], tuple[Path, Path]]
 
 
-def is_doubtful(localized: bool, agreement: float, confidence: float) -> bool:
-    """Return whether a pose is so uncertain that the mirror image must be tried, too."""
-    return localized and (agreement < DOUBTFUL[0] or confidence < DOUBTFUL[1])
+def is_doubtful(agreement: float, confidence: float) -> bool:
+    """Return whether a trusted pose is so uncertain that the mirror image must be tried, too."""
+    return agreement < DOUBTFUL[0] or confidence < DOUBTFUL[1]
 
 
 def mirror(camera: pycolmap.Camera) -> pycolmap.Camera:

@@ -18,6 +18,7 @@ def localize(
     config: dict,
     gate: Gate = DEFAULT_GATE,
     thorough: bool = True,
+    workers: int = 1,
 ) -> tuple[pycolmap.Rigid3d | None, dict]:
     """Localize a query.
 
@@ -30,6 +31,7 @@ def localize(
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
         gate: what a pose must have to be trusted.
         thorough: where few matches agree with a pose, try those of single images, too.
+        workers: threads, on which the result does not depend.
 
     Returns:
         The pose (camera from world) or None, and info on the cluster of map images with the best
@@ -44,7 +46,7 @@ def localize(
     for names in reference.clusters(list(matches)) if matches else [[]]:
         info, images = _correspondences(reference, names, matches)
         points = keypoints[info["keypoints"]], info["points3D"]
-        found = absolute_pose.estimate(*points, images, camera, config, gate, thorough)
+        found = absolute_pose.estimate(*points, images, camera, config, gate, thorough, workers)
         info |= {
             "reason": _reason(len(keypoints), names, info) or found.refusal,
             "confidence": round(max(0.0, found.confidence), 2),

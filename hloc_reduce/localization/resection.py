@@ -30,6 +30,8 @@ SEARCHES, GAIN = 3, 1.01  # each from the result of the one before, while the sc
 # of the linear start: six matches of a sample determine a projection
 SIX, TRIALS, SEED = 6, 200, 0
 
+View = tuple[pycolmap.Rigid3d, pycolmap.Camera]
+
 
 class Resection(NamedTuple):
     """A pose and intrinsics that were estimated together.
@@ -98,7 +100,7 @@ def resect(
     """
     if chosen is None:
         chosen = reprojection_errors(points2D, points3D, cam_from_world, camera)[0] <= max_error
-    start = view = _View.of(cam_from_world, camera)
+    start = view = _Parameters.of(cam_from_world, camera)
     noise, found = NOISE * photo_scale(camera), None
     for _ in range(ROUNDS):
         if chosen.sum() < degrees_of_freedom:
@@ -123,24 +125,27 @@ def resect_anew(
 
     Many parameters have local optima. So this tries several starts: the initial PINHOLE intrinsics,
     another aspect ratio, principal points near the corners, with the camera turned accordingly, and
-    the linear solution of `linear`. It does so again from the result, while that gets better.
+    the linear solution of `linear`. It does so again from the result, as long as that is better
+    than what it began with.
     """
 
-    def score(found: Resection) -> float:
+    def score(image: np.ndarray, view: View) -> float:
         """Return how many matches agree and how well, as MSAC does."""
-        errors, _ = reprojection_errors(
-            found.points2D, points3D, found.cam_from_world, found.camera
-        )
+        errors, _ = reprojection_errors(image, points3D, *view)
         return float(np.maximum(0, 1 - (errors / max_error) ** 2).sum())
 
-    best, least, view = None, 0.0, (cam_from_world, camera)
+    best, view = None, (cam_from_world, camera)
+    least = GAIN * score(points2D, view)
     for _ in range(SEARCHES):
         starts = _search(points2D, points3D, *view, max_error)
-        tried = [resect(points2D, points3D, *start, max_error, ALL) for start in starts]
-        found = max((one for one in tried if one is not None), key=score, default=None)
-        if found is None or score(found) <= least:
+        resected = (resect(points2D, points3D, *start, max_error, ALL) for start in starts)
+        scored = [(score(one.points2D, one[:2]), one) for one in resected if one is not None]
+        highest, found = max(scored, key=lambda both: both[0], default=(0.0, None))
+        if best is None or highest > least:
+            best = found
+        if found is None or highest <= least:
             break
-        best, least = found, GAIN * score(found)
+        least = GAIN * highest
         view = found.cam_from_world, _camera(camera, "PINHOLE", *found.camera.params[:4])
     return best
 
@@ -277,7 +282,7 @@ def _turned(
     return turn * cam_from_world, _camera(camera, "PINHOLE", fx, fy, cx + x, cy + y)
 
 
-class _View(NamedTuple):
+class _Parameters(NamedTuple):
     """The parameters that are optimized: rotation (3, 3), translation (3,), intrinsics (6,).
 
     The intrinsics are the logarithm of the focal length, a radial distortion, the logarithm of the
@@ -289,7 +294,7 @@ class _View(NamedTuple):
     intrinsics: np.ndarray
 
     @classmethod
-    def of(cls, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> "_View":
+    def of(cls, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> "_Parameters":
         fx, fy, cx, cy, distortion = [*camera.params, 0.0][:5]
         intrinsics = np.array([np.log(fx), distortion, np.log(fy / fx), cx, cy, 0.0])
         return cls(cam_from_world.rotation.matrix(), cam_from_world.translation, intrinsics)
@@ -308,7 +313,7 @@ class _View(NamedTuple):
         """The units of changes of the intrinsics: focal lengths for the principal point."""
         return np.array([1, 1, 1, *self.focal_lengths, 1])
 
-    def change(self, start: "_View") -> np.ndarray:
+    def change(self, start: "_Parameters") -> np.ndarray:
         """Return the difference (6,) from initial intrinsics, in units of PRIOR."""
         return (self.intrinsics - start.intrinsics) / (PRIOR * start._units)
 
@@ -324,11 +329,11 @@ class _View(NamedTuple):
         below = points2D[:, 1] - self.intrinsics[4]
         return points2D - np.stack([skew * fx / fy * below, np.zeros(len(below))], axis=1)
 
-    def moved(self, step: np.ndarray) -> "_View":
+    def moved(self, step: np.ndarray) -> "_Parameters":
         """Return the view after a step (7 to 12,) of the free parameters."""
         turn = pycolmap.Rotation3d(step[:3]).matrix()
         step = np.pad(step, (0, SKEW - len(step)))
-        return _View(
+        return _Parameters(
             turn @ self.rotation,
             turn @ self.translation + step[3:POSE],
             self.intrinsics + self._units * step[POSE:],
@@ -354,11 +359,11 @@ class _View(NamedTuple):
 def _fit(
     points2D: np.ndarray,
     points3D: np.ndarray,
-    view: _View,
-    start: _View,
+    view: _Parameters,
+    start: _Parameters,
     degrees_of_freedom: int,
     noise: float,
-) -> _View:
+) -> _Parameters:
     """Minimize the Cauchy loss of the residuals by the Levenberg-Marquardt method.
 
     Parameters that the residuals do not determine stay as they are in `start`.

@@ -187,8 +187,10 @@ def _check_some_matched(
 
 def _may_be_mirrored(record: dict) -> bool:
     """Tell whether the mirror image of a query is yet to be tried."""
-    known = (record[key] for key in ("localized", "agreement", "confidence"))
-    return record["mirror_image"] is None and is_doubtful(*known)
+    tried = record["mirror_image"] is not None
+    return (
+        record["localized"] and not tried and is_doubtful(record["agreement"], record["confidence"])
+    )
 
 
 def localize_all(

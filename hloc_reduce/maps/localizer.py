@@ -50,6 +50,7 @@ class Localizer:
     ):
         contents = read(Path(map_dir), None if onnx is None else Path(onnx))
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
+        self.workers = parallel.cores()
         self.preprocessing, self.cameras = contents.preprocessing, contents.cameras
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
@@ -105,7 +106,8 @@ class Localizer:
         lap("matching")
         cam_from_world, info = self._estimate(features, matches, camera, refinement)
         lap("pose")
-        if mirrored.is_doubtful(info["reason"] is None, info["agreement"], info["confidence"]):
+        known = info["agreement"], info["confidence"]
+        if info["reason"] is None and mirrored.is_doubtful(*known):
             flipped = self._extract(image, flip=True)
             matches = self._match(flipped["descriptors"], retrieved)
             camera = mirrored.mirror(camera)
@@ -145,6 +147,7 @@ class Localizer:
             merged(config, refinement),
             self.gate.of_photo(float(features["blur"])),
             thorough,
+            self.workers,
         )
 
     @parallel.one_thread()

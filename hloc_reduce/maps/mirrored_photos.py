@@ -146,7 +146,7 @@ class _Judge:
             name
             for name, record in as_mirrored.items()
             if record["confidence"] > as_they_are[name]["confidence"]
-            and not is_doubtful(True, record["agreement"], record["confidence"])
+            and not is_doubtful(record["agreement"], record["confidence"])
         }
 
     def _localize(

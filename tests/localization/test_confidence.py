@@ -307,6 +307,32 @@ def test_a_rival_is_found_in_a_sample_of_many_matches(monkeypatch):
     assert re.fullmatch("ambiguous: another pose has 3.. inliers, this one 8..", found.refusal)
 
 
+@pytest.mark.parametrize("config", [{}, FREE], ids=["given", "guessed"])
+def test_the_number_of_threads_changes_nothing(config):
+    """Neither of poses by single images, nor of a rival that is looked for in the meantime."""
+    first, second = matches(40, 1000), matches(30, 900, pose=pose_of(0, (50, 0, 8)), seed=1)
+    parts = (
+        *(np.concatenate(part) for part in zip(first, second, strict=True)),
+        [
+            np.r_[:40, 200:300],
+            np.arange(40, 1040),
+            np.r_[1040:1140],
+            np.arange(1070, 1970),
+        ],
+    )
+    poses = [
+        absolute_pose.estimate(*parts, GUESS if config else CAMERA, config, DEFAULT_GATE, True, n)
+        for n in (1, 3)
+    ]
+    assert poses[0].num_inliers >= 38
+    fields = [
+        (one.cam_from_world.matrix().tolist(), one.camera.params.tolist(), one.inliers.tolist())
+        + (one.confidence, one.agreement, one.refusal)
+        for one in poses
+    ]
+    assert fields[0] == fields[1]
+
+
 def test_a_gate_of_ones_own_is_kept():
     own = Gate(min_agreement=((0, 0.3), (50, 0.4)))
     assert own.of_matches({"ratio_threshold": 0.8}, 64) == own
