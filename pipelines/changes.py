@@ -82,7 +82,7 @@ def main(
         # if a run that adds others is repeated, they are gone
         if add_images is None or not {*names}.isdisjoint(built.names()):
             built = maps.remove(built, names)
-            print(f"{built.num_images} photos are left in the map {folder}.")
+            print(f"Photos left in the map {folder}: {built.num_images}.")
     if add_images is not None:
         before = built.num_images
         built = maps.add(built, add_images, add_model, refine_map=refine_map)

@@ -16,7 +16,6 @@ from ..aggregate_features import vocabulary_of
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..localization import intrinsics
-from ..mapping import extension
 from ..maps import compact, points
 from ..maps.compact import Source
 from ..maps.map import RETRIEVAL, Map
@@ -139,14 +138,9 @@ def matcher_of(matcher: str) -> str:
 
 
 def _of_map(built: Map) -> Source:
-    """Return what a map of `pipelines.localize` gives, with its own matcher.
-
-    Images that may be misplaced, and points that fewer than two others see, are left out.
-    """
-    model, kept = colmap.read_model(built.sfm), {*built.references()}
-    extension.remove(model, {image.name for image in model.images.values()} - kept)
+    """Return what a map of `pipelines.localize` gives, with its own matcher."""
     return Source(
-        *(model, built.feature, built.conf, built.matcher),
+        *(colmap.read_model(built.sfm), built.feature, built.conf, built.matcher),
         *(built.descriptors, built.vocabulary, built.cameras),
     )
 

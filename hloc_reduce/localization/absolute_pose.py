@@ -152,7 +152,7 @@ def estimate(
 
 
 def _rivals(matches: _Matches, pose: Pose) -> list[Pose]:
-    """Return the pose that the other matches than the inliers of a pose give, if there are some."""
+    """Return the pose that the outliers of a pose give, none if they are few."""
     others = np.flatnonzero(~pose.inliers)
     if not len(others) >= RIVAL * pose.num_inliers > 0:
         return []

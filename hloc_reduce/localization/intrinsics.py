@@ -143,10 +143,10 @@ def infer_all(
 
 
 def of_another_size(image_dir: Path, names: Iterable[str]) -> list[str]:
-    """Return photos whose longer side is not that of most photos of the same lens.
+    """Return photos whose longer side is not that of more than half of the photos of a lens.
 
     They are smaller copies or were cropped: EXIF data, which they keep, do not tell. Several photos
-    of an equal size are another setting of the camera.
+    of an equal size are another setting of the camera, and of a digital zoom EXIF data do tell.
 
     Args:
         image_dir: the folder of the photos.
@@ -154,13 +154,15 @@ def of_another_size(image_dir: Path, names: Iterable[str]) -> list[str]:
     """
     lenses: dict[str, dict[int, list[str]]] = {}
     for name in names:
-        if (exif := exif_camera(image_dir / name)) is not None:
+        exif = exif_camera(image_dir / name)
+        if exif is not None and not exif.zoomed:
             lenses.setdefault(exif.lens, {}).setdefault(max(exif.size), []).append(name)
     return sorted(
         name
         for sides in lenses.values()
         for named in sides.values()
-        if len(named) < WELL_KNOWN <= max(map(len, sides.values()))
+        if len(named) < WELL_KNOWN <= (most := max(map(len, sides.values())))
+        if 2 * most > sum(map(len, sides.values()))
         for name in named
     )
 

@@ -23,7 +23,7 @@ MirrorImages = Callable[[list[str]], tuple[Path, Path]]
 
 
 def is_doubtful(agreement: float, confidence: float) -> bool:
-    """Return whether a trusted pose is so uncertain that the mirror image must be tried, too."""
+    """Return whether a pose is so uncertain that that of the mirror image may be the right one."""
     return agreement < DOUBTFUL[0] or confidence < DOUBTFUL[1]
 
 

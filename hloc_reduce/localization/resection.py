@@ -330,7 +330,7 @@ class _Parameters(NamedTuple):
         return points2D - np.stack([skew * fx / fy * below, np.zeros(len(below))], axis=1)
 
     def moved(self, step: np.ndarray) -> "_Parameters":
-        """Return the view after a step (7 to 12,) of the free parameters."""
+        """Return the parameters after a step (7 to 12,) of the free ones."""
         turn = pycolmap.Rotation3d(step[:3]).matrix()
         step = np.pad(step, (0, SKEW - len(step)))
         return _Parameters(

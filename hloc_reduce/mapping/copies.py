@@ -72,12 +72,13 @@ def _count(
         ray, moved = xyz[its] - centres[i], centres - centres[i]
         squared = (ray**2).sum(axis=1)
         near = np.flatnonzero((moved**2).sum(axis=1) <= REACH**2 * squared.max(initial=0))
-        # from the centres that are near: the ray to each point is `ray - moved`
+        # from a centre that is near, the ray to each point is `ray - moved`
         along = moved[near] @ ray.T
-        cosine = squared - along  # times both distances, like this the following
-        others = np.maximum(squared - 2 * along + (moved[near] ** 2).sum(axis=1)[:, None], 0)
-        alike = (cosine > 0) & (cosine**2 > np.cos(np.radians(ANGLE)) ** 2 * squared * others)
-        alike &= (others > squared / DISTANCE**2) & (others < squared * DISTANCE**2)
+        product = squared - along  # of both rays
+        its_squared = squared - 2 * along + (moved[near] ** 2).sum(axis=1)[:, None]
+        least = np.cos(np.radians(ANGLE)) ** 2 * squared * its_squared
+        alike = (product > 0) & (product**2 > least)
+        alike &= (its_squared > squared / DISTANCE**2) & (its_squared < squared * DISTANCE**2)
         wanted = alike & inside[np.ix_(near, its)]
         expected[i, near] = np.count_nonzero(wanted, axis=1)
         shared[i, near] = np.count_nonzero(wanted & seen[np.ix_(near, its)], axis=1)

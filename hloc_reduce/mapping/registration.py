@@ -1,5 +1,6 @@
 """Which images are in a model of photos alone, and what to say about the others."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 from .. import logger
@@ -71,15 +72,27 @@ def _left_out(dropped: dict[str, str], missing: list[str]) -> str:
     return " ".join(said)
 
 
-def check(sfm_dir: Path, accept_partial: bool) -> None:
+def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -> None:
     """Report which images are missing from a model.
+
+    Args:
+        sfm_dir: folder of the model.
+        accept_partial: whether it may have fewer than half of the images.
+        left_out: images that it was not to have; they are reported elsewhere.
 
     Raises:
         InputError: if it has fewer than half of the images, unless `accept_partial`.
     """
     state = provenance.read(sfm_dir / REGISTRATION)
     missing, number, spread = state["missing"], state["images"], state.pop("spread", 1.0)
-    registered = number - len(missing)
+    registered, everything = number - len(missing), number + len(left_out)
+    if left_out and registered < LEAST * everything and not accept_partial:
+        raise InputError(
+            f"Only {registered} of {everything} photos are in the map. Left out: "
+            f"{cli.some(sorted(left_out), NAMED)}, because they are mirrored, or their size, focal "
+            "length or principal point is not that of the others. Use photos as the camera took "
+            "them. To use the map as it is, run again with --accept_partial."
+        )
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
         if state["alike"] and spread > SPREAD:
             logger.warning(

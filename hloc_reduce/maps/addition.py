@@ -84,7 +84,6 @@ class Addition:
         self.descriptors = self.folder / self.built.descriptors.name
         self.matches = self.folder / "matches.h5"
         self.inside = sorted(image.name for image in self.sfm.images.values())
-        self.references = [name for name in self.inside if name not in self.built.misplaced]
 
     def begin(self, names: list[str], posed: bool) -> list[str]:
         """Return the photos that are new; begin anew unless their addition was interrupted."""
@@ -173,7 +172,7 @@ class Addition:
         left, number = list(inferred), 0
         while left:
             number += 1
-            pairs = self._pairs(left, sorted([*self.references, *self.added]), f"round{number}")
+            pairs = self._pairs(left, sorted([*self.inside, *self.added]), f"round{number}")
             queries: list[tuple[str, pycolmap.Camera | None]] = [
                 (name, inferred[name][0]) for name in left
             ]

@@ -38,7 +38,7 @@ from .map import FINISHED, RETRIEVAL, SFM, Map, models, with_projection
 MORE = "-keypoints_colmap"  # also of its features
 FURTHER = "-further"  # with the same keypoints as the first one
 UNMIRRORED = "-unmirrored"  # without the mirrored photos of another attempt
-UNCROPPED = "-uncropped"  # without the photos whose intrinsics do not fit those of the others
+ALIKE = "-alike"  # without photos whose intrinsics are unlike those of the others
 OWN = "-per_image"  # with a camera for each photo
 MIRRORED = "mirrored"  # folder of what is known of mirror images
 ROUNDS = 3  # of additional pairs, in which larger sets of photos get connected
@@ -48,8 +48,8 @@ ROUNDS = 3  # of additional pairs, in which larger sets of photos get connected
 class Building:
     """A map that is being built; `names` loses images that cannot be read.
 
-    `matches` are its match files by the names of their feature files. `mirrored` and `cropped` are
-    images that are left out.
+    `matches` are its match files by the names of their feature files. `mirrored` and
+    `unlike_others` are images that are left out; `names` has not those of another size.
     """
 
     folder: RunFolder
@@ -62,7 +62,7 @@ class Building:
     camera_mode: pycolmap.CameraMode
     matches: dict[str, Path] = field(default_factory=dict)
     mirrored: list[str] = field(default_factory=list)
-    cropped: list[str] = field(default_factory=list)
+    unlike_others: list[str] = field(default_factory=list)
 
     def build(
         self,
@@ -78,17 +78,17 @@ class Building:
         if model is not None and reference is not None:
             folder, sfm, fit = SFM, self._of_model(conf, model, reference), cropping.NOT_TRIED
         else:
-            self.cropped = intrinsics.of_another_size(self.image_dir, self.names)
-            if self.cropped:
-                logger.info("Left out, as of another size: %s.", cli.some(self.cropped))
+            self.unlike_others = intrinsics.of_another_size(self.image_dir, self.names)
+            self.names = self._kept
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
-            registration.check(self.folder.path / folder, self.accept_partial)
+            left_out = {*self.mirrored, *self.unlike_others}
+            registration.check(self.folder.path / folder, self.accept_partial, left_out)
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
         names = {sfm.images[i].name for i in sfm.reg_image_ids()}
-        cameras = intrinsics.of_map(sfm, self.image_dir, names)
+        cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
         summary = {
             "id": uuid.uuid4().hex,
             "feature": feature,
@@ -99,14 +99,14 @@ class Building:
             "conf": with_projection(conf, lambda path: Path(path).name),
             "keypoints": keypoints,
             "sfm": folder,
-            "images": len(self.names),
+            "images": len({*self.names, *self.unlike_others}),
             "images_with_pose": sfm.num_reg_images(),
             "images_contradicting_others": contradicting,
             "images_of_uncertain_position": uncertain,
             "gain_of_free_principal_points": fit.gain,
             "images_altered": fit.altered,
             "images_mirrored": self.mirrored,
-            "images_cropped": self.cropped,
+            "images_unlike_others": self.unlike_others,
             "points3D": sfm.num_points3D(),
             **intrinsics.to_dict(cameras),
             "seconds": self.folder.seconds(),
@@ -142,7 +142,7 @@ class Building:
     @property
     def _kept(self) -> list[str]:
         """The images that are not left out."""
-        left_out = {*self.mirrored, *self.cropped}
+        left_out = {*self.mirrored, *self.unlike_others}
         return [name for name in self.names if name not in left_out]
 
     def _of_photos_alone(self, conf: dict) -> tuple[str, dict, pycolmap.Reconstruction]:
@@ -185,6 +185,7 @@ class Building:
                 found.clear()
                 attempt(f"{folder}{UNMIRRORED}", conf)
         if not found:
+            cropping.warn(cropping.NOT_TRIED, self.unlike_others)
             mirrored_photos.warn(self.mirrored)
             raise errors[-1]
         return found[0]
@@ -202,8 +203,8 @@ class Building:
     ) -> tuple[str, pycolmap.Reconstruction, cropping.Fit]:
         """Reconstruct again if the photos do not fit.
 
-        First with a camera for each photo, if they share some; then without those whose intrinsics
-        are not like the others'.
+        First with a camera for each photo, if they share some; then without the fewer than half
+        whose intrinsics are unlike those of the others.
 
         Args:
             conf: configuration of the features.
@@ -235,13 +236,13 @@ class Building:
             logger.info("Trying again with a camera for each photo.")
             if found := attempt(OWN, pycolmap.CameraMode.PER_IMAGE):
                 return found
-        if fit.altered:
+        if 0 < 2 * len(fit.altered) < sfm.num_reg_images():
             logger.info("Trying again without %s.", cli.some(fit.altered))
-            before = self.cropped
-            self.cropped = sorted([*before, *fit.altered])
-            if found := attempt(UNCROPPED, self.camera_mode):
+            before = self.unlike_others
+            self.unlike_others = sorted([*before, *fit.altered])
+            if found := attempt(ALIKE, self.camera_mode):
                 return found
-            self.cropped = before
+            self.unlike_others = before
         return folder, sfm, fit
 
     def _fit(self, sfm: pycolmap.Reconstruction) -> cropping.Fit:

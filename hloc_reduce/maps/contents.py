@@ -111,7 +111,7 @@ def _of_folder(path: Path) -> Contents:
     built = Map(path)
     matcher = matchers_confs.confs[built.matcher]["model"]
     reference = SfmMap(colmap.read_model(built.sfm))
-    names = built.references()
+    names = sorted(reference.images)
     engine = TorchEngine(
         *(extractors.load(built.conf["model"]), matcher),
         *(read_vocabulary(built.vocabulary), built.storage),

@@ -136,19 +136,19 @@ def _adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool) 
     return sfm.compute_mean_reprojection_error()
 
 
-def warn(fit: Fit, cropped: list[str]) -> None:
+def warn(fit: Fit, unlike_others: list[str]) -> None:
     """Warn of photos that may be cropped.
 
     Args:
         fit: of the map, from `find`.
-        cropped: photos that were left out of it.
+        unlike_others: photos that were left out of it.
     """
-    if cropped:
+    if unlike_others:
         logger.warning(
-            "Photos that were cropped or enlarged, or are smaller copies, are not in the map: %s. "
-            "Their size, focal length or principal point is not that of the others. Use photos as "
-            "the camera took them. map.json lists all of them.",
-            cli.some(cropped),
+            "Left out of the map, because their size, focal length or principal point is not that "
+            "of the other photos: %s. Either these or the others were cropped or resized: use "
+            "photos as the camera took them. map.json lists all that are left out.",
+            cli.some(unlike_others),
         )
     if fit.altered:
         logger.warning(

@@ -173,7 +173,7 @@ def _finish(
         "gain_of_free_principal_points": 0.0,
         "images_altered": [],
         "images_mirrored": [],
-        "images_cropped": [],
+        "images_unlike_others": [],
         "points3D": reference.num_points3D(),
         **intrinsics.to_dict(cameras),
         "seconds": folder.seconds(),

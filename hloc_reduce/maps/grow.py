@@ -115,7 +115,7 @@ def remove(built: Map, names: Iterable[str]) -> Map:
             extension.remove(sfm, removed)
             if not sfm.num_points3D():
                 raise InputError(f"No point of the map {built.folder} would be left.")
-        if removed & {*inside, *built.mirrored}:
+        if removed & {*inside, *built.mirrored, *built.unlike_others}:
             _commit(built, sfm, -len(removed), removed=removed)
         for path in (built.features, built.descriptors):
             merge(path, [path], removed)
@@ -162,10 +162,11 @@ def _commit_addition(addition: Addition) -> None:
     known = provenance.read(built.folder / FINGERPRINTS)
     new = {f"{IMAGES}{name}": addition.fingerprints[f"{IMAGES}{name}"] for name in addition.added}
     provenance.write(built.folder / FINGERPRINTS, known | new)
-    cameras = intrinsics.of_map(addition.sfm, addition.image_dir, addition.added)
+    alike = {*addition.added} - {*built.unlike_others}
+    cameras = intrinsics.of_map(addition.sfm, addition.image_dir, alike)
     more = len(new.keys() - known.keys())
     _commit(built, addition.sfm, more, addition.added, cameras=cameras)
-    logger.info("%d photos were added to the map %s.", len(addition.added), built.folder)
+    logger.info("Photos added to the map %s: %d.", built.folder, len(addition.added))
 
 
 def _commit(
@@ -217,7 +218,7 @@ def _commit(
         "gain_of_free_principal_points": fit.gain,
         "images_altered": fit.altered,
         "images_mirrored": sorted({*built.mirrored} - {*added} - {*removed}),
-        "images_cropped": sorted({*built.cropped} - {*added} - {*removed}),
+        "images_unlike_others": sorted({*built.unlike_others} - {*added} - {*removed}),
         "points3D": sfm.num_points3D(),
     }
     if cameras is not None:

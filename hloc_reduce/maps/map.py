@@ -43,9 +43,7 @@ class Map:
         contradicting: images whose poses contradict the others.
         uncertain: images whose positions are uncertain, see `precision.find`.
         cropping: how much better the images fit with other intrinsics.
-        cropped: images that are left out, as they may be cropped.
-        misplaced: images that may be misplaced: those that contradict the others, or have other
-            intrinsics.
+        unlike_others: images that are left out, as their intrinsics are unlike those of the others.
         mirrored: images without a pose, as they are mirrored.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
@@ -86,8 +84,7 @@ class Map:
         self.uncertain = {str(name): float(share) for name, share in found}
         gain = float(content.get("gain_of_free_principal_points", 0))
         self.cropping = cropping.Fit(gain, list(content.get("images_altered", [])))
-        self.cropped = list(content.get("images_cropped", []))
-        self.misplaced = {*self.contradicting, *self.cropping.altered}
+        self.unlike_others = list(content.get("images_unlike_others", []))
         self.mirrored = list(content.get("images_mirrored", []))
         self.num_points3D = int(content["points3D"])
         self.camera_mode = content.get("camera_mode")
@@ -167,26 +164,12 @@ class Map:
         """Warn of what may be wrong with the map, as was found when it was built."""
         contradictions.warn(self.contradicting)
         precision.warn(self.uncertain)
-        cropping.warn(self.cropping, self.cropped)
+        cropping.warn(self.cropping, self.unlike_others)
         mirrored_photos.warn(self.mirrored)
 
     def names(self) -> list[str]:
         """List the images that have a pose."""
         return sorted(image.name for image in colmap.read_model(self.sfm).images.values())
-
-    def references(self) -> list[str]:
-        """List the images by which photos are localized: all but those that may be misplaced.
-
-        Raises:
-            InputError: if there are none.
-        """
-        found = [name for name in self.names() if name not in self.misplaced]
-        if not found:
-            raise InputError(
-                f"No photo can be localized in the map {self.folder}: all of its own may be "
-                f"misplaced, see {FINISHED}. Build it of other photos, or with other poses."
-            )
-        return found
 
 
 def models(names: Iterable[str]) -> set[str]:

@@ -75,7 +75,7 @@ def collect(sfm: pycolmap.Reconstruction, features: Path) -> Points:
         InputError: when an image has other features, or the map has no points.
     """
     ids = np.array(sorted(sfm.point3D_ids()), np.int64)
-    images = {sfm.images[i].name: sfm.images[i] for i in sfm.reg_image_ids()}
+    images = {image.name: image for image in sfm.images.values()}
     names = sorted(images)
     visible, cells, sums = [], [], np.zeros((len(ids), dimension(features)), np.float32)
     for name in progress(names, "Collecting points", "image"):

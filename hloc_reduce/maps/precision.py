@@ -45,8 +45,8 @@ def warn(uncertain: dict[str, float]) -> None:
     if uncertain:
         named = [f"{name} ({share:.0%})" for name, share in uncertain.items()]
         logger.warning(
-            "These positions are uncertain by more than %.0f %% of their distance: %s. "
-            "Queries near them may be localized as far off. More photos between them and the "
+            "The positions of these photos are uncertain by more than %.0f %% of their distance: "
+            "%s. Queries near them may be localized as far off. More photos between them and the "
             "others help, or intrinsics: a COLMAP model, EXIF data, or --camera_mode single.",
             *(100 * MAX_POSITION, cli.some(named)),
         )

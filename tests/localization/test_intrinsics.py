@@ -110,8 +110,13 @@ def test_photos_of_another_size_by_the_same_lens(tmp_path):
     assert intrinsics.of_another_size(tmp_path, ["0.jpg", "1.jpg", "crop.jpg"]) == []
     for i in range(3):
         write_photo(tmp_path / f"half{i}.jpg", size=(240, 180))
+    write_photo(tmp_path / "zoomed.jpg", size=(200, 150), zoom=2)  # has a camera of its own
     names = [path.name for path in tmp_path.iterdir()]
     assert intrinsics.of_another_size(tmp_path, names) == ["crop.jpg"]
+    for i in range(3, 5):  # no size is that of most
+        write_photo(tmp_path / f"half{i}.jpg", size=(240, 180))
+    names = [path.name for path in tmp_path.iterdir()]
+    assert intrinsics.of_another_size(tmp_path, names) == []
 
 
 def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):

@@ -5,7 +5,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hloc_reduce.localization import absolute_pose
+from hloc_reduce.localization import absolute_pose, resection
 from hloc_reduce.localization.absolute_pose import Pose
 from hloc_reduce.localization.confidence import (
     DEFAULT_GATE,
@@ -124,6 +124,16 @@ def test_wrong_matches_near_a_wrong_start_do_not_keep_it(wrong):
     found = resect_anew(points2D, points3D, start.cam_from_world, pinhole, 12.0)
     assert found.inliers[:300].all()
     assert np.degrees((found.cam_from_world * POSE.inverse()).rotation.angle()) < 0.5
+
+
+@pytest.mark.parametrize(("photo", "searches"), [("whole", 1), ("squeezed", 2)])
+def test_a_search_that_gains_nothing_is_the_last_one(photo, searches, monkeypatch):
+    camera, calls, search = PHOTOS[photo], [], resection._search
+    points2D, points3D = matches(camera, 300)
+    start = camera_of(camera.width, camera.height, [1400, 1400, 800, camera.height / 2], "PINHOLE")
+    monkeypatch.setattr(resection, "_search", lambda *given: calls.append(1) or search(*given))
+    found = resect_anew(points2D, points3D, POSE, start, 12.0)
+    assert found.inliers[:300].all() and len(calls) == searches
 
 
 @pytest.mark.parametrize("photo", ["left two thirds", "corner", "squeezed"])

@@ -1,5 +1,7 @@
 """Sides of a place that a mapper put one upon the other."""
 
+import itertools
+
 import numpy as np
 import pycolmap
 import pytest
@@ -67,6 +69,29 @@ def test_photos_that_are_too_far_away_are_not_compared(monkeypatch):
     monkeypatch.setattr(copies, "REACH", np.inf)
     for part, whole in zip((expected, shared), copies._count(model, images), strict=False):
         assert np.array_equal(part, whole)
+
+
+def test_points_are_expected_from_similar_directions_and_distances():
+    model = two_sides(100, turn=30.0)
+    images = list(model.images.values())
+    for image in images[::3]:
+        image.frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(), [0, 0, 3]) * (
+            image.cam_from_world()
+        )
+    ids = sorted(model.points3D)
+    xyz = np.array([model.points3D[i].xyz for i in ids])
+    seen = [np.isin(ids, [p.point3D_id for p in image.points2D]) for image in images]
+    rays = [xyz - image.projection_center() for image in images]
+    length = [np.linalg.norm(ray, axis=1) for ray in rays]
+    expected = np.zeros((len(images), len(images)))
+    for i, j in itertools.permutations(range(len(images)), 2):
+        angle = np.degrees(np.arccos((rays[i] * rays[j]).sum(axis=1) / length[i] / length[j]))
+        ratio = np.maximum(length[i] / length[j], length[j] / length[i])
+        wanted = seen[i] & (angle < copies.ANGLE) & (ratio < copies.DISTANCE)
+        expected[i, j] = (wanted & copies._inside(images[j], xyz)).sum()
+    counted, _, _ = copies._count(model, images)
+    assert 0 < (expected > 0).sum() < len(images) ** 2 - len(images)
+    assert np.array_equal(counted, expected + expected.T)
 
 
 def test_some_of_the_points_are_enough(monkeypatch):

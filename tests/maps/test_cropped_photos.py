@@ -1,20 +1,24 @@
-"""Photos of a map that were cropped, enlarged or misplaced: none is localized by them."""
-
-import json
+"""Photos that were cropped or enlarged: maps of photos alone do without them."""
 
 import pytest
 from conftest import FOCAL
 from PIL import Image
 
-from hloc_reduce import Localizer, compact, maps
-from hloc_reduce.maps import cropping
-from hloc_reduce.utils import parsers
+from hloc_reduce import Localizer, maps
+from hloc_reduce.mapping import registration
+from hloc_reduce.maps import build, cropping
+from hloc_reduce.runtime import provenance
+from hloc_reduce.utils.cli import InputError
 from pipelines import localize
 
 PIPELINE = localize
+STATE = {"missing": [], "parts": [[]], "unmatched": [], "implausible": {}, "alike": False}
 
 
-def test_a_photo_of_another_size_by_the_same_camera_is_left_out(plane, tmp_path, caplog, run):
+@pytest.mark.parametrize("most", [100, 2])
+def test_a_photo_of_another_size_by_the_same_camera_is_left_out(
+    plane, tmp_path, most, monkeypatch, caplog, run
+):
     """It may be a smaller copy, or cropped: EXIF data, which it keeps, do not tell."""
     images, outputs = plane / "images", tmp_path / "outputs"
     for path in sorted(images.iterdir()):
@@ -25,57 +29,50 @@ def test_a_photo_of_another_size_by_the_same_camera_is_left_out(plane, tmp_path,
             part = photo.crop((0, 0, 252, 189)) if path.stem == "1" else photo
             part.save(path.with_suffix(".jpg"), quality=95, exif=exif)
         path.unlink()
+    monkeypatch.setattr(build, "MAX_EXHAUSTIVE", most)
     run("--map_images", images, "--outputs", outputs, "--camera_mode", "single")
     built = maps.Map(outputs / "map")
-    assert built.cropped == ["1.jpg"]
+    assert built.unlike_others == ["1.jpg"]
     assert built.names() == ["0.jpg", "2.jpg", "3.jpg", "4.jpg"]
-    assert "are smaller copies, are not in the map: 1.jpg." in caplog.text
+    assert "Left out of the map, because their size" in caplog.text
     info = Localizer(built.folder).localize(images / "1.jpg")[1]
     assert "1.jpg" not in info["retrieved"] and info["intrinsics"] == "unknown"
 
 
-@pytest.mark.parametrize("others_fit", [True, False])
+@pytest.mark.parametrize(
+    ("altered", "others_fit"),
+    [(["1.png"], True), (["1.png"], False), (["1.png", "2.png", "4.png"], True)],
+)
 def test_a_map_is_built_again_without_altered_photos(
-    plane, tmp_path, others_fit, monkeypatch, caplog, run
+    plane, tmp_path, altered, others_fit, monkeypatch, caplog, run
 ):
+    """If they are fewer than half, and the others fit."""
+
     def find(sfm):
         whole = sfm.num_reg_images() == 5
         fits = not whole and others_fit
-        return cropping.Fit(0.0, []) if fits else cropping.Fit(0.4, ["1.png"] if whole else [])
+        return cropping.Fit(0.0, []) if fits else cropping.Fit(0.4, altered if whole else [])
 
     monkeypatch.setattr(cropping, "find", find)
     outputs = tmp_path / "outputs"
     run("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
     built = maps.Map(outputs / "map")
-    others = ["0.png", "2.png", "3.png", "4.png"]
     [sfm] = [path.name for path in built.folder.glob("sfm*")]
-    if others_fit:
-        assert built.cropped == ["1.png"] and built.names() == others and sfm == "sfm-uncropped"
-        assert "are not in the map: 1.png." in caplog.text and "may be wrong" not in caplog.text
+    if others_fit and len(altered) == 1:
+        assert built.unlike_others == altered and sfm == "sfm-alike"
+        assert built.names() == ["0.png", "2.png", "3.png", "4.png"]
+        assert "other photos: 1.png." in caplog.text and "may be wrong" not in caplog.text
     else:
-        assert not built.cropped and len(built.names()) == 5 and sfm == "sfm"
+        assert not built.unlike_others and len(built.names()) == 5 and sfm == "sfm"
         assert "The map may be wrong." in caplog.text
-    assert built.references() == others
 
 
-def test_photos_that_may_be_misplaced_localize_no_others(place, tmp_path, run, refused):
-    build, images, outputs = place
-    new = "--query_images", images / "query/day"
-    run(*build, *new)
-    file = outputs / "map/map.json"
-    content = json.loads(file.read_text())
-    content |= {"images_altered": ["db/2.png"], "images_contradicting_others": ["db/0.png"]}
-    file.write_text(json.dumps(content))
-    compact.main(tmp_path / "place.hlm", outputs / "map")
-    again = "--map", outputs / "map", *new, "--outputs", outputs
-    run(*again, "--overwrite")
-    photo = images / "query/day/a.png"
-    for localizer in (Localizer(outputs / "map"), Localizer(tmp_path / "place.hlm")):
-        pose, info = localizer.localize(photo)
-        assert {*info["retrieved"]} == {"db/1.png", "db/3.png"} and pose is not None
-    [pairs] = outputs.glob("queries-day/pairs-*.txt")
-    assert {*parsers.parse_retrieval(pairs)["a.png"]} == {"db/1.png", "db/3.png"}
-
-    content["images_altered"] = maps.Map(outputs / "map").names()
-    file.write_text(json.dumps(content))
-    assert "all of its own may be misplaced" in refused(*again)
+def test_fewer_than_half_are_accepted_on_demand(tmp_path, caplog):
+    provenance.write(tmp_path / registration.REGISTRATION, {**STATE, "images": 3})
+    with pytest.raises(
+        InputError, match="Only 3 of 7 photos are in the map. Left out: a.jpg, b.jpg"
+    ):
+        registration.check(tmp_path, False, {"d.jpg", "c.jpg", "b.jpg", "a.jpg"})
+    registration.check(tmp_path, True, {"d.jpg", "c.jpg", "b.jpg", "a.jpg"})
+    registration.check(tmp_path, False, {"c.jpg", "b.jpg", "a.jpg"})
+    assert not caplog.text

@@ -7,6 +7,7 @@ import shutil
 import signal
 
 import cv2
+import h5py
 import numpy as np
 import pycolmap
 import pytest
@@ -54,21 +55,31 @@ def poses(folder):
     return {image.name: image.cam_from_world().matrix().tolist() for image in images}
 
 
-def test_a_photo_that_was_mirrored_is_added(grown, run):
+@pytest.mark.parametrize("key", ["images_mirrored", "images_unlike_others"])
+def test_a_photo_that_was_left_out_is_added_and_removed(key, grown, tmp_path, run):
     folder, new, model = grown
     content = provenance.read(folder / "map.json")
-    provenance.write(folder / "map.json", {**content, "images_mirrored": ["left.jpg", NEW]})
-    run("--map", folder, "--add_images", new, "--add_model", model)
-    assert maps.Map(folder).mirrored == ["left.jpg"] and NEW in names(folder)
-
-
-def test_a_mirrored_photo_is_removed(grown, tmp_path, run):
-    folder, new, model = grown
+    provenance.write(folder / "map.json", {**content, key: ["left.jpg", NEW]})
     run("--map", folder, "--add_images", new, "--add_model", model)
     content = provenance.read(folder / "map.json")
-    provenance.write(folder / "map.json", {**content, "images_mirrored": ["left.jpg", NEW]})
+    assert content[key] == ["left.jpg"] and NEW in names(folder)
+    provenance.write(folder / "map.json", {**content, key: ["left.jpg", NEW]})
     run("--map", folder, "--remove_images", write(tmp_path / "list.txt", f"{NEW}\n"))
-    assert maps.Map(folder).mirrored == ["left.jpg"]
+    assert provenance.read(folder / "map.json")[key] == ["left.jpg"]
+
+
+def test_a_photo_that_is_only_left_out_is_removed(grown, tmp_path, refused, run):
+    """It has features, like all photos of the folder, and is in no model."""
+    folder, _, _ = grown
+    content = provenance.read(folder / "map.json")
+    features = maps.Map(folder).features
+    with h5py.File(features, "a") as file:
+        file.copy(file[BASE[0]], NEW)
+    provenance.write(folder / "map.json", {**content, "images_unlike_others": [NEW]})
+    arguments = "--map", folder, "--remove_images", write(tmp_path / "list.txt", f"{NEW}\n")
+    run(*arguments)
+    assert provenance.read(folder / "map.json")["images_unlike_others"] == []
+    assert "has no photo" in refused(*arguments)
 
 
 def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):
