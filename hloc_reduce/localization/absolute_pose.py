@@ -40,8 +40,9 @@ UNCLEAR = 1.05  # above it, the other intrinsics may be right; 1 if the photo ma
 RIGHT = 1.1  # above it, the other intrinsics are right
 # multiples of MAX_POSITION and MAX_ROTATION
 PRECISE = 0.6, 1.0  # uncertainty of a pose; one error in ten is more than 1.9 times as large
+ESTIMATED = 0.4, 1.0  # the same, with all intrinsics estimated
 TOLERANT = 1.2  # between poses with listed and other focal lengths: many lists are 5 % off
-CROPPED = 3.0, 2.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
+CROPPED = 3.0, 1.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
 ZOOMED = 1.2  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
 LISTED = 0.1, 50.0  # range of listed focal lengths, in longer sides
 # distances of the principal point from the centre, as shares of the size
@@ -343,7 +344,8 @@ def _refusal(
 def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d) -> str | None:
     """Return how the inliers fail to determine a pose, None if they determine it."""
     inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
-    limits = [(pose.degrees_of_freedom, PRECISE, "the inliers do not fix the pose: its")]
+    precise = ESTIMATED if pose.degrees_of_freedom == ALL else PRECISE
+    limits = [(pose.degrees_of_freedom, precise, "the inliers do not fix the pose: its")]
     if matches.may_be_cropped(pose):
         reason = "it may be cropped, and without its intrinsics its"
         limits.append((ALL, CROPPED, reason))

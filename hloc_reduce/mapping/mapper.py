@@ -9,11 +9,13 @@ import pycolmap
 
 from .. import logger
 from ..runtime import provenance
-from ..utils import colmap
+from ..utils import cli, colmap
 from . import copies, epipolar
 from . import database as databases
 from .plausibility import (
+    COPY,
     MAX_DISTORTION,
+    MISPLACED,
     SPREAD,
     VIEWPOINTS,
     Models,
@@ -118,14 +120,18 @@ class Mapper:
         number = len(self.names)
         enough = number if number <= FEW else ENOUGH * number
         enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
-        best: Models = [], {}
-        for attempt, changed in enumerate(self.attempts, start=1):
+
+        def attempted(changed: dict) -> Models:
             options = colmap.mapper_options(changed)
             found = colmap.incremental_mapping(
                 database, self.image_dir, folder, options, self.verbose
             )
             shutil.rmtree(folder, ignore_errors=True)
-            best = max(best, keep_plausible(found, *evidence), key=lambda both: _size(both[0]))
+            return keep_plausible(found, *evidence)
+
+        best: Models = [], {}
+        for attempt, changed in enumerate(self.attempts, start=1):
+            best = max(best, attempted(changed), key=lambda both: _size(both[0]))
             registered = _size(best[0])[0]
             logger.info(
                 "Attempt %d of up to %d: %d of %d images reconstructed.",
@@ -133,6 +139,15 @@ class Mapper:
             )
             if registered >= enough:
                 break
+        models, dropped = best
+        lenses = {name for name, what in dropped.items() if what not in (MISPLACED, COPY)}
+        if models and lenses:
+            # a photo with an implausible lens has bent the model of the others
+            logger.info("Trying again without %s.", cli.some(sorted(lenses)))
+            names = [name for name in self.names if name not in lenses]
+            others, more = attempted({"image_names": names})
+            if _size(others)[0] >= _size(models)[0]:
+                return others, more | dropped
         return best
 
 

@@ -89,6 +89,8 @@ class Building:
         uncertain = precision.find(sfm) if model is None else {}
         names = {sfm.images[i].name for i in sfm.reg_image_ids()}
         cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
+        if fit.gain > cropping.GAIN:
+            cameras = cameras._replace(known={})  # they may be wrong
         summary = {
             "id": uuid.uuid4().hex,
             "feature": feature,

@@ -8,9 +8,10 @@ import numpy as np
 import pycolmap
 
 from .. import logger
-from ..localization import absolute_pose
+from ..localization import absolute_pose, intrinsics
 from ..localization.confidence import DEFAULT_GATE
 from ..localization.projection import reprojection_errors
+from ..localization.query import merged
 from ..localization.references import SfmMap
 from ..mapping import copies
 from ..runtime import parallel
@@ -47,8 +48,9 @@ def judge(sfm: pycolmap.Reconstruction, matches: Path, names: Collection[str]) -
 
     A photo whose pose agrees with less than half of its matches with points that at least two
     other photos see is localized by these, with the intrinsics of the map. It contradicts the
-    others if that gives a pose elsewhere, with the confidence of a localized query. So do photos
-    that were given wrong poses or that the mapper placed wrongly.
+    others if that gives a pose elsewhere, with the confidence of a localized query, or if unknown
+    intrinsics do, with a pose that is trusted. So do photos that were given wrong poses, or that
+    the mapper placed wrongly, perhaps because they were cropped.
 
     Args:
         sfm: the map.
@@ -124,11 +126,19 @@ def _contradicts(
     errors, _ = reprojection_errors(points2D, points3D, image.cam_from_world(), image.camera)
     if 2 * (errors <= absolute_pose.MAX_ERROR).sum() >= len(errors):
         return False
+    matches = points2D, points3D, images
+
+    def elsewhere(pose: absolute_pose.Pose) -> bool:
+        placed = absolute_pose.Pose(image.cam_from_world(), image.camera, pose.inliers)
+        return absolute_pose.differ(pose, placed, points3D, FAR, TURNED)
+
     config: dict = {"estimation": {"ransac": {"max_error": absolute_pose.MAX_ERROR}}}
-    pose = absolute_pose.estimate(points2D, points3D, images, image.camera, config, DEFAULT_GATE)
-    if pose.num_inliers < DEFAULT_GATE.min_inliers:
-        return False
-    if pose.confidence < DEFAULT_GATE.min_confidence:
-        return False
-    placed = absolute_pose.Pose(image.cam_from_world(), image.camera, pose.inliers)
-    return absolute_pose.differ(pose, placed, points3D, FAR, TURNED)
+    pose = absolute_pose.estimate(*matches, image.camera, config, DEFAULT_GATE)
+    enough = pose.num_inliers >= DEFAULT_GATE.min_inliers
+    if enough and pose.confidence >= DEFAULT_GATE.min_confidence and elsewhere(pose):
+        return True
+    size = np.empty((image.camera.height, image.camera.width), np.uint8)
+    guess, source = intrinsics.infer(size, intrinsics.MapCameras({}, set()))
+    config = merged(config, intrinsics.REFINEMENTS[source])
+    pose = absolute_pose.estimate(*matches, guess, config, DEFAULT_GATE)
+    return pose.refusal is None and elsewhere(pose)
