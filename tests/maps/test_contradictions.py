@@ -1,12 +1,16 @@
 """Photos of a map that the other photos place elsewhere."""
 
 import copy
+import itertools
 import shutil
 
+import h5py
+import numpy as np
 import pycolmap
 import pytest
 
 from hloc_reduce import maps
+from hloc_reduce.maps import contradictions
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
 
@@ -75,3 +79,34 @@ def test_copies_of_a_place_are_named(plane, photos, tmp_path, caplog):
     model = write_model(tmp_path / "both", poses, camera)
     maps.main(tmp_path / "map", plane / "images", model)
     assert "or the place looks the same at two positions" in caplog.text
+
+
+def test_a_cropped_photo_that_the_mapper_misplaced_is_named(tmp_path):
+    """Only with other intrinsics than those of the map do most of its matches agree with a pose."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-1, 1, (300, 3))
+    model, names = pycolmap.Reconstruction(), [f"{i}.jpg" for i in range(6)]
+    shared = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=1000, height=800, params=[1100, 500, 400, 0], camera_id=1
+    )
+    enlarged = pycolmap.Camera(
+        model="PINHOLE", width=1000, height=800, params=[1600, 1600, 800, 650]
+    )
+    for i, name in enumerate(names):
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d([0, 0.1 * i - 0.3, 0]), [0, 0, 4])
+        cropped = name == "3.jpg"
+        pixels = (enlarged if cropped else shared).img_from_cam(pose * points)
+        pixels += generator.normal(0, 0.5, pixels.shape)
+        image = pycolmap.Image(name=name, keypoints=pixels, camera_id=1, image_id=i + 1)
+        colmap.add_image(model, shared, image, shifted(pose, 1.5 * cropped))
+    for row, point in enumerate(points):
+        track = [
+            pycolmap.TrackElement(i + 1, row) for i, name in enumerate(names) if name != "3.jpg"
+        ]
+        model.add_point3D(point, pycolmap.Track(track))
+    matches = tmp_path / "matches.h5"
+    with h5py.File(matches, "w") as file:
+        for first, second in itertools.combinations(names, 2):
+            file[f"{first}/{second}/matches0"] = np.arange(300, dtype=np.int32)
+            file[f"{first}/{second}/matching_scores0"] = np.ones(300, np.float16)
+    assert contradictions.judge(model, matches, names) == ["3.jpg"]

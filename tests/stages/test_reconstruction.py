@@ -94,6 +94,33 @@ def test_further_attempts_where_images_are_missing(scene, matched, tmp_path, mon
     assert attempts == [(6, 30)]
 
 
+@pytest.mark.parametrize("kept", [5, 4])
+def test_a_photo_with_an_implausible_lens_does_not_bend_the_others(
+    scene, matched, tmp_path, monkeypatch, caplog, kept
+):
+    """The others are reconstructed without it, if that loses none of them."""
+    names, pairs, matches = matched
+    mapping, tried = colmap.incremental_mapping, []
+
+    def bent(database, image_dir, output, options, verbose):
+        tried.append(list(options.image_names))
+        models = mapping(database, image_dir, output, options, verbose)
+        bad = models[0].find_image_with_name(names[2])
+        if not tried[-1]:
+            models[0].cameras[bad.camera_id].focal_length *= 50
+        elif kept == 4:
+            models[0].deregister_frame(models[0].find_image_with_name(names[0]).frame_id)
+        return models
+
+    monkeypatch.setattr(colmap, "incremental_mapping", bent)
+    arguments = (tmp_path / "sfm", scene.images, pairs, scene.features, matches)
+    model = reconstruction.main(*arguments, image_list=names, once=True)
+    assert not tried[0] and {*tried[1]} == {*names} - {names[2]}
+    assert model.num_reg_images() == 5
+    assert f"{names[2]} (focal length" in caplog.text
+    assert ("their estimated focal lengths differ" in caplog.text) == (kept == 4)
+
+
 @pytest.mark.parametrize("is_poor", [True, False])
 def test_focal_lengths_that_differ_are_doubted(
     scene, matched, tmp_path, monkeypatch, caplog, is_poor
