@@ -36,7 +36,8 @@ SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the median depth of the inliers
 # ratios of the confidence with other intrinsics to the confidence with the assumed ones
 DISTORTED = 1.02  # above it, the lens has a radial distortion
-UNCLEAR = 1.05  # above it, the other intrinsics may be right; 1 if the photo may be cropped
+UNCLEAR = 1.05  # above it, the other intrinsics may be right
+UNCLEAR_CROPPED = 0.8  # the same, if the photo may be cropped: they have more parameters
 RIGHT = 1.1  # above it, the other intrinsics are right
 # multiples of MAX_POSITION and MAX_ROTATION
 PRECISE = 0.6, 1.0  # uncertainty of a pose; one error in ten is more than 1.9 times as large
@@ -235,7 +236,7 @@ def _calibrate(matches: _Matches, pose: Pose) -> tuple[Pose, str | None]:
         centred = resection.centred(pose.cam_from_world, pose.camera)
         guesses = (image, start), (matches.points2D, centred)
         return pose, _contradiction(matches, pose, other, guesses)
-    unclear = 1.0 if matches.may_be_cropped(assumed) else UNCLEAR
+    unclear = UNCLEAR_CROPPED if matches.may_be_cropped(assumed) else UNCLEAR
     return _choose(assumed, other, points3D, unclear) if other else (assumed, None)
 
 

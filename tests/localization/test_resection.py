@@ -146,13 +146,21 @@ def test_few_matches_of_a_cropped_photo_are_refused_or_right(photo, number):
         assert position < 0.05 and rotation < 2
 
 
-@pytest.mark.parametrize("unclear, is_trusted", [(absolute_pose.UNCLEAR, True), (1.0, False)])
-def test_a_slightly_better_fit_turns_a_photo_that_may_be_cropped(unclear, is_trusted):
+@pytest.mark.parametrize(
+    ("unclear", "confidence", "is_trusted"),
+    [
+        (absolute_pose.UNCLEAR, 103, True),
+        (absolute_pose.UNCLEAR_CROPPED, 103, False),
+        (absolute_pose.UNCLEAR_CROPPED, 90, False),  # 14 of 441 crops, 4 to 8 degrees off
+        (absolute_pose.UNCLEAR_CROPPED, 75, True),
+    ],
+)
+def test_an_equal_fit_turns_a_photo_that_may_be_cropped(unclear, confidence, is_trusted):
     """7 of 98 accepted crops were turned by 5 to 16 degrees: the right pose had fitted better."""
     turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.1, 0])), np.zeros(3))
     inliers, points3D = np.ones(50, bool), matches(WHOLE, 50, wrong=0)[1]
     assumed = Pose(turn * POSE, guessed(1600, 1200), inliers, confidence=100, degrees_of_freedom=7)
-    right = Pose(POSE, WHOLE, inliers, confidence=103, degrees_of_freedom=ALL)
+    right = Pose(POSE, WHOLE, inliers, confidence=confidence, degrees_of_freedom=ALL)
     found, doubt = absolute_pose._choose(assumed, right, points3D, unclear)
     assert found is assumed and (doubt is None) == is_trusted
 
