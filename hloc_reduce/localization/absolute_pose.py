@@ -37,14 +37,14 @@ SAME_POSITION = 0.25  # of the median depth of the inliers
 # ratios of the confidence with other intrinsics to the confidence with the assumed ones
 DISTORTED = 1.02  # above it, the lens has a radial distortion
 UNCLEAR = 1.05  # above it, the other intrinsics may be right
-UNCLEAR_CROPPED = 0.8  # the same, if the photo may be cropped: they have more parameters
+UNCLEAR_CROPPED = 0.8  # the same, if the photo may be cropped: their parameters cost confidence
 RIGHT = 1.1  # above it, the other intrinsics are right
 # multiples of MAX_POSITION and MAX_ROTATION
 PRECISE = 0.6, 1.0  # uncertainty of a pose; one error in ten is more than 1.9 times as large
 ESTIMATED = 0.4, 1.0  # the same, with all intrinsics estimated
 TOLERANT = 1.2  # between poses with listed and other focal lengths: many lists are 5 % off
 CROPPED = 3.0, 1.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
-ZOOMED = 1.2  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
+ZOOMED = 1.15  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
 LISTED = 0.1, 50.0  # range of listed focal lengths, in longer sides
 # distances of the principal point from the centre, as shares of the size
 OFF_CENTRE, CENTRED = 0.15, 0.02
