@@ -319,7 +319,7 @@ def _refusal(
     if pose.cam_from_world is None or pose.confidence < gate.min_confidence:
         return (
             f"{number} inliers of {len(matches)} matches may be chance: confidence "
-            f"{max(0, pose.confidence):.1f}, at least {gate.min_confidence:g} is needed"
+            f"{_down(max(0, pose.confidence), 1)}, at least {gate.min_confidence:g} is needed"
         )
     focal_length = pose.camera.mean_focal_length()
     low, high = focal_lengths(matches.camera, matches.is_focal_length_guessed)
@@ -334,7 +334,7 @@ def _refusal(
     if pose.agreement < least:
         return (
             "the matches of no image agree with the pose: agreement "
-            f"{pose.agreement:.2f}, at least {least:g} is needed"
+            f"{_down(pose.agreement, 2)}, at least {least:g} is needed"
         )
     for other in others:
         if is_rival(pose, other, matches.points3D):
@@ -368,6 +368,11 @@ def _imprecision(matches: _Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d
 def _up(value: float) -> float:
     """Round up to tenths: what is above a limit is not to be printed as the limit."""
     return np.ceil(10 * value) / 10
+
+
+def _down(value: float, digits: int) -> str:
+    """Round down: what is below a limit is not to be printed as the limit."""
+    return f"{np.floor(value * 10**digits) / 10**digits:.{digits}f}"
 
 
 def _is_off_centre(camera: pycolmap.Camera) -> bool:

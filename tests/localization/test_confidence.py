@@ -242,6 +242,21 @@ def test_a_pose_that_no_image_agrees_with_is_refused():
     assert agreement(np.zeros(0, bool), []) == 0
 
 
+def test_values_below_a_limit_are_not_printed_as_the_limit():
+    """A photo was refused with 'agreement 0.86, at least 0.86 is needed'."""
+    given = *matches(60, 20), [np.arange(80)]
+    found = solve(*given)
+    for gate in (
+        Gate(min_agreement=((0, found.agreement + 1e-4),)),
+        Gate(min_confidence=found.confidence + 1e-4),
+    ):
+        refusal = solve(*given, gate=gate).refusal
+        value, least = re.search(
+            r"(?:agreement|confidence) ([\d.]+), at least ([\d.]+)", refusal
+        ).groups()
+        assert float(value) < float(least)
+
+
 def test_in_noisy_photos_fewer_matches_must_agree():
     gate = DEFAULT_GATE.of_matches({}, 64)
     assert gate.of_photo(2.0).min_agreement < gate.of_photo(0.0).min_agreement
