@@ -40,6 +40,7 @@ RULES = {
     "zoomed": databases.ZOOMED,
     "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
     "points": f"{MORE} times as many where focal lengths differ",
+    "lenses": "others without the implausible ones",
     "spread": SPREAD,
     "viewpoints": VIEWPOINTS,
     "misplaced": f"{epipolar.AGREEING} of {epipolar.EVIDENCE} matches or more",

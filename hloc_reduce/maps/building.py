@@ -82,8 +82,7 @@ class Building:
             self.names = self._kept
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
-            left_out = {*self.mirrored, *self.unlike_others}
-            registration.check(self.folder.path / folder, self.accept_partial, left_out)
+            registration.check(self.folder.path / folder, self.accept_partial, self._left_out)
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
@@ -142,9 +141,13 @@ class Building:
         return sfm
 
     @property
+    def _left_out(self) -> set[str]:
+        return {*self.mirrored, *self.unlike_others}
+
+    @property
     def _kept(self) -> list[str]:
         """The images that are not left out."""
-        left_out = {*self.mirrored, *self.unlike_others}
+        left_out = self._left_out
         return [name for name in self.names if name not in left_out]
 
     def _of_photos_alone(self, conf: dict) -> tuple[str, dict, pycolmap.Reconstruction]:
