@@ -91,7 +91,7 @@ def check(
     Raises:
         InputError: see `main`.
     """
-    keypoints, described = database.num_keypoints(), database.num_descriptors()
+    keypoints, described = map(database.numbers, ("keypoints", "descriptors"))
     if not described:
         raise InputError(
             f"{database.path} has no descriptors: give the database that COLMAP extracted the "

@@ -10,6 +10,7 @@ import hashlib
 import re
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from hloc_reduce import compact, extract_features, localize_sfm, maps
 from hloc_reduce.confs import features as features_confs
@@ -80,40 +81,34 @@ def open_map(
     if camera_mode is not None and (map_images is None or model_or_map is not None):
         raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
     mode = colmap.camera_mode(camera_mode or "auto")
+    is_built = model_or_map and (maps.is_map(model_or_map) or maps.is_compact(model_or_map))
+    if is_built and (database or map_images):
+        option = "--database" if database else "--map_images"
+        raise InputError(
+            f"--map {model_or_map} is a map that was built: leave out {option} to localize in it, "
+            "or give the COLMAP model that it was built from."
+        )
+    new: dict[str, Any] = {
+        "feature": feature or features_confs.RECOMMENDED,
+        "projection": projection,
+        "matcher": matcher,
+        "overwrite": overwrite,
+        "storage": storage or STORAGES[0],
+        "keypoints": keypoints or KEYPOINTS[0],
+    }
+    folder = outputs / "map"
     if database is not None:
-        return _of_database(
-            *(outputs, database, model_or_map, map_images, overwrite),
-            {
-                "feature": feature or features_confs.RECOMMENDED,
-                "projection": projection,
-                "matcher": matcher,
-                "storage": storage or STORAGES[0],
-                "keypoints": keypoints or KEYPOINTS[0],
-            },
-        )
-    if map_images is not None:
-        if model_or_map and (maps.is_map(model_or_map) or maps.is_compact(model_or_map)):
+        if model_or_map is None:
             raise InputError(
-                f"--map {model_or_map} is a map that was built: leave out --map_images to localize "
-                "in it, or give the COLMAP model that it was built from."
+                f"Give --map, the COLMAP model that was made from --database {database}."
             )
-        return maps.main(
-            outputs / "map",
-            map_images,
-            model_or_map,
-            feature or features_confs.RECOMMENDED,
-            projection,
-            matcher,
-            num_covis,
-            overwrite,
-            storage or STORAGES[0],
-            keypoints or KEYPOINTS[0],
-            accept_partial,
-            mode,
-        )
+        return maps.from_database.main(folder, database, model_or_map, image_dir=map_images, **new)
+    if map_images is not None:
+        new |= {"num_covis": num_covis, "accept_partial": accept_partial, "camera_mode": mode}
+        return maps.main(folder, map_images, model_or_map, **new)
     if model_or_map is None:
         raise InputError("Give --map_images, the folder of the photos to build a map of.")
-    built = _open(model_or_map, outputs / "map", overwrite)
+    built = _open(model_or_map, folder, overwrite)
     built.warn()
     if feature or projection:
         built.check_feature(feature or features_confs.RECOMMENDED, projection)
@@ -124,27 +119,6 @@ def open_map(
                 f"The map {model_or_map} was built with --{option} {getattr(built, option)}."
             )
     return built
-
-
-def _of_database(
-    outputs: Path,
-    database: Path,
-    model: Path | None,
-    map_images: Path | None,
-    overwrite: bool,
-    options: dict,
-) -> Map:
-    """Build a map from a COLMAP database and its model."""
-    if model is None:
-        raise InputError(f"Give --map, the COLMAP model that was made from --database {database}.")
-    if maps.is_map(model) or maps.is_compact(model):
-        raise InputError(
-            f"--map {model} is a map that was built: leave out --database to localize in it, or "
-            "give the COLMAP model that was made from the database."
-        )
-    return maps.from_database.main(
-        outputs / "map", database, model, overwrite=overwrite, image_dir=map_images, **options
-    )
 
 
 def _open(model_or_map: Path, folder: Path, overwrite: bool) -> Map:

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from hloc_reduce import aggregate_features, pairs_from_retrieval
-from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.maps.map import RETRIEVAL, Map
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.h5 import list_h5_names
@@ -51,7 +50,7 @@ def retrieve(
         return
     source = Path(retrieval)
     if retrieval == "vlad":
-        source = aggregate_features.main(retrieval_confs.confs["vlad"], features, map_names)
+        source = aggregate_features.main(RETRIEVAL, features, map_names)
     of_descriptors = source.suffix in GLOBAL_SUFFIXES
     select = pairs_from_retrieval.main if of_descriptors else pairs_from_retrieval.select
     select(source, output, num_loc, query_list=query_names, db_list=map_names)

@@ -24,16 +24,9 @@ def pose_error(estimated: pycolmap.Rigid3d | None, true: pycolmap.Rigid3d) -> tu
     """
     if estimated is None:
         return FAILED
-    estimated_rotation, true_rotation = estimated.rotation.matrix(), true.rotation.matrix()
-    centre = -estimated_rotation.T @ estimated.translation
-    true_centre = -true_rotation.T @ true.translation
-    difference = estimated_rotation @ true_rotation.T
-    sine = np.linalg.norm(difference - difference.T) / 8**0.5
-    cosine = (np.trace(difference) - 1) / 2
-    return (
-        float(np.linalg.norm(centre - true_centre)),
-        float(np.degrees(np.arctan2(sine, cosine))),
-    )
+    centre, true_centre = (pose.inverse().translation for pose in (estimated, true))
+    degrees = np.degrees(estimated.rotation.angle_to(true.rotation))
+    return float(np.linalg.norm(centre - true_centre)), float(degrees)
 
 
 def status(pose: pycolmap.Rigid3d | None, localized: bool) -> str:

@@ -12,7 +12,7 @@ from ..utils.codes import storage_of
 from ..utils.feature_files import stored_descriptors
 from ..utils.files import replacing
 from ..utils.h5 import list_h5_names, open_h5, stored_bytes
-from ..utils.tables import aligned
+from ..utils.tables import aligned, joined
 from .poses import ERRORS, pose_error, status, summarize_errors
 
 
@@ -131,13 +131,8 @@ def recall_table(feature: str, lists: Mapping[str, dict]) -> str:
     columns = [[feature, "distance [m]", "orient. [deg]", "recall [%]"]]
     for name, summary in lists.items():
         if "recall_percent" in summary:
-            metres, degrees = zip(*summary["thresholds_m_deg"], strict=True)
-            columns.append(
-                [
-                    name.split("_")[0],
-                    " / ".join(f"{value:g}" for value in metres),
-                    " / ".join(f"{value:g}" for value in degrees),
-                    " / ".join(f"{value:.1f}" for value in summary["recall_percent"]),
-                ]
-            )
+            limits = [
+                joined(values, "g") for values in zip(*summary["thresholds_m_deg"], strict=True)
+            ]
+            columns.append([name.split("_")[0], *limits, joined(summary["recall_percent"], ".1f")])
     return aligned(list(zip(*columns, strict=True)), left=0)

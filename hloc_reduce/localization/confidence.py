@@ -1,7 +1,7 @@
 """Tell right poses from chance, and precise poses from uncertain ones."""
 
 from dataclasses import dataclass, replace
-from math import lgamma
+from math import comb, log10
 
 import numpy as np
 import pycolmap
@@ -90,7 +90,7 @@ def confidence(
         chances = np.bincount(place)
         by_chance = np.minimum(1, chances * np.pi * threshold**2 * density[first]).mean()
         tail = _log10_tail(inliers - sample, number - sample, by_chance)
-        poses = _log10_choose(number, sample) + sample * np.log10(chances.mean())
+        poses = log10(comb(number, sample)) + sample * np.log10(chances.mean())
         return poses + np.log10(SOLUTIONS * THRESHOLDS) + tail
 
     thresholds = np.geomspace(min(FINEST * scale, max_error), max_error, THRESHOLDS)
@@ -116,10 +116,6 @@ def _density(points2D: np.ndarray, projected: np.ndarray, camera: pycolmap.Camer
     distance = cKDTree(visible).query(points2D, k=[NEIGHBORS + 1])[0][:, 0]
     share = NEIGHBORS / len(projected)
     return np.maximum(uniform, share / (np.pi * np.maximum(distance, 1) ** 2))
-
-
-def _log10_choose(n: int, k: int) -> float:
-    return (lgamma(n + 1) - lgamma(k + 1) - lgamma(n - k + 1)) / np.log(10)
 
 
 def _log10_tail(successes: int, trials: int, probability: float) -> float:

@@ -18,18 +18,15 @@ ZOOM, FOCAL_35MM, FOCAL_LENGTH = 0xA404, 0xA405, 0x920A
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
 WELL_KNOWN = 3  # images from which the map knows the intrinsics of their camera
 MAX_ZOOM = 1.01
-_REFINED = {"refine_focal_length": True}
+_REFINED = {"refinement": {"refine_focal_length": True}}
+_GUESSED = {"estimation": {"estimate_focal_length": True}, **_REFINED}
 # source of intrinsics -> options of `localize_sfm.main` that make up for their errors
 REFINEMENTS = {
     "list": {},
     "map": {},
-    "EXIF": {"refinement": _REFINED},
-    "guess": {"estimation": {"estimate_focal_length": True}, "refinement": _REFINED},
-    "unknown": {
-        "estimation": {"estimate_focal_length": True},
-        "refinement": _REFINED,
-        "photo": {"cropped": True},
-    },
+    "EXIF": _REFINED,
+    "guess": _GUESSED,
+    "unknown": {**_GUESSED, "photo": {"cropped": True}},
 }
 
 

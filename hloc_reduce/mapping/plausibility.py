@@ -8,7 +8,7 @@ import pycolmap
 
 from .. import logger
 from ..localization.confidence import focal_lengths
-from . import copies
+from . import copies, extension
 from .epipolar import Pair, misplaced
 
 SPREAD = 1.2  # ratio of focal lengths above which one camera for all images is tried
@@ -46,18 +46,17 @@ def keep_plausible(
     for model in models:
         images = [model.images[i] for i in model.reg_image_ids()]
         shared = Counter(image.camera_id for image in images)
-        implausible = {}
+        lenses = {}
         for image in images:
             camera_id = image.camera_id
             lens = _implausible(model.cameras[camera_id], cameras[camera_id], shared[camera_id])
             if lens is not None:
-                implausible[image.name] = lens
-                model.deregister_frame(image.frame_id)
-        if implausible:
-            _keep_connected(model)
-        dropped |= implausible
-        dropped |= dict.fromkeys(_drop_misplaced(model, keypoints or {}, verified or {}), MISPLACED)
-        dropped |= dict.fromkeys(_drop_copies(model), COPY)
+                lenses[image.name] = lens
+        dropped |= _drop(model, lenses)
+        wrong = misplaced(model, keypoints or {}, verified) if verified else []
+        dropped |= _drop(model, dict.fromkeys(wrong, MISPLACED))
+        while found := copies.find(model):
+            dropped |= _drop(model, dict.fromkeys(found, COPY))
     whole = []
     for model in models:
         if min(size(model)) < 2:
@@ -103,33 +102,12 @@ def count_viewpoints(model: pycolmap.Reconstruction) -> int:
     return number
 
 
-def _drop_misplaced(
-    model: pycolmap.Reconstruction,
-    keypoints: Mapping[str, np.ndarray],
-    verified: Mapping[Pair, np.ndarray],
-) -> list[str]:
-    """Drop photos that contradict their matches, see `epipolar.misplaced`; return their names."""
-    dropped = misplaced(model, keypoints, verified) if verified else []
+def _drop(model: pycolmap.Reconstruction, dropped: dict[str, str]) -> dict[str, str]:
+    """Drop photos, and those that only these connect; return the photos."""
     if dropped:
-        _drop(model, set(dropped))
+        extension.remove(model, dropped)
+        _keep_connected(model)
     return dropped
-
-
-def _drop_copies(model: pycolmap.Reconstruction) -> list[str]:
-    """Drop photos that contradict others, see `copies.find`; return their names."""
-    dropped: list[str] = []
-    while found := copies.find(model):
-        dropped += found
-        _drop(model, set(found))
-    return dropped
-
-
-def _drop(model: pycolmap.Reconstruction, names: set[str]) -> None:
-    """Drop photos, and those that only these connect."""
-    for image_id in model.reg_image_ids():
-        if model.images[image_id].name in names:
-            model.deregister_frame(model.images[image_id].frame_id)
-    _keep_connected(model)
 
 
 def _keep_connected(model: pycolmap.Reconstruction) -> None:

@@ -1,7 +1,6 @@
 """The stages by which a map is built, with several attempts for photos without poses."""
 
 import shutil
-import uuid
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +16,6 @@ from .. import (
     pairs_from_exhaustive,
     pairs_from_retrieval,
     pairs_from_verification,
-    projections,
     reconstruction,
     triangulation,
 )
@@ -29,10 +27,9 @@ from ..mapping import mapper, plausibility, registration
 from ..runtime import provenance
 from ..runtime.outputs import RunFolder
 from ..utils import cli, colmap
-from ..utils.files import replacing
 from ..utils.parsers import parse_pairs, write_pairs
 from . import contradictions, cropping, mirrored_photos, precision
-from .map import FINISHED, RETRIEVAL, SFM, Map, models, with_projection
+from .map import FINISHED, RETRIEVAL, SFM, Map, keep_projection, models, write
 
 # suffixes of the models of later attempts
 MORE = "-keypoints_colmap"  # also of its features
@@ -90,33 +87,29 @@ class Building:
         cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
         if fit.gain > cropping.GAIN:
             cameras = cameras._replace(known={})  # they may be wrong
-        summary = {
-            "id": uuid.uuid4().hex,
-            "feature": feature,
-            "matcher": self.matcher,
-            "image_dir": str(self.image_dir.resolve()),
-            "model": str(model.resolve()) if model is not None else None,
-            "camera_mode": self.camera_mode.name.lower() if model is None else None,
-            "conf": with_projection(conf, lambda path: Path(path).name),
-            "keypoints": keypoints,
-            "sfm": folder,
-            "images": len({*self.names, *self.unlike_others}),
-            "images_with_pose": sfm.num_reg_images(),
-            "images_contradicting_others": contradicting,
-            "images_of_uncertain_position": uncertain,
-            "gain_of_free_principal_points": fit.gain,
-            "images_altered": fit.altered,
-            "images_mirrored": self.mirrored,
-            "images_unlike_others": self.unlike_others,
-            "points3D": sfm.num_points3D(),
-            **intrinsics.to_dict(cameras),
-            "seconds": self.folder.seconds(),
-        }
-        provenance.write(self.folder.path / FINISHED, summary)
+        write(
+            *(self.folder.path, conf, sfm, cameras),
+            feature=feature,
+            matcher=self.matcher,
+            image_dir=str(self.image_dir.resolve()),
+            model=str(model.resolve()) if model is not None else None,
+            camera_mode=self.camera_mode.name.lower() if model is None else None,
+            keypoints=keypoints,
+            sfm=folder,
+            images=len({*self.names, *self.unlike_others}),
+            images_contradicting_others=contradicting,
+            images_of_uncertain_position=uncertain,
+            gain_of_free_principal_points=fit.gain,
+            images_altered=fit.altered,
+            images_mirrored=self.mirrored,
+            images_unlike_others=self.unlike_others,
+            seconds=self.folder.seconds(),
+        )
         built = Map(self.folder.path)
         built.warn()
         drop_others(self.folder, built)
-        provenance.write(self.folder.path / FINISHED, {**summary, "bytes": self.folder.bytes()})
+        finished = self.folder.path / FINISHED
+        provenance.write(finished, provenance.read(finished) | {"bytes": self.folder.bytes()})
         return built
 
     def _of_model(
@@ -313,10 +306,9 @@ class Building:
     def _match(self, pairs: Path, features: Path, matches: Path | None = None) -> Path:
         conf = matchers_confs.confs[self.matcher]
         with self.folder.stage("match_map"):
-            if matches is not None:
-                matches = match_features.main(conf, pairs, features, matches=matches)
-            else:
-                matches = match_features.main(conf, pairs, features.stem, self.folder.path)
+            name = f"{features.stem}_{conf['output']}_{pairs.stem}.h5"
+            matches = matches or self.folder.path / name
+            match_features.main(conf, pairs, features, matches=matches)
         self.matches[features.stem] = matches
         return matches
 
@@ -329,15 +321,3 @@ def drop_others(folder: RunFolder, built: Map) -> None:
         begins = f"{name}.h5", f"{name}_matches", f"{RETRIEVAL['output']}_{name}."
         folder.delete(other for other in folder.written if other.startswith(begins))
     folder.delete({MIRRORED, *models(folder.written)} - {built.sfm.name})
-
-
-def keep_projection(conf: dict, folder: Path) -> dict:
-    """Copy the projection of a feature to a folder and return the configuration with the copy."""
-
-    def copy(projection: str) -> str:
-        source, prefix = projections.find(projection), projections.split_prefix(projection)[1]
-        with replacing(folder / source.name) as temporary:
-            shutil.copyfile(source, temporary)
-        return f"{folder / source.name}{prefix and f'@{prefix}'}"
-
-    return with_projection(conf, copy)

@@ -16,8 +16,8 @@ from ..localization.references import SfmMap
 from ..mapping import copies
 from ..runtime import parallel
 from ..utils import cli
-from ..utils.h5 import iterate_h5_names, open_h5
-from ..utils.match_files import get_matches, name_in_pair
+from ..utils.h5 import open_h5
+from ..utils.match_files import get_matches, list_pairs
 from ..utils.progress import progress
 
 OTHERS = 2  # photos that see a point by which another one is judged
@@ -86,14 +86,10 @@ def warn(names: list[str]) -> None:
 
 def _partners(sfm: pycolmap.Reconstruction, matches: Path) -> dict[str, list[str]]:
     """Return for each image of a map those that it was matched with."""
-    names = {name_in_pair(image.name): image.name for image in sfm.images.values()}
-    partners: dict[str, list[str]] = {name: [] for name in names.values()}
-    with open_h5(matches) as file:
-        for pair in iterate_h5_names(file.id):
-            first, _, second = pair.partition("/")
-            if first in names and second in names:
-                partners[names[first]].append(names[second])
-                partners[names[second]].append(names[first])
+    partners: dict[str, list[str]] = {image.name: [] for image in sfm.images.values()}
+    for first, second in list_pairs(matches, partners):
+        partners[first].append(second)
+        partners[second].append(first)
     return partners
 
 

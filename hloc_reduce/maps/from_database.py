@@ -1,6 +1,5 @@
 """Build a map from a COLMAP model and the database it was made from: no photo is read."""
 
-import uuid
 from pathlib import Path
 
 import pycolmap
@@ -12,7 +11,6 @@ from ..detectors.dog import KEYPOINTS
 from ..localization import intrinsics
 from ..mapping import copies
 from ..reduce import Reduction
-from ..runtime import provenance
 from ..runtime.outputs import RunFolder
 from ..utils import colmap
 from ..utils.cli import InputError, no_folder
@@ -21,8 +19,7 @@ from ..utils.colmap import StoredDatabase
 from ..utils.match_files import check_names
 from ..utils.paths import strings_as_paths
 from .build import begin, claim, digests, model_files
-from .building import keep_projection
-from .map import FINISHED, RETRIEVAL, SFM, Map, with_projection
+from .map import FINISHED, RETRIEVAL, SFM, Map, keep_projection, write
 
 
 @strings_as_paths
@@ -72,6 +69,7 @@ def main(
         names = from_colmap.check(opened, reduction, reference)
         check_names(names)
         cameras = _cameras(reference, names, image_dir)
+        told = intrinsics.to_dict(cameras)
         groups = {"database": opened.files(), "model": model_files(model)}
         named = {key: {path.name: path for path in part} for key, part in groups.items()}
         fingerprints, found = digests(map_dir, named)
@@ -79,7 +77,7 @@ def main(
             "feature": extract_features.provenance(conf),
             "matcher": matchers_confs.confs[matcher]["model"],
             **found,
-            "cameras": {"known": _to_lists(cameras), "models": sorted(cameras.models)},
+            "cameras": {"known": told["cameras"], "models": told["camera_models"]},
         }
         inputs = database, model, projection, image_dir
         with claim(map_dir, made_from, overwrite, *inputs) as folder:
@@ -87,20 +85,21 @@ def main(
                 begin(map_dir, fingerprints)
                 logger.info("Building the map %s of %d images.", map_dir, len(names))
                 conf = keep_projection(conf, map_dir)
-                contradicting = _build(
-                    *(folder, opened, reduction, conf, names, reference, model, found)
+                _build(folder, opened, reduction, conf, names, reference, model, found)
+                write(
+                    *(map_dir, conf, reference, cameras),
+                    feature=name,
+                    matcher=matcher,
+                    image_dir=str((image_dir or map_dir / "images").resolve()),
+                    model=str(model.resolve()),
+                    database=str(database.resolve()),
+                    keypoints=keypoints,
+                    images=len(names),
+                    images_with_pose=len(names),
+                    images_contradicting_others=copies.find(reference),
+                    seconds=folder.seconds(),
+                    bytes=folder.bytes(),
                 )
-                about = {
-                    "feature": name,
-                    "matcher": matcher,
-                    "image_dir": str((image_dir or map_dir / "images").resolve()),
-                    "model": str(model.resolve()),
-                    "database": str(database.resolve()),
-                    "conf": with_projection(conf, lambda path: Path(path).name),
-                    "keypoints": keypoints,
-                    "images_contradicting_others": contradicting,
-                }
-                _finish(folder, about, reference, names, cameras)
             built = Map(map_dir)
             built.warn()
             return built
@@ -120,10 +119,6 @@ def _cameras(
     return intrinsics.of_map(reference, image_dir)
 
 
-def _to_lists(cameras: intrinsics.MapCameras) -> dict[str, list]:
-    return {name: intrinsics.to_list(camera) for name, camera in cameras.known.items()}
-
-
 def _build(
     folder: RunFolder,
     database: StoredDatabase,
@@ -133,12 +128,8 @@ def _build(
     reference: pycolmap.Reconstruction,
     model: Path,
     found: dict[str, dict[str, str]],
-) -> list[str]:
-    """Write the features, global descriptors and model of a map.
-
-    Returns:
-        The images whose poses contradict the others.
-    """
+) -> None:
+    """Write the features, global descriptors and model of a map."""
     with folder.stage("extract_features"):
         features = folder.path / f"{conf['output']}.h5"
         from_colmap.write(database, features, reduction, names, found["database"])
@@ -149,34 +140,3 @@ def _build(
         triangulation.replacing_map(folder.path / SFM, found["model"], model) as written,
     ):
         reference.write_binary(written)
-    with folder.stage("judge_poses"):
-        contradicting = copies.find(reference)
-    return contradicting
-
-
-def _finish(
-    folder: RunFolder,
-    about: dict,
-    reference: pycolmap.Reconstruction,
-    names: list[str],
-    cameras: intrinsics.MapCameras,
-) -> None:
-    """Write map.json."""
-    summary = {
-        "id": uuid.uuid4().hex,
-        **about,
-        "camera_mode": None,
-        "sfm": SFM,
-        "images": len(names),
-        "images_with_pose": len(names),
-        "images_of_uncertain_position": {},
-        "gain_of_free_principal_points": 0.0,
-        "images_altered": [],
-        "images_mirrored": [],
-        "images_unlike_others": [],
-        "points3D": reference.num_points3D(),
-        **intrinsics.to_dict(cameras),
-        "seconds": folder.seconds(),
-        "bytes": folder.bytes(),
-    }
-    provenance.write(folder.path / FINISHED, summary)

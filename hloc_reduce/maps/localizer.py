@@ -55,11 +55,8 @@ class Localizer:
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
         self.gate = gate.of_matches(contents.matcher, contents.dim)
-        self.engine, self.reference, self.names = (
-            contents.engine,
-            contents.reference,
-            contents.names,
-        )
+        self.engine, self.reference = contents.engine, contents.reference
+        self.names = contents.names
         self._similarity, self._match = contents.similarity, contents.match
 
     def localize(

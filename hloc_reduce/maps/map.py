@@ -1,17 +1,23 @@
 """Maps to localize in: the points, features and global descriptors of photos, kept in a folder."""
 
 import json
+import shutil
+import uuid
 from collections.abc import Callable, Iterable
 from pathlib import Path
+
+import pycolmap
 
 from .. import aggregate_features, extract_features, projections
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
 from ..localization import intrinsics
+from ..runtime import provenance
 from ..utils import colmap
 from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import STORAGES
+from ..utils.files import replacing
 from ..utils.h5 import file_provenance, open_h5
 from ..utils.paths import strings_as_paths
 from . import contradictions, cropping, mirrored_photos, precision
@@ -190,6 +196,54 @@ def with_projection(conf: dict, change: Callable[[str], str]) -> dict:
     if model.get("projection") is not None:
         model["projection"] = change(model["projection"])
     return {**conf, "model": model}
+
+
+def keep_projection(conf: dict, folder: Path) -> dict:
+    """Copy the projection of a feature to a folder and return the configuration with the copy."""
+
+    def copy(projection: str) -> str:
+        source, prefix = projections.find(projection), projections.split_prefix(projection)[1]
+        with replacing(folder / source.name) as temporary:
+            shutil.copyfile(source, temporary)
+        return f"{folder / source.name}{prefix and f'@{prefix}'}"
+
+    return with_projection(conf, copy)
+
+
+def write(
+    folder: Path,
+    conf: dict,
+    reconstruction: pycolmap.Reconstruction,
+    cameras: intrinsics.MapCameras,
+    **content: object,
+) -> None:
+    """Write map.json, with which a map is finished.
+
+    Args:
+        folder: of the map.
+        conf: configuration of the features.
+        reconstruction: the model.
+        cameras: what the map tells about the intrinsics of other photos.
+        content: what else map.json says, or says differently from that of a map of a given model
+            that contains all images and nothing doubtful.
+    """
+    whole: dict[str, object] = {
+        "id": uuid.uuid4().hex,
+        "camera_mode": None,
+        "sfm": SFM,
+        "images": reconstruction.num_reg_images(),
+        "images_with_pose": reconstruction.num_reg_images(),
+        "images_contradicting_others": [],
+        "images_of_uncertain_position": {},
+        "gain_of_free_principal_points": 0.0,
+        "images_altered": [],
+        "images_mirrored": [],
+        "images_unlike_others": [],
+        "points3D": reconstruction.num_points3D(),
+    }
+    conf = with_projection(conf, lambda path: Path(path).name)
+    content = {**whole, "conf": conf, **intrinsics.to_dict(cameras), **content}
+    provenance.write(folder / FINISHED, content)
 
 
 def is_map(folder: Path) -> bool:

@@ -6,7 +6,6 @@ import numpy as np
 import pycolmap
 
 from ..confs import features as features_confs
-from ..localization import intrinsics
 from ..localization.projection import reprojection_errors
 from ..runtime import provenance
 from ..runtime.group_writer import GroupWriter
@@ -17,7 +16,7 @@ from ..utils.files import announce, file_sha256, replacing
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
 from .compact import CompactMap
-from .map import FINISHED, PLACE, RETRIEVAL, SFM, Map, with_projection
+from .map import FINISHED, PLACE, RETRIEVAL, SFM, Map, write
 
 COMPACT = "compact"  # in the configuration of a folder: the sha256 of the file
 
@@ -78,20 +77,14 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
         temporary.write_bytes(save({"vocabulary": compact.vocabulary}))
     with replacing(folder / PLACE) as temporary:
         temporary.write_text(digest)
-    cameras = compact.cameras
-    content = {
-        "id": digest,
-        "feature": compact.feature,
-        "matcher": compact.matcher,
-        "image_dir": str(folder / "images"),  # there are none
-        "conf": with_projection(conf, lambda path: Path(path).name),
-        "keypoints": features_confs.keypoints_of(conf["model"]) or "adaptive",
-        "sfm": SFM,
-        "images_with_pose": len(compact.names),
-        "points3D": len(compact.points),
-        **intrinsics.to_dict(cameras),
-    }
-    provenance.write(folder / FINISHED, content)
+    write(
+        *(folder, conf, model, compact.cameras),
+        id=digest,
+        feature=compact.feature,
+        matcher=compact.matcher,
+        image_dir=str(folder / "images"),  # there are none
+        keypoints=features_confs.keypoints_of(conf["model"]) or "adaptive",
+    )
 
 
 def _add_image(model: pycolmap.Reconstruction, compact: CompactMap, number: int) -> np.ndarray:

@@ -88,14 +88,13 @@ def of_projection(mlp: network.MLP, metadata: dict, maps: list[Tracks]) -> dict[
 
 
 @strings_as_paths
-def main(projection: Path, maps: dict[str, tuple[Path, Path]], cache: Path, seed: int = 0) -> Path:
+def main(projection: Path, maps: dict[str, tuple[Path, Path]], cache: Path) -> Path:
     """Add levels to the file of a projection, or replace them.
 
     Args:
         projection: the file, with metadata of its training.
         maps: from the name of each map to the folders of its images and its COLMAP model.
         cache: folder for the tracks, which trainings share.
-        seed: of the tracks.
 
     Returns:
         `projection`.
@@ -108,7 +107,7 @@ def main(projection: Path, maps: dict[str, tuple[Path, Path]], cache: Path, seed
     mlp, metadata = network.read(projection)
     descriptor, base = metadata["descriptor"], metadata.get("base")
     files = [
-        tracks.main(images, model, cache / name, descriptor, seed, base)
+        tracks.main(images, model, cache / name, descriptor, conf=base)
         for name, (images, model) in maps.items()
     ]
     data = [tracks.load(file) for file in files]

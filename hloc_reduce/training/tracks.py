@@ -172,10 +172,8 @@ def main(
             scaled = keypoints[name][kept]  # in pixels of the resized image
             scaled[:, :2] = (scaled[:, :2] + 0.5) * ratio - 0.5
             scaled[:, 2:3] *= ratio.mean()
-            known, generator = (
-                get_descriptors(file, name)[kept],
-                np.random.default_rng([seed, number]),
-            )
+            known = get_descriptors(file, name)[kept]
+            generator = np.random.default_rng([seed, number])
             arrays = {
                 "descriptors": describe(image, scaled, known, generator),
                 "points": observed[kept],

@@ -39,16 +39,14 @@ def drop_overlays(
 
     still = {name: np.zeros(len(points), int) for name, points in keypoints.items()}
     number = {name: np.zeros(len(points), int) for name, points in keypoints.items()}
-    for pair, indices in matches.items():
-        first, second = (
-            keypoints[name][column] for name, column in zip(pair, indices.T, strict=True)
-        )
-        same = np.abs(first - second).max(axis=1, initial=0) <= STILL
-        for name, column in zip(pair, indices.T, strict=True):
+    for (a, b), indices in matches.items():
+        first, second = indices.T
+        same = np.abs(keypoints[a][first] - keypoints[b][second]).max(axis=1, initial=0) <= STILL
+        for name, column in ((a, first), (b, second)):
             np.add.at(number[name], column, 1)
             np.add.at(still[name], column, same)
     least = min(PHOTOS, len(keypoints) - 1)
-    covered = {}
+    covered = {name: np.zeros(len(points), bool) for name, points in keypoints.items()}
     for name, points in keypoints.items():
         overlay = (still[name] >= max(2, least)) & (still[name] >= SHARE * number[name])
         if overlay.sum() >= LEAST:
@@ -56,18 +54,13 @@ def drop_overlays(
             near = distance <= AROUND
             if near.mean() <= COVERED:
                 covered[name] = near
-    if not covered:
-        return dict(matches)
-    logger.info(
-        "Matches of what is at the same place in many photos, such as a logo or a time stamp, are "
-        "left out in %d photos: %s.",
-        *(len(covered), some(sorted(covered))),
-    )
-    kept = {}
-    for pair, indices in matches.items():
-        out = np.zeros(len(indices), bool)
-        for name, column in zip(pair, indices.T, strict=True):
-            if name in covered:
-                out |= covered[name][column]
-        kept[pair] = indices[~out]
-    return kept
+    if having := sorted(name for name, inside in covered.items() if inside.any()):
+        logger.info(
+            "Matches of what is at the same place in many photos, such as a logo or a time stamp, "
+            "are left out in %d photos: %s.",
+            *(len(having), some(having)),
+        )
+    return {
+        (a, b): indices[~(covered[a][indices[:, 0]] | covered[b][indices[:, 1]])]
+        for (a, b), indices in matches.items()
+    }

@@ -41,12 +41,7 @@ class Lines:
     """Logs at most one line every `INTERVAL` seconds. Arguments as in `progress`."""
 
     def __init__(
-        self,
-        items: Iterable | None = None,
-        desc: str = "",
-        unit: str = "item",
-        total: int | None = None,
-        initial: int = 0,
+        self, items: Iterable | None, desc: str, unit: str, total: int | None, initial: int
     ):
         self.items, self.desc, self.unit, self.initial = items, desc, unit, initial
         self.total = len(items) if total is None and isinstance(items, Sized) else total

@@ -63,13 +63,10 @@ class StoredDatabase:
         """Return the width and height of an image."""
         return self._sizes[name]
 
-    def num_keypoints(self) -> dict[str, int]:
-        """Return the number of keypoints of each image that has any."""
-        return self._numbers("keypoints")
-
-    def num_descriptors(self) -> dict[str, int]:
-        """Return the number of descriptors of each image that has any."""
-        return self._numbers("descriptors")
+    def numbers(self, table: str) -> dict[str, int]:
+        """Return the number of "keypoints" or "descriptors" of each image that has any."""
+        rows = dict(self._rows(f"SELECT image_id, rows FROM {table} WHERE rows > 0"))
+        return {name: rows[i] for name, i in self.images.items() if i in rows}
 
     def descriptor_type(self) -> str:
         """Return the type of all descriptors, a value of `TYPES`.
@@ -99,22 +96,15 @@ class StoredDatabase:
         found = self._array("descriptors", name, np.uint8)
         return found if len(found) else np.zeros((0, 128), np.uint8)
 
-    def _numbers(self, table: str) -> dict[str, int]:
-        rows = dict(self._rows(f"SELECT image_id, rows FROM {table} WHERE rows > 0"))
-        return {name: rows[i] for name, i in self.images.items() if i in rows}
-
     def _array(self, table: str, name: str, dtype: type) -> np.ndarray:
-        """Return the array of an image in a table."""
+        """Return the array of an image in a table; an empty one if there is none."""
         asked = f"SELECT rows, cols, data FROM {table} WHERE image_id = ?"
         rows = self._rows(asked, self.images[name])
-        return self._shaped(rows, f"the {table} of {name}", dtype)
-
-    def _shaped(self, rows: list[tuple], what: str, dtype: type) -> np.ndarray:
-        """Return the only array among rows (number, width, data); an empty one if there is none."""
         if not rows or not rows[0][0]:
             return np.zeros((0, 2), dtype)
         number, width, data = rows[0]
         if number * width * np.dtype(dtype).itemsize != len(data or b""):
+            what = f"the {table} of {name}"
             raise InputError(f"Cannot read the database {self.path} ({what} are truncated).")
         return np.frombuffer(data, dtype).reshape(number, width)
 
