@@ -32,7 +32,7 @@ def main(
     vocabulary: Path | None = None,
     image_list: list[str] | None = None,
 ) -> Path:
-    """Compute a global descriptor of every image of a feature file that could be read, or of some.
+    """Compute a global descriptor for each readable image of a feature file, or for some.
 
     Stale ones, of other features or another vocabulary, are replaced.
 

@@ -265,7 +265,7 @@ def _main() -> None:
     parser.add_argument(
         "--feature",
         required=True,
-        help="feature, see pipelines.aachen --list_features, or a YAML file of one",
+        help="feature, see pipelines.aachen --list_features, or its YAML file",
     )
     parser.add_argument("--output", type=Path, required=True, help="ONNX file")
     parser.add_argument(
@@ -274,7 +274,7 @@ def _main() -> None:
     parser.add_argument(
         "--projection_only",
         action="store_true",
-        help="write the projection alone, from descriptors to fewer numbers",
+        help="write the projection alone, from descriptors to fewer dimensions",
     )
     main(**vars(parser.parse_args()))
 

@@ -324,11 +324,11 @@ def _main() -> None:
     parser = cli.Parser(__doc__, "--conf colmap_sift_sv64 --image_dir photos --export_dir outputs")
     parser.add_argument("--image_dir", type=Path, required=True, help="folder of images")
     parser.add_argument("--export_dir", type=Path, help="folder for the feature file")
-    parser.add_argument("--feature_path", type=Path, help="the feature file itself")
+    parser.add_argument("--feature_path", type=Path, help="feature file, instead of --export_dir")
     parser.add_argument(
         "--conf",
         default=features_confs.RECOMMENDED,
-        help="feature, see pipelines.aachen --list_features, or a YAML file of one",
+        help="feature, see pipelines.aachen --list_features, or its YAML file",
     )
     parser.add_argument("--image_list", type=Path, help="text file of names, one per line")
     features_confs.add_storage_option(parser)

@@ -227,7 +227,7 @@ def _main() -> None:
     parser.add_argument(
         "--feature",
         default=features_confs.RECOMMENDED,
-        help=f"feature of {COLMAP}, see pipelines.aachen --list_features",
+        help=f"{COLMAP} or a projection of it, see pipelines.aachen --list_features",
     )
     parser.add_argument(
         "--model",

@@ -190,12 +190,11 @@ def _main() -> None:
     parser.add_argument(
         "--queries",
         type=Path,
-        help="query list with intrinsics, or a glob (default: those of the pairs, by an iPhone 7)",
+        help="query list with intrinsics, or a glob (default: the queries of --retrieval, with "
+        "those of an iPhone 7)",
     )
-    parser.add_argument(
-        "--skip_matches", type=int, help="leave out cutouts with fewer matches with the query"
-    )
-    pixels = "pixels of a photo of 4032 pixels, of others in proportion"
+    parser.add_argument("--skip_matches", type=int, help="ignore cutouts with fewer matches")
+    pixels = "pixels for a photo of 4032 pixels, scaled for other sizes"
     stage.add_options(parser, RANSAC_THRESH, pixels)
     stage.run(parser, main)
 

@@ -1,6 +1,6 @@
 """Localize queries in a COLMAP model: 2D-3D matches through retrieved images, PnP + RANSAC."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -25,7 +25,7 @@ RANSAC_THRESH = 12.0  # pixels, as in hloc
 @strings_as_paths
 def main(
     reference_sfm: Path | pycolmap.Reconstruction,
-    queries: Path | list[tuple[str, pycolmap.Camera | None]],
+    queries: Path | Sequence[tuple[str, pycolmap.Camera | None]],
     retrieval: Path,
     features: Path,
     matches: Path,
@@ -61,7 +61,7 @@ def main(
         overwrite: localize all queries again.
         refinements: more options, as in `config`, for queries with inexact intrinsics.
         full_names: write whole names instead of `basename`.
-        executor: does the work; a map in memory is localized in by this process.
+        executor: runs the localization; with a reconstruction in memory, this process does.
         gate: what a pose must have for the query to be called localized.
         mirror_images: extracts and matches mirror images of queries, see `localization.stage.main`.
 
@@ -81,7 +81,7 @@ def main(
     options: dict[str, object] = {"config": config}
     if isinstance(queries, Path):
         inputs += sorted(queries.parent.glob(queries.name))
-        listed: list[tuple[str, pycolmap.Camera | None]] = [*stage.read_queries(queries)]
+        listed: Sequence[tuple[str, pycolmap.Camera | None]] = stage.read_queries(queries)
     else:
         listed = queries
         options["queries"] = to_lists(queries)
@@ -137,7 +137,7 @@ def _main() -> None:
     parser.add_argument(
         "--covisibility_clustering",
         action="store_true",
-        help="localize in each cluster of retrieved images that see common points separately",
+        help="localize separately in each cluster of covisible images",
     )
     parser.add_argument(
         "--prepend_camera_name", action="store_true", help="write folder/basename of each query"

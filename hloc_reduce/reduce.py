@@ -87,7 +87,7 @@ def main(
 
 
 class Reduction:
-    """What makes descriptors of a feature from those of its base.
+    """Converts base descriptors to those of a feature.
 
     Args:
         feature: as in `confs.features.get`, like `projection` and `storage`.
@@ -187,7 +187,7 @@ def sampled(names: list[str]) -> list[str]:
 
 
 def told_by(descriptors: np.ndarray, place: str) -> str:
-    """Tell how the descriptors of COLMAP's SIFT in a file are normalized, and log it.
+    """Detect how SIFT descriptors are normalized, and log it.
 
     Args:
         descriptors: see `normalization.detect`.
@@ -228,7 +228,7 @@ def _main() -> None:
     parser.add_argument(
         "--feature",
         required=True,
-        help="what to reduce to: colmap_sift_sv32 for SIFT of hloc or COLMAP, aliked_sv32 for "
+        help="target feature: colmap_sift_sv32 for SIFT of hloc or COLMAP, aliked_sv32 for "
         "hloc's aliked-n16, and others of pipelines.aachen --list_features",
     )
     add_options(parser)
@@ -236,15 +236,15 @@ def _main() -> None:
 
 
 def add_options(parser: cli.Parser) -> None:
-    """Add the options of what descriptors are reduced to, and how."""
+    """Add the options for the projection, the storage and the normalization."""
     parser.add_argument("--projection", type=Path, help="file of another projection of its base")
     features_confs.add_storage_option(parser)
     parser.add_argument(
         "--normalization",
-        help=f"of SIFT descriptors, one of {', '.join(NORMALIZATIONS)}: COLMAP's names, and "
-        "rootsift for hloc's (default: told by their numbers)",
+        help=f"normalization of SIFT descriptors, one of {', '.join(NORMALIZATIONS)}: COLMAP's "
+        "names, and rootsift for hloc's (default: detected)",
     )
-    parser.add_argument("--overwrite", action="store_true", help="reduce all images again")
+    parser.add_argument("--overwrite", action="store_true", help="write all images again")
 
 
 if __name__ == "__main__":

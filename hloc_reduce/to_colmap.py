@@ -1,7 +1,7 @@
 """Write features and matches into a new COLMAP database.
 
-For `colmap mapper`, GLOMAP and `colmap gui`. The database has the keypoints, the matches, and the
-matches that are verified by two-view geometry; no descriptors, as COLMAP has none of other sizes.
+For `colmap mapper`, GLOMAP and `colmap gui`. The database has keypoints, matches and verified
+matches, but no descriptors: nothing needs to be matched again.
 """
 
 import tempfile

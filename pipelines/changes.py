@@ -27,7 +27,7 @@ def add_options(parser: cli.Parser) -> None:
     parser.add_argument(
         "--refine_map",
         action="store_true",
-        help="adjust the poses of all photos of the map to those of --add_images",
+        help="also adjust the poses of the photos that are already in the map",
     )
     parser.add_argument(
         "--remove_images", type=Path, help="text file of the names of photos to remove from --map"

@@ -17,7 +17,7 @@ from hloc_reduce.localization.mirrored import MirrorImages
 from hloc_reduce.maps.map import RETRIEVAL
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.executors import SERIAL, Executor
-from hloc_reduce.runtime.outputs import RunFolder
+from hloc_reduce.runtime.outputs import CONF, RunFolder
 from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.h5 import get_text, open_h5
 from hloc_reduce.utils.paths import strings_as_paths
@@ -134,10 +134,10 @@ class DatasetRun(Run):
         if self._given is not None:
             with open_h5(self._given) as file:
                 conf["features"] = get_text(file, "id", str(self._given))
-            before = provenance.read(outputs / "conf.json")
+            before = provenance.read(outputs / CONF)
             redone = before.get("features") not in (None, conf["features"])
             overwrite |= redone and {**before, "features": conf["features"]} == conf
-        elif overwrite or not (outputs / "conf.json").exists():
+        elif overwrite or not (outputs / CONF).exists():
             extract_features.check_model(self.conf)
         return RunFolder(outputs, conf, overwrite, inputs)
 

@@ -20,7 +20,7 @@ from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance, trace
 from hloc_reduce.runtime.group_writer import failures
-from hloc_reduce.runtime.outputs import RunFolder
+from hloc_reduce.runtime.outputs import CONF, RunFolder
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES
@@ -231,7 +231,7 @@ def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> P
     """
     name = re.sub(NOT_IN_NAMES, "_", (queries or query_images.resolve()).stem).strip("._-")
     folder = outputs / f"queries-{name or 'all'}"
-    before = provenance.read(folder / "conf.json")
+    before = provenance.read(folder / CONF)
     own = _queries_of(folder, query_images, queries)
     if any(before.get(key, value) != value for key, value in own.items()):
         where = f"{own['query_images']}\n{queries and own['queries']}"
@@ -253,8 +253,8 @@ def _main() -> None:
         "--map",
         type=Path,
         metavar="MODEL|MAP",
-        help="COLMAP model of the photos in --map_images, or a map that was built before, a folder "
-        "or a file of hloc_reduce.compact",
+        help="COLMAP model of --map_images or --database; or a map of an earlier run: its folder "
+        "or .hlm file",
     )
     parser.add_argument(
         "--map_images", type=Path, help="photos of the map; without --map they are reconstructed"
@@ -278,8 +278,8 @@ def _main() -> None:
     parser.add_argument(
         "--outputs",
         type=Path,
-        help="folder for the map, in map, and for the results, in queries-<name of --queries or "
-        "--query_images>, followed by a digest if other queries have that name",
+        help="results folder: the map goes to OUTPUTS/map, poses to OUTPUTS/queries-<name of "
+        "--queries or --query_images>",
     )
     parser.add_argument(
         "--num_covis", type=int, default=20, help="other images that each map image is matched with"

@@ -1,6 +1,5 @@
 """The queries of pipelines.localize: their names and intrinsics, and whether photos changed."""
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from hloc_reduce.localization import intrinsics
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance
 from hloc_reduce.utils import cli
+from hloc_reduce.utils.files import is_readable
 from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.parsers import parse_query_lists
 
@@ -103,11 +103,7 @@ class Photos:
         before = provenance.read(path)
         known = before.get("queries", {})
         files = {name: query_images / name for name in names}
-        found = {
-            name: file
-            for name, file in files.items()
-            if file.is_file() and os.access(file, os.R_OK)
-        }
+        found = {name: file for name, file in files.items() if is_readable(file)}
         self._map, self._photos = built.id, provenance.fingerprints(found, known)
         self.changed = provenance.changed(known, self._photos)
         if before and before.get("map") != built.id:

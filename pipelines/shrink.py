@@ -193,9 +193,8 @@ def _localize(
     match_features.main(
         conf, pairs, features, matches=matches, features_ref=map_features, overwrite=True
     )
-    given: list[tuple[str, pycolmap.Camera | None]] = [*queries]
     records = localize_sfm.main(
-        sfm, given, pairs, features, matches, poses, full_names=True, overwrite=True
+        sfm, queries, pairs, features, matches, poses, full_names=True, overwrite=True
     )
     seconds = time.perf_counter() - start
     localized = [record for record in records.values() if record["localized"]]

@@ -1,4 +1,4 @@
-"""Write a map into one small file that localization needs nothing else beside.
+"""Pack everything that localization needs from a map into one small file.
 
 Keeps one descriptor for each 3D point, which images see it, and what retrieval needs: no photos, no
 keypoints. Localize in it with pipelines.localize --map FILE, or with Localizer(FILE).

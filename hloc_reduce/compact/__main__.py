@@ -26,7 +26,7 @@ def _main() -> None:
     add(
         "--storage",
         help=f"storage of the points' descriptors, one of {', '.join(STORAGES)} (default: the "
-        f"map's if it is one of codes, else uint4 for up to {FEW} numbers of DoG features "
+        f"map's if it stores codes, else uint4 for DoG features of up to {FEW} dimensions "
         "and uint2 for others)",
     )
     add(

@@ -1,7 +1,7 @@
 """Local features: base descriptors, their projections, networks, and features of YAML files.
 
 `<descriptor>_<scheme><dim>` are the paper's; `<descriptor>_nested` is 64-D, and
-`<descriptor>_nested@<dim>` its first numbers. `colmap_sift` is COLMAP's SIFT.
+`<descriptor>_nested@<dim>` its first dimensions. `colmap_sift` is COLMAP's SIFT.
 """
 
 import re
@@ -116,7 +116,7 @@ def dimension(name: str) -> int | None:
 
 def table() -> str:
     """Format the features with the size of their descriptors, as float16, and their weights."""
-    lines = [("feature", "numbers", "bytes", "matcher", "weights")]
+    lines = [("feature", "dim", "bytes", "matcher", "weights")]
     for name, conf in confs.items():
         dim = dimension(name)
         numbers = (str(dim), str(2 * dim)) if dim else ("", "")

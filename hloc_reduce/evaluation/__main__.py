@@ -187,8 +187,8 @@ def _add_poses(add: Callable[..., cli.Parser]) -> None:
         "poses",
         help="compare estimated with true poses",
         description="Compare estimated with true poses, both camera from world: recall, median "
-        "errors, cumulative curves. A query without an estimate is a failure. Estimates have the "
-        "full names of queries or, as in a submission, the last parts of these.",
+        "errors, cumulative curves. A query without an estimate is a failure. Estimates name "
+        "queries in full, or by file name as in a submission.",
         example="--estimates poses.txt --ground_truth ground_truth_poses.txt",
     )
     command.add_argument(
@@ -209,8 +209,8 @@ def _add_poses(add: Callable[..., cli.Parser]) -> None:
         "--thresholds",
         nargs="+",
         metavar="aachen|inloc|M,DEG",
-        help="the paper's, where Aachen's are wider for queries in a folder night..., or pairs of "
-        "metres and degrees (default: aachen)",
+        help="aachen (wider for queries in a folder night...), inloc, or pairs of metres and "
+        "degrees (default: aachen)",
     )
     command.add_argument(
         "--outputs",

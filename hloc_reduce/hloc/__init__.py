@@ -1,4 +1,4 @@
-"""A plugin for hloc, github.com/cvg/Hierarchical-Localization, of November 2025 or later."""
+"""A plugin for hloc, github.com/cvg/Hierarchical-Localization, of December 2025 or later."""
 
 import copy
 from collections.abc import Iterable

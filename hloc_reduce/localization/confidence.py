@@ -210,10 +210,10 @@ class Gate:
     """What a pose must have for the query to be called localized.
 
     Args:
-        min_confidence: the least `confidence`.
-        min_inliers: the least number of RANSAC's inliers.
-        min_agreement: pairs, in ascending order, of a confidence and the least `agreement` of poses
-            with at least this confidence; default: by the matches, see `of_matches`.
+        min_confidence: the minimum `confidence`.
+        min_inliers: the minimum number of RANSAC's inliers.
+        min_agreement: pairs, in ascending order, of a confidence and the minimum `agreement` of
+            poses with at least this confidence; default: by the matches, see `of_matches`.
         min_agreement_noisy: the same for photos whose noise was reduced.
 
     Raises:
@@ -266,12 +266,12 @@ def add_gate_options(parser: Parser) -> None:
         "--min_confidence",
         type=float,
         default=DEFAULT_GATE.min_confidence,
-        help="least confidence of a localized query: minus the decimal logarithm of the number of "
-        "such poses that are expected by chance",
+        help="minimum confidence of a localized query: -log10 of the number of poses with as many "
+        "inliers that are expected by chance",
     )
     parser.add_argument(
         "--min_inliers",
         type=int,
         default=DEFAULT_GATE.min_inliers,
-        help="least number of inliers of a localized query",
+        help="minimum number of inliers of a localized query",
     )

@@ -142,7 +142,7 @@ def _report(records: dict[str, dict], unreadable: Mapping[str, str], log_path: P
 def _refuse(
     load_reference: Callable[[], Reference],
     features: Path,
-    queries: list[tuple[str, pycolmap.Camera | None]],
+    queries: Sequence[tuple[str, pycolmap.Camera | None]],
     retrieved: Mapping[str, list[str]],
 ) -> Iterator[tuple[str, dict]]:
     """Yield the names and the records of the queries that are not to be localized."""

@@ -1,6 +1,5 @@
 """New photos that are being added to a map: described, localized in it and placed in its model."""
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +27,7 @@ from ..runtime.outputs import CONF
 from ..triangulation import read_matches
 from ..utils import cli
 from ..utils.cli import InputError
-from ..utils.files import announce, delete
+from ..utils.files import announce, delete, is_readable
 from ..utils.match_files import check_names
 from ..utils.parsers import parse_pairs
 from . import contradictions
@@ -36,6 +35,7 @@ from .map import FINGERPRINTS, RETRIEVAL, Map
 from .mirroring import mirror_images
 
 GROWING = "growing"  # the folder of an addition, in that of the map
+NUM_LOC = 20  # images of the map that a new photo is matched with
 IMAGES = "images/"  # begins the names of photos in the fingerprints of a map
 
 
@@ -50,10 +50,6 @@ def _digests(fingerprints: Mapping[str, list]) -> dict[str, str]:
     return {name: digest for name, digest in named.items() if name is not None}
 
 
-def _is_readable(path: Path) -> bool:
-    return path.is_file() and os.access(path, os.R_OK)
-
-
 @dataclass
 class Addition:
     """New photos that are being added to a map.
@@ -61,9 +57,8 @@ class Addition:
     Args:
         built: the map.
         sfm: its model, to which images are added.
-        image_dir: as in `grow.add`, like `num_loc` and `refine_map`.
-        num_loc: see `image_dir`.
-        refine_map: see `image_dir`.
+        image_dir: folder of the new photos.
+        refine_map: adjust the poses of the other photos, too.
 
     Attributes:
         added: names of the photos that are in the model now.
@@ -73,7 +68,6 @@ class Addition:
     built: Map
     sfm: pycolmap.Reconstruction
     image_dir: Path
-    num_loc: int
     refine_map: bool
     added: list[str] = field(default_factory=list)
     left_out: dict[str, list[str]] = field(default_factory=dict)
@@ -87,17 +81,16 @@ class Addition:
 
     def begin(self, names: list[str], posed: bool) -> list[str]:
         """Return the photos that are new; begin anew unless their addition was interrupted."""
-        files = {f"{IMAGES}{name}": self.image_dir / name for name in names}
-        broken = [key for key, path in files.items() if not _is_readable(path)]
-        self._leave_out("not readable", [key.removeprefix(IMAGES) for key in broken])
-        files = {key: path for key, path in files.items() if key not in broken}
+        broken = [name for name in names if not is_readable(self.image_dir / name)]
+        self._leave_out("not readable", broken)
+        files = {f"{IMAGES}{name}": self.image_dir / name for name in names if name not in broken}
         known = provenance.read(self.built.folder / FINGERPRINTS)
         self.fingerprints = provenance.fingerprints(files, {})
         digests, before = _digests(self.fingerprints), _digests(known)
         new = self._new(digests, {name: before.get(name) for name in self.inside})
         check_names([*self.inside, *new])
         images = {name: digests[name] for name in new}
-        conf = {"map": self.built.id, "images": images, "num_loc": self.num_loc, "posed": posed}
+        conf = {"map": self.built.id, "images": images, "num_loc": NUM_LOC, "posed": posed}
         if provenance.read(self.folder / CONF) != conf:
             announce(self.folder)
             delete(self.folder)
@@ -173,9 +166,7 @@ class Addition:
         while left:
             number += 1
             pairs = self._pairs(left, sorted([*self.inside, *self.added]), f"round{number}")
-            queries: list[tuple[str, pycolmap.Camera | None]] = [
-                (name, inferred[name][0]) for name in left
-            ]
+            queries = [(name, inferred[name][0]) for name in left]
             records = localize_sfm.main(
                 *(self.sfm, queries, pairs, self.features),
                 *(self._match(pairs), self.folder / f"poses-round{number}.txt"),
@@ -203,7 +194,7 @@ class Addition:
         """Pair photos with the most similar ones of others."""
         pairs = self.folder / f"pairs-{what}.txt"
         return pairs_from_retrieval.main(
-            self.descriptors, pairs, self.num_loc, query_list=names, db_list=others
+            self.descriptors, pairs, NUM_LOC, query_list=names, db_list=others
         )
 
     def _match(self, pairs: Path, mirrored: Path | None = None) -> Path:

@@ -78,9 +78,11 @@ def main(
     check_names(names)
     has_points = reference is not None and reference.num_points3D() > 0
     exhaustive = not has_points and len(names) <= MAX_EXHAUSTIVE
-    if overwrite or not (map_dir / "conf.json").exists():
+    if overwrite or not (map_dir / CONF).exists():
         extract_features.check_model(conf)
-    fingerprints, found = _digests(map_dir, image_dir, names, model)
+    images = {name: image_dir / name for name in names}
+    parts = {path.name: path for path in model_files(model)}
+    fingerprints, found = digests(map_dir, {"images": images, "model": parts})
     made_from = {
         "feature": extract_features.provenance(conf),
         "matcher": matchers_confs.confs[matcher]["model"],
@@ -146,17 +148,6 @@ def _list(
         return names
     names = sorted(image.name for image in reference.images.values())
     return list_images(image_dir, keep_present(image_dir, names, accept_partial))
-
-
-def _digests(
-    map_dir: Path, image_dir: Path, names: list[str], model: Path | None
-) -> tuple[dict, dict[str, dict[str, str]]]:
-    """Return the fingerprints of a map's images and model, and the digests of both by name."""
-    groups = {
-        "images": {name: image_dir / name for name in names},
-        "model": {path.name: path for path in model_files(model)},
-    }
-    return digests(map_dir, groups)
 
 
 def digests(

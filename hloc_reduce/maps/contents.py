@@ -1,4 +1,4 @@
-"""What a map holds in memory to localize one photo at a time, whether a folder or one file."""
+"""A map in memory, read from a folder or a compact file."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What computes for a map in memory: any models, in torch."""
+"""The torch engine of a map in memory."""
 
 from pathlib import Path
 

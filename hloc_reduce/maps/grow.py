@@ -28,15 +28,12 @@ from . import cropping, precision
 from .addition import GROWING, IMAGES, Addition, photo_of
 from .map import FINGERPRINTS, FINISHED, PLACE, SFM, Map, models
 
-NUM_LOC = 20  # images of the map that a new photo is matched with
-
 
 @strings_as_paths
 def add(
     built: Map,
     image_dir: Path,
     model: Path | None = None,
-    num_loc: int = NUM_LOC,
     refine_map: bool = False,
 ) -> Map:
     """Add photos to a map: localize them, extend the points that they see, and triangulate others.
@@ -50,7 +47,6 @@ def add(
         image_dir: folder of the photos.
         model: COLMAP model with their poses in the frame of the map, which are kept; default: they
             are localized, with intrinsics from `localization.intrinsics.infer`.
-        num_loc: the number of most similar images that each photo is matched with.
         refine_map: adjust the poses of the other photos, too.
 
     Returns:
@@ -70,7 +66,7 @@ def add(
             raise InputError(f"{model} has a pose of no photo in {image_dir}.")
     with _opened(built) as folder, folder.stage("add_images"):
         built = Map(built.folder)  # another run may have changed it before it was locked
-        addition = Addition(built, colmap.read_model(built.sfm), image_dir, num_loc, refine_map)
+        addition = Addition(built, colmap.read_model(built.sfm), image_dir, refine_map)
         new = addition.begin(names, posed=reference is not None)
         if not new:
             addition.report()

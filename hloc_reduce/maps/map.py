@@ -14,6 +14,7 @@ from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
 from ..localization import intrinsics
 from ..runtime import provenance
+from ..runtime.outputs import CONF
 from ..utils import colmap
 from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import STORAGES
@@ -50,7 +51,7 @@ class Map:
         uncertain: images whose positions are uncertain, see `precision.find`.
         cropping: how much better the images fit with other intrinsics.
         unlike_others: images that are left out, as their intrinsics are unlike those of the others.
-        mirrored: images without a pose, as they are mirrored.
+        mirrored: images that are left out because they are mirrored.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
         cameras: what the map tells about the intrinsics of other photos.
@@ -153,7 +154,7 @@ class Map:
             InputError: if it is another one, or has the same name but another projection.
         """
         name, conf = features_confs.get(feature, projection, self.storage, self.keypoints)
-        made_by = json.loads((self.folder / "conf.json").read_text()).get("feature")
+        made_by = provenance.read(self.folder / CONF).get("feature")
         known = (
             name == self.feature
             if made_by is None

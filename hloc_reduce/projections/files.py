@@ -59,7 +59,7 @@ def find(projection: str | Path) -> Path:
 
 
 def split_prefix(projection: str | Path) -> tuple[str, str]:
-    """Split `name@24` into the name and the prefix, "" without one."""
+    """Split `name@24`, the first 24 dimensions, into the name and "24"; "" without a number."""
     match = PREFIX.fullmatch(str(projection))
     return (match[1], match[2]) if match else (str(projection), "")
 

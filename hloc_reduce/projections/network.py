@@ -80,7 +80,7 @@ class Projection(nn.Module):
 
     @torch.no_grad()
     def forward(self, descriptors: torch.Tensor) -> torch.Tensor:
-        """Map descriptors (N, 128) of unit norm to (N, dim) float32 of unit norm.
+        """Map descriptors (N, D) of unit norm to (N, dim) float32 of unit norm.
 
         On a CPU it is computed in float64, as by `light.projection`, with which it agrees when both
         are rounded to float16, unless `exact` is False.

@@ -24,7 +24,7 @@ def _main() -> None:
         "--num_queries",
         type=int,
         default=NUM_QUERIES,
-        help="number of queries without --queries, evenly from the worst to the best",
+        help="number of queries shown without --queries, spread evenly from worst to best",
     )
     parser.add_argument(
         "--pictures_dir", type=Path, help="also write plots and pictures of matches to this folder"

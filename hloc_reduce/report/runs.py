@@ -18,7 +18,7 @@ from ..evaluation.poses import ERRORS, counted_errors
 from ..localization.records import log_file, read_records
 from ..localization.references import ScanMap, SfmMap
 from ..maps.map import is_map
-from ..runtime.outputs import SHARED
+from ..runtime.outputs import CONF, SHARED
 from ..utils import cli, colmap
 from ..utils.cli import InputError, no_folder
 from ..utils.files import MEGABYTE
@@ -26,7 +26,7 @@ from ..utils.h5 import open_h5
 from ..utils.parsers import parse_poses, parse_retrieval
 
 COUNTS = ("num_matches", "num_correspondences", "num_inliers")
-BEGUN = ("conf.json", "summary.json")  # either tells that a pipeline has begun a run
+BEGUN = (CONF, "summary.json")  # either tells that a pipeline has begun a run
 
 
 class Run:

@@ -1,4 +1,4 @@
-"""Processes for what lets no other thread of its process run; they import nothing but that."""
+"""Worker processes for functions that block other threads, such as COLMAP's detector."""
 
 import os
 import signal
@@ -22,10 +22,9 @@ warnings.filterwarnings("ignore", "Failed to kill subprocesses", UserWarning)
 
 @contextmanager
 def pool(number: int) -> Iterator["_Pool"]:
-    """Start processes of one thread each for the time of a block.
+    """Start single-threaded processes for the duration of a block.
 
-    They end with the block, at once if that is by an error or Ctrl-C, and soon also when this
-    process is killed.
+    They end with it: at once after an error or Ctrl-C, and soon if this process is killed.
     """
     for trackers in (resource_tracker, loky_tracker):
         trackers.ensure_running()  # which may unblock the signals that `_starting` blocks

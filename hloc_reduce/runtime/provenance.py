@@ -1,9 +1,10 @@
-"""Provenance: what determines the content of a file. A file is stale when it has changed.
+"""Provenance: what determines the content of a file.
 
-There are two mechanisms. Each derived file has a header with its provenance: the attributes of an
-h5 file (`group_writer`), the first line of a JSON lines file, a JSON file in or beside a COLMAP
-model. Each outputs folder has a configuration, conf.json (`outputs`). A third, the fingerprints of
-photos, serves users who copy or touch their photos: their content counts, not their time.
+A file is stale when its provenance has changed. There are two mechanisms. Each derived file has a
+header with its provenance: the attributes of an h5 file (`group_writer`), the first line of a JSON
+lines file, a JSON file in or beside a COLMAP model. Each outputs folder has a configuration,
+conf.json (`outputs`). A third, the fingerprints of photos, serves users who copy or touch their
+photos: their content counts, not their time.
 """
 
 import json

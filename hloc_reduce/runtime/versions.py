@@ -1,4 +1,4 @@
-"""The versions of what determines the numbers."""
+"""Versions of the libraries that results depend on."""
 
 import platform
 from importlib import metadata

@@ -26,6 +26,11 @@ def observing(observe: Callable[[Path], None]) -> Iterator[None]:
         _observers.remove(observe)
 
 
+def is_readable(path: Path) -> bool:
+    """Return whether this process may read a file."""
+    return path.is_file() and os.access(path, os.R_OK)
+
+
 def announce(path: Path) -> None:
     """Tell observers that a file or folder is about to be written."""
     for observe in _observers:

@@ -68,7 +68,7 @@ def add_camera_mode(parser: Parser) -> None:
         "--camera_mode",
         default="auto",
         help=f"which photos share a camera, as in COLMAP: {modes}; auto: those "
-        "of the same make, model, focal length and size by EXIF data, without a digital zoom",
+        "whose EXIF data have the same make, model, focal length and size, and no digital zoom",
     )
 
 
