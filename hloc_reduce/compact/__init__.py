@@ -16,9 +16,10 @@ from ..aggregate_features import vocabulary_of
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..localization import intrinsics
-from ..maps import compact, points
-from ..maps.compact import Source
+from ..maps import packing, points
+from ..maps.compact import SUFFIX
 from ..maps.map import RETRIEVAL, Map
+from ..maps.packing import Source
 from ..pairs_from_retrieval import read_global
 from ..utils import cli, colmap
 from ..utils.cli import InputError
@@ -127,8 +128,8 @@ def write(
 
 def check_output(output: Path) -> None:
     """Raise an InputError unless a compact map can have the name `output`."""
-    if output.suffix != compact.SUFFIX:
-        raise InputError(f"{output}, a compact map, must end in {compact.SUFFIX}.")
+    if output.suffix != SUFFIX:
+        raise InputError(f"{output}, a compact map, must end in {SUFFIX}.")
     cli.check_file(output)
 
 
@@ -190,7 +191,7 @@ def _encode(
 ) -> tuple[bytes, dict[str, int]]:
     """Encode the points that images need most."""
     chosen = everything.only(points.select(everything, number))
-    return compact.encode(chosen, source, rows)
+    return packing.encode(chosen, source, rows)
 
 
 def _fit(

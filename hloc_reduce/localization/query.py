@@ -7,6 +7,7 @@ import pycolmap
 
 from . import absolute_pose
 from .confidence import DEFAULT_GATE, RIVAL_BY_OTHERS, Gate
+from .pose import differ
 from .references import Reference
 
 
@@ -61,7 +62,7 @@ def localize(
     for other, its_info in solved:
         if info["reason"] is None is its_info["reason"] and other is not best:
             rivals = other.num_inliers >= RIVAL_BY_OTHERS * best.num_inliers
-            if rivals and absolute_pose.differ(best, other, info["points3D"]):
+            if rivals and differ(best, other, info["points3D"]):
                 info["reason"] = (
                     f"ambiguous: a pose by other images has {other.num_inliers} inliers, this one "
                     f"{best.num_inliers}"

@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -15,15 +14,14 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..light.projection import Layer
 from ..light.projection import read as read_layers
-from ..light.vlad import VOCABULARY, read_vocabulary
+from ..light.vlad import read_vocabulary
 from ..localization import intrinsics
 from ..utils.cli import InputError, choose
-from ..utils.codes import CODED, FLOATS, QUANTIZED, STORAGES, check_levels, restore, store
-from ..utils.files import file_sha256, replacing
+from ..utils.codes import CODED, FLOATS, QUANTIZED, STORAGES, check_levels, restore
+from ..utils.files import replacing
 from ..utils.parsers import check_names, parse_camera
 from . import points as points_of_map
 from . import signs
-from .points import Points
 
 VERSION = 2
 VERSIONS = 1, VERSION  # that are read; in the first one, all coordinates have the same bits
@@ -31,122 +29,6 @@ SUFFIX = ".hlm"
 # what a file may ask for
 MAX_DIM, MAX_GLOBAL, MAX_SIDE, LEAST_OCTAVE = 512, 2**14, 4096, -1
 PROJECTION = re.compile(r"[\w+-]+(@\d+)?")  # a name, and a prefix of a nested one
-
-
-@dataclass(frozen=True)
-class Source:
-    """What a compact map is made from, apart from its points.
-
-    Args:
-        model: the COLMAP model that the points are from.
-        feature: name of the feature.
-        conf: its configuration, whose storage is that of the points' descriptors.
-        matcher: a key of `confs.matchers`.
-        global_descriptors: h5 file of the images' global descriptors.
-        vocabulary: of these.
-        cameras: what the map tells about the intrinsics of other photos.
-    """
-
-    model: pycolmap.Reconstruction
-    feature: str
-    conf: dict
-    matcher: str
-    global_descriptors: Path
-    vocabulary: Path
-    cameras: intrinsics.MapCameras
-
-
-def encode(
-    points: Points, source: Source, global_descriptors: np.ndarray
-) -> tuple[bytes, dict[str, int]]:
-    """Return the content of a compact map, the same for the same arguments.
-
-    Args:
-        points: that it has.
-        source: what it is made from.
-        global_descriptors: (I, G) of the images of the points.
-
-    Returns:
-        The content, and the number of bytes of each part.
-    """
-    from safetensors.numpy import save
-
-    _check_model(source.conf["model"], source.feature)
-    points = points.sorted()
-    tensors: dict[str, np.ndarray] = {}
-    metadata: dict[str, Any] = {
-        "version": VERSION,
-        "feature": source.feature,
-        "conf": {key: source.conf[key] for key in ("model", "preprocessing")},
-        "matcher": source.matcher,
-        "known": {name: intrinsics.to_list(one) for name, one in source.cameras.known.items()},
-        "sizes": sorted(source.cameras.sizes),
-        "models": sorted(source.cameras.models),
-        "focal_lengths": source.cameras.focal_lengths,
-    }
-    for add in (_add_images, _add_points, _add_descriptors, _add_vocabulary, _add_projection):
-        add(tensors, metadata, points, source)
-    tensors["retrieval"], metadata["signs"] = signs.pack(global_descriptors)
-    content = save(tensors, {"map": json.dumps(metadata, sort_keys=True)})
-    parts = {name: tensor.nbytes for name, tensor in tensors.items()}
-    return content, parts | {"header": len(content) - sum(parts.values())}
-
-
-def _add_images(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
-    images = {image.name: image for image in source.model.images.values()}
-    shown = [images[name] for name in points.names]
-    ids = sorted({image.camera_id for image in shown})
-    poses = [image.cam_from_world() for image in shown]
-    tensors["names"] = np.frombuffer("\n".join(points.names).encode(), np.uint8)
-    tensors["rotations"] = np.array([pose.rotation.quat for pose in poses], np.float32)
-    tensors["translations"] = np.array([pose.translation for pose in poses])
-    numbers = [ids.index(image.camera_id) for image in shown]
-    tensors["camera_of_image"] = np.array(numbers, np.uint32)
-    metadata["cameras"] = [intrinsics.to_list(source.model.cameras[i]) for i in ids]
-
-
-def _add_points(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
-    packed, least, step, bits = points_of_map.quantize(
-        points.xyz, points_of_map.precision(points, source.model)
-    )
-    visible, kind = points_of_map.pack_visible(points.visible, len(points))
-    tensors["coordinates"], tensors["visible"] = packed, visible
-    tensors["num_visible"] = np.array([len(part) for part in points.visible], np.uint32)
-    metadata |= {"points": len(points), "least": least.tolist(), "step": step}
-    metadata |= {"bits": bits, "visible": kind}
-
-
-def _add_descriptors(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
-    storage = source.conf.get("storage", STORAGES[0])
-    levels = features_confs.levels(source.conf)
-    stored, attrs = store({"descriptors": points.descriptors.T}, storage, levels)
-    key = QUANTIZED.get(storage, "descriptors")
-    tensors["descriptors"] = stored[key]
-    if levels is not None:
-        tensors["levels"] = attrs[key]["levels"]
-    scale = [] if levels is not None else [float(value) for value in attrs.get(key, {}).values()]
-    metadata |= {"storage": storage, "scale": scale}
-
-
-def _add_vocabulary(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
-    """Add the vocabulary unless it is the one that ships."""
-    if file_sha256(source.vocabulary) != file_sha256(VOCABULARY):
-        tensors["vocabulary"] = read_vocabulary(source.vocabulary).astype(np.float16)
-
-
-def _add_projection(tensors: dict, metadata: dict, points: Points, source: Source) -> None:
-    """Name the projection, if any, and add it unless it is one that ships."""
-    projection = source.conf["model"].get("projection")
-    if not projection:
-        return
-    file, prefix = projections.find(projection), projections.split_prefix(projection)[1]
-    metadata["projection_sha256"] = file_sha256(file)
-    metadata["projection_suffix"] = file.suffix
-    shipped = file.stem in projections.names() and projections.checksum(file.stem)
-    if shipped != metadata["projection_sha256"]:
-        tensors["projection"] = np.frombuffer(file.read_bytes(), np.uint8)
-    name = file.stem + (prefix and f"@{prefix}")
-    metadata["conf"]["model"] = {**source.conf["model"], "projection": name}
 
 
 class CompactMap:
@@ -248,7 +130,7 @@ class CompactMap:
         self.feature = PurePath(metadata["feature"]).name
         check_names([self.feature], self.path)
         conf = features_confs.check(metadata["conf"], self.path)
-        _check_model(conf["model"], self.feature)
+        check_model(conf["model"], self.feature)
         if not 0 < (conf["preprocessing"]["resize_max"] or MAX_SIDE) <= MAX_SIDE:
             raise ValueError(f"photos of more than {MAX_SIDE} pixels")
         self.conf: dict[str, Any] = {
@@ -382,7 +264,7 @@ class CompactMap:
         return self.pose(names[0] if names else self.names[0])
 
 
-def _check_model(model: dict, feature: str) -> None:
+def check_model(model: dict, feature: str) -> None:
     """Refuse a feature whose extractor or weights a file cannot be trusted with, or does not have.
 
     Raises:

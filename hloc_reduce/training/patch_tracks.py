@@ -11,16 +11,9 @@ from ..descriptors.model import Descriptor
 from ..runtime.group_writer import resume_or_replace
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
+from .describers import VARIANTS, describe_mirrored, photometric_variant
 from .loop import device
-from .tracks import (
-    VARIANTS,
-    describe_mirrored,
-    is_current,
-    parts_of,
-    photometric_variant,
-    save,
-    stamp,
-)
+from .tracks import is_current, parts_of, save, stamp
 
 
 @strings_as_paths

@@ -4,12 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
-import torch
 from safetensors.numpy import load_file, save_file
-from scipy.spatial import cKDTree
 
 from .. import (
     extract_features,
@@ -20,9 +17,7 @@ from .. import (
     triangulation,
 )
 from ..confs import features as features_confs
-from ..descriptors import COLMAP, DESCRIPTORS, DIM
-from ..descriptors.model import Descriptor
-from ..extractors.dog import extract_patches
+from ..descriptors import DESCRIPTORS
 from ..maps.map import Map, is_map
 from ..runtime import provenance
 from ..runtime.group_writer import resume_or_replace
@@ -34,15 +29,12 @@ from ..utils.files import replacing
 from ..utils.h5 import get_dataset, open_h5
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
+from . import describers
 from .completion import Completion
-from .loop import device
 
 NUM_COVIS = 20
 MATCHED = "sift"  # finds the tracks of all descriptors of patches
 KEYPOINTS = "hloc"  # settings of DoG that the shipped projections were trained with
-VARIANTS = 4  # the photo and three photometric variants, each as seen and mirrored
-MAX_SHIFT = 1.5  # pixels between a keypoint of the photo and the same one of a variant
-NEIGHBORS = 4  # candidates for it
 
 
 @dataclass
@@ -158,7 +150,11 @@ def main(
     if is_current(tracks, made_from):
         return tracks
     complete, matched, keypoints = _observations(reconstruction, features, names)
-    describe = PatchDescriber(descriptor) if patches else FeatureDescriber(conf["model"])
+    describe = (
+        describers.PatchDescriber(descriptor)
+        if patches
+        else describers.FeatureDescriber(conf["model"])
+    )
     with resume_or_replace(parts_of(tracks), made_from) as writer, open_h5(features) as file:
         todo = [(number, name) for number, name in enumerate(names) if name not in writer]
         done = len(names) - len(todo)
@@ -244,7 +240,7 @@ def _observations(
 
 def stamp(descriptor: str, seed: int, inputs: list[Path]) -> dict:
     """Return the provenance of a file for `load`."""
-    options = {"variants": VARIANTS, "seed": seed, "descriptor": descriptor, "format": 2}
+    options = {"variants": describers.VARIANTS, "seed": seed, "descriptor": descriptor, "format": 2}
     return provenance.of_inputs(options, inputs)
 
 
@@ -289,118 +285,3 @@ def save(path: Path, made_from: dict, names: list[str]) -> Path:
 def load(path: Path) -> Tracks:
     """Read the file that `save` wrote."""
     return Tracks(**load_file(path))
-
-
-class PatchDescriber:
-    """Describes keypoints by the patches around them, in a photo and its variants."""
-
-    def __init__(self, descriptor: str):
-        self.describe = Descriptor(descriptor).to(device())
-
-    @torch.no_grad()
-    def __call__(
-        self,
-        image: torch.Tensor,
-        keypoints: np.ndarray,
-        known: np.ndarray,
-        generator: np.random.Generator,
-    ) -> np.ndarray:
-        """Describe the keypoints of a photo.
-
-        Args:
-            image: (1, 1, H, W) float32 in [0, 1].
-            keypoints: (N, 4) x, y, scale (pixels), orientation (degrees).
-            known: not used.
-            generator: draws the variants.
-
-        Returns:
-            (N, 2, VARIANTS, D) float16: as seen and mirrored.
-        """
-        described = np.empty((len(keypoints), 2, VARIANTS, DIM), np.float16)
-        photo = image[0, 0].numpy()
-        for variant in range(VARIANTS):
-            view = photometric_variant(photo, generator) if variant else photo
-            patches = extract_patches(torch.from_numpy(view)[None, None], keypoints)
-            described[:, :, variant] = describe_mirrored(patches, self.describe)
-        return described
-
-
-class FeatureDescriber:
-    """Describes keypoints by an extractor, which detects them again in each variant."""
-
-    def __init__(self, model: dict):
-        self.extract = extractors.load(model).eval().to(device())
-        self.mirror = MIRRORS.get(self.extract.descriptor, np.copy)
-
-    @torch.no_grad()
-    def __call__(
-        self,
-        image: torch.Tensor,
-        keypoints: np.ndarray,
-        known: np.ndarray,
-        generator: np.random.Generator,
-    ) -> np.ndarray:
-        """Describe the keypoints of a photo (1, C, H, W) as `PatchDescriber` does.
-
-        A keypoint that is not found within `MAX_SHIFT` pixels in a variant keeps its `known`
-        descriptor (N, D). Only COLMAP's SIFT is mirrored; of others both views are as seen.
-        """
-        described = np.repeat(known[:, None, None].astype(np.float16), VARIANTS, axis=2)
-        photo = image[0].numpy().transpose(1, 2, 0)
-        for variant in range(1, VARIANTS):
-            view = np.atleast_3d(photometric_variant(photo, generator)).transpose(2, 0, 1)
-            features = self.extract({"image": torch.from_numpy(view.copy())[None].to(device())})
-            found = features["keypoints"][0].cpu().numpy()
-            if not len(found):
-                continue
-            descriptors = features["descriptors"][0].T.cpu().numpy()
-            # several keypoints may lie at one place with different orientations: take the best
-            distance, near = cKDTree(found).query(
-                keypoints[:, :2], k=range(1, NEIGHBORS + 1), distance_upper_bound=MAX_SHIFT
-            )
-            candidates = descriptors[np.minimum(near, len(found) - 1)]
-            likeness = np.einsum("nkd,nd->nk", candidates, known.astype(np.float32))
-            best = np.where(np.isfinite(distance), likeness, -np.inf).argmax(axis=1)
-            again = np.isfinite(distance[:, 0])
-            described[again, 0, variant] = candidates[again, best[again]]
-        return np.concatenate([described, self.mirror(described)], axis=1)
-
-
-def mirror_colmap_sift(descriptors: np.ndarray) -> np.ndarray:
-    """Mirror COLMAP's SIFT descriptors (..., 128) as `describe_mirrored` does patches."""
-    bins = descriptors.reshape(*descriptors.shape[:-1], 4, 4, 8)  # rows, columns, orientations
-    mirrored = np.roll(bins[..., ::-1, :, ::-1], 1, axis=-1)  # orientation 0 stays
-    return mirrored.reshape(descriptors.shape)
-
-
-MIRRORS = {COLMAP: mirror_colmap_sift}
-
-
-def describe_mirrored(patches: torch.Tensor, describe: Descriptor) -> np.ndarray:
-    """Describe patches (N, 1, 32, 32) as seen and mirrored, (N, 2, 128) float32.
-
-    They are mirrored across the axis of the keypoint's orientation, which stays the same.
-    """
-    views = (patches.to(device()), patches.flip(2).to(device()))
-    return np.stack([describe(view).cpu().numpy() for view in views], axis=1)
-
-
-def photometric_variant(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Draw another photo of the same under other light: darker or brighter, blurred, noisy, 8 bit.
-
-    Args:
-        image: (H, W) or (H, W, C) float32 in [0, 1].
-        generator: draws gamma 0.5-2, gain 0.08-1.2, blur up to 1.5 px and noise up to 2 %.
-
-    Returns:
-        Like the image, without the last axis if C is 1.
-    """
-    gamma = 2 ** generator.uniform(-1, 1)
-    gain = np.exp(generator.uniform(np.log(0.08), np.log(1.2)))
-    view = gain * image**gamma
-    blur = generator.uniform(-1.5, 1.5)
-    if blur > 0.3:
-        view = cv2.GaussianBlur(view, (0, 0), blur)
-    noise = generator.uniform(0, 0.02) * np.sqrt(gain)  # less light, less shot noise
-    view = view + noise * generator.standard_normal(view.shape, np.float32)
-    return (np.round(view.clip(0, 1) * 255) / 255).astype(np.float32)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from hloc_reduce.localization import absolute_pose
+from hloc_reduce.localization import absolute_pose, refusals
 from hloc_reduce.localization.confidence import (
     DEFAULT_GATE,
     Gate,
@@ -19,6 +19,8 @@ from hloc_reduce.localization.confidence import (
     reprojection_errors,
     uncertainty,
 )
+from hloc_reduce.localization.pose import Matches
+from hloc_reduce.localization.refusals import imprecision
 from hloc_reduce.utils.cli import InputError
 
 CAMERA = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1600, height=1200, params=[1400, 800, 600])
@@ -160,8 +162,8 @@ def test_inliers_that_do_not_fix_the_pose_are_refused():
     found = solve(keypoints, points)
     assert "the inliers do not fix the pose" in found.refusal
     assert "known intrinsics would help" not in found.refusal
-    its_matches = absolute_pose._Matches(keypoints, points, CAMERA, FREE)
-    assert "known intrinsics would help" in absolute_pose._imprecision(its_matches, found, TRUE)
+    its_matches = Matches(keypoints, points, CAMERA, FREE)
+    assert "known intrinsics would help" in imprecision(its_matches, found, TRUE)
     assert uncertainty(keypoints[:3], points[:3], TRUE, CAMERA) == (np.inf, np.inf)
 
 
@@ -169,9 +171,9 @@ def test_inliers_that_do_not_fix_the_pose_are_refused():
 def test_a_position_is_certain_to_3_percent(monkeypatch, uncertain, is_refused):
     keypoints, points = matches(20, 0)
     found = solve(keypoints, points)
-    monkeypatch.setattr(absolute_pose, "uncertainty", lambda *_: (uncertain, 0.1))
-    its_matches = absolute_pose._Matches(keypoints, points, CAMERA, {})
-    reason = absolute_pose._imprecision(its_matches, found, TRUE)
+    monkeypatch.setattr(refusals, "uncertainty", lambda *_: (uncertain, 0.1))
+    its_matches = Matches(keypoints, points, CAMERA, {})
+    reason = imprecision(its_matches, found, TRUE)
     assert ("% of the distance (at most 3 %)" in (reason or "")) == is_refused
 
 
@@ -330,7 +332,7 @@ def test_a_rival_is_found_in_another_thread(replaced, workers, monkeypatch):
     first, second = matches(60, 0), matches(40, 0, pose=pose_of(0, (50, 0, 8)), seed=1)
     parts = (np.concatenate(part) for part in zip(first, second, strict=True))
     images = [np.arange(0, 100, 2), np.arange(1, 100, 2)]
-    calibrate = absolute_pose._calibrate
+    calibrate = absolute_pose.calibrate
 
     def calibrated(its_matches, pose):
         best, doubt = calibrate(its_matches, pose)
@@ -338,7 +340,7 @@ def test_a_rival_is_found_in_another_thread(replaced, workers, monkeypatch):
         kept = best.inliers & (np.arange(100) < 59)
         return (replace(best, inliers=kept) if replaced else best), doubt
 
-    monkeypatch.setattr(absolute_pose, "_calibrate", calibrated)
+    monkeypatch.setattr(absolute_pose, "calibrate", calibrated)
     found = absolute_pose.estimate(*parts, images, CAMERA, {}, DEFAULT_GATE, True, workers)
     number = 59 if replaced else 60
     assert found.refusal == f"ambiguous: another pose has 40 inliers, this one {number}"

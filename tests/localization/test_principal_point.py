@@ -6,6 +6,7 @@ import pytest
 
 from hloc_reduce.localization import absolute_pose
 from hloc_reduce.localization.confidence import DEFAULT_GATE
+from hloc_reduce.localization.pose import Pose
 from hloc_reduce.localization.projection import reprojection_errors
 
 POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04])), [0.3, 0.1, 8.0])
@@ -14,7 +15,7 @@ GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
 
 def solve(
     true_params: list, listed_params: list, number: int, depth: float = 3
-) -> tuple[absolute_pose.Pose, float]:
+) -> tuple[Pose, float]:
     """Return the pose with a listed camera, and its rotation error in degrees."""
     true, listed = (
         pycolmap.Camera(model="PINHOLE", width=1200, height=900, params=params)

@@ -5,8 +5,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hloc_reduce.localization import absolute_pose, resection
-from hloc_reduce.localization.absolute_pose import Pose
+from hloc_reduce.localization import absolute_pose, calibration, resection
+from hloc_reduce.localization.calibration import choose
 from hloc_reduce.localization.confidence import (
     DEFAULT_GATE,
     INDEPENDENT,
@@ -15,6 +15,7 @@ from hloc_reduce.localization.confidence import (
     uncertainty,
 )
 from hloc_reduce.localization.intrinsics import REFINEMENTS
+from hloc_reduce.localization.pose import Matches, Pose
 from hloc_reduce.localization.resection import (
     ALL,
     RADIAL,
@@ -114,7 +115,7 @@ def test_wrong_matches_near_a_wrong_start_do_not_keep_it(wrong):
     points2D, points3D = matches(camera, 300, depth=1, wrong=wrong)
     right = points2D[:300], points3D[:300]
     one_focal_length = guessed(camera.width, camera.height)
-    its_matches = absolute_pose._Matches(*right, one_focal_length, REFINEMENTS["guess"])
+    its_matches = Matches(*right, one_focal_length, REFINEMENTS["guess"])
     start = absolute_pose._estimate(its_matches, np.arange(300))
     assert start.num_inliers < 50 and error(start)[1] > 20
     pinhole = camera_of(1600, 720, start.camera.params[[0, 0, 1, 2]], "PINHOLE")
@@ -149,10 +150,10 @@ def test_few_matches_of_a_cropped_photo_are_refused_or_right(photo, number):
 @pytest.mark.parametrize(
     ("unclear", "confidence", "is_trusted"),
     [
-        (absolute_pose.UNCLEAR, 103, True),
-        (absolute_pose.UNCLEAR_CROPPED, 103, False),
-        (absolute_pose.UNCLEAR_CROPPED, 90, False),  # 14 of 441 crops, 4 to 8 degrees off
-        (absolute_pose.UNCLEAR_CROPPED, 75, True),
+        (calibration.UNCLEAR, 103, True),
+        (calibration.UNCLEAR_CROPPED, 103, False),
+        (calibration.UNCLEAR_CROPPED, 90, False),  # 14 of 441 crops, 4 to 8 degrees off
+        (calibration.UNCLEAR_CROPPED, 75, True),
     ],
 )
 def test_an_equal_fit_turns_a_photo_that_may_be_cropped(unclear, confidence, is_trusted):
@@ -161,7 +162,7 @@ def test_an_equal_fit_turns_a_photo_that_may_be_cropped(unclear, confidence, is_
     inliers, points3D = np.ones(50, bool), matches(WHOLE, 50, wrong=0)[1]
     assumed = Pose(turn * POSE, guessed(1600, 1200), inliers, confidence=100, degrees_of_freedom=7)
     right = Pose(POSE, WHOLE, inliers, confidence=confidence, degrees_of_freedom=ALL)
-    found, doubt = absolute_pose._choose(assumed, right, points3D, unclear)
+    found, doubt = choose(assumed, right, points3D, unclear)
     assert found is assumed and (doubt is None) == is_trusted
 
 
@@ -178,7 +179,7 @@ def test_an_equal_fit_turns_a_photo_that_may_be_cropped(unclear, confidence, is_
 )
 def test_other_focal_lengths_than_those_of_the_map_may_be_of_crops(focal_length, photo, expected):
     camera = camera_of(1600, 1200, [focal_length, 800, 600, 0], "SIMPLE_RADIAL")
-    its_matches = absolute_pose._Matches(*matches(WHOLE, 20), camera, {"photo": photo})
+    its_matches = Matches(*matches(WHOLE, 20), camera, {"photo": photo})
     assert its_matches.may_be_cropped(Pose(POSE, camera, np.ones(20, bool))) == expected
 
 
@@ -238,8 +239,8 @@ def test_a_negative_focal_length_is_not_refined():
     """RANSAC may return one; the gate refuses it."""
     camera = camera_of(1600, 1200, [-1400, 800, 600, 0], "SIMPLE_RADIAL")
     pose = Pose(POSE, camera, np.ones(50, bool), confidence=50)
-    given = absolute_pose._Matches(*matches(WHOLE, 30), camera, REFINEMENTS["guess"])
-    found, doubt = absolute_pose._calibrate(given, pose)
+    given = Matches(*matches(WHOLE, 30), camera, REFINEMENTS["guess"])
+    found, doubt = absolute_pose.calibrate(given, pose)
     assert found is pose and doubt is None
 
 

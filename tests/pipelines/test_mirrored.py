@@ -5,7 +5,7 @@ import pytest
 from command import outcome, run
 
 from hloc_reduce import Localizer, extract_features
-from hloc_reduce.localization import absolute_pose, mirrored
+from hloc_reduce.localization import mirrored, refusals
 from hloc_reduce.localization.records import log_file, read_records
 from hloc_reduce.utils.cli import InputError
 from pipelines import aachen, inloc, localize
@@ -22,7 +22,7 @@ def symmetric() -> float:
 @pytest.fixture
 def as_certain_as_right_ones(monkeypatch):
     """Without intrinsics the wrong pose is uncertain by 3.3 %, for which it would be refused."""
-    monkeypatch.setattr(absolute_pose, "PRECISE", (1.0, 1.0))
+    monkeypatch.setattr(refusals, "PRECISE", (1.0, 1.0))
 
 
 def mirror(path, of):

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from hloc_reduce.evaluation.ranking import nearest_neighbor_ap
-from hloc_reduce.training import sv, tracks
+from hloc_reduce.training import describers, sv
 from hloc_reduce.training.tracks import Tracks
 
 SMALL = {"hidden": [64], "distance_weight": 0.0, "steps": 300, "batch_size": 100, "lr": 3e-3}
@@ -17,7 +17,7 @@ def noisy_tracks(number=400, views=4, seed=0):
     signal = np.zeros((number, 128))
     signal[:, :8] = generator.standard_normal((number, 8))
     track = np.repeat(np.arange(number), views)
-    noise = generator.standard_normal((len(track), 2, tracks.VARIANTS, 128))
+    noise = generator.standard_normal((len(track), 2, describers.VARIANTS, 128))
     noise[..., :8] = 0
     descriptors = signal[track, None, None] + 0.3 * noise
     descriptors /= np.linalg.norm(descriptors, axis=-1, keepdims=True)

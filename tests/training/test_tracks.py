@@ -11,7 +11,7 @@ import torch
 from interruption import interrupted
 
 from hloc_reduce.confs import features
-from hloc_reduce.training import tracks
+from hloc_reduce.training import describers, tracks
 from hloc_reduce.training.completion import Completion
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.colmap import detect_dog, point3D_ids
@@ -37,7 +37,7 @@ def tracked(plane, kept):
 def test_tracks_of_a_plane(tracked):
     data = tracks.load(tracked / "out/tracks_sift.safetensors")
     assert data.num_tracks > 100
-    assert data.descriptors.shape == (len(data.track), 2, tracks.VARIANTS, 128)
+    assert data.descriptors.shape == (len(data.track), 2, describers.VARIANTS, 128)
     assert (np.diff(data.track) >= 0).all() and data.track[0] == 0
     # the photo's descriptors are those of the feature file, found again by their places
     with h5py.File(tracked / "out/feats-dog-sift.h5") as file:
@@ -75,7 +75,7 @@ def test_colmaps_sift_is_mirrored_by_hand(textured):
     others, mirrored = detect_dog(np.ascontiguousarray(photo[::-1]), options)
     others[:, 1], others[:, 3] = len(photo) - 1 - others[:, 1], -others[:, 3]
     compared = [
-        tracks.mirror_colmap_sift(descriptors[i]) @ mirrored[j]
+        describers.mirror_colmap_sift(descriptors[i]) @ mirrored[j]
         for i, keypoint in enumerate(keypoints)
         for j in np.flatnonzero(np.abs(others[:, :2] - keypoint[:2]).max(1) < 0.1)
         if abs((others[j, 3] - keypoint[3] + 180) % 360 - 180) < 1
@@ -88,7 +88,7 @@ def test_tracks_of_colmaps_sift(plane):
     data = tracks.load(tracks.main(plane / "images", plane / "model", plane / "out", "colmap_sift"))
     assert data.num_tracks > 100 and not data.matched.all()
     photos, mirrored = data.descriptors[:, 0], data.descriptors[:, 1]
-    assert (tracks.mirror_colmap_sift(photos) == mirrored).all()
+    assert (describers.mirror_colmap_sift(photos) == mirrored).all()
     assert not (plane / "out/feats-dog-sift.h5").exists()
 
 
@@ -110,7 +110,7 @@ def undescribed(tracked, tmp_path):
 
 def test_description_goes_on_after_an_interruption(tracked, undescribed, monkeypatch):
     """What was described is not described again, and the file is that of an undisturbed run."""
-    described = interrupted(monkeypatch, tracks.PatchDescriber, "__call__", 3, 5)
+    described = interrupted(monkeypatch, describers.PatchDescriber, "__call__", 3, 5)
     for number in (3, 5):
         with pytest.raises(KeyboardInterrupt):
             tracks.main(*undescribed)
@@ -122,10 +122,10 @@ def test_description_goes_on_after_an_interruption(tracked, undescribed, monkeyp
 
 
 def test_what_was_described_with_another_seed_is_not_used(undescribed, tmp_path, monkeypatch):
-    monkeypatch.setattr(tracks, "VARIANTS", 2)
+    monkeypatch.setattr(describers, "VARIANTS", 2)
     *folders, output = undescribed
     shutil.copytree(output, tmp_path / "whole")
-    described = interrupted(monkeypatch, tracks.PatchDescriber, "__call__", 4)
+    described = interrupted(monkeypatch, describers.PatchDescriber, "__call__", 4)
     with pytest.raises(KeyboardInterrupt):
         tracks.main(*undescribed)
     path = tracks.main(*undescribed, seed=1)
@@ -185,12 +185,12 @@ class Extractor(torch.nn.Module):
 
 
 def test_keypoints_are_found_anew_in_variants(monkeypatch):
-    monkeypatch.setattr(tracks.extractors, "load", lambda _: Extractor())
-    describe = tracks.FeatureDescriber({"name": "test"})
+    monkeypatch.setattr(describers.extractors, "load", lambda _: Extractor())
+    describe = describers.FeatureDescriber({"name": "test"})
     known = np.eye(256, dtype=np.float16)[:2]
     keypoints = np.array([[1, 2], [50, 60]], np.float32)
     described = describe(torch.rand(1, 3, 80, 90), keypoints, known, np.random.default_rng(0))
-    assert described.shape == (2, 2, tracks.VARIANTS, 256) and described.dtype == np.float16
+    assert described.shape == (2, 2, describers.VARIANTS, 256) and described.dtype == np.float16
     assert (described[:, :, 0] == known[:, None]).all()
     assert (described[0, :, 1:] == np.eye(256)[10] + np.eye(256)[0]).all()
     assert (described[1, :, 1:] == known[1]).all()
@@ -198,7 +198,7 @@ def test_keypoints_are_found_anew_in_variants(monkeypatch):
 
 def test_tracks_of_an_extractor(plane, monkeypatch):
     """Its own keypoints; without scales and orientations nothing is completed."""
-    monkeypatch.setattr(tracks, "VARIANTS", 2)
+    monkeypatch.setattr(describers, "VARIANTS", 2)
     conf = features.feature("plain", {"name": "dog", "max_keypoints": 300})
     path = tracks.main(plane / "images", plane / "model", plane / "out", "plain", conf=conf)
     data = tracks.load(path)
@@ -214,7 +214,7 @@ def test_tracks_of_an_extractor(plane, monkeypatch):
         for name in file:
             del file[name]["oris"]
     shutil.rmtree(plane / "out/sfm_plain")
-    monkeypatch.setattr(tracks, "VARIANTS", 1)
+    monkeypatch.setattr(describers, "VARIANTS", 1)
     tracks.main(plane / "images", plane / "model", plane / "out", "plain", conf=conf)
     assert tracks.load(path).matched.all()
 
@@ -222,7 +222,7 @@ def test_tracks_of_an_extractor(plane, monkeypatch):
 def test_photometric_variants_are_images():
     image = np.linspace(0, 1, 40 * 50, dtype=np.float32).reshape(40, 50)
     generator = np.random.default_rng(0)
-    views = [tracks.photometric_variant(image, generator) for _ in range(30)]
+    views = [describers.photometric_variant(image, generator) for _ in range(30)]
     assert all(view.dtype == np.float32 and view.shape == (40, 50) for view in views)
     assert min(view.max() for view in views) < 0.2 and max(view.mean() for view in views) > 0.4
     assert all(view.min() >= 0 and view.max() <= 1 for view in views)

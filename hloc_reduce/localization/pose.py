@@ -1,0 +1,130 @@
+"""A pose with the matches that agree with it, and how poses compare."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from .confidence import RIVAL
+from .projection import POSE
+
+MAX_ERROR = 12.0  # pixels, pycolmap's default
+# poses that differ by more are rivals
+SAME_ROTATION = 10.0  # degrees
+SAME_POSITION = 0.25  # of the median depth of the inliers
+ZOOMED = 1.15  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A pose and how the matches agree with it.
+
+    Args:
+        cam_from_world: the pose, None if there is none.
+        camera: intrinsics, refined if the configuration says so.
+        inliers: (M,) bool.
+        confidence: see `confidence.confidence`.
+        agreement: see `confidence.agreement`.
+        refusal: why it is not trusted, None if it is.
+        degrees_of_freedom: the number of estimated parameters, see `projection`.
+    """
+
+    cam_from_world: pycolmap.Rigid3d | None
+    camera: pycolmap.Camera
+    inliers: np.ndarray
+    confidence: float = -np.inf
+    agreement: float = 0.0
+    refusal: str | None = None
+    degrees_of_freedom: int = POSE
+
+    @property
+    def num_inliers(self) -> int:
+        """The number of inliers."""
+        return int(self.inliers.sum())
+
+
+@dataclass(frozen=True)
+class Matches:
+    """All matches of a query, its intrinsics, and how its pose is estimated.
+
+    Args:
+        points2D: (M, 2) image points, COLMAP's pixels.
+        points3D: (M, 3) their world points.
+        camera: intrinsics.
+        config: as in `absolute_pose.estimate`.
+    """
+
+    points2D: np.ndarray
+    points3D: np.ndarray
+    camera: pycolmap.Camera
+    config: dict
+
+    def __len__(self) -> int:
+        return len(self.points2D)
+
+    @property
+    def max_error(self) -> float:
+        """The inlier threshold in pixels."""
+        return self.config.get("estimation", {}).get("ransac", {}).get("max_error", MAX_ERROR)
+
+    def may_be_cropped(self, pose: Pose) -> bool:
+        """Return whether the photo may be cropped, or enlarged, too, by the focal length found."""
+        photo = self.config.get("photo", {})
+        low, high = photo.get("focal_lengths", (0, np.inf))
+        fits = low / ZOOMED <= pose.camera.mean_focal_length() <= ZOOMED * high
+        return bool(photo.get("cropped")) or not fits
+
+    @property
+    def is_focal_length_guessed(self) -> bool:
+        """Whether RANSAC estimates the focal length."""
+        return bool(self.config.get("estimation", {}).get("estimate_focal_length"))
+
+    @property
+    def is_focal_length_free(self) -> bool:
+        """Whether the focal length is estimated or refined."""
+        refined = self.config.get("refinement", {}).get("refine_focal_length")
+        return self.is_focal_length_guessed or bool(refined)
+
+
+def quality(pose: Pose) -> tuple[float, int]:
+    """Return the confidence and the number of inliers, by which poses are compared."""
+    return pose.confidence, pose.num_inliers
+
+
+def is_rival(pose: Pose, other: Pose, points3D: np.ndarray) -> bool:
+    """Return whether another pose, from other matches, makes a pose ambiguous.
+
+    Args:
+        pose: the best one.
+        other: from the same matches (M).
+        points3D: (M, 3) their points.
+    """
+    if other.confidence < RIVAL * pose.confidence:
+        return False
+    shared = (other.inliers & pose.inliers).sum()
+    return bool(2 * shared < other.num_inliers) and differ(pose, other, points3D)
+
+
+def differ(
+    pose: Pose,
+    other: Pose,
+    points3D: np.ndarray,
+    position: float = SAME_POSITION,
+    rotation: float = SAME_ROTATION,
+) -> bool:
+    """Return whether two poses differ by more than a position or a rotation.
+
+    Args:
+        pose: one of them.
+        other: the other one.
+        points3D: (M, 3) the points of the first one's matches.
+        position: in units of the median depth of the first one's inliers.
+        rotation: in degrees.
+    """
+    if pose.cam_from_world is None or other.cam_from_world is None:
+        return False
+    relative = pose.cam_from_world * other.cam_from_world.inverse()
+    inliers = points3D[pose.inliers]
+    depths = inliers @ pose.cam_from_world.rotation.matrix().T + pose.cam_from_world.translation
+    moved = np.linalg.norm(relative.translation) / np.median(depths[:, 2])
+    return np.degrees(relative.rotation.angle()) > rotation or moved > position
