@@ -59,15 +59,9 @@ def most_covisible(point3D_ids: Iterable[np.ndarray], number: int) -> Iterator[n
         point3D_ids: for each image the points of its keypoints (N,), -1 for none.
         number: maximum number of rows for each image; ties keep the order of the images.
     """
-    from scipy.sparse import coo_array
-
-    points = [ids[ids >= 0] for ids in point3D_ids]
-    rows = np.repeat(np.arange(len(points)), [len(ids) for ids in points])
-    _, columns = np.unique(np.concatenate(points), return_inverse=True)
-    shape = (len(points), columns.max(initial=-1) + 1)
-    observed = coo_array((np.ones(len(rows), np.int32), (rows, columns)), shape).tocsr()
+    observed = colmap.visibility(point3D_ids)
     seen_by = observed.T.tocsr()
-    for start in range(0, len(points), BLOCK):
+    for start in range(0, observed.shape[0], BLOCK):
         counts = (observed[start : start + BLOCK] @ seen_by).tocsr()
         for i, (begin, end) in enumerate(pairwise(counts.indptr), start):
             others, shared = counts.indices[begin:end], counts.data[begin:end]

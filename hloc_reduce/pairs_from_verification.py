@@ -11,6 +11,7 @@ import pycolmap
 
 from . import logger
 from .mapping.database import ZOOMED, import_images
+from .mapping.overlays import drop_overlays
 from .pairs_from_retrieval import rank, read_global, similarity
 from .runtime import provenance
 from .triangulation import Pair, Verified, read_matches
@@ -18,7 +19,6 @@ from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.h5 import file_provenance, list_h5_names, open_h5
 from .utils.images import list_images
-from .utils.overlays import drop_overlays
 from .utils.parsers import parse_pairs, write_pairs
 from .utils.paths import strings_as_paths
 

@@ -8,13 +8,13 @@ import pycolmap
 from . import logger
 from .mapping import registration
 from .mapping.mapper import RULES, Mapper, attempts_for
+from .mapping.overlays import drop_overlays
 from .runtime import provenance
 from .triangulation import STAMP, add_options, read_matches, replacing_map
 from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.h5 import list_h5_names
 from .utils.images import list_images
-from .utils.overlays import drop_overlays
 from .utils.paths import strings_as_paths
 
 # COLMAP would drop parts of fewer than 10 images

@@ -6,8 +6,6 @@ is built. A new map has the feature colmap_sift_sv64 and its matcher unless you 
 --add_images adds photos to a map.
 """
 
-import hashlib
-import re
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -18,23 +16,21 @@ from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
-from hloc_reduce.runtime import provenance, trace
+from hloc_reduce.runtime import trace
 from hloc_reduce.runtime.group_writer import failures
-from hloc_reduce.runtime.outputs import CONF, RunFolder
+from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.paths import strings_as_paths
 
 from . import changes, options
-from .queries import Photos, Queries
+from .queries import LISTED, Photos, Queries, identity, results_folder
 from .retrieval import retrieve_in_map
 from .run import Run, readable
 
 MADE_FROM = "made_from.json"  # the map and the photos of the queries
-LISTED = "queries_with_intrinsics.txt"  # written for a folder of queries
 OF_MAP = "feature", "projection", "matcher", "storage", "keypoints", "camera_mode"  # options
-NOT_IN_NAMES = r"[^\w.-]+"  # characters of a glob
 
 
 @strings_as_paths
@@ -167,7 +163,7 @@ def main(
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
     photos = Photos(outputs / MADE_FROM, built, query_images, names)
-    conf = {"map": built.place, **_queries_of(outputs, query_images, queries), "num_loc": num_loc}
+    conf = {"map": built.place, **identity(outputs, query_images, queries), "num_loc": num_loc}
     inputs = [query_images, *([queries] if queries else [])]
     folder = RunFolder(outputs, conf, overwrite, inputs, stale=bool(photos.changed))
     with Run(folder, built.feature, built.matcher) as run:
@@ -219,33 +215,8 @@ def main(
         return run.finish(summary, wanted.lists, records, truth, limits, features, poses, files)
 
 
-def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> Path:
-    """Return the folder for the results of queries, named after their list or folder.
-
-    If that folder holds results of other queries, a digest of the path is appended to the name.
-
-    Args:
-        outputs: the parent folder.
-        query_images: folder of the photos.
-        queries: their list, if there is one.
-    """
-    name = re.sub(NOT_IN_NAMES, "_", (queries or query_images.resolve()).stem).strip("._-")
-    folder = outputs / f"queries-{name or 'all'}"
-    before = provenance.read(folder / CONF)
-    own = _queries_of(folder, query_images, queries)
-    if any(before.get(key, value) != value for key, value in own.items()):
-        where = f"{own['query_images']}\n{queries and own['queries']}"
-        folder = folder.with_name(f"{folder.name}-{hashlib.sha256(where.encode()).hexdigest()[:8]}")
-    return folder
-
-
-def _queries_of(folder: Path, query_images: Path, queries: Path | None) -> dict[str, str]:
-    """Return the part of the configuration of a folder for results that tells their queries."""
-    listed = queries or folder / LISTED
-    return {"query_images": str(query_images.resolve()), "queries": str(listed.resolve())}
-
-
-def _main() -> None:
+def _parser() -> cli.Parser:
+    """Return the parser of the command line."""
     parser = cli.Parser(
         __doc__, "--map sparse --map_images photos --query_images new --outputs outputs/place"
     )
@@ -290,20 +261,33 @@ def _main() -> None:
     options.add_localization_options(parser, "none", 50)
     # None: what an old map was built with
     parser.set_defaults(feature=None, storage=None, keypoints=None, camera_mode=None)
-    given = options.parse(parser)
+    return parser
+
+
+def _check(given: dict, is_changed: bool) -> None:
+    """Raise an InputError for options that contradict each other.
+
+    Args:
+        given: the options.
+        is_changed: whether photos are added to a map or removed from it.
+    """
     for name, names in (("storage", STORAGES), ("keypoints", KEYPOINTS)):
         if given[name] is not None:
             cli.choose(name, given[name], names)
-    change = {name: given.pop(name) for name in changes.NAMES}
-    if given["outputs"] is None and (given["query_images"] is not None or not any(change.values())):
+    if given["outputs"] is None and (given["query_images"] is not None or not is_changed):
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
-    small = given["compact"]
-    if small is not None:
-        compact.check_output(small)
+    if given["compact"] is not None:
+        compact.check_output(given["compact"])
         if given["map"] is not None and maps.is_compact(given["map"]):
             raise InputError(f"--map {given['map']} is a compact map: leave out --compact.")
+
+
+def _main() -> None:
+    given = options.parse(_parser())
+    change = {name: given.pop(name) for name in changes.NAMES}
+    _check(given, any(change.values()))
     profiled = given.pop("profile") and given["outputs"] is not None
     trace_file = given["outputs"] / "trace.json" if profiled else None
     with trace.recording(trace_file):
@@ -314,8 +298,8 @@ def _main() -> None:
             changes.main(folder, **change)
         if given["outputs"] is not None:
             _run(given)
-        elif small is not None:
-            compact.main(small, given["map"])
+        elif given["compact"] is not None:
+            compact.main(given["compact"], given["map"])
 
 
 def _run(given: dict) -> None:

@@ -1,5 +1,7 @@
 """The queries of pipelines.localize: their names and intrinsics, and whether photos changed."""
 
+import hashlib
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +13,7 @@ from hloc_reduce import logger
 from hloc_reduce.localization import intrinsics
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance
+from hloc_reduce.runtime.outputs import CONF
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.files import is_readable
 from hloc_reduce.utils.images import list_images
@@ -24,6 +27,8 @@ SOURCES = {
     "guess": "guessed and refined with the pose",
     "unknown": "guessed and refined with the pose, of sizes that no map photo has: perhaps cropped",
 }
+LISTED = "queries_with_intrinsics.txt"  # written for a folder of queries
+NOT_IN_NAMES = r"[^\w.-]+"  # characters of a glob
 
 
 @dataclass(frozen=True)
@@ -122,3 +127,29 @@ class Photos:
         for name in unreadable:
             self._photos.pop(name, None)
         self.write()
+
+
+def results_folder(outputs: Path, query_images: Path, queries: Path | None) -> Path:
+    """Return the folder for the results of queries, named after their list or folder.
+
+    If that folder holds results of other queries, a digest of the path is appended to the name.
+
+    Args:
+        outputs: the parent folder.
+        query_images: folder of the photos.
+        queries: their list, if there is one.
+    """
+    name = re.sub(NOT_IN_NAMES, "_", (queries or query_images.resolve()).stem).strip("._-")
+    folder = outputs / f"queries-{name or 'all'}"
+    before = provenance.read(folder / CONF)
+    own = identity(folder, query_images, queries)
+    if any(before.get(key, value) != value for key, value in own.items()):
+        where = f"{own['query_images']}\n{queries and own['queries']}"
+        folder = folder.with_name(f"{folder.name}-{hashlib.sha256(where.encode()).hexdigest()[:8]}")
+    return folder
+
+
+def identity(folder: Path, query_images: Path, queries: Path | None) -> dict[str, str]:
+    """Return the part of the configuration of a folder for results that tells their queries."""
+    listed = queries or folder / LISTED
+    return {"query_images": str(query_images.resolve()), "queries": str(listed.resolve())}

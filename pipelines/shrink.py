@@ -75,14 +75,9 @@ def main(
     Raises:
         InputError: when a file is missing or ambiguous, or is not of the feature.
     """
-    if not hloc_outputs.is_dir():
-        raise cli.no_folder(hloc_outputs)
-    if max_mb is not None and not max_mb > 0:
-        raise InputError(f"--max_mb {max_mb:g}: it must be above 0.")
-    if outputs.resolve() == hloc_outputs.resolve():
-        raise InputError(f"--outputs {outputs} is hloc's folder: choose another one.")
     if ground_truth is not None and queries is None:
         raise InputError("--ground_truth is of queries: give --queries, too.")
+    _check(hloc_outputs, outputs, max_mb)
     features = features or _only(_feature_files(hloc_outputs), hloc_outputs, "features")
     sfm = sfm or _only(_models(hloc_outputs, features), hloc_outputs, "sfm")
     map_names = sorted(image.name for image in colmap.read_model(sfm).images.values())
@@ -117,20 +112,29 @@ def main(
         }
         rows = [{COLUMNS[0]: name, COLUMNS[1]: size / MEGABYTE} for name, size in sizes.items()]
         if listed:
-            tried = (
-                (sfm, features, features, matcher),
-                (sfm, small, small, matcher),
-                (built.sfm, small, built.features, built.matcher),
-            )
             pairs = outputs / "pairs-query.txt"
             names = [name for name, _ in listed]
             retrieval.retrieve_in_map(built, small, pairs, num_loc, names, map_names)
-            stages = "localize-hloc", "localize-reduced", "localize-compact"
-            for name, row, files in zip(stages, rows, tried, strict=True):
+            tried = {
+                "localize-hloc": (sfm, features, features, matcher),
+                "localize-reduced": (sfm, small, small, matcher),
+                "localize-compact": (built.sfm, small, built.features, built.matcher),
+            }
+            for (name, files), row in zip(tried.items(), rows, strict=True):
                 with folder.stage(name):
                     row |= _localize(outputs / name, listed, pairs, *files, truth)
         write_csv(rows, outputs / TABLE)
     return rows
+
+
+def _check(hloc_outputs: Path, outputs: Path, max_mb: float | None) -> None:
+    """Raise an InputError for arguments that cannot be right."""
+    if not hloc_outputs.is_dir():
+        raise cli.no_folder(hloc_outputs)
+    if max_mb is not None and not max_mb > 0:
+        raise InputError(f"--max_mb {max_mb:g}: it must be above 0.")
+    if outputs.resolve() == hloc_outputs.resolve():
+        raise InputError(f"--outputs {outputs} is hloc's folder: choose another one.")
 
 
 def _only(found: Sequence[Path], folder: Path, option: str) -> Path:

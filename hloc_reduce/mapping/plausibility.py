@@ -8,6 +8,7 @@ import pycolmap
 
 from .. import logger
 from ..localization.confidence import focal_lengths
+from ..utils import colmap
 from . import copies, extension
 from .epipolar import Pair, misplaced
 
@@ -112,20 +113,12 @@ def _drop(model: pycolmap.Reconstruction, dropped: dict[str, str]) -> dict[str, 
 
 def _keep_connected(model: pycolmap.Reconstruction) -> None:
     """Keep only the largest set of images that common points connect."""
-    from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     ids = sorted(model.reg_image_ids())
-    row = {image_id: number for number, image_id in enumerate(ids)}
-    seen = [
-        (row[element.image_id], number)
-        for number, point in enumerate(model.points3D.values())
-        for element in point.track.elements
-    ]
-    if not seen:
+    if not ids or not model.num_points3D():
         return
-    image, point = np.array(seen).T
-    sees = coo_array((np.ones(len(image)), (image, point)), (len(ids), point.max() + 1)).tocsr()
+    sees = colmap.visibility(colmap.point3D_ids(model.images[i]) for i in ids)
     _, label = connected_components(sees @ sees.T, directed=False)
     largest = np.bincount(label).argmax()
     for image_id, part in zip(ids, label, strict=True):

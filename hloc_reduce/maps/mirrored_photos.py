@@ -20,7 +20,7 @@ from ..localize_sfm import RANSAC_THRESH
 from ..mapping import extension
 from ..runtime.executors import SERIAL
 from ..utils import cli
-from ..utils.colmap import point3D_ids
+from ..utils.colmap import point3D_ids, visibility
 from ..utils.parsers import parse_retrieval, write_pairs
 from . import mirroring
 
@@ -89,10 +89,7 @@ def _largest_group(sfm: pycolmap.Reconstruction) -> set[str]:
     from scipy.sparse.csgraph import connected_components
 
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
-    points = [np.unique(ids[ids >= 0]) for ids in map(point3D_ids, images)]
-    rows = np.repeat(np.arange(len(images)), [len(ids) for ids in points])
-    columns = np.unique(np.concatenate(points), return_inverse=True)[1].reshape(-1)
-    shows = coo_array((np.ones(len(rows), np.int64), (rows, columns))).tocsr()
+    shows = visibility(map(point3D_ids, images)).sign()
     shared = (shows @ shows.T).tocoo()
     many = shared.data >= SHARED * np.median(shared.diagonal())
     pairs = shared.row[many], shared.col[many]

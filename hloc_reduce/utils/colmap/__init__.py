@@ -27,6 +27,7 @@ from .models import (
     infer_camera,
     point3D_ids,
     read_model,
+    visibility,
     write_part,
 )
 from .sift import check_dog_options, detect_dog

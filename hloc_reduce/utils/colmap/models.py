@@ -1,12 +1,13 @@
 """COLMAP models: read, check, select images; and the cameras of photos."""
 
 import shutil
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from functools import lru_cache
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from struct import error as struct_error
 from struct import unpack_from
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
@@ -14,6 +15,9 @@ import pycolmap
 from ..cli import InputError
 from ..files import replacing
 from ..parsers import CAMERA_MODELS, check_names
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
@@ -154,6 +158,21 @@ def point3D_ids(image: pycolmap.Image) -> np.ndarray:
     for i in image.get_observation_point2D_idxs():
         found[i] = image.point2D(i).point3D_id
     return found
+
+
+def visibility(ids_of_images: Iterable[np.ndarray]) -> "csr_array":
+    """Return how many keypoints of each image show each point (I, P) int32, a sparse matrix.
+
+    Args:
+        ids_of_images: for each image the points of its keypoints (N,), -1 for none.
+    """
+    from scipy.sparse import coo_array
+
+    points = [ids[ids >= 0] for ids in ids_of_images]
+    rows = np.repeat(np.arange(len(points)), [len(ids) for ids in points])
+    _, columns = np.unique(np.concatenate(points), return_inverse=True)
+    shape = len(points), columns.max(initial=-1) + 1
+    return coo_array((np.ones(len(rows), np.int32), (rows, columns)), shape).tocsr()
 
 
 def cam_from_img(camera: pycolmap.Camera, points2D: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from .. import logger
-from .cli import some
+from ..utils.cli import some
 
 # pixels that a keypoint of an overlay moves from photo to photo, at most: also what a camera that
 # circles around an object looks at stays nearly where it is
