@@ -186,8 +186,8 @@ class Addition:
             if not placed:
                 break
             found = sorted(placed)
-            among = self._pairs(found, found, f"new{number}") if len(found) > 1 else None
-            self._extend(placed, [pairs, *([among] if among else [])])
+            everything = sorted([*self.inside, *self.added, *found])
+            self._extend(placed, [pairs, self._pairs(found, everything, f"new{number}")])
         self._leave_out("not localized in the map", left)
 
     def _pairs(self, names: list[str], others: list[str], what: str) -> Path:
