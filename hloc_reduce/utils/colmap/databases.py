@@ -3,14 +3,17 @@
 import errno
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pycolmap
 
 from ..cli import InputError, Parser, choose, some
+
+Options = TypeVar("Options")
 
 FULL = 2**16  # free bytes, below which COLMAP cannot even open a database
 
@@ -72,6 +75,24 @@ def add_camera_mode(parser: Parser) -> None:
     )
 
 
+def parse_options(kind: Callable[[dict], Options], options: dict, what: str) -> Options:
+    """Convert a dict to options of pycolmap.
+
+    Args:
+        kind: pycolmap's class.
+        options: their values by name.
+        what: their name in messages.
+
+    Raises:
+        InputError: for an unknown option, or a value of another type.
+    """
+    try:
+        return kind(options)
+    except (AttributeError, TypeError, RuntimeError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"The {what} options {options} cannot be used ({reason}).") from None
+
+
 def import_images(
     database: Path,
     image_dir: Path,
@@ -86,11 +107,7 @@ def import_images(
     """
     with open_database(database):
         pass
-    try:
-        reader = pycolmap.ImageReaderOptions(options)
-    except (AttributeError, TypeError, RuntimeError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise InputError(f"The image options {options} cannot be used ({reason}).") from None
+    reader = parse_options(pycolmap.ImageReaderOptions, options, "image")
     pycolmap.import_images(database, image_dir, camera_mode, image_names=names, options=reader)
     with open_database(database) as opened:
         imported = {image.name for image in opened.read_all_images()}

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from ..cli import InputError
 from ..interrupts import interruptible
 from ..parsers import parse_pairs, write_pairs
-from .databases import full_disk, open_database
+from .databases import full_disk, open_database, parse_options
 
 
 def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
@@ -20,11 +19,7 @@ def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
     Raises:
         InputError: for an unknown option.
     """
-    try:
-        return pycolmap.IncrementalPipelineOptions(options)
-    except (AttributeError, TypeError, RuntimeError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise InputError(f"The mapper options {options} cannot be used ({reason}).") from None
+    return parse_options(pycolmap.IncrementalPipelineOptions, options, "mapper")
 
 
 def solver_options(options: pycolmap.BundleAdjustmentOptions) -> Any:

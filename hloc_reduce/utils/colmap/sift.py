@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from ..cli import InputError
+from .databases import parse_options
 
 
 def detect_dog(image: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray]:
@@ -63,9 +63,5 @@ def check_dog_options(options: dict) -> None:
 
 
 def _extraction_options(options: dict) -> pycolmap.FeatureExtractionOptions:
-    try:
-        sift = pycolmap.SiftExtractionOptions(options)
-    except (AttributeError, TypeError, RuntimeError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise InputError(f"The DoG options {options} cannot be used ({reason}).") from None
+    sift = parse_options(pycolmap.SiftExtractionOptions, options, "DoG")
     return pycolmap.FeatureExtractionOptions(sift=sift)
