@@ -81,7 +81,7 @@ def check(
     """Check that a database has descriptors for a feature, and is that of a model.
 
     Args:
-        database: it.
+        database: COLMAP database.
         reduction: to the feature.
         model: the model, if there is one.
 
@@ -126,13 +126,13 @@ def write(
     """Write images of a database, as `check` returns them, into a feature file.
 
     Args:
-        database: it.
-        output: see `main`, like `normalization` and `overwrite`.
+        database: COLMAP database.
+        output: the feature file.
         reduction: to the feature.
         names: the images.
         made_from: what determines the content of the database.
-        normalization: see `output`.
-        overwrite: see `output`.
+        normalization: of the SIFT descriptors; default: detected.
+        overwrite: write all images again.
     """
     normalization = normalization or _normalization(database, names)
     cli.choose("normalization", normalization, NORMALIZATIONS)

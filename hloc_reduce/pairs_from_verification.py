@@ -102,8 +102,8 @@ def more_pairs(
         listed: known pairs, each sorted.
         connected: from connected pair to its number of verified matches.
         descriptors: (N, G) global descriptors of the images.
-        num_matched: see `main`.
-        num_covis: see `main`.
+        num_matched: most similar images that each image is paired with.
+        num_covis: covisible images that each image is paired with.
 
     Returns:
         New pairs, each sorted.

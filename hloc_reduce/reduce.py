@@ -90,9 +90,9 @@ class Reduction:
     """Converts base descriptors to those of a feature.
 
     Args:
-        feature: as in `confs.features.get`, like `projection` and `storage`.
-        projection: see `feature`.
-        storage: see `feature`.
+        feature: name of a feature, or its YAML file.
+        projection: projection file to use with the base descriptor of `feature`.
+        storage: how descriptors are stored, one of `utils.codes.STORAGES`.
 
     Attributes:
         name: of the feature.
@@ -190,7 +190,7 @@ def told_by(descriptors: np.ndarray, place: str) -> str:
     """Detect how SIFT descriptors are normalized, and log it.
 
     Args:
-        descriptors: see `normalization.detect`.
+        descriptors: (N, 128) of many keypoints.
         place: name of the file.
 
     Raises:

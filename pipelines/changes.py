@@ -41,9 +41,9 @@ def check(
 
     Args:
         given: the other options of `pipelines.localize`.
-        add_images: see `main`, like `add_model` and `refine_map`.
-        add_model: see `add_images`.
-        refine_map: see `add_images`.
+        add_images: folder of photos to add.
+        add_model: COLMAP model of their poses.
+        refine_map: also adjust the poses of the photos that are in the map.
     """
     if add_images is None and (add_model is not None or refine_map):
         raise InputError(
@@ -70,7 +70,7 @@ def main(
         folder: of the map.
         add_images: folder of photos to add.
         add_model: COLMAP model of their poses, see `maps.add`.
-        refine_map: see `maps.add`.
+        refine_map: also adjust the poses of the photos that are in the map.
         remove_images: text file of the names of photos to remove.
 
     Raises:

@@ -59,7 +59,7 @@ def main(
         run: the run, with features, map and global descriptors.
         place: its data set.
         sfm: its map.
-        max_mb: see `hloc_reduce.compact.main`.
+        max_mb: size of the file in 1,000,000 bytes.
         lists: the queries of each list.
         limits: the recall thresholds of each list.
 

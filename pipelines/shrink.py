@@ -58,14 +58,14 @@ def main(
     Args:
         hloc_outputs: the folder, which is not changed.
         outputs: folder of the reduced feature file, the compact map, and the table, shrink.csv.
-        feature: as in `reduce.main`, like `storage`.
-        storage: see `feature`.
+        feature: name of a feature, or its YAML file.
+        storage: how descriptors are stored, one of `utils.codes.STORAGES`.
         features: hloc's feature file, with the queries; default: the only one in the folder.
         sfm: COLMAP model of its keypoints; default: the only one in the folder.
         queries: query list with intrinsics, or a glob of several.
         ground_truth: true poses of the queries.
         num_loc: retrieved map images per query, by VLAD.
-        max_mb: see `compact.main`.
+        max_mb: size of the compact map in 1,000,000 bytes; default: with all points.
         overwrite: replace earlier results.
 
     Returns:

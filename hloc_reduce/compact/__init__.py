@@ -96,12 +96,12 @@ def write(
     """Write a compact map of what a pipeline has in memory and in files.
 
     Args:
-        output: see `main`, like `matcher`, `storage`, `max_mb`, the result and the errors.
+        output: the file.
         source: what it is made from.
         features: feature file of the images.
-        matcher: see `output`.
-        storage: see `output`.
-        max_mb: see `output`.
+        matcher: matcher of queries; default: the map's, but NN-ratio90 for NN-ratio.
+        storage: storage of the points' descriptors; default: as in `main`.
+        max_mb: size of the file in 1,000,000 bytes; default: with all points.
     """
     matcher = matcher or matcher_of(source.matcher)
     cli.choose("matcher", matcher, matchers_confs.confs)

@@ -242,7 +242,7 @@ def of_patches(name: str) -> tuple[str, str | None]:
     """Return the base descriptor and the projection, if any, of a feature of patches.
 
     Args:
-        name: see `get`.
+        name: name of a feature, or its YAML file.
 
     Raises:
         InputError: for an unknown feature, or one that cannot describe patches.

@@ -108,7 +108,7 @@ class Graph(torch.nn.Module):
         """Compute the features of an image.
 
         Args:
-            image: see `Extractor.fixed`.
+            image: (1, 3, H, W) float32 RGB in [0, 1]; H and W are multiples of `stride`.
 
         Returns:
             Keypoints (N, 2) x, y in pixels, centres at integers; scores (N,); and descriptors
@@ -152,8 +152,8 @@ def extract(
 
     Args:
         model: an extractor.
-        image: see `utils.images.resized`.
-        preprocessing: see `utils.images.resized`.
+        image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
+        preprocessing: `grayscale`, `resize_max` and `resize_force` of the feature's configuration.
         device: of the model.
 
     Returns:
@@ -177,8 +177,8 @@ def extract_several(
 
     Args:
         models: extractors with equal `detection`.
-        image: see `utils.images.resized`.
-        preprocessing: see `utils.images.resized`.
+        image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
+        preprocessing: `grayscale`, `resize_max` and `resize_force` of the feature's configuration.
         device: of the models.
         detect: replaces `detect` of the models, for example by a call in another process.
 

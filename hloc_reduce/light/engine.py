@@ -43,8 +43,9 @@ class LightEngine:
         """Extract the features of a photo, see `extractors.extract`.
 
         Args:
-            image: see `utils.images.resized`.
-            preprocessing: see `utils.images.resized`.
+            image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
+            preprocessing: `grayscale`, `resize_max` and `resize_force` of the feature's
+                configuration.
         """
         pixels, size = resized(image, preprocessing)
         return in_original(self._extract(pixels), pixels.shape, size, dog.NOISE)

@@ -93,9 +93,10 @@ def mutual_nearest(
     Args:
         descriptors0: (N, D) int16, see `nearest`.
         descriptors1: (M, D) int16, see `nearest`.
-        ratio_threshold: see `nearest`.
+        ratio_threshold: maximum ratio of the distances to the nearest and the second nearest; None
+            for no ratio test.
         rows: (K,) rows of descriptors0 to match; default: all.
-        distance_threshold: see `nearest`.
+        distance_threshold: maximum distance to the nearest; None for any.
         mutual: if False, match each row with its nearest only one way.
 
     Returns:
@@ -146,8 +147,9 @@ def match_images_of_points(
         points: (P, D) int16, see `nearest`.
         query: (N, D) int16, see `nearest`.
         images: of each image the rows of its points (K,) int64, ascending.
-        ratio_threshold: see `nearest`.
-        distance_threshold: see `nearest`.
+        ratio_threshold: maximum ratio of the distances to the nearest and the second nearest; None
+            for no ratio test.
+        distance_threshold: maximum distance to the nearest; None for any.
 
     Returns:
         For each image (M, 2) int64, the rows of the photo's descriptors and of `images[i]`, the

@@ -168,7 +168,7 @@ def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict
     """Return the options of `localize_sfm.main` for a photo with inferred intrinsics.
 
     Args:
-        camera: from `infer`, like `source`.
+        camera: as `infer` returns it.
         source: a key of `REFINEMENTS`.
         of_map: what the map tells.
 

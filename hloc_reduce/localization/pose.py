@@ -23,8 +23,8 @@ class Pose:
         cam_from_world: the pose, None if there is none.
         camera: intrinsics, refined if the configuration says so.
         inliers: (M,) bool.
-        confidence: see `confidence.confidence`.
-        agreement: see `confidence.agreement`.
+        confidence: -log10 of the number of such poses that are expected by chance.
+        agreement: the largest share of an image's matches that agree, minus one standard deviation.
         refusal: why it is not trusted, None if it is.
         degrees_of_freedom: the number of estimated parameters, see `projection`.
     """

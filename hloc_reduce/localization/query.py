@@ -32,7 +32,7 @@ def localize(
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
         gate: what a pose must have to be trusted.
         thorough: where few matches agree with a pose, try those of single images, too.
-        workers: see `absolute_pose.estimate`.
+        workers: threads that estimate poses.
 
     Returns:
         The pose (camera from world) or None, and info on the cluster of map images with the best

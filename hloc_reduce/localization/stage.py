@@ -208,13 +208,13 @@ def localize_all(
     """Yield the names and the records of queries.
 
     Args:
-        load_reference: as in `main`, like `config` to `matches`.
-        config: see `load_reference`.
-        skip_matches: see `load_reference`.
-        gate: see `load_reference`.
-        executor: see `load_reference`.
-        features: see `load_reference`.
-        matches: see `load_reference`.
+        load_reference: returns the map; called in each process that localizes queries.
+        config: returns the options of a query from its name and intrinsics.
+        skip_matches: leave out retrieved images with fewer matches.
+        gate: what a pose must have for the query to be called localized.
+        executor: does the work.
+        features: feature file of the queries.
+        matches: match file of the pairs.
         tasks: names and intrinsics of the queries, with the images that are retrieved for each.
         thorough: also try matches of single images, as `absolute_pose.estimate` does.
         said: what the progress bar says.

@@ -24,10 +24,12 @@ def contradicting(
     Args:
         common: (N, N) what each pair of photos has in common, symmetric.
         expected: (N, N) what it is expected to have, symmetric.
-        share: see above.
+        share: two groups contradict each other if they have less in common than this share of what
+            is expected.
         enough: whether sums of what is expected of two groups, of these sizes, are evidence: of
             arrays that broadcast.
-        apart: see above.
+        apart: the same for groups that are not joined to each other, in sets of up to `MOST`
+            photos.
 
     Returns:
         Indices of the group; none if no groups contradict each other.

@@ -47,16 +47,16 @@ def main(
         image_dir: folder of the images.
         model: COLMAP model with their poses; None to reconstruct them, in an arbitrary frame and
             scale.
-        feature: as in `confs.features.get`, like `projection`, `storage` and `keypoints`.
-        projection: see `feature`.
+        feature: name of a feature, or its YAML file.
+        projection: projection file to use with the base descriptor of `feature`.
         matcher: a key of `confs.matchers`; default: the feature's.
         num_covis: each image is paired with this number of the most covisible ones in the model.
             Without points in the model, or without a model, up to `MAX_EXHAUSTIVE` images are all
             paired with each other, and of more each with the most similar ones; without a model,
             pairs are added where these leave images unconnected.
         overwrite: rebuild the map.
-        storage: see `feature`.
-        keypoints: see `feature`.
+        storage: how descriptors are stored, one of `utils.codes.STORAGES`.
+        keypoints: settings of the DoG detector, one of `detectors.dog.KEYPOINTS`.
         accept_partial: do without images that are missing or unreadable; without a model, build a
             map even if fewer than half of the images are in it.
         camera_mode: which images share a camera, without a model.

@@ -41,11 +41,11 @@ def main(
         map_dir: the folder of the map.
         database: COLMAP database with keypoints and descriptors.
         model: the COLMAP model that was made from it, with points.
-        feature: as in `from_colmap.main`, like `projection` and `storage`.
-        projection: see `feature`.
+        feature: name of a feature, or its YAML file.
+        projection: projection file to use with the base descriptor of `feature`.
         matcher: default: the feature's.
         overwrite: rebuild the map.
-        storage: see `feature`.
+        storage: how descriptors are stored, one of `utils.codes.STORAGES`.
         keypoints: settings of DoG for queries, as in `confs.features.get`.
         image_dir: folder of the images, whose EXIF data tell more about the cameras, and which the
             report shows; None if there are none.

@@ -45,11 +45,11 @@ def extract(
     """Extract the features of the mirror images of some photos.
 
     Args:
-        conf: as in `mirror_images`, like `image_dir`, `features` and `executor`.
-        image_dir: see `conf`.
+        conf: configuration of the features.
+        image_dir: folder of the photos.
         names: the photos.
-        features: see `conf`.
-        executor: see `conf`.
+        features: the feature file.
+        executor: runs the extraction.
 
     Returns:
         The feature file.

@@ -120,10 +120,11 @@ def mutual_nearest(
     Args:
         descriptors0: (N, D) of unit norm, or int16 from `utils.codes.to_integers`.
         descriptors1: (M, D) like these.
-        ratio_threshold: see `nearest`.
+        ratio_threshold: maximum ratio of the distances to the nearest and the second nearest; None
+            for no ratio test.
         rows: (K,) rows of descriptors0 to match; default: all.
-        gpu_bytes: see `nearest`.
-        distance_threshold: see `nearest`.
+        gpu_bytes: GPU memory that may be used at once.
+        distance_threshold: maximum distance to the nearest; None for any.
         mutual: if False, match each row with its nearest only one way.
 
     Returns:
@@ -170,9 +171,10 @@ def mutual_nearest_padded(
     Args:
         descriptors0: (N, D) of unit norm of each pair, N > 0.
         descriptors1: (M, D) of unit norm of each pair, M > 0.
-        ratio_threshold: see `nearest`.
-        distance_threshold: see `nearest`.
-        mutual: see `mutual_nearest`.
+        ratio_threshold: maximum ratio of the distances to the nearest and the second nearest; None
+            for no ratio test.
+        distance_threshold: maximum distance to the nearest; None for any.
+        mutual: if False, match each descriptor0 with its nearest only one way.
 
     Returns:
         For each pair the index of the match of each descriptor0 (N,) int64, or -1, and its cosine

@@ -50,9 +50,9 @@ def strongest_fixed(
 
     Args:
         scores: (H, W) float.
-        radius: see `strongest`.
-        min_score: see `strongest`.
-        border: see `strongest`; at least `radius`.
+        radius: a maximum is above all other scores in the square of side 2 radius + 1 around it.
+        min_score: lower ones are dropped.
+        border: number of pixels at each border without keypoints, at least `radius`.
         number: of keypoints, at least 1.
         weights: (H, W) float above 0, which the scores of maxima are multiplied by.
 

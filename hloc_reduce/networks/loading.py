@@ -53,7 +53,7 @@ def output_size(path: Path, layer: str, what: str) -> int:
     Args:
         path: the file.
         layer: name of the convolution.
-        what: see `read_into`.
+        what: name of the file in messages.
 
     Raises:
         InputError: when the file is broken, or another network's.

@@ -38,9 +38,9 @@ def main(
     Args:
         folders: outputs folders of runs, or folders with such folders, as for `runs.find`.
         output: the HTML file.
-        queries: the queries whose matches are shown; default: `num_queries`, evenly from the worst
-            to the best.
-        num_queries: see `queries`.
+        queries: the queries whose matches are shown; default: `num_queries` of them, spread evenly
+            from the worst to the best.
+        num_queries: how many queries are shown without `queries`.
         pictures_dir: also write plots (SVG) and pictures of matches (JPEG) to this folder.
 
     Returns:

@@ -227,11 +227,11 @@ def fill(
 
     Args:
         writers: by key, the writers of the files.
-        work: see `executors`; yields groups, each with the key of its writer.
-        items: see `Executor.map`.
+        work: from items to groups, each with the key of its writer.
+        items: what `work` is given; drawn as they are needed.
         executor: where the work is done.
-        size: see `Executor.map`.
-        gpu: see `Executor.map`.
+        size: items per chunk, enough to be worth handing to another process.
+        gpu: the work uses a GPU if there is one.
 
     Yields:
         The key of the writer and the name of each group.
