@@ -102,8 +102,9 @@ def more_pairs(
         listed: known pairs, each sorted.
         connected: from connected pair to its number of verified matches.
         descriptors: (N, G) global descriptors of the images.
-        num_matched: most similar images that each image is paired with.
-        num_covis: covisible images that each image is paired with.
+        num_matched: maximum number of new pairs of a poorly connected image with similar images,
+            and again with neighbours of its neighbours.
+        num_covis: maximum number of new pairs of any other image with neighbours of its neighbours.
 
     Returns:
         New pairs, each sorted.

@@ -50,7 +50,9 @@ def main(
     images, some with other initial pairs. With `camera_mode` AUTO, if at most two thirds of the
     images are in the model, or focal lengths differ by more than a factor of 1.2, and one camera
     may have taken all of them, the mapper runs with one shared camera. Its model is kept if it has
-    at least 1.5 times as many images, or 1.5 times as many points where focal lengths differ.
+    at least 1.5 times as many images, or 1.5 times as many points where focal lengths differ. It
+    also runs and is kept if focal lengths differ by more than a factor of 1.05, although all images
+    fit with one camera, and 0.9 times as many points are found.
 
     Args:
         sfm_dir: folder of the new COLMAP model; a model made from the same inputs is read instead.
@@ -84,7 +86,8 @@ def main(
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
     names = list_images(image_dir, list_h5_names(features) if image_list is None else image_list)
-    attempts = [{}] if once or mapper_options else attempts_for(len(names))
+    thorough = [{}] if mapper_options else attempts_for(len(names))
+    attempts = thorough[:1] if once else thorough
     chosen = {
         "camera_mode": camera_mode.name,
         "image_options": image_options or {},
@@ -109,6 +112,7 @@ def main(
                 *(building, image_dir, names, image_options or {}, keypoints, found),
                 unverified=None if skip_geometric_verification else pairs,
                 attempts=[{**options, **changed} for changed in attempts],
+                thorough=[{**options, **changed} for changed in thorough],
                 verbose=verbose,
             ).reconstruct(camera_mode)
         sfm = colmap.read_model(sfm_dir)

@@ -75,9 +75,9 @@ def main(
     Raises:
         InputError: when a file is missing or ambiguous, or is not of the feature.
     """
+    _check(hloc_outputs, outputs, max_mb)
     if ground_truth is not None and queries is None:
         raise InputError("--ground_truth is of queries: give --queries, too.")
-    _check(hloc_outputs, outputs, max_mb)
     features = features or _only(_feature_files(hloc_outputs), hloc_outputs, "features")
     sfm = sfm or _only(_models(hloc_outputs, features), hloc_outputs, "sfm")
     map_names = sorted(image.name for image in colmap.read_model(sfm).images.values())

@@ -102,6 +102,12 @@ def write(
         matcher: matcher of queries; default: the map's, but NN-ratio90 for NN-ratio.
         storage: storage of the points' descriptors; default: as in `main`.
         max_mb: size of the file in 1,000,000 bytes; default: with all points.
+
+    Returns:
+        The bytes of each part of the file.
+
+    Raises:
+        InputError: for an unknown matcher, or a size that is too small.
     """
     matcher = matcher or matcher_of(source.matcher)
     cli.choose("matcher", matcher, matchers_confs.confs)

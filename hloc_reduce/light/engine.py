@@ -44,8 +44,7 @@ class LightEngine:
 
         Args:
             image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-            preprocessing: `grayscale`, `resize_max` and `resize_force` of the feature's
-                configuration.
+            preprocessing: of the feature's configuration, and `mirrored`, to swap left and right.
         """
         pixels, size = resized(image, preprocessing)
         return in_original(self._extract(pixels), pixels.shape, size, dog.NOISE)

@@ -68,7 +68,11 @@ class Matches:
         return self.config.get("estimation", {}).get("ransac", {}).get("max_error", MAX_ERROR)
 
     def may_be_cropped(self, pose: Pose) -> bool:
-        """Return whether the photo may be cropped, or enlarged, too, by the focal length found."""
+        """Return whether the photo may be cropped.
+
+        Its size tells, or that the focal length of a pose is unlike the map's, as that of photos
+        which were cropped and enlarged again.
+        """
         photo = self.config.get("photo", {})
         low, high = photo.get("focal_lengths", (0, np.inf))
         fits = low / ZOOMED <= pose.camera.mean_focal_length() <= ZOOMED * high

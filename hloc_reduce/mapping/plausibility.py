@@ -12,7 +12,9 @@ from ..utils import colmap
 from . import copies, extension
 from .epipolar import Pair, misplaced
 
-SPREAD = 1.2  # ratio of focal lengths above which one camera for all images is tried
+# ratios of focal lengths of images that one camera may have taken: one camera for all is tried
+SPREAD = 1.2  # above it, always
+DOUBTFUL = 1.05  # above it, if the images fit with one
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
 MANY = 3  # images of one camera estimate its focal length better than EXIF data do
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint

@@ -35,7 +35,7 @@ from .map import FINGERPRINTS, RETRIEVAL, Map
 from .mirroring import mirror_images
 
 GROWING = "growing"  # the folder of an addition, in that of the map
-NUM_LOC = 20  # images of the map that a new photo is matched with
+NUM_LOC = 20  # most similar images that a new photo is matched with
 IMAGES = "images/"  # begins the names of photos in the fingerprints of a map
 
 

@@ -87,7 +87,7 @@ class Building:
         cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
         if fit.gain > cropping.GAIN:
             cameras = cameras._replace(known={})  # they may be wrong
-        write(
+        written = write(
             *(self.folder.path, conf, sfm, cameras),
             feature=feature,
             matcher=self.matcher,
@@ -108,8 +108,7 @@ class Building:
         built = Map(self.folder.path)
         built.warn()
         drop_others(self.folder, built)
-        finished = self.folder.path / FINISHED
-        provenance.write(finished, provenance.read(finished) | {"bytes": self.folder.bytes()})
+        provenance.write(self.folder.path / FINISHED, written | {"bytes": self.folder.bytes()})
         return built
 
     def _of_model(

@@ -7,8 +7,8 @@ import numpy as np
 import pycolmap
 
 from .. import logger
-from ..mapping.extension import OPTIONS
-from ..utils import cli, colmap
+from ..mapping.adjustment import adjusted_error, with_own_cameras
+from ..utils import cli
 
 LARGEST = 200  # images: adjusting more takes minutes, and more photos bend a map less
 # cropped photos, and others with wrong focal lengths, gain 18 % and more, those of sound maps at
@@ -57,15 +57,15 @@ def find(sfm: pycolmap.Reconstruction) -> Fit:
     if len(images) > LARGEST or residuals <= 2 * own:
         return NOT_TRIED
     adjusted = copy.deepcopy(sfm)
-    error = _adjusted_error(adjusted, refine_principal_point=False)
+    error = adjusted_error(adjusted)
 
     def gain(freed: pycolmap.Reconstruction, parameters: int) -> float:
         by_chance = (1 - parameters / residuals) ** 0.5
-        return 1 - _adjusted_error(freed, refine_principal_point=True) / (error * by_chance or 1.0)
+        return 1 - adjusted_error(freed, refine_principal_point=True) / (error * by_chance or 1.0)
 
-    separate = _with_own_cameras(adjusted)
+    separate = with_own_cameras(adjusted)
     if len(cameras) < len(images):
-        _adjusted_error(separate, refine_principal_point=False)
+        adjusted_error(separate)
     of_own = gain(separate, own - sum(cameras.values()) + 2 * len(cameras))
     if of_own > GAIN and (altered := _altered(separate, _focal_lengths(adjusted))):
         return Fit(of_own, altered)
@@ -76,21 +76,6 @@ def find(sfm: pycolmap.Reconstruction) -> Fit:
 def _focal_lengths(sfm: pycolmap.Reconstruction) -> dict[str, float]:
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     return {image.name: sfm.cameras[image.camera_id].mean_focal_length() for image in images}
-
-
-def _with_own_cameras(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """Copy the images, points and tracks of a map, with a camera for each image."""
-    made = pycolmap.Reconstruction()
-    for image_id in sfm.reg_image_ids():
-        image = sfm.images[image_id]
-        camera = copy.deepcopy(sfm.cameras[image.camera_id])
-        camera.camera_id = image_id
-        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-        copied = pycolmap.Image(image.name, keypoints, camera_id=image_id, image_id=image_id)
-        colmap.add_image(made, camera, copied, image.cam_from_world())
-    for point in sfm.points3D.values():
-        made.add_point3D(point.xyz, point.track)
-    return made
 
 
 def _altered(sfm: pycolmap.Reconstruction, assumed: dict[str, float]) -> list[str]:
@@ -117,23 +102,6 @@ def _off_centre(camera: pycolmap.Camera) -> np.ndarray:
     principal_point = np.array([camera.principal_point_x, camera.principal_point_y])
     size = np.array([camera.width, camera.height])
     return (principal_point - size / 2) / size.max()
-
-
-def _adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool) -> float:
-    """Adjust a map, in place, and return its mean reprojection error in pixels."""
-    options = OPTIONS.get_global_bundle_adjustment()
-    options.refine_principal_point = refine_principal_point
-    options.print_summary = False
-    solver = colmap.solver_options(options)
-    # by COLMAP's limit of the gradient, 1, the adjustment of few points ends before it begins
-    solver.gradient_tolerance, solver.function_tolerance = 1e-4, 1e-6
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in sfm.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, sfm).solve()
-    sfm.update_point_3d_errors()
-    return sfm.compute_mean_reprojection_error()
 
 
 def warn(fit: Fit, unlike_others: list[str]) -> None:
@@ -163,7 +131,7 @@ def warn(fit: Fit, unlike_others: list[str]) -> None:
         logger.warning(
             "The photos fit %.0f %% better if their principal points are not in their centres: "
             "they may be cropped, or have wrong focal lengths, and positions may be off by a tenth "
-            "of the distance and more. Uncropped photos, a COLMAP model with known intrinsics, or "
-            "--camera_mode single for photos of one camera help.",
+            "of the distance and more. Uncropped photos or a COLMAP model with known intrinsics "
+            "help, and --camera_mode single if one camera took all photos, but each has its own.",
             100 * fit.gain,
         )

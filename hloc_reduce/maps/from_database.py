@@ -86,6 +86,8 @@ def main(
                 logger.info("Building the map %s of %d images.", map_dir, len(names))
                 conf = keep_projection(conf, map_dir)
                 _build(folder, opened, reduction, conf, names, reference, model, found)
+                with folder.stage("judge_poses"):
+                    contradicting = copies.find(reference)
                 write(
                     *(map_dir, conf, reference, cameras),
                     feature=name,
@@ -96,7 +98,7 @@ def main(
                     keypoints=keypoints,
                     images=len(names),
                     images_with_pose=len(names),
-                    images_contradicting_others=copies.find(reference),
+                    images_contradicting_others=contradicting,
                     seconds=folder.seconds(),
                     bytes=folder.bytes(),
                 )

@@ -217,8 +217,8 @@ def write(
     reconstruction: pycolmap.Reconstruction,
     cameras: intrinsics.MapCameras,
     **content: object,
-) -> None:
-    """Write map.json, with which a map is finished.
+) -> dict:
+    """Write map.json, with which a map is finished, and return it.
 
     Args:
         folder: of the map.
@@ -243,8 +243,9 @@ def write(
         "points3D": reconstruction.num_points3D(),
     }
     conf = with_projection(conf, lambda path: Path(path).name)
-    content = {**whole, "conf": conf, **intrinsics.to_dict(cameras), **content}
-    provenance.write(folder / FINISHED, content)
+    whole |= {"conf": conf, **intrinsics.to_dict(cameras), **content}
+    provenance.write(folder / FINISHED, whole)
+    return whole
 
 
 def is_map(folder: Path) -> bool:

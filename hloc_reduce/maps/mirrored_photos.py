@@ -13,7 +13,7 @@ from ..confs.matchers import confs as matchers_confs
 from ..confs.retrieval import confs as retrieval_confs
 from ..localization import intrinsics, stage
 from ..localization.confidence import DEFAULT_GATE
-from ..localization.mirrored import is_doubtful, mirror
+from ..localization.mirrored import mirror
 from ..localization.query import merged
 from ..localization.references import SfmMap
 from ..localize_sfm import RANSAC_THRESH
@@ -29,6 +29,7 @@ from . import mirroring
 SHARED = 0.5
 SIMILAR = 20  # photos by which one is localized
 FEWEST = 3  # photos that may tell whether others are mirrored
+CERTAIN = 0.9, 250.0  # least agreement and confidence of the mirror image of a mirrored photo
 CONFIG = {"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}
 
 
@@ -143,7 +144,8 @@ class _Judge:
             name
             for name, record in as_mirrored.items()
             if record["confidence"] > as_they_are[name]["confidence"]
-            and not is_doubtful(record["agreement"], record["confidence"])
+            and record["agreement"] >= CERTAIN[0]
+            and record["confidence"] >= CERTAIN[1]
         }
 
     def _localize(

@@ -124,7 +124,13 @@ def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):
     assert names(folder) == [*BASE, NEW]
 
 
-def test_photos_that_are_localized(place, tmp_path, caplog, run, refused):
+def test_photos_that_are_localized(place, tmp_path, monkeypatch, caplog, run, refused):
+    paired, pair = [], addition.pairs_from_retrieval.main
+
+    def logged(descriptors, output, number, query_list, db_list):
+        paired.append((output.name, query_list, db_list))
+        return pair(descriptors, output, number, query_list=query_list, db_list=db_list)
+
     build, images, outputs = place
     run(*build)
     folder = outputs / "map"
@@ -132,8 +138,12 @@ def test_photos_that_are_localized(place, tmp_path, caplog, run, refused):
     new = images / "query/day"  # one that the map shows, and a grey one
     cv2.imwrite(str(new / "noise.png"), np.random.default_rng(0).integers(0, 255, (270, 360)))
     (new / "broken.png").write_text("no photo")
-    run("--map", folder, "--add_images", new)
+    with monkeypatch.context() as context:
+        context.setattr(addition.pairs_from_retrieval, "main", logged)
+        run("--map", folder, "--add_images", new)
     assert names(folder) == ["a.png", *sorted(before)]
+    everything = ["a.png", *sorted(before)]  # as when a map is built: new ones only among these
+    assert ("pairs-new1.txt", ["a.png"], everything) in paired
     assert {name: poses(folder)[name] for name in before} == before
     assert "not readable: broken.png" in caplog.text
     assert "not localized in the map: grey.png, noise.png" in caplog.text

@@ -40,6 +40,7 @@ def mirror_images(outputs):
 @pytest.mark.usefixtures("as_certain_as_right_ones")
 def test_photos_of_ones_own(place, tmp_path, monkeypatch):
     """The mirrored photo is refused by the pipeline and in memory, and would not be otherwise."""
+    monkeypatch.setattr(mirrored, "DOUBTFUL", (0.9, 250.0))
     build, images, outputs = place
     new = tmp_path / "new"
     new.mkdir()

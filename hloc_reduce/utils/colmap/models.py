@@ -163,8 +163,10 @@ def point3D_ids(image: pycolmap.Image) -> np.ndarray:
 def visibility(ids_of_images: Iterable[np.ndarray]) -> "csr_array":
     """Return how many keypoints of each image show each point (I, P) int32, a sparse matrix.
 
+    Its columns are the points that any image shows, by ascending id.
+
     Args:
-        ids_of_images: for each image the points of its keypoints (N,), -1 for none.
+        ids_of_images: for each of one or more images the points of its keypoints (N,), -1 for none.
     """
     from scipy.sparse import coo_array
 
