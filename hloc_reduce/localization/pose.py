@@ -12,7 +12,7 @@ MAX_ERROR = 12.0  # pixels, pycolmap's default
 # poses that differ by more are rivals
 SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the median depth of the inliers
-ZOOMED = 1.15  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
+ZOOMED = 1.05  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
 
 
 @dataclass(frozen=True)
