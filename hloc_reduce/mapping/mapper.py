@@ -17,6 +17,7 @@ from .adjustment import adjusted_error, with_one_camera
 from .plausibility import (
     COPY,
     DOUBTFUL,
+    FEW,
     MAX_DISTORTION,
     MISPLACED,
     SPREAD,
@@ -34,7 +35,6 @@ RELAXED = {
     "init_min_tri_angle": 8.0,
     "abs_pose_min_num_inliers": 15,
 }
-FEW = 100  # images: further attempts take little time, even for one missing image
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
 SEEDS = (1, 2, 3)
 MORE = 1.5  # times as many images show that one camera took all

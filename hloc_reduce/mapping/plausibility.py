@@ -14,7 +14,8 @@ from .epipolar import Pair, misplaced
 
 # ratios of focal lengths of images that one camera may have taken: one camera for all is tried
 SPREAD = 1.2  # above it, always
-DOUBTFUL = 1.05  # above it, if the images fit with one
+DOUBTFUL = 1.05  # above it, for few images, if these fit with one
+FEW = 100  # images: further attempts take little time, even for one missing image
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
 MANY = 3  # images of one camera estimate its focal length better than EXIF data do
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint

@@ -7,7 +7,7 @@ from .. import logger
 from ..runtime import provenance
 from ..utils import cli
 from ..utils.cli import InputError
-from .plausibility import COPY, DOUBTFUL, MISPLACED, VIEWPOINTS
+from .plausibility import COPY, DOUBTFUL, FEW, MISPLACED, SPREAD, VIEWPOINTS
 
 REGISTRATION = "registration.json"  # which images are in the model, and in other parts
 # shares of registered images: a model with fewer is reported in detail, or refused
@@ -94,7 +94,7 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
             "them. To use the map as it is, run again with --accept_partial."
         )
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
-        if state["alike"] and spread > DOUBTFUL:
+        if state["alike"] and spread > (DOUBTFUL if number <= FEW else SPREAD):
             logger.warning(
                 "The map may be wrong: its photos have the same size, but their estimated focal "
                 "lengths differ by a factor of %.2f. If one camera with a fixed zoom took all, run "
