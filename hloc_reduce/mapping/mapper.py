@@ -85,20 +85,10 @@ class Mapper:
         """Write the best model, its database and its registration."""
         database = self.write_database(camera_mode)
         models, dropped = self.run(database, self.attempts)
-        registered, points = _size(models)
         alike = camera_mode == pycolmap.CameraMode.AUTO and _are_alike(database)
-        several = len(self.attempts) > 1
-        few = several and MORE * registered <= len(_matched(database))
-        spread = focal_length_spread(models)
-        fits = alike and DOUBTFUL < spread <= SPREAD and _fits_one_camera(models[0])
-        if alike and (few or fits or spread > SPREAD):
-            logger.info("Trying again with one camera for all images.")
-            shared = self.write_database(pycolmap.CameraMode.SINGLE)
-            found, implausible = self.run(shared, self.thorough if fits else self.attempts)
-            images, more = _size(found)
-            enough = spread > DOUBTFUL and more >= (ALMOST if fits else MORE) * points
-            if found and (images >= MORE * registered or (images >= registered and enough)):
-                models, dropped, database, alike = found, implausible, shared, False
+        if alike and (shared := self._with_one_camera(models, database)):
+            (models, dropped), database = shared
+            alike = False
         if not models:
             raise NoModelError(nothing(self.image_dir, dropped))
         models[0].write(self.folder)
@@ -117,6 +107,25 @@ class Mapper:
         database.rename(self.folder / "database.db")
         for other in self.folder.glob("database-*"):
             other.unlink()
+
+    def _with_one_camera(
+        self, models: list[pycolmap.Reconstruction], database: Path
+    ) -> tuple[Models, Path] | None:
+        """Return models with one camera for all images, and their database, if they are better."""
+        registered, points = _size(models)
+        spread, several = focal_length_spread(models), len(self.attempts) > 1
+        few = several and MORE * registered <= len(_matched(database))
+        fits = DOUBTFUL < spread <= SPREAD and _fits_one_camera(models[0])
+        if not (few or fits or spread > SPREAD):
+            return None
+        logger.info("Trying again with one camera for all images.")
+        shared = self.write_database(pycolmap.CameraMode.SINGLE)
+        found = self.run(shared, self.thorough if fits else self.attempts)
+        images, more = _size(found[0])
+        enough = more >= MORE * points if spread > SPREAD else fits and more >= ALMOST * points
+        if found[0] and (images >= MORE * registered or (images >= registered and enough)):
+            return found, shared
+        return None
 
     def write_database(self, mode: pycolmap.CameraMode) -> Path:
         """Write a database of the images and their verified matches."""
