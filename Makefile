@@ -13,8 +13,9 @@ OLD := $(VENV)/pycolmap-$(OLDEST)
 STAGES_OF_COLMAP := from_colmap localize_sfm more_pairs pairs_from_covisibility \
 	pairs_from_verification reconstruction to_colmap triangulation
 
-# two workers take files in alphabetical order; in pytest-xdist's own order the slowest come last
-TWO := -n 2 --dist loadfile --no-loadscope-reorder
+# Workers take files in alphabetical order; in pytest-xdist's own order the slowest come last. Three
+# keep two cores busy, because some tests wait.
+WORKERS := -n 3 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test types suite test-long lint clean
 .DELETE_ON_ERROR:
@@ -31,9 +32,9 @@ types: $(VENV)/installed
 	$(BIN)/mypy
 
 suite: $(VENV)/installed $(OLD)/installed
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(WORKERS)
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
-	OMP_NUM_THREADS=1 PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest $(TWO) \
+	OMP_NUM_THREADS=1 PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest $(WORKERS) \
 		tests/models/test_dog.py tests/mapping $(STAGES_OF_COLMAP:%=tests/stages/test_%.py) \
 		tests/maps/test_localizer.py \
 		tests/maps/test_compact.py::test_a_file_localizes_as_its_map \
