@@ -114,7 +114,7 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
                 f" {_left_out(implausible, missing)}" if implausible else "",
             )
         return
-    message = shortfall(sfm_dir / REGISTRATION, **state)
+    message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
     if registered < LEAST * number and not accept_partial:
         raise InputError(f"{message} To use the map as it is, run again with --accept_partial.")
     logger.warning(message)
@@ -128,6 +128,7 @@ def shortfall(
     unmatched: list[str],
     implausible: dict[str, str],
     alike: bool,
+    left_out: int = 0,
 ) -> str:
     """Say which images are not in a model, why, and what to try.
 
@@ -139,13 +140,16 @@ def shortfall(
         unmatched: the images without verified matches.
         implausible: from each dropped image to what is implausible about it.
         alike: each image has its own camera, but one camera may have taken all.
+        left_out: number of further images that the model was not to have.
     """
     registered = images - len(missing)
     only = "Only " if registered < ENOUGH * images else ""
     said = [
-        f"{only}{registered} of {images} photos are in the map.",
+        f"{only}{registered} of {images + left_out} photos are in the map.",
         f"Missing: {cli.some(missing, NAMED)}{f' (all in {path})' * bool(missing[NAMED:])}.",
     ]
+    if left_out:
+        said.append(f"{left_out} more {'is' if left_out == 1 else 'are'} left out.")
     tries: list[str] = []
     if len(parts) > 1:
         sizes = [str(len(part)) for part in parts]

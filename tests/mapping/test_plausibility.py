@@ -125,6 +125,8 @@ def test_parts_that_do_not_connect():
     assert "2 parts that do not connect, of 5 and 3 photos" in message
     assert "the second has f, g, h." in message and "between the parts" in message
     assert "matches j." in message and "--camera_mode" not in message
+    message = registration.shortfall(Path("x"), **state, left_out=2)
+    assert "Only 5 of 12 photos" in message and "2 more are left out." in message
     state |= {"implausible": {"i": "distortion 4.6"}, "alike": True}
     message = registration.shortfall(Path("x"), **state)
     assert "no lens has" in message and "i (distortion 4.6)." in message
