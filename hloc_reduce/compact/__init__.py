@@ -31,7 +31,7 @@ TRIES = 12  # sizes that are tried to come close to a limit
 AIM, CLOSE = 0.998, 0.995  # shares of the limit that are aimed at, and are close enough
 # descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
-FEW = 32  # numbers of DoG's features that are stored as uint4; others as uint2
+FEW = 32  # dimensions of DoG's features that are stored as uint4; others as uint2
 
 
 @strings_as_paths
@@ -59,7 +59,7 @@ def main(
         matcher: a key of `confs.matchers`; default: the map's, or the feature's, but NN-ratio90
             instead of NN-ratio.
         storage: of the points' descriptors; default: that of the map if it has codes, else uint4
-            for up to 32 numbers of DoG's features, uint2 for others, and float16 without levels.
+            for up to 32 dimensions of DoG's features, uint2 for others, and float16 without levels.
         max_mb: the size of the file in 1,000,000 bytes; points that images need least are left out.
 
     Returns:
