@@ -15,7 +15,7 @@ import pycolmap
 
 # agreement and confidence below which poses are doubtful. Those of most mirrored photos have an
 # agreement of at most 0.85 or a confidence of at most 125; two of a castle 0.92 and 432.
-DOUBTFUL = 0.95, 500.0
+DOUBTFUL = 0.9, 500.0
 SIDED = ("p2", "sx1", "sx2")  # parameters
 
 # from names of queries to files of the features and of the matches of their mirror images
