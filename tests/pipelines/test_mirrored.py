@@ -37,6 +37,15 @@ def mirror_images(outputs):
     return {name: record["mirror_image"] for name, record in records.items()}
 
 
+@pytest.mark.parametrize(
+    "agreement, confidence, expected",
+    [(0.92, 432, True), (0.90, 375, True), (0.85, 2000, True), (0.96, 2783, False)],
+)
+def test_poses_like_those_of_mirrored_photos_are_doubtful(agreement, confidence, expected):
+    """The first two were of mirrored photos of a castle, and were not tried."""
+    assert mirrored.is_doubtful(agreement, confidence) == expected
+
+
 @pytest.mark.usefixtures("as_certain_as_right_ones")
 def test_photos_of_ones_own(place, tmp_path, monkeypatch):
     """The mirrored photo is refused by the pipeline and in memory, and would not be otherwise."""
