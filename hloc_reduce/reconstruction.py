@@ -86,8 +86,7 @@ def main(
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
     names = list_images(image_dir, list_h5_names(features) if image_list is None else image_list)
-    thorough = [{}] if mapper_options else attempts_for(len(names))
-    attempts = thorough[:1] if once else thorough
+    attempts = [{}] if mapper_options else attempts_for(len(names))
     chosen = {
         "camera_mode": camera_mode.name,
         "image_options": image_options or {},
@@ -95,7 +94,7 @@ def main(
         "skip_geometric_verification": skip_geometric_verification,
         "min_match_score": min_match_score,
         "overlays": "dropped",
-        "attempts": attempts,
+        "attempts": attempts[:1] if once else attempts,
         **RULES,
         "once": once,
     }
@@ -112,7 +111,7 @@ def main(
                 *(building, image_dir, names, image_options or {}, keypoints, found),
                 unverified=None if skip_geometric_verification else pairs,
                 attempts=[{**options, **changed} for changed in attempts],
-                thorough=[{**options, **changed} for changed in thorough],
+                once=once,
                 verbose=verbose,
             ).reconstruct(camera_mode)
         sfm = colmap.read_model(sfm_dir)

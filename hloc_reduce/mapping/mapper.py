@@ -78,13 +78,13 @@ class Mapper:
     matches: dict[tuple[str, str], np.ndarray]  # from pair to (M, 2)
     unverified: Path | None  # text file of pairs to verify by two-view geometry
     attempts: list[dict]  # of pycolmap's IncrementalPipelineOptions
-    thorough: list[dict]  # the same, with one camera for images that fit with one
+    once: bool  # make the first attempt only, unless images fit with one camera
     verbose: bool
 
     def reconstruct(self, camera_mode: pycolmap.CameraMode) -> None:
         """Write the best model, its database and its registration."""
         database = self.write_database(camera_mode)
-        models, dropped = self.run(database, self.attempts)
+        models, dropped = self.run(database, self.once)
         alike = camera_mode == pycolmap.CameraMode.AUTO and _are_alike(database)
         if alike and (shared := self._with_one_camera(models, database)):
             (models, dropped), database = shared
@@ -113,14 +113,14 @@ class Mapper:
     ) -> tuple[Models, Path] | None:
         """Return models with one camera for all images, and their database, if they are better."""
         registered, points = _size(models)
-        spread, several = focal_length_spread(models), len(self.attempts) > 1
+        spread, several = focal_length_spread(models), len(self.attempts) > 1 and not self.once
         few = several and MORE * registered <= len(_matched(database))
         fits = DOUBTFUL < spread <= SPREAD and _fits_one_camera(models[0])
         if not (few or fits or spread > SPREAD):
             return None
         logger.info("Trying again with one camera for all images.")
         shared = self.write_database(pycolmap.CameraMode.SINGLE)
-        found = self.run(shared, self.thorough if fits else self.attempts)
+        found = self.run(shared, self.once and not fits)
         images, more = _size(found[0])
         enough = more >= MORE * points if spread > SPREAD else fits and more >= ALMOST * points
         if found[0] and (images >= MORE * registered or (images >= registered and enough)):
@@ -134,7 +134,7 @@ class Mapper:
         databases.write(path, *arguments, self.image_options, self.verbose)
         return path
 
-    def run(self, database: Path, attempts: list[dict]) -> Models:
+    def run(self, database: Path, once: bool) -> Models:
         """Return the plausible models of the best attempt; stop when enough images are in one."""
         cameras, folder = colmap.read_cameras(database), self.folder / "models"
         evidence = cameras, self.keypoints, colmap.read_verified(database)
@@ -151,6 +151,7 @@ class Mapper:
             return keep_plausible(found, *evidence)
 
         best: Models = [], {}
+        attempts = self.attempts[:1] if once else self.attempts
         for attempt, changed in enumerate(attempts, start=1):
             best = max(best, attempted(changed), key=lambda both: _size(both[0]))
             registered = _size(best[0])[0]

@@ -161,9 +161,14 @@ def test_one_camera_for_focal_lengths_that_differ_little(
                 keypoints = enlarged * (keypoints - [320, 240]) + [320, 240]
             file[name]["keypoints"][...] = keypoints
 
+    attempts = []
+
     def bent(database, *arguments):
+        attempts.append(len(colmap.read_cameras(database)))
+        if attempts.count(1) == 1 == attempts[-1]:
+            return []  # then the next attempt counts
         models = mapping(database, *arguments)
-        if enlarged == 1 and len(colmap.read_cameras(database)) > 1:
+        if enlarged == 1 and attempts[-1] > 1:
             models[0].cameras[1].focal_length *= 1.08
         return models
 
@@ -171,4 +176,5 @@ def test_one_camera_for_focal_lengths_that_differ_little(
     arguments = (tmp_path / "sfm", scene.images, pairs, scene.features, matches)
     model = reconstruction.main(*arguments, image_list=names, once=True)
     assert model.num_cameras() == (1 if enlarged == 1 else 6)
+    assert attempts == ([6, 1, 1] if enlarged == 1 else [6])
     assert ("may be wrong" in caplog.text) == (enlarged != 1)
