@@ -1,12 +1,10 @@
 """Keypoints and descriptors of this project's own network."""
 
-from ..networks import MINI, fetch_weights
+from ..networks import MINI, MINI_SIZE, fetch_weights
 from ..networks.edgepoint2 import EdgePoint2 as Network
 from ..networks.loading import load_file, output_size
 from ..utils.cli import choose
 from .edgepoint2 import EdgePoint2
-
-SIZE = "M"  # of EdgePoint2's architecture
 
 
 class Mini(EdgePoint2):
@@ -21,8 +19,8 @@ class Mini(EdgePoint2):
     def _init(self, conf: dict) -> None:
         name = choose("model_name", conf["model_name"], MINI)
         weights, what = fetch_weights(name, conf["weights"]), f"The weights of {name}"
-        self.dim = output_size(weights, "desc_head.2", what)
-        self.network = load_file(Network(SIZE, self.dim), weights, what)
+        self.dim = output_size(weights, Network.last, what)
+        self.network = load_file(Network(MINI_SIZE, self.dim), weights, what)
 
     @property
     def descriptor(self) -> str:

@@ -52,6 +52,7 @@ ALIKED = {
 }
 
 MINI = ("mini32",)  # this project's own
+MINI_SIZE = "L"  # of EdgePoint2's architecture
 WEIGHTS = Path(__file__).parent / "weights"
 
 NETWORKS = (

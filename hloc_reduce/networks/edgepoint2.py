@@ -65,6 +65,7 @@ class EdgePoint2(nn.Module):
     """
 
     stride = 32  # the sides of its images are multiples of it
+    last = "desc_head.2"  # the layer of the descriptors
 
     def __init__(self, size: str, dim: int):
         super().__init__()

@@ -12,17 +12,22 @@ from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 from safetensors.torch import save_file
 from torch import nn
-from torch.nn.functional import cosine_similarity, grid_sample, normalize, smooth_l1_loss
+from torch.nn.functional import (
+    cosine_similarity,
+    cross_entropy,
+    grid_sample,
+    max_pool2d,
+    normalize,
+    smooth_l1_loss,
+)
 
 from .. import logger
-from ..networks import EDGEPOINT2, MINI, fetch_weights
+from ..networks import EDGEPOINT2, MINI, MINI_SIZE, fetch_weights
 from ..networks.edgepoint2 import EdgePoint2
-from ..networks.keypoints import strongest
-from ..networks.loading import load_weights, read_into
+from ..networks.loading import load_weights, output_size, read_into
 from ..runtime.versions import versions
 from ..utils import cli
 from ..utils.cli import InputError
@@ -30,18 +35,16 @@ from ..utils.files import file_sha256, replacing
 from ..utils.paths import strings_as_paths
 from . import views
 from .loop import device, fit
-from .losses import contrastive_loss
 
-ARCHITECTURE = "M"
-RECIPE = {"lr": 0.002, "weight_decay": 0.0, "final_lr": 0.0}
-BATCH = 4  # pairs of views
+RECIPE = {"lr": 0.003, "weight_decay": 0.0, "final_lr": 0.0}
 HIGHEST = 14.0  # logit at which the scores of the teacher are clamped
-SCORES, MATCHES = 0.5, 0.2  # weights of the losses
+SCORES, MATCHES = 0.5, 0.5  # weights of the losses
 # Scores near keypoints are few, and count more; errors above this many logits grow linearly.
 HIGH, WEIGHT, LINEAR = -6.0, 9.0, 4.0
 KEYPOINTS, RADIUS, MIN_SCORE, BORDER = 256, 2, -5.0, 8  # of a view
-FEWEST = 32  # matched keypoints of a pair
+NEAR = 4.0  # pixels: keypoints nearer than that need not be told apart
 TEMPERATURE = 0.06
+NEVER = -1e4  # similarity of what is not compared
 # Lloyd-Max levels of 2 bits of a normal distribution, and the threshold between them
 INNER, OUTER, THRESHOLD = 0.4528, 1.5104, 0.9816
 
@@ -55,10 +58,35 @@ def rounded(descriptors: torch.Tensor) -> torch.Tensor:
     return descriptors + (normalize(mean + deviation * levels) - values)
 
 
-def sample(dense: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """Return the descriptors (N, D) at pixels (N, 2) of a view, from a map (D, h, w)."""
-    grid = (points + 0.5) / views.SIZE * 2 - 1
-    return normalize(grid_sample(dense[None], grid[None, None], align_corners=False)[0, :, 0].T)
+def find(scores: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Find the keypoints of views, those with the highest scores.
+
+    Args:
+        scores: (B, 1, H, W), logits.
+
+    Returns:
+        Their pixels x, y (B, KEYPOINTS, 2), float32, and whether there is one (B, KEYPOINTS).
+    """
+    highest = max_pool2d(scores, 2 * RADIUS + 1, stride=1, padding=RADIUS)
+    maxima = torch.where((scores == highest) & (scores > MIN_SCORE), scores, -torch.inf)
+    inner = maxima[:, 0, BORDER:-BORDER, BORDER:-BORDER]
+    found, index = inner.flatten(1).topk(KEYPOINTS)
+    width = inner.shape[2]
+    pixels = torch.stack([index % width, index // width], dim=2) + BORDER
+    return pixels.float(), found.isfinite()
+
+
+def sample(dense: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    """Return the descriptors (B, N, D) at pixels (B, N, 2) of views, from maps (B, D, h, w)."""
+    grid = (pixels + 0.5) / views.SIZE * 2 - 1
+    return normalize(grid_sample(dense, grid[:, None], align_corners=False)[:, :, 0].mT, dim=2)
+
+
+def moved(pixels: torch.Tensor, matrices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return where pixels (B, N, 2) are after homographies (B, 3, 3), and whether in the view."""
+    there = pixels @ matrices[:, :, :2].mT + matrices[:, None, :, 2]
+    there = there[..., :2] / there[..., 2:]
+    return there, ((there >= BORDER) & (there < views.SIZE - BORDER)).all(dim=2)
 
 
 def matching_loss(
@@ -72,20 +100,24 @@ def matching_loss(
         matrices: (B, 3, 3) float32, from pixels of the first view to pixels of the second.
 
     Returns:
-        A scalar, the mean over pairs with enough keypoints in common; 0 if there are none.
+        The mean cross entropy of finding a keypoint among the others of its pair, in both
+        directions, a scalar; 0 if no views have a keypoint in common.
     """
-    losses = []
-    for i, matrix in enumerate(matrices):
-        limits = RADIUS, MIN_SCORE, BORDER, KEYPOINTS
-        points, _ = strongest(scores[2 * i, 0].detach(), *limits)
-        moved = points @ matrix[:, :2].T + matrix[:, 2]
-        moved = moved[:, :2] / moved[:, 2:]
-        inside = ((moved >= BORDER) & (moved < views.SIZE - BORDER)).all(dim=1)
-        if inside.sum() < FEWEST:
-            continue
-        here, there = sample(dense[2 * i], points[inside]), sample(dense[2 * i + 1], moved[inside])
-        losses.append(contrastive_loss(here, rounded(there), TEMPERATURE))
-    return torch.stack(losses).mean() if losses else dense.new_zeros(())
+    pixels, found = find(scores[::2].detach())
+    places, inside = moved(pixels, matrices)
+    valid = found & inside
+    places = places.where(valid[..., None], 0.0)  # some are at infinity
+    if not valid.any():
+        return dense.new_zeros(())
+    here, there = sample(dense[::2], pixels), sample(dense[1::2], places)
+    there = there.masked_scatter(valid[..., None], rounded(there[valid]))
+    same = torch.eye(KEYPOINTS, dtype=torch.bool, device=dense.device)
+    apart = same | (torch.cdist(places, places) > NEAR)
+    compared = apart & valid[:, :, None] & valid[:, None]
+    similarities = (here @ there.mT / TEMPERATURE).masked_fill(~compared, NEVER)
+    right = torch.arange(KEYPOINTS, device=dense.device).expand(len(valid), -1)[valid]
+    forth, back = (cross_entropy(rows[valid], right) for rows in (similarities, similarities.mT))
+    return (forth + back) / 2
 
 
 def score_loss(scores: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
@@ -97,23 +129,16 @@ def score_loss(scores: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
 
 
 def loss(
-    student: nn.Module, teacher: nn.Module, sources: list[views.Source], seed: int, step: int
+    student: nn.Module, teacher: nn.Module, photos: views.Photos, batch: int, seed: int, step: int
 ) -> torch.Tensor:
     """Compute the loss of a training step."""
-    rng = np.random.default_rng([seed, step])
-    pairs = list(views.draw(sources, BATCH, rng))
-    device = next(student.parameters()).device
-    clean, degraded = (
-        torch.from_numpy(np.concatenate(part))[:, None].to(device)
-        for part in ([pair.clean for pair in pairs], [pair.degraded for pair in pairs])
-    )
-    matrices = torch.tensor(np.stack([p.matrix for p in pairs]), dtype=torch.float32, device=device)
+    pairs = photos.draw(batch, (seed, step))
     with torch.no_grad():
-        wanted, wanted_scores = teacher(clean)
-    dense, scores = student(degraded)
+        wanted, wanted_scores = teacher(pairs.clean)
+    dense, scores = student(pairs.degraded)
     unlike = (1 - cosine_similarity(dense, wanted, dim=1)).mean()
     wrong = score_loss(scores, wanted_scores)
-    return unlike + SCORES * wrong + MATCHES * matching_loss(dense, scores, matrices)
+    return unlike + SCORES * wrong + MATCHES * matching_loss(dense, scores, pairs.matrices)
 
 
 @strings_as_paths
@@ -126,6 +151,7 @@ def main(
     start: Path | None = None,
     steps: int = 4000,
     cache: Path = Path("outputs/training/towns"),
+    batch: int = 4,
     seed: int = 0,
 ) -> Path:
     """Train a network.
@@ -136,9 +162,11 @@ def main(
         dim: dimension of its descriptors.
         towns: seeds of demo towns that are rendered by day and by night.
         teacher: a model of EdgePoint2 with the same dimension, such as E32.
-        start: weights of an earlier training to start from; default: random ones.
-        steps: number of training steps, of 8 views each.
+        start: weights of an earlier training to start from, whose descriptors may have another
+            dimension: then only the last layer starts from random ones; default: all do.
+        steps: number of training steps.
         cache: folder for the rendered photos.
+        batch: pairs of views of a step.
         seed: of everything random.
 
     Raises:
@@ -154,19 +182,22 @@ def main(
     if not sources:
         raise InputError("Give photos, --images, or seeds of --towns.")
     torch.manual_seed(seed)
-    student = EdgePoint2(ARCHITECTURE, dim)
+    student = EdgePoint2(MINI_SIZE, dim)
     if start:
-        read_into(student, fetch_weights(MINI[0], start), "The weights")
-    student = student.to(device())
-    guide = load_weights(EdgePoint2(teacher[0], dim), teacher).to(device())
+        _start_from(student, start)
+    guide = load_weights(EdgePoint2(teacher[0], dim), teacher)
+    for network in (student, guide):
+        # channels last are faster
+        network.to(device=device(), memory_format=torch.channels_last)  # type: ignore[call-overload]
     metadata = {
-        "architecture": f"EdgePoint2 {ARCHITECTURE}{dim}",
+        "architecture": f"EdgePoint2 {MINI_SIZE}{dim}",
         "dim": dim,
         "teacher": f"EdgePoint2 {teacher}",
         "images": [path.resolve().parent.name for path in images],
         "towns": towns,
         "photos": len(sources),
         "steps": steps,
+        "batch": batch,
         "recipe": RECIPE,
         "seed": seed,
         "start": start and file_sha256(start),
@@ -174,8 +205,9 @@ def main(
     names = [f"{source.clean} {source.clean.stat().st_size}" for source in sources]
     digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
     checkpoint = output.with_suffix(".checkpoint")
-    step_loss = partial(loss, student, guide, sources, seed)
-    made_from = json.dumps({**metadata, "digest": digest, "batch": BATCH})
+    photos = views.Photos(sources, device())
+    step_loss = partial(loss, student, guide, photos, batch, seed)
+    made_from = json.dumps({**metadata, "digest": digest})
     fit(student.train(), step_loss, steps, RECIPE, checkpoint, made_from)
     metadata["versions"] = versions()
     weights = {key: value.contiguous().cpu() for key, value in student.state_dict().items()}
@@ -184,6 +216,15 @@ def main(
     checkpoint.unlink(missing_ok=True)
     logger.info("The weights are in %s.", output)
     return output
+
+
+def _start_from(student: EdgePoint2, start: Path) -> None:
+    """Copy the weights of a file, except a last layer with another number of dimensions."""
+    path, what = fetch_weights(MINI[0], start), "The weights"
+    given = EdgePoint2(MINI_SIZE, output_size(path, EdgePoint2.last, what))
+    weights, own = read_into(given, path, what).state_dict(), student.state_dict()
+    same = {key: value for key, value in weights.items() if value.shape == own[key].shape}
+    student.load_state_dict(own | same)
 
 
 def _main() -> None:
@@ -198,6 +239,7 @@ def _main() -> None:
     add("--teacher", help="model of EdgePoint2 (default: E<dim>)")
     add("--start", type=Path, help="weights to start from, to adapt them to other photos")
     add("--steps", type=int, default=4000, help="number of training steps")
+    add("--batch", type=int, default=4, help="pairs of views of a step; a GPU takes 64")
     cache = Path("outputs/training/towns")
     add("--cache", type=Path, default=cache, help="folder for rendered photos")
     add("--seed", type=int, default=0, help="seed of everything random")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from interruption import interrupted
+from safetensors.torch import load_file
 from torch.nn.functional import normalize
 
 from hloc_reduce import extract_features, extractors
@@ -17,6 +18,8 @@ from hloc_reduce.training import mini, views
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.h5 import list_h5_names
+
+CPU = torch.device("cpu")
 
 
 @pytest.fixture
@@ -34,30 +37,76 @@ def teacher(monkeypatch):
     """A random teacher, which needs no download."""
 
     def load(network, name):
-        assert name == "T32"
+        assert name in ("T32", "T48")
         torch.manual_seed(7)
-        return EdgePoint2("T", 32).eval()
+        return EdgePoint2("T", int(name[1:])).eval()
 
     monkeypatch.setattr(mini, "load_weights", load)
 
 
 def test_views_show_the_same_place(photos):
     """The homography maps the first view to the second, where both show the photo."""
-    pairs = list(views.draw(views.of_folders([photos]), 6, np.random.default_rng(0)))
+    sources = views.of_folders([photos])
+    pairs = views.Photos(sources, CPU).draw(6, (0, 0))
     inside = np.zeros((views.SIZE, views.SIZE), np.float32)
     inside[4:-4, 4:-4] = 1
-    for pair in pairs:
-        size = (views.SIZE, views.SIZE)
-        moved = cv2.warpPerspective(pair.clean[0], pair.matrix, size)
-        common = cv2.warpPerspective(inside, pair.matrix, size) == 1
+    clean = pairs.clean[:, 0].numpy()
+    for first, second, matrix in zip(clean[::2], clean[1::2], pairs.matrices.numpy(), strict=True):
+        moved = cv2.warpPerspective(first, matrix, inside.shape)
+        common = cv2.warpPerspective(inside, matrix, inside.shape) == 1
         assert common.mean() > 0.05
-        error = np.abs(moved - pair.clean[1])[common].mean()
-        assert error < 0.3 * np.abs(pair.clean[0] - pair.clean[1])[common].mean()
-        for part in (pair.clean, pair.degraded):
-            assert part.dtype == np.float32 and part.min() >= 0 and part.max() <= 1
-    assert any(np.abs(pair.clean - pair.degraded).mean() > 0.1 for pair in pairs)
-    again = list(views.draw(views.of_folders([photos]), 6, np.random.default_rng(0)))
-    assert all(np.array_equal(a.degraded, b.degraded) for a, b in zip(pairs, again, strict=True))
+        error = np.abs(moved - second)[common].mean()
+        assert error < 0.3 * np.abs(first - second)[common].mean()
+    for part in (pairs.clean, pairs.degraded):
+        assert part.dtype == torch.float32 and part.min() >= 0 and part.max() <= 1
+    changes = (pairs.clean - pairs.degraded).abs().mean(dim=(1, 2, 3))
+    assert changes.max() > 0.1 and 0 < (changes == 0).sum() < 12  # some are kept
+    again = views.Photos(sources, CPU).draw(6, (0, 0))
+    assert torch.equal(again.degraded, pairs.degraded)
+    others = views.Photos(sources, CPU).draw(6, (0, 1))
+    assert not torch.equal(others.clean, pairs.clean)
+
+
+def test_views_by_night_show_the_place_by_day(tmp_path):
+    """The student sees the dark photo through the homography of the clean one."""
+    day = np.tile(np.arange(0, 240, 0.5, np.float32)[None], (360, 1)).astype(np.uint8)
+    for name, photo in (("day", day), ("night", day // 4)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), photo)
+    source = views.Source(tmp_path / "day.png", tmp_path / "night.png")
+    pairs = views.Photos([source], CPU).draw(8, (0, 0))
+    errors = (pairs.degraded - pairs.clean / 4).abs().amax(dim=(1, 2, 3))
+    assert 5 <= (errors < 0.01).sum() < 16
+
+
+def test_lamps_shine_in_lit_views_only():
+    lit = np.array([True, False, True])
+    light = views._lamps(np.random.default_rng(0), lit, 64, CPU)
+    assert light.shape == (3, 1, 64, 64) and light.min() >= 0
+    assert torch.equal(light.amax(dim=(1, 2, 3)) > 1, torch.from_numpy(lit))
+
+
+def test_blurs_keep_the_light():
+    """A kernel sums up to 1; without a blur, a view stays as it is."""
+    kernels = views._kernels(np.random.default_rng(0), 40)
+    np.testing.assert_allclose(kernels.sum(axis=(1, 2)), 1, atol=1e-5)
+    view = torch.rand(40, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    blurred = views._blurred(view, kernels)
+    sharp = kernels.reshape(40, -1).max(axis=1) == 1
+    assert 2 < sharp.sum() < 30
+    torch.testing.assert_close(blurred[sharp], view[sharp])
+    assert (blurred.std(dim=(1, 2, 3)) < view.std(dim=(1, 2, 3)))[~sharp].all()
+
+
+@pytest.mark.parametrize("quality", [40, 75, 95])
+def test_jpeg_is_that_of_opencv(textured, quality):
+    levels = cv2.resize(textured, (64, 48))
+    buffer = cv2.imencode(".jpg", levels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    expected = cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE).astype(int)
+    given = torch.from_numpy(levels).float()[None, None]
+    found = views._jpeg(given, torch.full((1, 1, 1, 1), float(quality)))[0, 0].numpy()
+    # libjpeg computes with integers
+    assert np.abs(found - expected).mean() < 0.5
+    assert np.abs(expected - levels).mean() > 1.4
 
 
 def test_towns_by_day_and_by_night(tmp_path, monkeypatch):
@@ -90,25 +139,51 @@ def test_rounded_has_four_levels_a_number():
     assert torch.equal(descriptors.grad, torch.ones_like(descriptors))
 
 
-def test_matching_loss_is_lower_for_the_right_place():
-    """Descriptors that tell places apart, moved by 16 pixels between the views."""
+@pytest.fixture
+def shifted():
+    """Descriptors that tell places apart, and scores, moved by 16 pixels between two views."""
     side = views.SIZE
     generator = torch.Generator().manual_seed(0)
     place = torch.randn(1, 16, side // 4 + 4, side // 4 + 4, generator=generator)
+    heights = torch.randn(1, 1, side + 16, side + 16, generator=generator)
     dense = torch.cat([place[:, :, 4:, 4:], place[:, :, :-4, :-4]])
-    scores = torch.randn(2, 1, side, side, generator=generator)
-    moved = torch.eye(3)[None].clone()
-    moved[0, :2, 2] = 16.0
-    right = mini.matching_loss(dense, scores, moved)
+    scores = torch.cat([heights[:, :, 16:, 16:], heights[:, :, :-16, :-16]])
+    matrices = torch.eye(3)[None].clone()
+    matrices[0, :2, 2] = 16.0
+    return dense, scores, matrices
+
+
+def test_the_matching_loss_is_lower_for_the_right_place(shifted):
+    dense, scores, matrices = shifted
+    right = mini.matching_loss(*shifted)
     assert right < 0.5 * mini.matching_loss(dense, scores, torch.eye(3)[None])
-    moved[0, :2, 2] = 10_000.0  # nothing in common
-    assert mini.matching_loss(dense, scores, moved) == 0
+    matrices[0, :2, 2] = 10_000.0  # nothing in common
+    assert mini.matching_loss(dense, scores, matrices) == 0
+
+
+def test_keypoints_at_infinity_leave_the_gradient_finite(shifted):
+    """Of a homography that moves the pixels of a column to infinity, as a strong tilt can."""
+    dense, scores, matrices = shifted
+    matrices[0, 2] = torch.tensor([-1 / 160, 0, 1])  # the column x = 160
+    scores = scores.clone()
+    scores[0, 0, 100:200:10, 160] = 50.0
+    dense = dense.clone().requires_grad_()
+    mini.matching_loss(dense, scores, matrices).backward()
+    assert dense.grad.isfinite().all() and dense.grad.abs().max() > 0
+
+
+def test_keypoints_are_the_highest_maxima():
+    scores = torch.full((1, 1, 64, 64), -9.0)
+    for x, y, height in ((20, 30, 3.0), (40, 12, 5.0), (2, 30, 9.0), (21, 31, 2.0)):
+        scores[0, 0, y, x] = height
+    pixels, found = mini.find(scores)
+    # not the one at the border, nor the one beside a higher one
+    assert found.sum() == 2 and pixels[0, :2].tolist() == [[40, 12], [20, 30]]
 
 
 def test_an_interrupted_training_resumes(photos, teacher, tmp_path, monkeypatch):
     """With the same weights as an uninterrupted one, which a feature then uses."""
-    monkeypatch.setattr(mini, "BATCH", 1)
-    settings = {"teacher": "T32", "steps": 3}
+    settings = {"teacher": "T32", "steps": 3, "batch": 1}
     whole = mini.main([photos], tmp_path / "whole.safetensors", **settings)
     monkeypatch.setattr("hloc_reduce.training.loop.CHECKPOINT_STEPS", 1)
     part = tmp_path / "part.safetensors"
@@ -127,6 +202,14 @@ def test_an_interrupted_training_resumes(photos, teacher, tmp_path, monkeypatch)
     assert list_h5_names(features) == ["0.png", "1.png"]
     adapted = mini.main([photos], tmp_path / "more.safetensors", start=whole, **settings)
     assert adapted.read_bytes() != whole.read_bytes()
+    wider = mini.main(
+        [photos], tmp_path / "wider.safetensors", 48, start=whole, teacher="T48", steps=1, batch=1
+    )
+    weights, before = load_file(wider), load_file(whole)
+    assert weights[f"{EdgePoint2.last}.weight"].shape[0] == 48
+    # one step of Adam moves each weight by the learning rate at most
+    change = weights["block3.layer.0.weight"] - before["block3.layer.0.weight"]
+    assert 0 < change.abs().max() < 1.01 * mini.RECIPE["lr"]
     whole.write_bytes(adapted.read_bytes())  # features of other weights are not mixed
     with pytest.raises(InputError, match="another configuration .weights_sha256"):
         extract_features.main(conf, photos, tmp_path)
