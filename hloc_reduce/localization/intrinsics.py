@@ -15,9 +15,11 @@ from ..utils.parsers import to_line
 
 MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769  # EXIF tags
 ZOOM, FOCAL_35MM, FOCAL_LENGTH = 0xA404, 0xA405, 0x920A
+WIDTH, HEIGHT = 0xA002, 0xA003  # as the camera wrote it
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
 WELL_KNOWN = 3  # images from which the map knows the intrinsics of their camera
 MAX_ZOOM = 1.01
+RESHAPED = 1.02  # ratio of aspect ratios: a copy of another size differs by rounding only
 _REFINED = {"refinement": {"refine_focal_length": True}}
 _GUESSED = {"estimation": {"estimate_focal_length": True}, **_REFINED}
 # source of intrinsics -> options of `localize_sfm.main` that make up for their errors
@@ -38,17 +40,24 @@ class ExifCamera(NamedTuple):
         lens: make, model and focal length.
         size: (width, height) of the photo, which determines its intrinsics together with the lens.
         zoomed: digitally, which changes the intrinsics but not always the focal length in EXIF.
+        cropped: the photo has not the shape that EXIF data say the camera gave it.
     """
 
     model: str
     lens: str
     size: tuple[int, int]
     zoomed: bool
+    cropped: bool = False
 
     @property
     def name(self) -> str:
         """The lens and the size."""
         return f"{self.lens} {self.size[0]}x{self.size[1]}"
+
+    @property
+    def tells(self) -> bool:
+        """Whether the lens and the size determine the intrinsics."""
+        return not (self.zoomed or self.cropped)
 
 
 def exif_camera(image: Path) -> ExifCamera | None:
@@ -60,12 +69,16 @@ def exif_camera(image: Path) -> ExifCamera | None:
         make, model = (str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL))
         focal_length = float(more.get(FOCAL_35MM) or more.get(FOCAL_LENGTH) or 0)
         zoom = float(more.get(ZOOM) or 1)
+        taken = int(more.get(WIDTH) or 0), int(more.get(HEIGHT) or 0)
     except Exception:  # Pillow raises many types for broken data
         return None
     if not (model and focal_length > 0):
         return None
-    name = f"{make} {model}"
-    return ExifCamera(name, f"{name} {focal_length:g} mm", size, zoom > MAX_ZOOM)
+    name, reshaped = f"{make} {model}", 1.0
+    if min(taken) > 0:  # photos may have been turned
+        reshaped = max(size) / min(size) * min(taken) / max(taken)
+    is_cropped = not 1 / RESHAPED <= reshaped <= RESHAPED
+    return ExifCamera(name, f"{name} {focal_length:g} mm", size, zoom > MAX_ZOOM, is_cropped)
 
 
 class MapCameras(NamedTuple):
@@ -96,8 +109,8 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         The camera and its source, a key of `REFINEMENTS`: "map" for a camera that the map knows,
         else a SIMPLE_RADIAL camera without distortion, from "EXIF" data or guessed. It is a "guess"
         if map photos have the size of the photo, which then is hardly cropped, else "unknown". So
-        are digital zooms, and photos by a camera of the map whose size no map photo has: their
-        EXIF data do not say what was cut off.
+        are digital zooms, photos of another shape than their EXIF data say, and photos by a camera
+        of the map whose size no map photo has: their EXIF data do not say what was cut off.
 
     Raises:
         InputError: if the image cannot be read.
@@ -112,7 +125,7 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         exif = exif_camera(image)
     size = camera.width, camera.height
     has_size = bool({size, size[::-1]} & of_map.sizes)
-    is_cut = exif is not None and (exif.zoomed or exif.model in of_map.models and not has_size)
+    is_cut = exif is not None and (not exif.tells or exif.model in of_map.models and not has_size)
     if exif is not None and not is_cut and exif.name in of_map.known:
         return of_map.known[exif.name], "map"
     if has_focal_length and not is_cut:
@@ -143,7 +156,8 @@ def of_another_size(image_dir: Path, names: Iterable[str]) -> list[str]:
     """Return photos whose longer side is not that of more than half of the photos of a lens.
 
     They are smaller copies or were cropped: EXIF data, which they keep, do not tell. Several photos
-    of an equal size are another setting of the camera, and of a digital zoom EXIF data do tell.
+    of an equal size are another setting of the camera, unless EXIF data say that they were cropped;
+    of a digital zoom EXIF data do tell.
 
     Args:
         image_dir: the folder of the photos.
@@ -153,15 +167,16 @@ def of_another_size(image_dir: Path, names: Iterable[str]) -> list[str]:
     for name in names:
         exif = exif_camera(image_dir / name)
         if exif is not None and not exif.zoomed:
-            lenses.setdefault(exif.lens, {}).setdefault(max(exif.size), []).append(name)
-    return sorted(
-        name
-        for sides in lenses.values()
-        for named in sides.values()
-        if len(named) < WELL_KNOWN <= (most := max(map(len, sides.values())))
-        if 2 * most > sum(map(len, sides.values()))
-        for name in named
-    )
+            side = 0 if exif.cropped else max(exif.size)
+            lenses.setdefault(exif.lens, {}).setdefault(side, []).append(name)
+    found = []
+    for sides in lenses.values():
+        most = max((len(named) for side, named in sides.items() if side), default=0)
+        if most >= WELL_KNOWN and 2 * most > sum(map(len, sides.values())):
+            for side, named in sides.items():
+                if len(named) < WELL_KNOWN or not side:
+                    found += named
+    return sorted(found)
 
 
 def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict:
@@ -210,7 +225,7 @@ def of_map(
     for image in photos:
         if (exif := exif_camera(image_dir / image.name)) is not None:
             models.add(exif.model)
-            if not exif.zoomed:
+            if exif.tells:
                 found.setdefault(exif.name, []).append(image.camera_id)
     known = {
         name: reconstruction.cameras[ids[0]]

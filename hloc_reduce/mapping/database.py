@@ -21,8 +21,9 @@ def import_images(
 ) -> None:
     """Create a COLMAP database with images, and cameras guessed from their EXIF data.
 
-    In the mode AUTO, images with a digital zoom get guessed cameras of their own: their focal
-    lengths in EXIF data may be those without the zoom. Not if `image_options` give parameters.
+    In the mode AUTO, images with a digital zoom, or of another shape than their EXIF data say, get
+    guessed cameras of their own: the focal lengths in EXIF data may be those without the zoom. Not
+    if `image_options` give parameters.
 
     Args:
         database: the file.
@@ -34,19 +35,19 @@ def import_images(
     Raises:
         InputError: for an unknown option, or an image that COLMAP skips.
     """
-    options, zoomed = image_options or {}, set()
+    options, untold = image_options or {}, set()
     if camera_mode == pycolmap.CameraMode.AUTO and not options.get("camera_params"):
         found = {name: exif_camera(image_dir / name) for name in names}
-        zoomed = {name for name, camera in found.items() if camera is not None and camera.zoomed}
-    if rest := [name for name in names if name not in zoomed]:
+        untold = {name for name, camera in found.items() if camera and not camera.tells}
+    if rest := [name for name in names if name not in untold]:
         colmap.import_images(database, image_dir, rest, camera_mode, options)
-    if not zoomed:
+    if not untold:
         return
     mode, factor = pycolmap.CameraMode.PER_IMAGE, options.get("default_focal_length_factor")
-    colmap.import_images(database, image_dir, sorted(zoomed), mode, options)
+    colmap.import_images(database, image_dir, sorted(untold), mode, options)
     with colmap.open_database(database) as opened:
         for image in opened.read_all_images():
-            if image.name in zoomed:
+            if image.name in untold:
                 camera = opened.read_camera(image.camera_id)
                 params, side = camera.params.copy(), max(camera.width, camera.height)
                 params[camera.focal_length_idxs()] = (factor or GUESSED_FOCAL) * side

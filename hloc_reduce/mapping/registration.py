@@ -93,15 +93,16 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
             "length or principal point is not that of the others. Use photos as the camera took "
             "them. To use the map as it is, run again with --accept_partial."
         )
+    is_doubtful = state["alike"] and spread > (DOUBTFUL if number <= FEW else SPREAD)
+    if is_doubtful:
+        logger.warning(
+            "The map may be wrong: its photos have the same size, but their estimated focal "
+            "lengths differ by a factor of %.2f. If one camera with a fixed zoom took all, run "
+            "again with --camera_mode single; otherwise add photos from more viewpoints.",
+            spread,
+        )
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
-        if state["alike"] and spread > (DOUBTFUL if number <= FEW else SPREAD):
-            logger.warning(
-                "The map may be wrong: its photos have the same size, but their estimated focal "
-                "lengths differ by a factor of %.2f. If one camera with a fixed zoom took all, run "
-                "again with --camera_mode single; otherwise add photos from more viewpoints.",
-                spread,
-            )
-        elif state["alike"]:
+        if state["alike"] and not is_doubtful:
             logger.info(
                 "EXIF data do not say which images share a camera, so each has its own. If one "
                 "camera with a fixed zoom took all, --camera_mode single gives better poses."

@@ -14,6 +14,9 @@ LARGEST = 200  # images: adjusting more takes minutes, and more photos bend a ma
 # cropped photos, and others with wrong focal lengths, gain 18 % and more, those of sound maps at
 # most 10 % (docs/localize.md)
 GAIN = 0.12
+# photos that share a camera gain by cameras of their own, too: if none is unlike the others, up to
+# 19 % in sound maps, and 31 % and more if many were cropped
+GAIN_OF_OWN = 0.25
 # a photo is altered if its intrinsics differ by more from those of the others
 ZOOMED = 1.1  # ratio of focal lengths
 OFF_CENTRE = 0.1  # of the longer side, between principal points
@@ -69,8 +72,9 @@ def find(sfm: pycolmap.Reconstruction) -> Fit:
     of_own = gain(separate, own - sum(cameras.values()) + 2 * len(cameras))
     if of_own > GAIN and (altered := _altered(separate, _focal_lengths(adjusted))):
         return Fit(of_own, altered)
-    is_shared = len(cameras) < len(images)
-    return Fit(gain(adjusted, 2 * len(cameras)) if is_shared else of_own, [])
+    if len(cameras) == len(images) or of_own > GAIN_OF_OWN:
+        return Fit(of_own, [])
+    return Fit(gain(adjusted, 2 * len(cameras)), [])
 
 
 def _focal_lengths(sfm: pycolmap.Reconstruction) -> dict[str, float]:
@@ -93,7 +97,8 @@ def _altered(sfm: pycolmap.Reconstruction, assumed: dict[str, float]) -> list[st
     moved = np.abs(centre[:, None] - centre).max(axis=2) > OFF_CENTRE
     seen = np.array([image.num_points3D for image in images]) >= OBSERVATIONS
     differs = (zoomed | moved) & seen & seen[:, None]
-    like_most = differs[differs.sum(axis=1).argmin()]  # a photo that differs from the fewest
+    # of a photo that differs from the fewest of those that tell
+    like_most = differs[np.where(seen, differs.sum(axis=1), len(images)).argmin()]
     return [image.name for image, differs in zip(images, like_most, strict=True) if differs]
 
 

@@ -34,12 +34,14 @@ def map_of(cameras: list[int]) -> pycolmap.Reconstruction:
     return reconstruction
 
 
-def write_photo(path, make="Maker", focal_35mm=36, size=(480, 360), zoom=None):
+def write_photo(path, make="Maker", focal_35mm=36, size=(480, 360), zoom=None, taken=None):
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = make, "Phone 1"
     exif.get_ifd(0x8769)[0xA405] = focal_35mm
     if zoom is not None:
         exif.get_ifd(0x8769)[0xA404] = zoom
+    if taken is not None:
+        exif.get_ifd(0x8769)[0xA002], exif.get_ifd(0x8769)[0xA003] = taken
     Image.new("RGB", size, (90, 120, 150)).save(path, exif=exif)
 
 
@@ -65,6 +67,13 @@ def test_the_camera_of_a_map_is_known_again(tmp_path):
         ({"zoom": 2.0, "make": "Other"}, "unknown"),
         ({"size": (288, 216)}, "unknown"),  # cropped, or made smaller
         ({"size": (288, 216), "make": "Other"}, "EXIF"),
+        ({"taken": (4000, 3000)}, "map"),  # made smaller
+        ({"taken": (3000, 4000)}, "map"),  # and turned
+        ({"taken": (4030, 3000)}, "map"),
+        ({"taken": (0, 3000)}, "map"),  # as some programs write
+        ({"taken": (4000, 2250)}, "unknown"),  # cropped
+        ({"taken": (4000, 2250), "make": "Other"}, "unknown"),
+        ({"taken": (480, 480), "size": (360, 480)}, "unknown"),
     ],
 )
 def test_what_was_zoomed_or_cut_keeps_its_exif_data(changed, source, tmp_path):
@@ -117,6 +126,18 @@ def test_photos_of_another_size_by_the_same_lens(tmp_path):
         write_photo(tmp_path / f"half{i}.jpg", size=(240, 180))
     names = [path.name for path in tmp_path.iterdir()]
     assert intrinsics.of_another_size(tmp_path, names) == []
+
+
+def test_photos_of_another_shape_than_exif_data_say(tmp_path):
+    """They are left out, however many of a size there are, if more were not cropped."""
+    for i in range(4):
+        write_photo(tmp_path / f"{i}.jpg", taken=(4000, 3000))
+    names = [f"{i}.jpg" for i in range(7)]
+    for i in range(4, 7):
+        write_photo(tmp_path / names[i], taken=(4000, 2250))
+    assert intrinsics.of_another_size(tmp_path, names) == names[4:]
+    assert intrinsics.of_another_size(tmp_path, names[1:]) == []
+    assert intrinsics.of_another_size(tmp_path, names[4:]) == []
 
 
 def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):

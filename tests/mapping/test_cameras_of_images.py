@@ -41,6 +41,17 @@ def test_digital_zooms_have_cameras_of_their_own(photos):
     assert found["c.jpg"].mean_focal_length() == 48 != found["a.jpg"].mean_focal_length()
 
 
+def test_cropped_photos_have_cameras_of_their_own(photos):
+    """Their shape is not that which EXIF data tell."""
+    exif = Image.open(photos / "a.jpg").getexif()
+    exif.get_ifd(0x8769)[0xA002], exif.get_ifd(0x8769)[0xA003] = 60, 30
+    Image.new("RGB", (40, 30)).save(photos / "b.jpg", exif=exif)
+    database.import_images(photos / "1.db", photos, ["a.jpg", "b.jpg"], pycolmap.CameraMode.AUTO)
+    found = cameras(photos / "1.db")
+    assert found["a.jpg"].camera_id != found["b.jpg"].camera_id
+    assert not found["b.jpg"].has_prior_focal_length
+
+
 def test_all_are_zoomed(photos):
     path, options = photos / "database.db", {"default_focal_length_factor": 2.0}
     names = ["c.jpg", "d.jpg"]

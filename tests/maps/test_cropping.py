@@ -94,6 +94,26 @@ def test_enlarged_photos_of_a_shared_camera_are_named(zoomed, caplog):
     assert ("are misplaced" in caplog.text) == bool(zoomed)
 
 
+def test_photos_with_few_points_hide_no_others():
+    """Three photos with 60 points tell nothing of themselves, and nothing against the others."""
+    model = reconstructed(zoomed=(2,), is_shared=True)
+    few = [model.images[i] for i in (1, 5, 8)]
+    for image in few:
+        for row in range(60, 300):
+            model.delete_observation(image.image_id, row)
+    assert [image.num_points3D for image in few] == [60] * 3
+    fit = cropping.find(model)
+    assert fit.altered == ["2.jpg"] and fit.gain > cropping.GAIN
+
+
+def test_crops_of_a_shared_camera_gain_by_cameras_of_their_own(caplog):
+    """The principal points differ by less than tells one photo from the others."""
+    fit = cropping.find(reconstructed(0.03, is_shared=True))
+    assert fit.altered == [] and fit.gain > cropping.GAIN_OF_OWN
+    cropping.warn(fit, [])
+    assert "their principal points are not in their centres" in caplog.text
+
+
 def test_one_half_is_named_if_the_other_was_enlarged():
     fit = cropping.find(reconstructed(zoomed=(0, 3, 5, 6), is_shared=True))
     halves = [["0.jpg", "3.jpg", "5.jpg", "6.jpg"], ["1.jpg", "2.jpg", "4.jpg", "7.jpg"]]

@@ -71,7 +71,8 @@ def add_camera_mode(parser: Parser) -> None:
         "--camera_mode",
         default="auto",
         help=f"which photos share a camera, as in COLMAP: {modes}; auto: those "
-        "whose EXIF data have the same make, model, focal length and size, and no digital zoom",
+        "whose EXIF data have the same make, model, focal length and size, and tell of no digital "
+        "zoom and no crop",
     )
 
 

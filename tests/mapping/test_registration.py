@@ -1,0 +1,28 @@
+"""What is said of the images that are in a model of photos alone."""
+
+import json
+
+import pytest
+
+from hloc_reduce.mapping import registration
+
+
+@pytest.mark.parametrize("number", [8, 14, 16])
+@pytest.mark.parametrize("spread", [1.02, 1.36])
+def test_focal_lengths_that_differ_are_doubted_however_many_are_missing(
+    number, spread, tmp_path, caplog
+):
+    """Of 16 frames 8 were in a map, with focal lengths of 292 to 397 pixels."""
+    state = {
+        "images": 16,
+        "missing": [f"{i}.jpg" for i in range(number, 16)],
+        "parts": [[f"{i}.jpg" for i in range(number)]],
+        "unmatched": [],
+        "implausible": {},
+        "alike": True,
+        "spread": spread,
+    }
+    (tmp_path / registration.REGISTRATION).write_text(json.dumps(state))
+    registration.check(tmp_path, accept_partial=False)
+    assert ("differ by a factor of 1.36" in caplog.text) == (spread > 1.1)
+    assert ("photos are in the map" in caplog.text) == (number == 8)
