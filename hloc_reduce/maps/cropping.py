@@ -15,7 +15,7 @@ LARGEST = 200  # images: adjusting more takes minutes, and more photos bend a ma
 # most 10 % (docs/localize.md)
 GAIN = 0.12
 # photos that share a camera gain by cameras of their own, too: if none is unlike the others, up to
-# 19 % in sound maps, and 31 % and more if many were cropped
+# 21 % in sound maps, and 31 % and more if many were cropped
 GAIN_OF_OWN = 0.25
 # a photo is altered if its intrinsics differ by more from those of the others
 ZOOMED = 1.1  # ratio of focal lengths
