@@ -117,7 +117,7 @@ def main(
         sfm = colmap.read_model(sfm_dir)
         logger.info("The map %s:\n%s", sfm_dir, sfm.summary())
     if checked:
-        registration.check(sfm_dir, accept_partial)
+        registration.warn(registration.check(sfm_dir, accept_partial))
     return sfm
 
 

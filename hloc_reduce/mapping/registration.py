@@ -72,13 +72,28 @@ def _left_out(dropped: dict[str, str], missing: list[str]) -> str:
     return " ".join(said)
 
 
-def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -> None:
+def warn(spread: float) -> None:
+    """Warn of doubtful focal lengths, whose ratio is above 1; see `check`."""
+    if spread > 1:
+        logger.warning(
+            "The map may be wrong: its photos have the same size, but their estimated focal "
+            "lengths differ by a factor of %.2f. If one camera with a fixed zoom took all, run "
+            "again with --camera_mode single; otherwise add photos from more viewpoints.",
+            spread,
+        )
+
+
+def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -> float:
     """Report which images are missing from a model.
 
     Args:
         sfm_dir: folder of the model.
         accept_partial: whether it may have fewer than half of the images.
         left_out: images that it was not to have; they are reported elsewhere.
+
+    Returns:
+        The ratio of the largest to the least focal length if one camera may have taken all images,
+        and they differ so much that the model may be wrong; 1 otherwise.
 
     Raises:
         InputError: if it has fewer than half of the images, unless `accept_partial`.
@@ -94,13 +109,7 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
             "them. To use the map as it is, run again with --accept_partial."
         )
     is_doubtful = state["alike"] and spread > (DOUBTFUL if number <= FEW else SPREAD)
-    if is_doubtful:
-        logger.warning(
-            "The map may be wrong: its photos have the same size, but their estimated focal "
-            "lengths differ by a factor of %.2f. If one camera with a fixed zoom took all, run "
-            "again with --camera_mode single; otherwise add photos from more viewpoints.",
-            spread,
-        )
+    doubtful = float(spread) if is_doubtful else 1.0
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
         if state["alike"] and not is_doubtful:
             logger.info(
@@ -114,11 +123,12 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
                 *(len(missing), number, cli.some(missing, NAMED)),
                 f" {_left_out(implausible, missing)}" if implausible else "",
             )
-        return
+        return doubtful
     message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
     if registered < LEAST * number and not accept_partial:
         raise InputError(f"{message} To use the map as it is, run again with --accept_partial.")
     logger.warning(message)
+    return doubtful
 
 
 def shortfall(

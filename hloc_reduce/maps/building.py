@@ -74,12 +74,14 @@ class Building:
         conf = keep_projection(conf, self.folder.path)
         if model is not None and reference is not None:
             folder, sfm, fit = SFM, self._of_model(conf, model, reference), cropping.NOT_TRIED
+            spread = 1.0
         else:
             self.unlike_others = intrinsics.of_another_size(self.image_dir, self.names)
             self.names = self._kept
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
-            registration.check(self.folder.path / folder, self.accept_partial, self._left_out)
+            path = self.folder.path / folder
+            spread = registration.check(path, self.accept_partial, self._left_out)
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
@@ -99,6 +101,7 @@ class Building:
             images=len({*self.names, *self.unlike_others}),
             images_contradicting_others=contradicting,
             images_of_uncertain_position=uncertain,
+            doubtful_focal_lengths=spread,
             gain_of_free_principal_points=fit.gain,
             images_altered=fit.altered,
             images_mirrored=self.mirrored,

@@ -13,6 +13,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
 from ..localization import intrinsics
+from ..mapping import registration
 from ..runtime import provenance
 from ..runtime.outputs import CONF
 from ..utils import colmap
@@ -49,6 +50,8 @@ class Map:
         num_images: images with a pose.
         contradicting: images whose poses contradict the others.
         uncertain: images whose positions are uncertain, see `precision.find`.
+        doubtful_focal_lengths: their ratio if it makes the map doubtful, 1 otherwise, see
+            `registration.check`.
         cropping: how much better the images fit with other intrinsics.
         unlike_others: images that are left out, as their intrinsics are unlike those of the others.
         mirrored: images that are left out because they are mirrored.
@@ -89,6 +92,7 @@ class Map:
         self.contradicting = list(content.get("images_contradicting_others", []))
         found = content.get("images_of_uncertain_position", {}).items()
         self.uncertain = {str(name): float(share) for name, share in found}
+        self.doubtful_focal_lengths = float(content.get("doubtful_focal_lengths", 1))
         gain = float(content.get("gain_of_free_principal_points", 0))
         self.cropping = cropping.Fit(gain, list(content.get("images_altered", [])))
         self.unlike_others = list(content.get("images_unlike_others", []))
@@ -169,6 +173,7 @@ class Map:
 
     def warn(self) -> None:
         """Warn of what may be wrong with the map, as was found when it was built."""
+        registration.warn(self.doubtful_focal_lengths)
         contradictions.warn(self.contradicting)
         precision.warn(self.uncertain)
         cropping.warn(self.cropping, self.unlike_others)
@@ -236,6 +241,7 @@ def write(
         "images_with_pose": reconstruction.num_reg_images(),
         "images_contradicting_others": [],
         "images_of_uncertain_position": {},
+        "doubtful_focal_lengths": 1.0,
         "gain_of_free_principal_points": 0.0,
         "images_altered": [],
         "images_mirrored": [],

@@ -23,6 +23,8 @@ def test_focal_lengths_that_differ_are_doubted_however_many_are_missing(
         "spread": spread,
     }
     (tmp_path / registration.REGISTRATION).write_text(json.dumps(state))
-    registration.check(tmp_path, accept_partial=False)
+    doubtful = registration.check(tmp_path, accept_partial=False)
+    assert doubtful == (spread if spread > 1.1 else 1)
+    registration.warn(doubtful)
     assert ("differ by a factor of 1.36" in caplog.text) == (spread > 1.1)
     assert ("photos are in the map" in caplog.text) == (number == 8)

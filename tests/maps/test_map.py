@@ -56,17 +56,19 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
     # what was found when it was built is said again; older maps do not have it
     content = json.loads((moved / "map.json").read_text())
     assert content.pop("gain_of_free_principal_points") == 0 and "may be cropped" not in caplog.text
-    assert content.pop("images_altered") == []
+    assert content.pop("images_altered") == [] and content.pop("doubtful_focal_lengths") == 1
     gain = {"gain_of_free_principal_points": 0.2}
     for more, said in (
         ({}, ""),
+        ({"doubtful_focal_lengths": 1.36}, "lengths differ by a factor of 1.36"),
         (gain, "may be cropped"),
         (gain | {"images_altered": ["db/2.png"]}, "than the others: db/2.png"),
     ):
         caplog.clear()
         (moved / "map.json").write_text(json.dumps(content | more))
         run(*given)
-        assert said in caplog.text and ("cropped" in caplog.text) == bool(said)
+        assert said in caplog.text
+        assert ("cropped" in caplog.text) == ("gain_of_free_principal_points" in more)
 
 
 def test_what_has_changed_is_noticed(place, aachen_layout, run, refused):
