@@ -179,6 +179,12 @@ def of_another_size(image_dir: Path, names: Iterable[str]) -> list[str]:
     return sorted(found)
 
 
+def cropped(image_dir: Path, names: Iterable[str]) -> list[str]:
+    """Return the photos of a folder that have another shape than their EXIF data say, sorted."""
+    found = {name: exif_camera(image_dir / name) for name in names}
+    return sorted(name for name, exif in found.items() if exif is not None and exif.cropped)
+
+
 def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict:
     """Return the options of `localize_sfm.main` for a photo with inferred intrinsics.
 

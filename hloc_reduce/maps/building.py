@@ -86,6 +86,7 @@ class Building:
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
         names = {sfm.images[i].name for i in sfm.reg_image_ids()}
+        cropped = intrinsics.cropped(self.image_dir, names) if model is None else []
         cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
         if fit.gain > cropping.GAIN:
             cameras = cameras._replace(known={})  # they may be wrong
@@ -104,6 +105,7 @@ class Building:
             doubtful_focal_lengths=spread,
             gain_of_free_principal_points=fit.gain,
             images_altered=fit.altered,
+            images_cropped=cropped,
             images_mirrored=self.mirrored,
             images_unlike_others=self.unlike_others,
             seconds=self.folder.seconds(),

@@ -1,6 +1,7 @@
 """Tell whether a map of photos alone fits much better with intrinsics of each photo's own."""
 
 import copy
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -109,13 +110,21 @@ def _off_centre(camera: pycolmap.Camera) -> np.ndarray:
     return (principal_point - size / 2) / size.max()
 
 
-def warn(fit: Fit, unlike_others: list[str]) -> None:
+def warn(fit: Fit, unlike_others: Sequence[str] = (), cropped: Sequence[str] = ()) -> None:
     """Warn of photos that may be cropped.
 
     Args:
         fit: of the map, from `find`.
         unlike_others: photos that were left out of it.
+        cropped: photos in it that were cropped, by their EXIF data.
     """
+    if cropped:
+        logger.warning(
+            "The map may be wrong. Photos whose width and height have another ratio than their "
+            "EXIF data say: %s. They were cropped, and where the optical axis meets them is not "
+            "known: use the original photos. map.json lists all of them.",
+            cli.some(cropped),
+        )
     if unlike_others:
         logger.warning(
             "Left out of the map, because their size, focal length or principal point is not that "

@@ -53,6 +53,7 @@ class Map:
         doubtful_focal_lengths: their ratio if it makes the map doubtful, 1 otherwise, see
             `registration.check`.
         cropping: how much better the images fit with other intrinsics.
+        cropped: images that were cropped, by their EXIF data.
         unlike_others: images that are left out, as their intrinsics are unlike those of the others.
         mirrored: images that are left out because they are mirrored.
         num_points3D: 3D points.
@@ -95,6 +96,7 @@ class Map:
         self.doubtful_focal_lengths = float(content.get("doubtful_focal_lengths", 1))
         gain = float(content.get("gain_of_free_principal_points", 0))
         self.cropping = cropping.Fit(gain, list(content.get("images_altered", [])))
+        self.cropped = list(content.get("images_cropped", []))
         self.unlike_others = list(content.get("images_unlike_others", []))
         self.mirrored = list(content.get("images_mirrored", []))
         self.num_points3D = int(content["points3D"])
@@ -176,7 +178,7 @@ class Map:
         registration.warn(self.doubtful_focal_lengths)
         contradictions.warn(self.contradicting)
         precision.warn(self.uncertain)
-        cropping.warn(self.cropping, self.unlike_others)
+        cropping.warn(self.cropping, self.unlike_others, self.cropped)
         mirrored_photos.warn(self.mirrored)
 
     def names(self) -> list[str]:
@@ -244,6 +246,7 @@ def write(
         "doubtful_focal_lengths": 1.0,
         "gain_of_free_principal_points": 0.0,
         "images_altered": [],
+        "images_cropped": [],
         "images_mirrored": [],
         "images_unlike_others": [],
         "points3D": reconstruction.num_points3D(),

@@ -39,6 +39,26 @@ def test_a_photo_of_another_size_by_the_same_camera_is_left_out(
     assert "1.jpg" not in info["retrieved"] and info["intrinsics"] == "unknown"
 
 
+@pytest.mark.parametrize(("taken", "number"), [((360, 270), 0), ((360, 203), 5)])
+def test_photos_that_exif_data_call_cropped_are_named(plane, tmp_path, taken, number, caplog, run):
+    """All were, so all stay; queries of the same kind have unknown intrinsics."""
+    images, outputs = plane / "images", tmp_path / "outputs"
+    for path in sorted(images.iterdir()):
+        exif = Image.Exif()
+        exif[0x010F], exif[0x0110] = "Maker", "Phone 1"
+        more = exif.get_ifd(0x8769)
+        more[0xA405], more[0xA002], more[0xA003] = round(FOCAL / 360 * 36), *taken
+        with Image.open(path) as photo:
+            photo.save(path.with_suffix(".jpg"), quality=95, exif=exif)
+        path.unlink()
+    run("--map_images", images, "--outputs", outputs, "--camera_mode", "single")
+    built = maps.Map(outputs / "map")
+    assert built.cropped == [f"{i}.jpg" for i in range(number)]
+    assert ("another ratio than their EXIF data say: 0.jpg, 1" in caplog.text) == (number > 0)
+    info = Localizer(built.folder).localize(images / "1.jpg")[1]
+    assert info["intrinsics"] == ("unknown" if number else "map")
+
+
 @pytest.mark.parametrize(
     ("altered", "others_fit"),
     [(["1.png"], True), (["1.png"], False), (["1.png", "2.png", "4.png"], True)],

@@ -71,7 +71,7 @@ def test_cropped_photos_fit_better_with_free_principal_points(shift, is_cropped,
     assert model.compute_mean_reprojection_error() == before
     assert all(image.cam_from_world() == poses[i] for i, image in model.images.items())
     assert fit.gain > 0.3 if is_cropped else abs(fit.gain) < 0.02
-    cropping.warn(fit, [])
+    cropping.warn(fit)
     assert ("cropped or enlarged" in caplog.text) == is_cropped
 
 
@@ -89,7 +89,7 @@ def test_enlarged_photos_of_a_shared_camera_are_named(zoomed, caplog):
     fit = cropping.find(reconstructed(zoomed=zoomed, is_shared=True))
     assert fit.altered == [f"{i}.jpg" for i in zoomed]
     assert fit.gain > 0.3 if zoomed else abs(fit.gain) < 0.02
-    cropping.warn(fit, [])
+    cropping.warn(fit)
     assert all(f"{i}.jpg" in caplog.text for i in zoomed)
     assert ("are misplaced" in caplog.text) == bool(zoomed)
 
@@ -110,7 +110,7 @@ def test_crops_of_a_shared_camera_gain_by_cameras_of_their_own(caplog):
     """The principal points differ by less than tells one photo from the others."""
     fit = cropping.find(reconstructed(0.03, is_shared=True))
     assert fit.altered == [] and fit.gain > cropping.GAIN_OF_OWN
-    cropping.warn(fit, [])
+    cropping.warn(fit)
     assert "their principal points are not in their centres" in caplog.text
 
 
