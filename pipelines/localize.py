@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from hloc_reduce import compact, extract_features, localize_sfm, maps
+from hloc_reduce import compact, extract_features, localize_sfm, logger, maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS
@@ -202,6 +202,7 @@ def main(
             "map": str(built.folder),
             "map_images": built.num_images,
             "map_points3D": built.num_points3D,
+            "map_doubts": built.doubts,
         }
         files = {
             "query_images": query_images,
@@ -317,6 +318,11 @@ def _run(given: dict) -> None:
     summary = main(
         built, query_images, results, queries, overwrite=given["overwrite"], **of_queries
     )
+    if built.doubts:
+        logger.warning(
+            "The map may be wrong, and poses in it by a tenth of the distance and more: it has %s.",
+            " and ".join(built.doubts),
+        )
     options.print_result(summary, results, "The poses, camera from world, are in {}.")
 
 

@@ -173,6 +173,18 @@ class Map:
                 "Leave it out to localize in this map."
             )
 
+    @property
+    def doubts(self) -> list[str]:
+        """Why its photos may be misplaced, and queries with them, in a few words each."""
+        is_cropped = self.cropped or self.cropping.altered or self.cropping.gain > cropping.GAIN
+        factor = self.doubtful_focal_lengths
+        reasons = {
+            f"focal lengths that differ by a factor of {factor:.2f}": factor > 1,
+            "photos that others place elsewhere": self.contradicting,
+            "photos that may be cropped or enlarged": is_cropped,
+        }
+        return [reason for reason, is_one in reasons.items() if is_one]
+
     def warn(self) -> None:
         """Warn of what may be wrong with the map, as was found when it was built."""
         registration.warn(self.doubtful_focal_lengths)

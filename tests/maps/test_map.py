@@ -68,7 +68,14 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
         (moved / "map.json").write_text(json.dumps(content | more))
         run(*given)
         assert said in caplog.text
+        assert len(maps.Map(moved).doubts) == bool(more)
         assert ("cropped" in caplog.text) == ("gain_of_free_principal_points" in more)
+    # and of poses in it
+    run(*given, "--query_images", images / "query/day")
+    assert outcome(outputs / "queries-day")[0]["map_doubts"] == [
+        "photos that may be cropped or enlarged"
+    ]
+    assert "The map may be wrong, and poses in it by a tenth of the distance" in caplog.text
 
 
 def test_what_has_changed_is_noticed(place, aachen_layout, run, refused):
