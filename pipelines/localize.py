@@ -105,7 +105,6 @@ def open_map(
     if model_or_map is None:
         raise InputError("Give --map_images, the folder of the photos to build a map of.")
     built = _open(model_or_map, folder, overwrite)
-    built.warn()
     if feature or projection:
         built.check_feature(feature or features_confs.RECOMMENDED, projection)
     given = {"storage": storage, "keypoints": keypoints, "matcher": matcher}
@@ -309,6 +308,8 @@ def _run(given: dict) -> None:
     of_queries = {name: given.pop(name) for name in ("num_loc", "ground_truth", "strict", "gate")}
     small = given.pop("compact")
     built = open_map(outputs, model_or_map=given.pop("map"), **given)
+    if given["map_images"] is None and given["database"] is None:  # others warn as they are built
+        built.warn()
     if small is not None:
         compact.main(small, built.folder)
     if query_images is None:
@@ -320,7 +321,8 @@ def _run(given: dict) -> None:
     )
     if built.doubts:
         logger.warning(
-            "The map may be wrong, and poses in it by a tenth of the distance and more: it has %s.",
+            "The map may be wrong, and poses in it may be off by a tenth of the distance or more: "
+            "it has %s.",
             " and ".join(built.doubts),
         )
     options.print_result(summary, results, "The poses, camera from world, are in {}.")

@@ -148,7 +148,7 @@ def _of_map(built: Map) -> Source:
     """Return what a map of `pipelines.localize` gives, with its own matcher."""
     return Source(
         *(colmap.read_model(built.sfm), built.feature, built.conf, built.matcher),
-        *(built.descriptors, built.vocabulary, built.cameras),
+        *(built.descriptors, built.vocabulary, built.cameras, built.doubts),
     )
 
 

@@ -6,20 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pycolmap
-from PIL import Image
 
 from ..utils import colmap
 from ..utils.cli import InputError
 from ..utils.files import replacing
 from ..utils.parsers import to_line
+from .exif import WELL_KNOWN, exif_camera
 
-MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769  # EXIF tags
-ZOOM, FOCAL_35MM, FOCAL_LENGTH = 0xA404, 0xA405, 0x920A
-WIDTH, HEIGHT = 0xA002, 0xA003  # as the camera wrote it
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
-WELL_KNOWN = 3  # images from which the map knows the intrinsics of their camera
-MAX_ZOOM = 1.01
-RESHAPED = 1.02  # ratio of aspect ratios: a copy of another size differs by rounding only
 _REFINED = {"refinement": {"refine_focal_length": True}}
 _GUESSED = {"estimation": {"estimate_focal_length": True}, **_REFINED}
 # source of intrinsics -> options of `localize_sfm.main` that make up for their errors
@@ -32,62 +26,13 @@ REFINEMENTS = {
 }
 
 
-class ExifCamera(NamedTuple):
-    """The camera that took a photo, by its EXIF data.
-
-    Args:
-        model: make and model.
-        lens: make, model and focal length.
-        size: (width, height) of the photo, which determines its intrinsics together with the lens.
-        zoomed: digitally, which changes the intrinsics but not always the focal length in EXIF.
-        cropped: the photo has not the shape that EXIF data say the camera gave it.
-    """
-
-    model: str
-    lens: str
-    size: tuple[int, int]
-    zoomed: bool
-    cropped: bool = False
-
-    @property
-    def name(self) -> str:
-        """The lens and the size."""
-        return f"{self.lens} {self.size[0]}x{self.size[1]}"
-
-    @property
-    def tells(self) -> bool:
-        """Whether the lens and the size determine the intrinsics."""
-        return not (self.zoomed or self.cropped)
-
-
-def exif_camera(image: Path) -> ExifCamera | None:
-    """Return the camera that took a photo, None if EXIF data do not tell."""
-    try:
-        with Image.open(image) as opened:
-            size, exif = opened.size, opened.getexif()
-        more = exif.get_ifd(EXIF)
-        make, model = (str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL))
-        focal_length = float(more.get(FOCAL_35MM) or more.get(FOCAL_LENGTH) or 0)
-        zoom = float(more.get(ZOOM) or 1)
-        taken = int(more.get(WIDTH) or 0), int(more.get(HEIGHT) or 0)
-    except Exception:  # Pillow raises many types for broken data
-        return None
-    if not (model and focal_length > 0):
-        return None
-    name, reshaped = f"{make} {model}", 1.0
-    if min(taken) > 0:  # photos may have been turned
-        reshaped = max(size) / min(size) * min(taken) / max(taken)
-    is_cropped = not 1 / RESHAPED <= reshaped <= RESHAPED
-    return ExifCamera(name, f"{name} {focal_length:g} mm", size, zoom > MAX_ZOOM, is_cropped)
-
-
 class MapCameras(NamedTuple):
     """What a map tells about the intrinsics of other photos.
 
     Args:
-        known: cameras that took several of its photos, by their `ExifCamera.name`.
+        known: cameras that took several of its photos, by their `exif.ExifCamera.name`.
         sizes: (width, height) of its photos.
-        models: `ExifCamera.model` of all cameras that took its photos.
+        models: `exif.ExifCamera.model` of all cameras that took its photos.
         focal_lengths: the least and the largest of its cameras, in longer sides; None if the map
             does not know.
     """
@@ -125,7 +70,8 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         exif = exif_camera(image)
     size = camera.width, camera.height
     has_size = bool({size, size[::-1]} & of_map.sizes)
-    is_cut = exif is not None and (not exif.tells or exif.model in of_map.models and not has_size)
+    is_copy = exif is not None and exif.model in of_map.models and not has_size
+    is_cut = is_copy or (exif is not None and not exif.is_original)
     if exif is not None and not is_cut and exif.name in of_map.known:
         return of_map.known[exif.name], "map"
     if has_focal_length and not is_cut:
@@ -150,39 +96,6 @@ def infer_all(
             if strict:
                 raise
     return inferred
-
-
-def of_another_size(image_dir: Path, names: Iterable[str]) -> list[str]:
-    """Return photos whose longer side is not that of more than half of the photos of a lens.
-
-    They are smaller copies or were cropped: EXIF data, which they keep, do not tell. Several photos
-    of an equal size are another setting of the camera, unless EXIF data say that they were cropped;
-    of a digital zoom EXIF data do tell.
-
-    Args:
-        image_dir: the folder of the photos.
-        names: the photos.
-    """
-    lenses: dict[str, dict[int, list[str]]] = {}
-    for name in names:
-        exif = exif_camera(image_dir / name)
-        if exif is not None and not exif.zoomed:
-            side = 0 if exif.cropped else max(exif.size)
-            lenses.setdefault(exif.lens, {}).setdefault(side, []).append(name)
-    found = []
-    for sides in lenses.values():
-        most = max((len(named) for side, named in sides.items() if side), default=0)
-        if most >= WELL_KNOWN and 2 * most > sum(map(len, sides.values())):
-            for side, named in sides.items():
-                if len(named) < WELL_KNOWN or not side:
-                    found += named
-    return sorted(found)
-
-
-def cropped(image_dir: Path, names: Iterable[str]) -> list[str]:
-    """Return the photos of a folder that have another shape than their EXIF data say, sorted."""
-    found = {name: exif_camera(image_dir / name) for name in names}
-    return sorted(name for name, exif in found.items() if exif is not None and exif.cropped)
 
 
 def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict:
@@ -231,7 +144,7 @@ def of_map(
     for image in photos:
         if (exif := exif_camera(image_dir / image.name)) is not None:
             models.add(exif.model)
-            if exif.tells:
+            if exif.is_original:
                 found.setdefault(exif.name, []).append(image.camera_id)
     known = {
         name: reconstruction.cameras[ids[0]]

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from ..localization.intrinsics import GUESSED_FOCAL, exif_camera
+from ..localization.exif import exif_camera
+from ..localization.intrinsics import GUESSED_FOCAL
 from ..utils import colmap
 
 # what the provenance of what is made from such a database says of its cameras
@@ -38,7 +39,7 @@ def import_images(
     options, untold = image_options or {}, set()
     if camera_mode == pycolmap.CameraMode.AUTO and not options.get("camera_params"):
         found = {name: exif_camera(image_dir / name) for name in names}
-        untold = {name for name, camera in found.items() if camera and not camera.tells}
+        untold = {name for name, camera in found.items() if camera and not camera.is_original}
     if rest := [name for name in names if name not in untold]:
         colmap.import_images(database, image_dir, rest, camera_mode, options)
     if not untold:

@@ -72,13 +72,18 @@ def _left_out(dropped: dict[str, str], missing: list[str]) -> str:
     return " ".join(said)
 
 
+def doubtful(spread: float, number: int) -> float:
+    """Return the ratio of the focal lengths of some images if it is doubtful, 1 otherwise."""
+    return round(spread, 2) if spread > (DOUBTFUL if number <= FEW else SPREAD) else 1.0
+
+
 def warn(spread: float) -> None:
     """Warn of doubtful focal lengths, whose ratio is above 1; see `check`."""
     if spread > 1:
         logger.warning(
             "The map may be wrong: its photos have the same size, but their estimated focal "
-            "lengths differ by a factor of %.2f. If one camera with a fixed zoom took all, run "
-            "again with --camera_mode single; otherwise add photos from more viewpoints.",
+            "lengths differ by a factor of %.2f. If one camera with a fixed zoom took all, build "
+            "it again with --camera_mode single; otherwise add photos from more viewpoints.",
             spread,
         )
 
@@ -108,10 +113,9 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
             "length or principal point is not that of the others. Use photos as the camera took "
             "them. To use the map as it is, run again with --accept_partial."
         )
-    is_doubtful = state["alike"] and spread > (DOUBTFUL if number <= FEW else SPREAD)
-    doubtful = float(spread) if is_doubtful else 1.0
+    factor = doubtful(spread, number) if state["alike"] else 1.0
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
-        if state["alike"] and not is_doubtful:
+        if state["alike"] and factor == 1:
             logger.info(
                 "EXIF data do not say which images share a camera, so each has its own. If one "
                 "camera with a fixed zoom took all, --camera_mode single gives better poses."
@@ -123,12 +127,12 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
                 *(len(missing), number, cli.some(missing, NAMED)),
                 f" {_left_out(implausible, missing)}" if implausible else "",
             )
-        return doubtful
+        return factor
     message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
     if registered < LEAST * number and not accept_partial:
         raise InputError(f"{message} To use the map as it is, run again with --accept_partial.")
     logger.warning(message)
-    return doubtful
+    return factor
 
 
 def shortfall(

@@ -22,7 +22,7 @@ from .. import (
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..extract_features import keep_readable
-from ..localization import intrinsics
+from ..localization import exif, intrinsics
 from ..mapping import mapper, plausibility, registration
 from ..runtime import provenance
 from ..runtime.outputs import RunFolder
@@ -76,7 +76,7 @@ class Building:
             folder, sfm, fit = SFM, self._of_model(conf, model, reference), cropping.NOT_TRIED
             spread = 1.0
         else:
-            self.unlike_others = intrinsics.of_another_size(self.image_dir, self.names)
+            self.unlike_others = exif.of_another_size(self.image_dir, self.names)
             self.names = self._kept
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
@@ -86,7 +86,7 @@ class Building:
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
         names = {sfm.images[i].name for i in sfm.reg_image_ids()}
-        cropped = intrinsics.cropped(self.image_dir, names) if model is None else []
+        cropped = exif.cropped(self.image_dir, names) if model is None else []
         cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
         if fit.gain > cropping.GAIN:
             cameras = cameras._replace(known={})  # they may be wrong

@@ -139,6 +139,7 @@ class CompactMap:
             "storage": self.storage,
         }
         self.matcher = choose("matcher", metadata["matcher"], matchers_confs.confs)
+        self.doubts = [str(doubt) for doubt in metadata.get("doubts", [])]
         sizes = {(int(width), int(height)) for width, height in metadata["sizes"]}
         known = {str(name): _camera(values) for name, values in metadata["known"].items()}
         models, focal = {str(m) for m in metadata["models"]}, metadata.get("focal_lengths")

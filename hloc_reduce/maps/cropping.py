@@ -13,7 +13,7 @@ from ..utils import cli
 
 LARGEST = 200  # images: adjusting more takes minutes, and more photos bend a map less
 # cropped photos, and others with wrong focal lengths, gain 18 % and more, those of sound maps at
-# most 10 % (docs/localize.md)
+# most 10 % (docs/maps.md)
 GAIN = 0.12
 # photos that share a camera gain by cameras of their own, too: if none is unlike the others, up to
 # 21 % in sound maps, and 31 % and more if many were cropped
@@ -28,8 +28,8 @@ class Fit(NamedTuple):
     """How much better the photos of a map fit with other intrinsics.
 
     Attributes:
-        gain: the share by which the mean reprojection error falls with free principal points, less
-            the part that the additional parameters alone explain.
+        gain: the share by which the mean reprojection error falls with free principal points, and
+            perhaps a camera for each photo, less the part that the additional parameters explain.
         altered: photos with other intrinsics than most: these, or the others, were cropped or
             enlarged.
     """
@@ -121,7 +121,7 @@ def warn(fit: Fit, unlike_others: Sequence[str] = (), cropped: Sequence[str] = (
     if cropped:
         logger.warning(
             "The map may be wrong. Photos whose width and height have another ratio than their "
-            "EXIF data say: %s. They were cropped, and where the optical axis meets them is not "
+            "EXIF data say: %s. They were cropped or stretched, so their principal points are not "
             "known: use the original photos. map.json lists all of them.",
             cli.some(cropped),
         )

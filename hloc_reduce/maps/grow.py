@@ -14,7 +14,8 @@ import pycolmap
 
 from .. import logger
 from ..localization import intrinsics
-from ..mapping import copies, extension
+from ..mapping import copies, extension, registration
+from ..mapping.plausibility import focal_length_spread
 from ..runtime import provenance
 from ..runtime.group_writer import merge
 from ..runtime.outputs import CONF, RunFolder
@@ -160,9 +161,8 @@ def _commit_addition(addition: Addition) -> None:
     provenance.write(built.folder / FINGERPRINTS, known | new)
     alike = {*addition.added} - {*built.unlike_others}
     cameras = intrinsics.of_map(addition.sfm, addition.image_dir, alike)
-    cropped = intrinsics.cropped(addition.image_dir, addition.added)
     more = len(new.keys() - known.keys())
-    _commit(built, addition.sfm, more, addition.added, cameras=cameras, cropped=cropped)
+    _commit(built, addition.sfm, more, addition.added, cameras=cameras)
     logger.info("Photos added to the map %s: %d.", built.folder, len(addition.added))
 
 
@@ -173,7 +173,6 @@ def _commit(
     added: Collection[str] = (),
     removed: Collection[str] = (),
     cameras: intrinsics.MapCameras | None = None,
-    cropped: Collection[str] = (),
 ) -> None:
     """Write a changed model and the map.json that names it.
 
@@ -184,7 +183,6 @@ def _commit(
         added: names of its new photos.
         removed: names of the photos that it lost.
         cameras: what the new photos tell about intrinsics.
-        cropped: new photos that were cropped, by their EXIF data.
     """
     content = json.loads((built.folder / FINISHED).read_text())
     number = 2
@@ -204,8 +202,11 @@ def _commit(
         if sfm.num_reg_images() <= cropping.LARGEST:
             fit = cropping.find(sfm)
     precision.warn({name: share for name, share in uncertain.items() if name in added})
-    known = built.cropping.gain > cropping.GAIN and {*fit.altered} <= {*built.cropping.altered}
-    cropping.warn(cropping.NOT_TRIED if known else fit, cropped=sorted(cropped))
+    if built.cropping.gain <= cropping.GAIN or {*fit.altered} - {*built.cropping.altered}:
+        cropping.warn(fit)
+    factor = built.doubtful_focal_lengths
+    if factor > 1:
+        factor = registration.doubtful(focal_length_spread([sfm]), sfm.num_reg_images())
     content |= {
         "id": uuid.uuid4().hex,
         "sfm": folder.name,
@@ -216,7 +217,8 @@ def _commit(
         "images_of_uncertain_position": uncertain,
         "gain_of_free_principal_points": fit.gain,
         "images_altered": fit.altered,
-        "images_cropped": sorted(({*built.cropped} | {*cropped}) - {*removed}),
+        "images_cropped": sorted({*built.cropped} - {*removed}),
+        "doubtful_focal_lengths": factor,
         "images_mirrored": sorted({*built.mirrored} - {*added} - {*removed}),
         "images_unlike_others": sorted({*built.unlike_others} - {*added} - {*removed}),
         "points3D": sfm.num_points3D(),

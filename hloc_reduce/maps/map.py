@@ -97,6 +97,7 @@ class Map:
         gain = float(content.get("gain_of_free_principal_points", 0))
         self.cropping = cropping.Fit(gain, list(content.get("images_altered", [])))
         self.cropped = list(content.get("images_cropped", []))
+        self._doubts = list(content.get("doubts", []))
         self.unlike_others = list(content.get("images_unlike_others", []))
         self.mirrored = list(content.get("images_mirrored", []))
         self.num_points3D = int(content["points3D"])
@@ -175,7 +176,10 @@ class Map:
 
     @property
     def doubts(self) -> list[str]:
-        """Why its photos may be misplaced, and queries with them, in a few words each."""
+        """Why its photos may be misplaced, and queries with them, in a few words each.
+
+        Photos of uncertain positions are none of them: these need not be wrong.
+        """
         is_cropped = self.cropped or self.cropping.altered or self.cropping.gain > cropping.GAIN
         factor = self.doubtful_focal_lengths
         reasons = {
@@ -183,7 +187,8 @@ class Map:
             "photos that others place elsewhere": self.contradicting,
             "photos that may be cropped or enlarged": is_cropped,
         }
-        return [reason for reason, is_one in reasons.items() if is_one]
+        found = [reason for reason, is_one in reasons.items() if is_one]
+        return found + [doubt for doubt in self._doubts if doubt not in found]
 
     def warn(self) -> None:
         """Warn of what may be wrong with the map, as was found when it was built."""

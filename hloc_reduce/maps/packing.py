@@ -1,7 +1,7 @@
 """Write compact maps. docs/map-format.md describes the file."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ class Source:
         global_descriptors: h5 file of the images' global descriptors.
         vocabulary: of these.
         cameras: what the map tells about the intrinsics of other photos.
+        doubts: why the map may be wrong, see `Map.doubts`.
     """
 
     model: pycolmap.Reconstruction
@@ -41,6 +42,7 @@ class Source:
     global_descriptors: Path
     vocabulary: Path
     cameras: intrinsics.MapCameras
+    doubts: list[str] = field(default_factory=list)
 
 
 def encode(
@@ -70,6 +72,7 @@ def encode(
         "sizes": sorted(source.cameras.sizes),
         "models": sorted(source.cameras.models),
         "focal_lengths": source.cameras.focal_lengths,
+        "doubts": source.doubts,
     }
     _add_images(tensors, metadata, points, source.model)
     _add_points(tensors, metadata, points, source.model)

@@ -84,6 +84,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
         matcher=compact.matcher,
         image_dir=str(folder / "images"),  # there are none
         keypoints=features_confs.keypoints_of(conf["model"]) or "adaptive",
+        doubts=compact.doubts,
     )
 
 

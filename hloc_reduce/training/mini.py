@@ -52,7 +52,7 @@ INNER, OUTER, THRESHOLD = 0.4528, 1.5104, 0.9816
 def rounded(descriptors: torch.Tensor) -> torch.Tensor:
     """Round descriptors (N, D) of unit norm to 2 bits a number; the gradient passes straight."""
     values = descriptors.detach()
-    mean, deviation = values.mean(dim=0), values.std(dim=0) + 1e-6
+    mean, deviation = values.mean(dim=0), values.std(dim=0, correction=0) + 1e-6
     standard = (values - mean) / deviation
     levels = torch.where(standard.abs() < THRESHOLD, INNER, OUTER) * standard.sign()
     return descriptors + (normalize(mean + deviation * levels) - values)
@@ -162,33 +162,30 @@ def main(
         dim: dimension of its descriptors.
         towns: seeds of demo towns that are rendered by day and by night.
         teacher: a model of EdgePoint2 with the same dimension, such as E32.
-        start: weights of an earlier training to start from, whose descriptors may have another
-            dimension: then only the last layer starts from random ones; default: all do.
+        start: weights of an earlier training to start from; if its descriptors have another
+            dimension, the last layer starts from random weights. Default: all layers do.
         steps: number of training steps.
         cache: folder for the rendered photos.
         batch: pairs of views of a step.
         seed: of everything random.
 
     Raises:
-        InputError: when there are no photos, no such teacher, or its dimension is another one.
+        InputError: when there are no photos, no such teacher, its dimension is another one, or the
+            batch is empty.
     """
     teacher = cli.choose("teacher", teacher or f"E{dim}", EDGEPOINT2)
     if int(teacher[1:]) != dim:
         raise InputError(f"The teacher {teacher} has another dimension than {dim}.")
     if output.suffix != ".safetensors":
         raise InputError(f"--output {output}: it must end in .safetensors.")
+    if batch < 1:
+        raise InputError(f"--batch {batch}: it must be at least 1.")
     images, towns = list(images), list(towns)
     sources = views.of_folders(images) + views.render_towns(towns, cache)
     if not sources:
         raise InputError("Give photos, --images, or seeds of --towns.")
     torch.manual_seed(seed)
-    student = EdgePoint2(MINI_SIZE, dim)
-    if start:
-        _start_from(student, start)
-    guide = load_weights(EdgePoint2(teacher[0], dim), teacher)
-    for network in (student, guide):
-        # channels last are faster
-        network.to(device=device(), memory_format=torch.channels_last)  # type: ignore[call-overload]
+    student, guide = _networks(dim, teacher, start)
     metadata = {
         "architecture": f"EdgePoint2 {MINI_SIZE}{dim}",
         "dim": dim,
@@ -202,12 +199,10 @@ def main(
         "seed": seed,
         "start": start and file_sha256(start),
     }
-    names = [f"{source.clean} {source.clean.stat().st_size}" for source in sources]
-    digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
     checkpoint = output.with_suffix(".checkpoint")
     photos = views.Photos(sources, device())
     step_loss = partial(loss, student, guide, photos, batch, seed)
-    made_from = json.dumps({**metadata, "digest": digest})
+    made_from = json.dumps({**metadata, "digest": _digest(sources)})
     fit(student.train(), step_loss, steps, RECIPE, checkpoint, made_from)
     metadata["versions"] = versions()
     weights = {key: value.contiguous().cpu() for key, value in student.state_dict().items()}
@@ -216,6 +211,23 @@ def main(
     checkpoint.unlink(missing_ok=True)
     logger.info("The weights are in %s.", output)
     return output
+
+
+def _networks(dim: int, teacher: str, start: Path | None) -> tuple[nn.Module, nn.Module]:
+    """Return the student and the teacher, on the device of the training."""
+    student = EdgePoint2(MINI_SIZE, dim)
+    if start:
+        _start_from(student, start)
+    networks = student, load_weights(EdgePoint2(teacher[0], dim), teacher)
+    for network in networks:
+        # channels last are faster
+        network.to(device=device(), memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return networks
+
+
+def _digest(sources: list[views.Source]) -> str:
+    names = [f"{source.clean} {source.clean.stat().st_size}" for source in sources]
+    return hashlib.sha256("\n".join(names).encode()).hexdigest()
 
 
 def _start_from(student: EdgePoint2, start: Path) -> None:

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from hloc_reduce.localization import intrinsics
+from hloc_reduce.localization import exif, intrinsics
 from hloc_reduce.localization.intrinsics import MapCameras
 from hloc_reduce.utils import colmap
 
@@ -71,6 +71,7 @@ def test_the_camera_of_a_map_is_known_again(tmp_path):
         ({"taken": (3000, 4000)}, "map"),  # and turned
         ({"taken": (4030, 3000)}, "map"),
         ({"taken": (0, 3000)}, "map"),  # as some programs write
+        ({"taken": (1, 3000)}, "map"),
         ({"taken": (4000, 2250)}, "unknown"),  # cropped
         ({"taken": (4000, 2250), "make": "Other"}, "unknown"),
         ({"taken": (480, 480), "size": (360, 480)}, "unknown"),
@@ -88,8 +89,15 @@ def test_what_was_zoomed_or_cut_keeps_its_exif_data(changed, source, tmp_path):
 @pytest.mark.parametrize("content", [b"", b"no image", b"\xff\xd8\xff\xe1\x00\x10Exif\0\0MM"])
 def test_broken_exif_data_tell_nothing(content, tmp_path):
     (tmp_path / "a.jpg").write_bytes(content)
-    assert intrinsics.exif_camera(tmp_path / "a.jpg") is None
-    assert intrinsics.exif_camera(tmp_path / "absent.jpg") is None
+    assert exif.exif_camera(tmp_path / "a.jpg") is None
+    assert exif.exif_camera(tmp_path / "absent.jpg") is None
+
+
+@pytest.mark.parametrize(
+    "taken", [(None, 3), ((4, 4), 3), (b"\0\1", 3), ("wide", 3), (float("nan"), 3), (-4, 3)]
+)
+def test_odd_sizes_in_exif_data_tell_nothing(taken):
+    assert not exif._is_cropped((480, 360), taken)
 
 
 def test_a_camera_of_few_photos_or_of_several_models_is_not_known(tmp_path):
@@ -115,17 +123,17 @@ def test_photos_of_another_size_by_the_same_lens(tmp_path):
     write_photo(tmp_path / "wide.jpg", size=(480, 270))
     write_photo(tmp_path / "tele.jpg", focal_35mm=90, size=(240, 180))
     names = [path.name for path in tmp_path.iterdir()]
-    assert intrinsics.of_another_size(tmp_path, names) == ["crop.jpg"]
-    assert intrinsics.of_another_size(tmp_path, ["0.jpg", "1.jpg", "crop.jpg"]) == []
+    assert exif.of_another_size(tmp_path, names) == ["crop.jpg"]
+    assert exif.of_another_size(tmp_path, ["0.jpg", "1.jpg", "crop.jpg"]) == []
     for i in range(3):
         write_photo(tmp_path / f"half{i}.jpg", size=(240, 180))
     write_photo(tmp_path / "zoomed.jpg", size=(200, 150), zoom=2)  # has a camera of its own
     names = [path.name for path in tmp_path.iterdir()]
-    assert intrinsics.of_another_size(tmp_path, names) == ["crop.jpg"]
+    assert exif.of_another_size(tmp_path, names) == ["crop.jpg"]
     for i in range(3, 5):  # no size is that of most
         write_photo(tmp_path / f"half{i}.jpg", size=(240, 180))
     names = [path.name for path in tmp_path.iterdir()]
-    assert intrinsics.of_another_size(tmp_path, names) == []
+    assert exif.of_another_size(tmp_path, names) == []
 
 
 def test_photos_of_another_shape_than_exif_data_say(tmp_path):
@@ -135,9 +143,9 @@ def test_photos_of_another_shape_than_exif_data_say(tmp_path):
     names = [f"{i}.jpg" for i in range(7)]
     for i in range(4, 7):
         write_photo(tmp_path / names[i], taken=(4000, 2250))
-    assert intrinsics.of_another_size(tmp_path, names) == names[4:]
-    assert intrinsics.of_another_size(tmp_path, names[1:]) == []
-    assert intrinsics.of_another_size(tmp_path, names[4:]) == []
+    assert exif.of_another_size(tmp_path, names) == names[4:]
+    assert exif.of_another_size(tmp_path, names[1:]) == []
+    assert exif.of_another_size(tmp_path, names[4:]) == []
 
 
 def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):

@@ -16,6 +16,7 @@ from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.maps import points, signs
 from hloc_reduce.maps.compact import CompactMap
 from hloc_reduce.maps.signs import Signs, hadamard, pack
+from hloc_reduce.runtime import provenance
 from hloc_reduce.utils import parsers
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize
@@ -145,6 +146,19 @@ def test_a_file_localizes_as_its_map(built, tmp_path, run):
     again = (outputs / "map/map.json").stat().st_mtime_ns
     run(*new)
     assert (outputs / "map/map.json").stat().st_mtime_ns == again
+
+
+def test_doubts_of_a_map_go_into_its_file(built, tmp_path, run, caplog):
+    folder, images = built
+    content = provenance.read(folder / "map.json")
+    provenance.write(folder / "map.json", content | {"doubtful_focal_lengths": 1.36})
+    compact.main(tmp_path / "place.hlm", folder)
+    outputs = tmp_path / "of_file"
+    new = ("--query_images", images / "query/day", "--outputs", outputs)
+    caplog.clear()
+    run("--map", tmp_path / "place.hlm", *new)
+    [doubt] = outcome(outputs / "queries-day")[0]["map_doubts"]
+    assert "differ by a factor of 1.36" in doubt and f"it has {doubt}" in caplog.text
 
 
 def test_a_limit_is_met_although_the_first_points_take_most(monkeypatch):

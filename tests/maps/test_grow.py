@@ -55,6 +55,21 @@ def poses(folder):
     return {image.name: image.cam_from_world().matrix().tolist() for image in images}
 
 
+def test_doubts_end_with_the_photos_that_raised_them(grown, tmp_path, run):
+    """Focal lengths are compared again; those of this map are equal."""
+    folder, new, model = grown
+    doubtful = {"images_cropped": [BASE[0], BASE[1]], "doubtful_focal_lengths": 1.3}
+    content = provenance.read(folder / "map.json")
+    provenance.write(folder / "map.json", content | doubtful)
+    assert len(maps.Map(folder).doubts) == 2
+    run("--map", folder, "--add_images", new, "--add_model", model)
+    content = provenance.read(folder / "map.json")
+    assert content["images_cropped"] == [BASE[0], BASE[1]]
+    assert content["doubtful_focal_lengths"] == 1
+    run("--map", folder, "--remove_images", write(tmp_path / "list.txt", f"{BASE[0]}\n"))
+    assert provenance.read(folder / "map.json")["images_cropped"] == [BASE[1]]
+
+
 @pytest.mark.parametrize("key", ["images_mirrored", "images_unlike_others"])
 def test_a_photo_that_was_left_out_is_added_and_removed(key, grown, tmp_path, run):
     folder, new, model = grown

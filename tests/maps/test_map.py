@@ -75,7 +75,7 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
     assert outcome(outputs / "queries-day")[0]["map_doubts"] == [
         "photos that may be cropped or enlarged"
     ]
-    assert "The map may be wrong, and poses in it by a tenth of the distance" in caplog.text
+    assert "poses in it may be off by a tenth of the distance or more" in caplog.text
 
 
 def test_what_has_changed_is_noticed(place, aachen_layout, run, refused):
