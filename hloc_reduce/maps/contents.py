@@ -55,6 +55,7 @@ class Contents:
         dim: of its descriptors.
         matcher: configuration of the matcher's model.
         cameras: what it tells about the intrinsics of other photos.
+        doubts: why it may be wrong, see `Map.doubts`.
         reference: its points.
         names: its images.
         similarity: returns the similarity (I,) of a global descriptor (G,) to those of its images.
@@ -68,6 +69,7 @@ class Contents:
     dim: int
     matcher: dict
     cameras: intrinsics.MapCameras
+    doubts: list[str]
     reference: Reference
     names: list[str]
     similarity: Callable[[np.ndarray], np.ndarray]
@@ -141,6 +143,7 @@ def _of_folder(path: Path) -> Contents:
         dim=dimension(built.features),
         matcher=matcher,
         cameras=built.cameras,
+        doubts=built.doubts,
         reference=reference,
         names=names,
         similarity=lambda descriptor: similarity(descriptor[None], global_descriptors)[0],
@@ -168,6 +171,7 @@ def _of_file(path: Path, onnx: Path | None) -> Contents:
         dim=compact.dim,
         matcher=matcher,
         cameras=compact.cameras,
+        doubts=compact.doubts,
         reference=compact,
         names=compact.names,
         similarity=compact.similarity,

@@ -52,6 +52,7 @@ class Localizer:
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.workers = parallel.cores()
         self.preprocessing, self.cameras = contents.preprocessing, contents.cameras
+        self.doubts = contents.doubts
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
         self.gate = gate.of_matches(contents.matcher, contents.dim)
@@ -73,7 +74,8 @@ class Localizer:
             The pose, camera from world, in the units of the map, or None if the photo cannot be
             localized, for the `reason` in info; and info as from `localization.query.localize`,
             with `points2D` (M, 2) in COLMAP's pixels, `retrieved`, names of map images, best first,
-            `intrinsics`, "given" or their source (`intrinsics.infer`), and `seconds` by stage.
+            `intrinsics`, "given" or their source (`intrinsics.infer`), `map_doubts`, why the map,
+            and the pose with it, may be wrong, in a few words each, and `seconds` by stage.
 
         Raises:
             InputError: if the image cannot be read, or the camera has another size.
@@ -115,6 +117,7 @@ class Localizer:
             "points2D": features["keypoints"][info["keypoints"]],
             "retrieved": retrieved,
             "intrinsics": source,
+            "map_doubts": self.doubts,
             "seconds": seconds,
         }
         return cam_from_world if info["reason"] is None else None, info

@@ -166,6 +166,7 @@ def answer(
         "num_inliers": info["num_inliers"],
         "camera": to_list(info["camera"]),
         "intrinsics": info["intrinsics"],
+        "map_doubts": info["map_doubts"],
         "retrieved": info["retrieved"][:SHOWN],
         "seconds": {stage: round(value, 4) for stage, value in info["seconds"].items()},
     }

@@ -155,6 +155,9 @@ def test_doubts_of_a_map_go_into_its_file(built, tmp_path, run, caplog):
     compact.main(tmp_path / "place.hlm", folder)
     outputs = tmp_path / "of_file"
     new = ("--query_images", images / "query/day", "--outputs", outputs)
+    for of_map in (folder, tmp_path / "place.hlm"):
+        [doubt] = Localizer(of_map).localize(images / "query/day/a.png")[1]["map_doubts"]
+        assert "differ by a factor of 1.36" in doubt
     caplog.clear()
     run("--map", tmp_path / "place.hlm", *new)
     [doubt] = outcome(outputs / "queries-day")[0]["map_doubts"]
