@@ -251,7 +251,7 @@ def _main() -> None:
     add("--teacher", help="model of EdgePoint2 (default: E<dim>)")
     add("--start", type=Path, help="weights to start from, to adapt them to other photos")
     add("--steps", type=int, default=4000, help="number of training steps")
-    add("--batch", type=int, default=4, help="pairs of views of a step; a GPU takes 64")
+    add("--batch", type=int, default=4, help="pairs of views of a step; a GPU takes 32 and more")
     cache = Path("outputs/training/towns")
     add("--cache", type=Path, default=cache, help="folder for rendered photos")
     add("--seed", type=int, default=0, help="seed of everything random")
