@@ -294,7 +294,9 @@ def _main() -> None:
         if any(change.values()):
             folder = given["map"]
             changes.check(given, **change)
-            open_map(folder, model_or_map=folder, **{name: given[name] for name in OF_MAP})
+            built = open_map(folder, model_or_map=folder, **{name: given[name] for name in OF_MAP})
+            if given["outputs"] is None:  # the map is not opened again
+                built.warn()
             changes.main(folder, **change)
         if given["outputs"] is not None:
             _run(given)

@@ -24,10 +24,10 @@ def degrade(views: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
     number, device = len(views), views.device
 
     def column(values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(values).to(device)[:, None, None, None]
+        return torch.from_numpy(values.astype(np.float32)).to(device)[:, None, None, None]
 
     def log_uniform(least: np.ndarray | float, most: np.ndarray | float) -> np.ndarray:
-        return np.exp(rng.uniform(np.log(least), np.log(most), number)).astype(np.float32)
+        return np.exp(rng.uniform(np.log(least), np.log(most), number))
 
     kept, dark = rng.random(number) < KEPT, rng.random(number) < 0.5
     linear = views**2.2
@@ -44,12 +44,11 @@ def degrade(views: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
     linear = linear + noise * (deviation**2 + shot**2 * linear).sqrt()
     exposure = np.where(dark, rng.uniform(0.002, 0.5, number), np.exp(rng.normal(0, 0.4, number)))
     tone = np.exp(rng.normal(0, 0.15, number)) / 2.2
-    exposed = (linear * column(exposure.astype(np.float32))).clamp(0, 1)
-    levels = (exposed ** column(tone.astype(np.float32)) * 255).round()
-    quality = rng.integers(40, 96, number).astype(np.float32)
-    compressed = column(rng.random(number) < 0.6)
-    levels = torch.where(compressed, _jpeg(levels, column(quality)), levels)
-    return torch.where(column(kept), views, levels / 255)
+    exposed = (linear * column(exposure)).clamp(0, 1)
+    levels = (exposed ** column(tone) * 255).round()
+    quality, compressed = column(rng.integers(40, 96, number)), rng.random(number) < 0.6
+    levels = torch.where(column(compressed) > 0, _jpeg(levels, quality), levels)
+    return torch.where(column(kept) > 0, views, levels / 255)
 
 
 def _lamps(

@@ -3,6 +3,7 @@
 import torch
 from torch.nn.functional import cross_entropy
 
+NEVER = -1e4  # similarity of what is not compared
 DUPLICATE_DISTANCE = 0.008  # nearer descriptors count as the same patch, as in HardNet
 
 
@@ -27,21 +28,31 @@ def triplet_loss(anchors: torch.Tensor, positives: torch.Tensor, margin: float) 
 
 
 def contrastive_loss(
-    anchors: torch.Tensor, positives: torch.Tensor, temperature: float
+    anchors: torch.Tensor,
+    positives: torch.Tensor,
+    temperature: float,
+    compared: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Compute InfoNCE (van den Oord et al., 2018) in both directions, with all rows as negatives.
 
     Args:
-        anchors: (N, D) of unit norm.
-        positives: (N, D) of unit norm, row i matching anchor i only.
+        anchors: (N, D) or (B, N, D) of unit norm; B sets that are not compared with each other.
+        positives: the same, row i matching anchor i only.
         temperature: by which cosines are divided; the lower, the more the nearest rows count.
+        compared: (B, N, N) bool, symmetric: which rows are negatives of which. A row that is not
+            compared with itself does not count. Default: all are.
 
     Returns:
         The mean cross entropy of finding positive i from anchor i, and the reverse, a scalar.
     """
-    similarities = anchors @ positives.T / temperature
-    right = torch.arange(len(anchors), device=anchors.device)
-    there, back = (cross_entropy(rows, right) for rows in (similarities, similarities.T))
+    similarities = anchors @ positives.mT / temperature
+    number = similarities.shape[-1]
+    if compared is None:
+        compared = torch.ones_like(similarities, dtype=torch.bool)
+    similarities = similarities.masked_fill(~compared, NEVER)
+    counts = compared.diagonal(dim1=-2, dim2=-1)
+    right = torch.arange(number, device=anchors.device).expand(counts.shape)[counts]
+    there, back = (cross_entropy(rows[counts], right) for rows in (similarities, similarities.mT))
     return (there + back) / 2
 
 

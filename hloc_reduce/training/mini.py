@@ -17,7 +17,6 @@ from safetensors.torch import save_file
 from torch import nn
 from torch.nn.functional import (
     cosine_similarity,
-    cross_entropy,
     grid_sample,
     max_pool2d,
     normalize,
@@ -35,6 +34,7 @@ from ..utils.files import file_sha256, replacing
 from ..utils.paths import strings_as_paths
 from . import views
 from .loop import device, fit
+from .losses import contrastive_loss
 
 RECIPE = {"lr": 0.003, "weight_decay": 0.0, "final_lr": 0.0}
 HIGHEST = 14.0  # logit at which the scores of the teacher are clamped
@@ -44,7 +44,6 @@ HIGH, WEIGHT, LINEAR = -6.0, 9.0, 4.0
 KEYPOINTS, RADIUS, MIN_SCORE, BORDER = 256, 2, -5.0, 8  # of a view
 NEAR = 4.0  # pixels: keypoints nearer than that need not be told apart
 TEMPERATURE = 0.06
-NEVER = -1e4  # similarity of what is not compared
 # Lloyd-Max levels of 2 bits of a normal distribution, and the threshold between them
 INNER, OUTER, THRESHOLD = 0.4528, 1.5104, 0.9816
 
@@ -114,10 +113,7 @@ def matching_loss(
     same = torch.eye(KEYPOINTS, dtype=torch.bool, device=dense.device)
     apart = same | (torch.cdist(places, places) > NEAR)
     compared = apart & valid[:, :, None] & valid[:, None]
-    similarities = (here @ there.mT / TEMPERATURE).masked_fill(~compared, NEVER)
-    right = torch.arange(KEYPOINTS, device=dense.device).expand(len(valid), -1)[valid]
-    forth, back = (cross_entropy(rows[valid], right) for rows in (similarities, similarities.mT))
-    return (forth + back) / 2
+    return contrastive_loss(here, there, TEMPERATURE, compared)
 
 
 def score_loss(scores: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:

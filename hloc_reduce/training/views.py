@@ -126,8 +126,7 @@ class Photos:
             seen = torch.from_numpy(night).to(self.device)
             degraded[seen] = self._warp(dark[night], homographies[night])
         matrices = np.linalg.inv(homographies[1::2]) @ homographies[::2]
-        matrices = torch.from_numpy(matrices.astype(np.float32)).to(self.device)
-        return Pairs(views, degraded, matrices)
+        return Pairs(views, degraded, self._to_device(matrices))
 
     def _warp(self, which: np.ndarray, homographies: np.ndarray) -> torch.Tensor:
         """Return views (V, 1, SIZE, SIZE) in [0, 1] of photos (V,)."""
@@ -143,12 +142,9 @@ class Photos:
         y = (y / depth).clamp(min=0).minimum(height - 1)
         left, top = x.long().minimum(width - 2), y.long().minimum(height - 2)
         corner = first + top * width + left
-        upper, upper_right, lower, lower_right = (
-            self.pixels[corner + step].float() for step in (0, 1, width, width + 1)
-        )
         upper, lower = (
-            torch.lerp(left_one, right_one, x - left)
-            for left_one, right_one in ((upper, upper_right), (lower, lower_right))
+            torch.lerp(self.pixels[row].float(), self.pixels[row + 1].float(), x - left)
+            for row in (corner, corner + width)
         )
         return torch.lerp(upper, lower, y - top).view(-1, 1, SIZE, SIZE) / 255
 

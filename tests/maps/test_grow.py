@@ -55,14 +55,16 @@ def poses(folder):
     return {image.name: image.cam_from_world().matrix().tolist() for image in images}
 
 
-def test_doubts_end_with_the_photos_that_raised_them(grown, tmp_path, run):
+def test_doubts_end_with_the_photos_that_raised_them(grown, tmp_path, run, caplog):
     """Focal lengths are compared again; those of this map are equal."""
     folder, new, model = grown
     doubtful = {"images_cropped": [BASE[0], BASE[1]], "doubtful_focal_lengths": 1.3}
     content = provenance.read(folder / "map.json")
     provenance.write(folder / "map.json", content | doubtful)
     assert len(maps.Map(folder).doubts) == 2
+    caplog.clear()
     run("--map", folder, "--add_images", new, "--add_model", model)
+    assert caplog.text.count("differ by a factor of 1.30") == 1
     content = provenance.read(folder / "map.json")
     assert content["images_cropped"] == [BASE[0], BASE[1]]
     assert content["doubtful_focal_lengths"] == 1

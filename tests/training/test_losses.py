@@ -24,6 +24,20 @@ def test_contrastive_loss_by_hand():
     assert contrastive_loss(anchors, positives, 0.5).item() == pytest.approx(expected, abs=1e-6)
 
 
+def test_contrastive_loss_of_sets_that_are_not_compared():
+    """Two sets, one with a row that does not count: the mean over the rows that do."""
+    generator = torch.Generator().manual_seed(0)
+    anchors, positives = torch.nn.functional.normalize(
+        torch.randn(2, 2, 4, 8, generator=generator), dim=-1
+    )
+    compared = torch.ones(2, 4, 4, dtype=torch.bool)
+    compared[1, 3], compared[1, :, 3] = False, False
+    first = contrastive_loss(anchors[0], positives[0], 0.1)
+    second = contrastive_loss(anchors[1, :3], positives[1, :3], 0.1)
+    found = contrastive_loss(anchors, positives, 0.1, compared)
+    assert found.item() == pytest.approx((4 * first + 3 * second).item() / 7, rel=1e-4)
+
+
 def test_distance_loss_by_hand():
     descriptors = torch.eye(3)
     embedded = torch.tensor([[1.0, 0.0], [1.0, 0.0], [-1.0, 0.0]])
