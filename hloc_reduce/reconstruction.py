@@ -68,7 +68,7 @@ def main(
         image_options: of pycolmap's ImageReaderOptions.
         mapper_options: of pycolmap's IncrementalPipelineOptions; if given, there is one attempt.
         overwrite: reconstruct again.
-        accept_partial: also return a model of fewer than half of the images.
+        accept_partial: also return a model that `registration.check` refuses.
         once: make one attempt only.
         checked: report missing images, see `registration.check`.
 
@@ -76,8 +76,8 @@ def main(
         The model with the most images. It has the keypoints of the feature file, in the same order.
 
     Raises:
-        InputError: when an input is missing, or fewer than half of the images are in the model,
-            which is kept for a run with `accept_partial`.
+        InputError: when an input is missing, or the model is refused; it is kept for a run with
+            `accept_partial`.
         NoModelError: when nothing can be reconstructed.
     """
     options = {**MAPPER_OPTIONS, **(mapper_options or {})}
@@ -132,7 +132,7 @@ def _main() -> None:
     parser.add_argument(
         "--accept_partial",
         action="store_true",
-        help="accept a map that has fewer than half of the photos",
+        help="accept a map that has fewer than half of the photos, or may be wrong",
     )
     parser.add_argument("--image_list", type=Path, help="text file of names, one per line")
     args = parser.parse_args()

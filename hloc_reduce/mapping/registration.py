@@ -12,6 +12,7 @@ from .plausibility import COPY, DOUBTFUL, FEW, MISPLACED, SPREAD, VIEWPOINTS
 REGISTRATION = "registration.json"  # which images are in the model, and in other parts
 # shares of registered images: a model with fewer is reported in detail, or refused
 ENOUGH, LEAST = 0.8, 0.5
+ACCEPT = "To use the map as it is, run again with --accept_partial."
 NAMED = 10  # images that a message names
 LENS = "lens"
 # why photos were dropped; see `plausibility`
@@ -80,12 +81,16 @@ def doubtful(spread: float, number: int) -> float:
 def warn(spread: float) -> None:
     """Warn of doubtful focal lengths, whose ratio is above 1; see `check`."""
     if spread > 1:
-        logger.warning(
-            "The map may be wrong: its photos have the same size, but their estimated focal "
-            "lengths differ by a factor of %.2f. If one camera with a fixed zoom took all, build "
-            "it again with --camera_mode single; otherwise add photos from more viewpoints.",
-            spread,
-        )
+        logger.warning(_doubt(spread))
+
+
+def _doubt(spread: float) -> str:
+    """Say that the ratio of the focal lengths of some images is doubtful, and what to try."""
+    return (
+        "The map may be wrong: its photos have the same size, but their estimated focal lengths "
+        f"differ by a factor of {spread:.2f}. If one camera with a fixed zoom took all, build it "
+        "again with --camera_mode single; otherwise add photos from more viewpoints."
+    )
 
 
 def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -> float:
@@ -93,7 +98,8 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
 
     Args:
         sfm_dir: folder of the model.
-        accept_partial: whether it may have fewer than half of the images.
+        accept_partial: whether it may have fewer than half of the images, or focal lengths that
+            differ by a factor above `SPREAD`.
         left_out: images that it was not to have; they are reported elsewhere.
 
     Returns:
@@ -101,7 +107,8 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
         and they differ so much that the model may be wrong; 1 otherwise.
 
     Raises:
-        InputError: if it has fewer than half of the images, unless `accept_partial`.
+        InputError: if it has fewer than half of the images, or one camera may have taken all and
+            their focal lengths differ too much, unless `accept_partial`.
     """
     state = provenance.read(sfm_dir / REGISTRATION)
     missing, number, spread = state["missing"], state["images"], state.pop("spread", 1.0)
@@ -111,7 +118,7 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
             f"Only {registered} of {everything} photos are in the map. Left out: "
             f"{cli.some(sorted(left_out), NAMED)}, because they are mirrored, or their size, focal "
             "length or principal point is not that of the others. Use photos as the camera took "
-            "them. To use the map as it is, run again with --accept_partial."
+            f"them. {ACCEPT}"
         )
     factor = doubtful(spread, number) if state["alike"] else 1.0
     if registered >= ENOUGH * number and len(state["parts"]) == 1:
@@ -127,11 +134,13 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
                 *(len(missing), number, cli.some(missing, NAMED)),
                 f" {_left_out(implausible, missing)}" if implausible else "",
             )
-        return factor
-    message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
-    if registered < LEAST * number and not accept_partial:
-        raise InputError(f"{message} To use the map as it is, run again with --accept_partial.")
-    logger.warning(message)
+    else:
+        message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
+        if registered < LEAST * number and not accept_partial:
+            raise InputError(f"{message} {ACCEPT}")
+        logger.warning(message)
+    if factor > SPREAD and not accept_partial:
+        raise InputError(f"{_doubt(factor)} {ACCEPT}")
     return factor
 
 

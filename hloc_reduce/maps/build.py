@@ -58,7 +58,8 @@ def main(
         storage: how descriptors are stored, one of `utils.codes.STORAGES`.
         keypoints: settings of the DoG detector, one of `detectors.dog.KEYPOINTS`.
         accept_partial: do without images that are missing or unreadable; without a model, build a
-            map even if fewer than half of the images are in it.
+            map even if fewer than half of the images are in it, or its focal lengths show that it
+            may be wrong.
         camera_mode: which images share a camera, without a model.
 
     Returns:
@@ -66,8 +67,8 @@ def main(
 
     Raises:
         InputError: if the folder has a map that was made from something else, something is missing
-            or wrong, or fewer than half of the images can be reconstructed; what is finished is
-            kept, for a run with `accept_partial`.
+            or wrong, or the reconstruction is refused, see `registration.check`; what is finished
+            is kept, for a run with `accept_partial`.
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher = matcher or features_confs.matcher_of(conf)

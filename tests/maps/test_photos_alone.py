@@ -70,6 +70,21 @@ def test_fewer_than_half_of_the_photos(plane, tmp_path, monkeypatch, caplog, run
     run(*build)  # is accepted for good
 
 
+def test_focal_lengths_that_differ(plane, tmp_path, monkeypatch, caplog, run, refused):
+    """Those of photos of a plane are not determined, so the map is refused, or accepted."""
+    build = ("--map_images", plane / "images", "--outputs", tmp_path / "outputs")
+    message = refused(*build)
+    assert "The map may be wrong" in message and "--camera_mode single" in message
+    assert not (tmp_path / "outputs/map/map.json").exists()
+    caplog.clear()
+    monkeypatch.setattr(colmap, "incremental_mapping", None)
+    run(*build, "--accept_partial")
+    assert caplog.text.count("The map may be wrong") == 1
+    factor = maps.Map(tmp_path / "outputs/map").doubtful_focal_lengths
+    assert factor > 1.2 and f"{factor:.2f}" in message
+    run(*build)  # is accepted for good
+
+
 def test_camera_modes(plane, tmp_path, caplog, run, refused):
     images, outputs = plane / "images", tmp_path / "outputs"
     build = ("--map_images", images, "--outputs", outputs)
@@ -106,7 +121,7 @@ def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeyp
 
     monkeypatch.setattr(maps.building.reconstruction, "main", fails_once)
     outputs = tmp_path / "outputs"
-    build = ("--map_images", plane / "images", "--outputs", outputs)
+    build = ("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
     run(*build)
     assert "0 of 5 photos are in the map." in caplog.text
     assert "Trying again with more keypoints." in caplog.text
@@ -151,7 +166,7 @@ def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatc
 
     monkeypatch.setattr(maps.building.reconstruction, "main", fails_again)
     outputs = tmp_path / "outputs"
-    run("--map_images", plane / "images", "--outputs", outputs)
+    run("--map_images", plane / "images", "--outputs", outputs, "--accept_partial")
     assert caplog.text.count("5 of 6 photos are in the map.") == 3
     assert "1 of 6 images are not in the map: other.png." in caplog.text
     assert "What to try" not in caplog.text
@@ -167,7 +182,8 @@ def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch, ru
     """One retrieved photo each leaves two parts; all are in the map in the end."""
     monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", 4)
     outputs = tmp_path / "outputs"
-    build = ("--map_images", plane / "images", "--outputs", outputs, "--num_covis", 1)
+    build = ("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
+    build += ("--num_covis", 1)
 
     def apart(descriptors, output, num_matched):
         parsers.write_pairs([("0.png", "1.png"), ("1.png", "2.png"), ("3.png", "4.png")], output)
@@ -188,7 +204,7 @@ def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch, ru
 
 def test_a_map_of_other_pairs_is_refused(plane, tmp_path, monkeypatch, run, refused):
     outputs = tmp_path / "outputs"
-    build = ("--map_images", plane / "images", "--outputs", outputs)
+    build = ("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
     run(*build)
     run(*build, "--num_covis", 3)  # of which all pairs know nothing
     assert len(list(parsers.parse_pairs(outputs / "map/pairs-db-exhaustive.txt"))) == 10
