@@ -112,35 +112,36 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
     """
     state = provenance.read(sfm_dir / REGISTRATION)
     missing, number, spread = state["missing"], state["images"], state.pop("spread", 1.0)
-    registered, everything = number - len(missing), number + len(left_out)
-    if left_out and registered < LEAST * everything and not accept_partial:
-        raise InputError(
-            f"Only {registered} of {everything} photos are in the map. Left out: "
-            f"{cli.some(sorted(left_out), NAMED)}, because they are mirrored, or their size, focal "
-            "length or principal point is not that of the others. Use photos as the camera took "
-            f"them. {ACCEPT}"
-        )
+    registered = number - len(missing)
     factor = doubtful(spread, number) if state["alike"] else 1.0
-    if registered >= ENOUGH * number and len(state["parts"]) == 1:
-        if state["alike"] and factor == 1:
-            logger.info(
-                "EXIF data do not say which images share a camera, so each has its own. If one "
-                "camera with a fixed zoom took all, --camera_mode single gives better poses."
-            )
-        if missing:
-            implausible = state["implausible"]
-            logger.warning(
-                "%d of %d images are not in the map: %s.%s",
-                *(len(missing), number, cli.some(missing, NAMED)),
-                f" {_left_out(implausible, missing)}" if implausible else "",
-            )
-    else:
-        message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
-        if registered < LEAST * number and not accept_partial:
+    few = registered < ENOUGH * number or len(state["parts"]) > 1
+    message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
+    if not accept_partial:
+        if registered < LEAST * number:
             raise InputError(f"{message} {ACCEPT}")
+        if registered < LEAST * (number + len(left_out)):
+            raise InputError(
+                f"Only {registered} of {number + len(left_out)} photos are in the map. Left out: "
+                f"{cli.some(sorted(left_out), NAMED)}, because they are mirrored, or their size, "
+                "focal length or principal point is not that of the others. Use photos as the "
+                f"camera took them. {ACCEPT}"
+            )
+    if few:
         logger.warning(message)
+    elif missing:
+        implausible = state["implausible"]
+        logger.warning(
+            "%d of %d images are not in the map: %s.%s",
+            *(len(missing), number, cli.some(missing, NAMED)),
+            f" {_left_out(implausible, missing)}" if implausible else "",
+        )
     if factor > SPREAD and not accept_partial:
         raise InputError(f"{_doubt(factor)} {ACCEPT}")
+    if state["alike"] and factor == 1 and not few:
+        logger.info(
+            "EXIF data do not say which images share a camera, so each has its own. If one "
+            "camera with a fixed zoom took all, --camera_mode single gives better poses."
+        )
     return factor
 
 

@@ -8,22 +8,27 @@ from hloc_reduce.mapping import registration
 from hloc_reduce.utils.cli import InputError
 
 
+def register(folder, number, images, **changed):
+    """Write that the first ones of some images are in a model."""
+    state = {
+        "images": images,
+        "missing": [f"{i}.jpg" for i in range(number, images)],
+        "parts": [[f"{i}.jpg" for i in range(number)]],
+        "unmatched": [],
+        "implausible": {},
+        "alike": False,
+        "spread": 1.0,
+    }
+    (folder / registration.REGISTRATION).write_text(json.dumps(state | changed))
+
+
 @pytest.mark.parametrize("number", [8, 14, 16])
 @pytest.mark.parametrize("spread", [1.02, 1.18, 1.36])
 def test_focal_lengths_that_differ_are_doubted_however_many_are_missing(
     number, spread, tmp_path, caplog
 ):
     """Of 16 frames 8 were in a map, with focal lengths of 292 to 397 pixels."""
-    state = {
-        "images": 16,
-        "missing": [f"{i}.jpg" for i in range(number, 16)],
-        "parts": [[f"{i}.jpg" for i in range(number)]],
-        "unmatched": [],
-        "implausible": {},
-        "alike": True,
-        "spread": spread,
-    }
-    (tmp_path / registration.REGISTRATION).write_text(json.dumps(state))
+    register(tmp_path, number, 16, alike=True, spread=spread)
     if spread > 1.2:
         with pytest.raises(InputError, match=r"factor of 1\.36.* --accept_partial"):
             registration.check(tmp_path, accept_partial=False)
@@ -32,3 +37,13 @@ def test_focal_lengths_that_differ_are_doubted_however_many_are_missing(
     registration.warn(doubtful)
     assert (f"differ by a factor of {spread}" in caplog.text) == (spread > 1.1)
     assert ("photos are in the map" in caplog.text) == (number == 8)
+
+
+@pytest.mark.parametrize(("number", "images"), [(4, 13), (7, 13)])
+def test_photos_that_are_left_out_are_not_blamed_for_others(number, images, tmp_path):
+    """Two of 15 photos of a facade were blamed although 9 others were missing, too."""
+    register(tmp_path, number, images)
+    with pytest.raises(InputError, match=f"Only {number} of 15 photos are in the map") as error:
+        registration.check(tmp_path, False, left_out=["a.jpg", "b.jpg"])
+    assert ("2 more are left out" in str(error.value)) == (number == 4)
+    assert ("Left out: a.jpg, b.jpg" in str(error.value)) == (number == 7)
