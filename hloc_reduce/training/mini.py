@@ -8,6 +8,7 @@ a number. An interrupted training resumes.
 
 import hashlib
 import json
+import math
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -36,7 +37,7 @@ from . import views
 from .loop import device, fit
 from .losses import contrastive_loss
 
-RECIPE = {"lr": 0.003, "weight_decay": 0.0, "final_lr": 0.0}
+RECIPE = {"weight_decay": 0.0, "final_lr": 0.0}
 HIGHEST = 14.0  # logit at which the scores of the teacher are clamped
 SCORES, MATCHES = 0.5, 0.5  # weights of the losses
 # Scores near keypoints are few, and count more; errors above this many logits grow linearly.
@@ -148,6 +149,7 @@ def main(
     steps: int = 4000,
     cache: Path = Path("outputs/training/towns"),
     batch: int = 4,
+    lr: float = 0.003,
     seed: int = 0,
 ) -> Path:
     """Train a network.
@@ -163,11 +165,12 @@ def main(
         steps: number of training steps.
         cache: folder for the rendered photos.
         batch: pairs of views of a step.
+        lr: learning rate of Adam, which falls linearly to 0.
         seed: of everything random.
 
     Raises:
-        InputError: when there are no photos, no such teacher, its dimension is another one, or the
-            batch is empty.
+        InputError: when there are no photos, no such teacher, its dimension is another one, the
+            batch is empty, or the learning rate is not above 0.
     """
     teacher = cli.choose("teacher", teacher or f"E{dim}", EDGEPOINT2)
     if int(teacher[1:]) != dim:
@@ -176,12 +179,15 @@ def main(
         raise InputError(f"--output {output}: it must end in .safetensors.")
     if batch < 1:
         raise InputError(f"--batch {batch}: it must be at least 1.")
+    if not 0 < lr < math.inf:
+        raise InputError(f"--lr {lr:g}: it must be above 0.")
     images, towns = list(images), list(towns)
     sources = views.of_folders(images) + views.render_towns(towns, cache)
     if not sources:
         raise InputError("Give photos, --images, or seeds of --towns.")
     torch.manual_seed(seed)
     student, guide = _networks(dim, teacher, start)
+    recipe = {"lr": lr, **RECIPE}
     metadata = {
         "architecture": f"EdgePoint2 {MINI_SIZE}{dim}",
         "dim": dim,
@@ -191,7 +197,7 @@ def main(
         "photos": len(sources),
         "steps": steps,
         "batch": batch,
-        "recipe": RECIPE,
+        "recipe": recipe,
         "seed": seed,
         "start": start and file_sha256(start),
     }
@@ -199,7 +205,7 @@ def main(
     photos = views.Photos(sources, device())
     step_loss = partial(loss, student, guide, photos, batch, seed)
     made_from = json.dumps({**metadata, "digest": _digest(sources)})
-    fit(student.train(), step_loss, steps, RECIPE, checkpoint, made_from)
+    fit(student.train(), step_loss, steps, recipe, checkpoint, made_from)
     metadata["versions"] = versions()
     weights = {key: value.contiguous().cpu() for key, value in student.state_dict().items()}
     with replacing(output) as temporary:
@@ -250,6 +256,7 @@ def _main() -> None:
     add("--batch", type=int, default=4, help="pairs of views of a step; a GPU takes 32 and more")
     cache = Path("outputs/training/towns")
     add("--cache", type=Path, default=cache, help="folder for rendered photos")
+    add("--lr", type=float, default=0.003, help="learning rate, which falls linearly to 0")
     add("--seed", type=int, default=0, help="seed of everything random")
     main(**vars(parser.parse_args()))
 
