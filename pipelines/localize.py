@@ -164,7 +164,10 @@ def main(
     photos = Photos(outputs / MADE_FROM, built, query_images, names)
     conf = {"map": built.place, **identity(outputs, query_images, queries), "num_loc": num_loc}
     inputs = [query_images, *([queries] if queries else [])]
-    folder = RunFolder(outputs, conf, overwrite, inputs, stale=bool(photos.changed))
+    remedy = (
+        f"Choose other --outputs, or repeat only the queries: --map {built.folder} --overwrite."
+    )
+    folder = RunFolder(outputs, conf, overwrite, inputs, bool(photos.changed), remedy=remedy)
     with Run(folder, built.feature, built.matcher) as run:
         photos.write()
         listed = queries or wanted.write(outputs / LISTED)

@@ -23,12 +23,15 @@ class Descriptor(nn.Module):
         super().__init__()
         base = DESCRIPTORS[choose("descriptor", name, DESCRIPTORS)]
         check_weights(name)  # before kornia unpickles them
-        self.describe = base.make().eval()
+        self.name, self.describe = name, base.make().eval()
 
     @torch.no_grad()
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
         """Map patches (N, 1, 32, 32) in [0, 1] to descriptors (N, 128) float32 of unit norm."""
         if len(patches) == 0:
             return patches.new_zeros((0, DIM))
-        batches = [self.describe(batch) for batch in patches.split(self.batch_size)]
-        return nn.functional.normalize(torch.cat(batches), dim=1)
+        described = torch.cat([self.describe(batch) for batch in patches.split(self.batch_size)])
+        if described.shape != (len(patches), DIM):
+            found = tuple(described.shape)
+            raise ValueError(f"The module of {self.name} returned {found} instead of (N, {DIM}).")
+        return nn.functional.normalize(described, dim=1)

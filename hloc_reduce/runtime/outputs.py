@@ -25,6 +25,7 @@ BOOKKEEPING = {CONF, STAGES, FILES, "summary.json", "queries.csv", "trace.json"}
 DELETING = {"is": "being deleted"}  # configuration of a folder whose deletion was interrupted
 NAMED = 3  # differences that a message names
 SHORT = 60  # characters of values that it shows
+REMEDY = "Choose other --outputs, one folder for each configuration, or --overwrite."
 
 
 class Lock:
@@ -79,6 +80,7 @@ class RunFolder:
         inputs: files and folders that the run reads; they must not be deleted.
         stale: delete earlier results even if they have the same configuration.
         kept: names of files that are never deleted.
+        remedy: what to do if the folder has another configuration.
 
     Attributes:
         written: names of the files and folders that runs wrote.
@@ -96,8 +98,9 @@ class RunFolder:
         inputs: Iterable[Path] = (),
         stale: bool = False,
         kept: Iterable[str] = (),
+        remedy: str = REMEDY,
     ):
-        self.path, self.kept = path, {*kept}
+        self.path, self.kept, self.remedy = path, {*kept}, remedy
         self._lock = Lock(path)
         try:
             self.written = self._read_written()
@@ -163,10 +166,7 @@ class RunFolder:
             overwrite = before == DELETING or stale and not changes
             if changes and not overwrite:
                 named = " and ".join(f"{key}{which}" for key, which in changes.items())
-                raise InputError(
-                    f"What {path} was made from differs: {named}. "
-                    "Choose other --outputs, one folder for each configuration, or --overwrite."
-                )
+                raise InputError(f"What {path} was made from differs: {named}. {self.remedy}")
         if not is_new and overwrite:
             for file in inputs:
                 if path.resolve() in file.resolve().parents:

@@ -16,7 +16,7 @@ from hostile import Harm
 
 from hloc_reduce import descriptors, extract_features, extractors
 from hloc_reduce.confs import features
-from hloc_reduce.descriptors import COLMAP, DESCRIPTORS
+from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, Base
 from hloc_reduce.descriptors.model import Descriptor
 from hloc_reduce.extract_features import provenance
 from hloc_reduce.training import __main__ as training
@@ -35,6 +35,13 @@ def test_descriptors_are_of_unit_norm_and_do_not_depend_on_the_batch(name, base_
     torch.testing.assert_close(described.norm(dim=1), torch.ones(150))
     torch.testing.assert_close(describe(patches[140:141]), described[140:141])
     assert describe(patches[:0]).shape == (0, 128)
+
+
+def test_a_module_of_another_dimension_is_refused(monkeypatch):
+    """Its features were written, and found to be wrong by their readers only."""
+    monkeypatch.setitem(DESCRIPTORS, "small", Base(lambda: torch.nn.Flatten()))
+    with pytest.raises(ValueError, match=r"small returned \(3, 1024\) instead of \(N, 128\)"):
+        Descriptor("small")(torch.rand(3, 1, 32, 32))
 
 
 @pytest.mark.parametrize(
@@ -194,5 +201,5 @@ def test_an_unknown_descriptor_is_answered_by_all_that_are_valid(act, valid, tmp
 )
 def test_an_unknown_base_is_answered_by_the_nearest(act, tmp_path, monkeypatch):
     (tmp_path / "images").mkdir()
-    with pytest.raises(InputError, match="Unknown descriptor 'sfit'. The nearest of 24: sift, "):
+    with pytest.raises(InputError, match=r"Unknown descriptor 'sfit'. The nearest of \d+: sift, "):
         act(tmp_path, monkeypatch)

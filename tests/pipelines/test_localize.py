@@ -22,6 +22,20 @@ def test_results_of_another_map_are_kept(place, tmp_path, run, refused):
     assert state(outputs / "queries-day") == results
 
 
+def test_another_num_loc_needs_no_other_map(place, run, refused):
+    """The message offered --overwrite, with which --map_images builds the whole map again."""
+    build, images, outputs = place
+    new = ("--query_images", images / "query/day")
+    run(*build, *new)
+    message = refused(*build, *new, "--num_loc", 2)
+    assert "differs: num_loc (50 before, 2 now)" in message
+    assert f"--map {outputs / 'map'} --overwrite" in message
+    written = (outputs / "map/map.json").stat().st_mtime_ns
+    run("--map", outputs / "map", *new, "--outputs", outputs, "--num_loc", 2, "--overwrite")
+    assert (outputs / "queries-day/pairs-query-vlad2.txt").exists()
+    assert (outputs / "map/map.json").stat().st_mtime_ns == written
+
+
 def test_queries_of_the_same_name_have_folders_of_their_own(place, tmp_path, run):
     build, images, outputs = place
     run(*build, "--query_images", images / "query/day")
