@@ -24,7 +24,7 @@ class ExifCamera(NamedTuple):
         size: (width, height) of the photo, which determines its intrinsics together with the lens.
         zoomed: digitally, which changes the intrinsics but not always the focal length in EXIF.
         cropped: or stretched: the photo has another ratio of width and height than its EXIF data
-            say.
+            say, or is square, which hardly any camera takes.
     """
 
     model: str
@@ -63,7 +63,13 @@ def exif_camera(image: Path) -> ExifCamera | None:
 
 
 def _is_cropped(size: tuple[int, int], taken: Sequence[object]) -> bool:
-    """Tell whether a size has another aspect ratio than one in EXIF data, if that can be right."""
+    """Tell whether a size is square or has another aspect ratio than one in EXIF data.
+
+    A size in EXIF data that cannot be right tells nothing.
+    """
+    aspect = max(size) / min(size)
+    if aspect < RESHAPED:
+        return True
     try:
         width, height = (float(value) for value in taken)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):
@@ -71,7 +77,7 @@ def _is_cropped(size: tuple[int, int], taken: Sequence[object]) -> bool:
     if not (min(width, height) > 0 and max(width, height) <= MAX_RATIO * min(width, height)):
         return False
     # photos may have been turned
-    ratio = max(size) / min(size) * min(width, height) / max(width, height)
+    ratio = aspect * min(width, height) / max(width, height)
     return not 1 / RESHAPED <= ratio <= RESHAPED
 
 
@@ -105,6 +111,6 @@ def of_another_size(image_dir: Path, names: Iterable[str]) -> list[str]:
 
 
 def cropped(image_dir: Path, names: Iterable[str]) -> list[str]:
-    """Return the photos of a folder that have another shape than their EXIF data say, sorted."""
+    """Return the photos of a folder that were cropped by their EXIF data or shape, sorted."""
     found = {name: exif_camera(image_dir / name) for name in names}
     return sorted(name for name, exif in found.items() if exif is not None and exif.cropped)

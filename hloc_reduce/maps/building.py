@@ -80,8 +80,7 @@ class Building:
             self.names = self._kept
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
-            path = self.folder.path / folder
-            spread = registration.check(path, self.accept_partial, self._left_out)
+            spread = self._check(self.folder.path / folder, fit)
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
@@ -115,6 +114,14 @@ class Building:
         drop_others(self.folder, built)
         provenance.write(self.folder.path / FINISHED, written | {"bytes": self.folder.bytes()})
         return built
+
+    def _check(self, sfm_dir: Path, fit: cropping.Fit) -> float:
+        """Report missing images as `registration.check` does; if it refuses them, also why."""
+        try:
+            return registration.check(sfm_dir, self.accept_partial, self._left_out)
+        except cli.InputError:
+            cropping.warn(fit, self.unlike_others, exif.cropped(self.image_dir, self.names))
+            raise
 
     def _of_model(
         self, conf: dict, model: Path, reference: pycolmap.Reconstruction

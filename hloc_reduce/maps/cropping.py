@@ -120,9 +120,9 @@ def warn(fit: Fit, unlike_others: Sequence[str] = (), cropped: Sequence[str] = (
     """
     if cropped:
         logger.warning(
-            "The map may be wrong. Photos whose width and height have another ratio than their "
-            "EXIF data say: %s. They were cropped or stretched, so their principal points are not "
-            "known: use the original photos. map.json lists all of them.",
+            "The map may be wrong. Photos that are square, or whose width and height have another "
+            "ratio than their EXIF data say: %s. They were cropped or stretched, so their "
+            "principal points are not known: use the original photos. map.json lists all of them.",
             cli.some(cropped),
         )
     if unlike_others:

@@ -75,6 +75,8 @@ def test_the_camera_of_a_map_is_known_again(tmp_path):
         ({"taken": (4000, 2250)}, "unknown"),  # cropped
         ({"taken": (4000, 2250), "make": "Other"}, "unknown"),
         ({"taken": (480, 480), "size": (360, 480)}, "unknown"),
+        ({"taken": (4000, 4000), "size": (480, 480)}, "unknown"),  # by a program, anywhere
+        ({"size": (480, 480)}, "unknown"),
     ],
 )
 def test_what_was_zoomed_or_cut_keeps_its_exif_data(changed, source, tmp_path):

@@ -40,7 +40,9 @@ def test_a_photo_of_another_size_by_the_same_camera_is_left_out(
 
 
 @pytest.mark.parametrize(("taken", "number"), [((360, 270), 0), ((360, 203), 5)])
-def test_photos_that_exif_data_call_cropped_are_named(plane, tmp_path, taken, number, caplog, run):
+def test_photos_that_exif_data_call_cropped_are_named(
+    plane, tmp_path, taken, number, caplog, run, refused
+):
     """All were, so all stay; queries of the same kind have unknown intrinsics."""
     images, outputs = plane / "images", tmp_path / "outputs"
     for path in sorted(images.iterdir()):
@@ -57,6 +59,10 @@ def test_photos_that_exif_data_call_cropped_are_named(plane, tmp_path, taken, nu
     assert ("another ratio than their EXIF data say: 0.jpg, 1" in caplog.text) == (number > 0)
     info = Localizer(built.folder).localize(images / "1.jpg")[1]
     assert info["intrinsics"] == ("unknown" if number else "map")
+    if number:  # with cameras of their own the focal lengths of a plane differ
+        caplog.clear()
+        assert "differ by a factor" in refused("--map_images", images, "--outputs", tmp_path / "2")
+        assert "another ratio than their EXIF data say: 0.jpg, 1" in caplog.text
 
 
 @pytest.mark.parametrize(
