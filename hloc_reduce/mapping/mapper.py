@@ -18,6 +18,7 @@ from .plausibility import (
     COPY,
     DOUBTFUL,
     FEW,
+    FEW_POINTS,
     MAX_DISTORTION,
     MISPLACED,
     SPREAD,
@@ -52,7 +53,7 @@ RULES = {
     "lenses": "others without the implausible ones",
     "spread": SPREAD,
     "viewpoints": VIEWPOINTS,
-    "misplaced": f"{epipolar.AGREEING} of {epipolar.EVIDENCE} matches or more",
+    "misplaced": f"{epipolar.AGREEING} of {epipolar.EVIDENCE} matches or more, {FEW_POINTS} points",
     "copies": f"sharing less than {copies.SHARE} of the points expected in {copies.ENOUGH}, any "
     f"less than {copies.APART}",
 }

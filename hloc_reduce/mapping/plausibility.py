@@ -17,6 +17,7 @@ SPREAD = 1.2  # above it, always
 DOUBTFUL = 1.05  # above it, for few images, if these fit with one
 FEW = 100  # images: further attempts take little time, even for one missing image
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
+FEW_POINTS = 8  # images with fewer points have no certain pose: the others were outliers
 MANY = 3  # images of one camera estimate its focal length better than EXIF data do
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
 VIEWPOINTS = 3  # at least, of a model: two do not determine the focal lengths
@@ -44,11 +45,11 @@ def keep_plausible(
 
     Returns:
         The models that have points, the largest first; and from the name of each dropped image to
-        what is implausible: the lens, `MISPLACED` or `COPY`.
+        what is implausible: the lens, `MISPLACED`, also with hardly any point left, or `COPY`.
     """
     dropped: dict[str, str] = {}
     for model in models:
-        images = [model.images[i] for i in model.reg_image_ids()]
+        images = _registered(model)
         shared = Counter(image.camera_id for image in images)
         lenses = {}
         for image in images:
@@ -59,6 +60,8 @@ def keep_plausible(
         dropped |= _drop(model, lenses)
         wrong = misplaced(model, keypoints or {}, verified) if verified else []
         dropped |= _drop(model, dict.fromkeys(wrong, MISPLACED))
+        few = [image.name for image in _registered(model) if image.num_points3D < FEW_POINTS]
+        dropped |= _drop(model, dict.fromkeys(few, MISPLACED))
         while found := copies.find(model):
             dropped |= _drop(model, dict.fromkeys(found, COPY))
     whole = []
@@ -73,6 +76,10 @@ def keep_plausible(
             *(model.num_reg_images(), number),
         )
     return sorted(whole, key=size, reverse=True), dropped
+
+
+def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [model.images[i] for i in model.reg_image_ids()]
 
 
 def _implausible(camera: pycolmap.Camera, initial: pycolmap.Camera, number: int) -> str | None:
@@ -136,6 +143,6 @@ def size(model: pycolmap.Reconstruction) -> tuple[int, int]:
 
 def focal_length_spread(models: list[pycolmap.Reconstruction]) -> float:
     """Return the ratio of the largest and the smallest focal length in the largest model, or 1."""
-    cameras = {image.camera_id for image in models[0].images.values()} if models else ()
+    cameras = {image.camera_id for image in _registered(models[0])} if models else ()
     focal_lengths = [models[0].cameras[i].mean_focal_length() for i in cameras]
     return max(focal_lengths) / min(focal_lengths) if focal_lengths else 1.0

@@ -7,7 +7,12 @@ import pycolmap
 import pytest
 
 from hloc_reduce.mapping import registration
-from hloc_reduce.mapping.plausibility import count_viewpoints, keep_plausible
+from hloc_reduce.mapping.plausibility import (
+    MISPLACED,
+    count_viewpoints,
+    focal_length_spread,
+    keep_plausible,
+)
 from hloc_reduce.utils import colmap
 
 
@@ -37,6 +42,18 @@ def names_of(models):
     return [{model.images[i].name for i in model.reg_image_ids()} for model in models]
 
 
+@pytest.mark.parametrize(("left", "is_kept"), [(0, False), (7, False), (8, True)])
+def test_an_image_that_has_lost_its_points_has_no_pose(left, is_kept):
+    """All points of one of 13 photos were outliers, and the map said that it has all of them."""
+    model, given = chain([1] * 5)
+    image = model.images[5]
+    for index in [i for i, p in enumerate(image.points2D) if p.has_point3D()][left:]:
+        model.delete_observation(5, index)
+    (found,), dropped = keep_plausible([model], given)
+    assert found.num_reg_images() == 4 + is_kept
+    assert dropped == ({} if is_kept else {"4.jpg": MISPLACED})
+
+
 @pytest.mark.parametrize(
     ("focal_length", "is_prior", "is_kept"),
     [
@@ -57,6 +74,8 @@ def test_focal_lengths_that_no_lens_has(focal_length, is_prior, is_kept):
     found, dropped = keep_plausible([model], given)
     everything = {f"{i}.jpg" for i in range(4)}
     assert names_of(found) == [everything if is_kept else everything - {"3.jpg"}]
+    spread = {1500.0: 3.0, 700.0: 1.4}[focal_length] if is_kept else 1.0  # of those that are kept
+    assert focal_length_spread(found) == spread
     assert dropped == ({} if is_kept else {"3.jpg": f"focal length {focal_length:.0f}"})
 
 
