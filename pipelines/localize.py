@@ -165,7 +165,8 @@ def main(
     conf = {"map": built.place, **identity(outputs, query_images, queries), "num_loc": num_loc}
     inputs = [query_images, *([queries] if queries else [])]
     remedy = (
-        f"Choose other --outputs, or repeat only the queries: --map {built.folder} --overwrite."
+        "Choose other --outputs, or replace the results, but not the map: "
+        f"--map {built.folder} --overwrite."
     )
     folder = RunFolder(outputs, conf, overwrite, inputs, bool(photos.changed), remedy=remedy)
     with Run(folder, built.feature, built.matcher) as run:

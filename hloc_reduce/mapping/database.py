@@ -10,7 +10,7 @@ from ..localization.intrinsics import GUESSED_FOCAL
 from ..utils import colmap
 
 # what the provenance of what is made from such a database says of its cameras
-ZOOMED = "cameras of their own, as cropped ones have"
+ZOOMED = "cameras of their own, as cropped and square ones have"
 
 
 def import_images(

@@ -19,6 +19,7 @@ from .plausibility import (
     DOUBTFUL,
     FEW,
     FEW_POINTS,
+    FEWEST,
     MAX_DISTORTION,
     MISPLACED,
     SPREAD,
@@ -53,7 +54,7 @@ RULES = {
     "lenses": "others without the implausible ones",
     "spread": SPREAD,
     "viewpoints": VIEWPOINTS,
-    "misplaced": f"{epipolar.AGREEING} of {epipolar.EVIDENCE} matches or more, {FEW_POINTS} points",
+    "misplaced": f"{epipolar.AGREEING} of {epipolar.EVIDENCE} matches or more, {FEWEST} points",
     "copies": f"sharing less than {copies.SHARE} of the points expected in {copies.ENOUGH}, any "
     f"less than {copies.APART}",
 }
@@ -163,7 +164,9 @@ class Mapper:
             if registered >= enough:
                 break
         models, dropped = best
-        lenses = {name for name, what in dropped.items() if what not in (MISPLACED, COPY)}
+        lenses = {
+            name for name, what in dropped.items() if what not in (MISPLACED, COPY, FEW_POINTS)
+        }
         if models and lenses:
             # a photo with an implausible lens has bent the model of the others
             logger.info("Trying again without %s.", cli.some(sorted(lenses)))

@@ -17,13 +17,13 @@ SPREAD = 1.2  # above it, always
 DOUBTFUL = 1.05  # above it, for few images, if these fit with one
 FEW = 100  # images: further attempts take little time, even for one missing image
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
-FEW_POINTS = 8  # images with fewer points have no certain pose: the others were outliers
+FEWEST = 8  # points of an image: fewer determine no pose for certain
 MANY = 3  # images of one camera estimate its focal length better than EXIF data do
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
 VIEWPOINTS = 3  # at least, of a model: two do not determine the focal lengths
 
-# in place of an implausible lens, see `epipolar.misplaced` and `copies`
-MISPLACED, COPY = "misplaced", "another side or a copy"
+# in place of an implausible lens; see `epipolar.misplaced` and `copies`
+MISPLACED, COPY, FEW_POINTS = "misplaced", "another side or a copy", "few points"
 
 Models = tuple[list[pycolmap.Reconstruction], dict[str, str]]  # see `keep_plausible`
 
@@ -34,7 +34,7 @@ def keep_plausible(
     keypoints: Mapping[str, np.ndarray] | None = None,
     verified: Mapping[Pair, np.ndarray] | None = None,
 ) -> Models:
-    """Drop images from models: those with implausible lenses, misplaced ones, and copies.
+    """Drop images from models: implausible lenses, misplaced ones, copies, and with few points.
 
     Args:
         models: of COLMAP's mapper.
@@ -45,7 +45,7 @@ def keep_plausible(
 
     Returns:
         The models that have points, the largest first; and from the name of each dropped image to
-        what is implausible: the lens, `MISPLACED`, also with hardly any point left, or `COPY`.
+        what is implausible: the lens, or `MISPLACED`, `COPY` or `FEW_POINTS`.
     """
     dropped: dict[str, str] = {}
     for model in models:
@@ -60,10 +60,10 @@ def keep_plausible(
         dropped |= _drop(model, lenses)
         wrong = misplaced(model, keypoints or {}, verified) if verified else []
         dropped |= _drop(model, dict.fromkeys(wrong, MISPLACED))
-        few = [image.name for image in _registered(model) if image.num_points3D < FEW_POINTS]
-        dropped |= _drop(model, dict.fromkeys(few, MISPLACED))
         while found := copies.find(model):
             dropped |= _drop(model, dict.fromkeys(found, COPY))
+        while few := [i.name for i in _registered(model) if i.num_points3D < FEWEST]:
+            dropped |= _drop(model, dict.fromkeys(few, FEW_POINTS))
     whole = []
     for model in models:
         if min(size(model)) < 2:

@@ -7,7 +7,16 @@ from .. import logger
 from ..runtime import provenance
 from ..utils import cli
 from ..utils.cli import InputError
-from .plausibility import COPY, DOUBTFUL, FEW, MISPLACED, SPREAD, VIEWPOINTS
+from .plausibility import (
+    COPY,
+    DOUBTFUL,
+    FEW,
+    FEW_POINTS,
+    FEWEST,
+    MISPLACED,
+    SPREAD,
+    VIEWPOINTS,
+)
 
 REGISTRATION = "registration.json"  # which images are in the model, and in other parts
 # shares of registered images: a model with fewer is reported in detail, or refused
@@ -26,6 +35,7 @@ WHY = {
         "These show another side of the place that looks the same, or a copy of it: from where "
         "COLMAP puts them, they would see many points of the others, but they match few of them"
     ),
+    FEW_POINTS: f"Fewer than {FEWEST} points are left in these, so their poses are not certain",
 }
 # what to try
 TRIES = {
@@ -35,6 +45,7 @@ TRIES = {
         "make a map of each side, because other photos of this one may be at the wrong side, too, "
         "or add photos all the way from one side to the other"
     ),
+    FEW_POINTS: "add photos between those in the map and those that are not",
 }
 
 
@@ -114,19 +125,20 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
     missing, number, spread = state["missing"], state["images"], state.pop("spread", 1.0)
     registered = number - len(missing)
     factor = doubtful(spread, number) if state["alike"] else 1.0
-    few = registered < ENOUGH * number or len(state["parts"]) > 1
+    is_partial = registered < ENOUGH * number or len(state["parts"]) > 1
+    doubt = f" {_doubt(factor)}" if factor > SPREAD else ""
     message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
     if not accept_partial:
         if registered < LEAST * number:
-            raise InputError(f"{message} {ACCEPT}")
+            raise InputError(f"{message}{doubt} {ACCEPT}")
         if registered < LEAST * (number + len(left_out)):
             raise InputError(
                 f"Only {registered} of {number + len(left_out)} photos are in the map. Left out: "
                 f"{cli.some(sorted(left_out), NAMED)}, because they are mirrored, or their size, "
                 "focal length or principal point is not that of the others. Use photos as the "
-                f"camera took them. {ACCEPT}"
+                f"camera took them.{doubt} {ACCEPT}"
             )
-    if few:
+    if is_partial:
         logger.warning(message)
     elif missing:
         implausible = state["implausible"]
@@ -135,9 +147,9 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
             *(len(missing), number, cli.some(missing, NAMED)),
             f" {_left_out(implausible, missing)}" if implausible else "",
         )
-    if factor > SPREAD and not accept_partial:
-        raise InputError(f"{_doubt(factor)} {ACCEPT}")
-    if state["alike"] and factor == 1 and not few:
+    if doubt and not accept_partial:
+        raise InputError(f"{doubt.strip()} {ACCEPT}")
+    if state["alike"] and factor == 1 and not is_partial:
         logger.info(
             "EXIF data do not say which images share a camera, so each has its own. If one "
             "camera with a fixed zoom took all, --camera_mode single gives better poses."

@@ -80,7 +80,7 @@ class Building:
             self.names = self._kept
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
-            spread = self._check(self.folder.path / folder, fit)
+            spread = self._check(folder, sfm, fit)
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
@@ -115,12 +115,15 @@ class Building:
         provenance.write(self.folder.path / FINISHED, written | {"bytes": self.folder.bytes()})
         return built
 
-    def _check(self, sfm_dir: Path, fit: cropping.Fit) -> float:
-        """Report missing images as `registration.check` does; if it refuses them, also why."""
+    def _check(self, folder: str, sfm: pycolmap.Reconstruction, fit: cropping.Fit) -> float:
+        """Call `registration.check`, and name the photos that may be why the model is refused."""
+        sfm_dir = self.folder.path / folder
         try:
             return registration.check(sfm_dir, self.accept_partial, self._left_out)
         except cli.InputError:
-            cropping.warn(fit, self.unlike_others, exif.cropped(self.image_dir, self.names))
+            names = {sfm.images[i].name for i in sfm.reg_image_ids()}
+            cropping.warn(fit, self.unlike_others, exif.cropped(self.image_dir, names))
+            mirrored_photos.warn(self.mirrored)
             raise
 
     def _of_model(

@@ -116,20 +116,20 @@ def warn(fit: Fit, unlike_others: Sequence[str] = (), cropped: Sequence[str] = (
     Args:
         fit: of the map, from `find`.
         unlike_others: photos that were left out of it.
-        cropped: photos in it that were cropped, by their EXIF data.
+        cropped: photos in it that were cropped, see `exif.cropped`.
     """
     if cropped:
         logger.warning(
             "The map may be wrong. Photos that are square, or whose width and height have another "
-            "ratio than their EXIF data say: %s. They were cropped or stretched, so their "
-            "principal points are not known: use the original photos. map.json lists all of them.",
+            "ratio than their EXIF data say: %s. They were cropped or stretched, perhaps by the "
+            "camera, so their principal points are not known: use the original photos.",
             cli.some(cropped),
         )
     if unlike_others:
         logger.warning(
             "Left out of the map, because their size, focal length or principal point is not that "
             "of the other photos: %s. Either these or the others were cropped or resized: use "
-            "photos as the camera took them. map.json lists all that are left out.",
+            "photos as the camera took them.",
             cli.some(unlike_others),
         )
     if fit.altered:
@@ -137,7 +137,7 @@ def warn(fit: Fit, unlike_others: Sequence[str] = (), cropped: Sequence[str] = (
             "The map may be wrong. Photos with another focal length or principal point than the "
             "others: %s. With other intrinsics, all photos fit %.0f %% better. Either these or the "
             "others were cropped or enlarged, and are misplaced, or the place is flat: use the "
-            "original photos. map.json lists all of them.",
+            "original photos.",
             cli.some(fit.altered),
             100 * fit.gain,
         )

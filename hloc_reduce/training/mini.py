@@ -180,7 +180,7 @@ def main(
     if batch < 1:
         raise InputError(f"--batch {batch}: it must be at least 1.")
     if not 0 < lr < math.inf:
-        raise InputError(f"--lr {lr:g}: it must be above 0.")
+        raise InputError(f"--lr {lr:g}: it must be a number above 0.")
     images, towns = list(images), list(towns)
     sources = views.of_folders(images) + views.render_towns(towns, cache)
     if not sources:

@@ -8,7 +8,7 @@ import pytest
 
 from hloc_reduce.mapping import registration
 from hloc_reduce.mapping.plausibility import (
-    MISPLACED,
+    FEW_POINTS,
     count_viewpoints,
     focal_length_spread,
     keep_plausible,
@@ -51,7 +51,20 @@ def test_an_image_that_has_lost_its_points_has_no_pose(left, is_kept):
         model.delete_observation(5, index)
     (found,), dropped = keep_plausible([model], given)
     assert found.num_reg_images() == 4 + is_kept
-    assert dropped == ({} if is_kept else {"4.jpg": MISPLACED})
+    assert dropped == ({} if is_kept else {"4.jpg": FEW_POINTS})
+
+
+def test_images_that_lose_their_points_to_such_an_image_have_no_pose_either():
+    """The last of six images shares 7 points with the fifth, which shares 7 with the fourth."""
+    model, given = chain([1] * 6)
+    for number in (5, 6):
+        points = [i for i, p in enumerate(model.images[number].points2D) if p.has_point3D()]
+        shared = [i for i in points if i < 10]  # with the image before
+        for index in shared[7:]:
+            model.delete_observation(number, index)
+    (found,), dropped = keep_plausible([model], given)
+    assert names_of([found]) == [{f"{i}.jpg" for i in range(4)}]
+    assert dropped == dict.fromkeys(["4.jpg", "5.jpg"], FEW_POINTS)
 
 
 @pytest.mark.parametrize(

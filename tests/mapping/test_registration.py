@@ -39,6 +39,15 @@ def test_focal_lengths_that_differ_are_doubted_however_many_are_missing(
     assert ("photos are in the map" in caplog.text) == (number == 8)
 
 
+def test_all_that_is_refused_is_said_at_once(tmp_path):
+    """Because one option accepts it all."""
+    register(tmp_path, 4, 16, alike=True, spread=1.5)
+    with pytest.raises(
+        InputError, match=r"Only 4 of 16 photos .* by a factor of 1\.50\. .*partial"
+    ):
+        registration.check(tmp_path, False)
+
+
 @pytest.mark.parametrize(("number", "images"), [(4, 13), (7, 13)])
 def test_photos_that_are_left_out_are_not_blamed_for_others(number, images, tmp_path):
     """Two of 15 photos of a facade were blamed although 9 others were missing, too."""

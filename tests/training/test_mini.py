@@ -244,7 +244,7 @@ def test_an_interrupted_training_resumes(photos, teacher, tmp_path, monkeypatch)
         (["--output", "a.pth"], "it must end in .safetensors"),
         (["--output", "a.safetensors"], "Give photos, --images, or seeds of --towns"),
         (["--output", "a.safetensors", "--batch", "0"], "must be at least 1"),
-        (["--output", "a.safetensors", "--lr", "0"], "must be above 0"),
+        (["--output", "a.safetensors", "--lr", "0"], "must be a number above 0"),
         (["--output", "a.safetensors", "--teacher", "M64"], "another dimension than 32"),
         (["--output", "a.safetensors", "--teacher", "XL"], "Unknown teacher 'XL'"),
         (["--output", "a.safetensors", "--images", "nowhere"], "nowhere"),
