@@ -115,7 +115,9 @@ class Mapper:
     ) -> tuple[Models, Path] | None:
         """Return models with one camera for all images, and their database, if they are better."""
         registered, points = _size(models)
-        spread, several = focal_length_spread(models), len(self.attempts) > 1 and not self.once
+        # a photo may have been dropped for its own focal length
+        spread = focal_length_spread(models, with_dropped=True)
+        several = len(self.attempts) > 1 and not self.once
         few = several and MORE * registered <= len(_matched(database))
         fits = DOUBTFUL < spread <= SPREAD and _fits_one_camera(models[0])
         if not (few or fits or spread > SPREAD):

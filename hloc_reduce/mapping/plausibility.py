@@ -141,8 +141,16 @@ def size(model: pycolmap.Reconstruction) -> tuple[int, int]:
     return model.num_reg_images(), model.num_points3D()
 
 
-def focal_length_spread(models: list[pycolmap.Reconstruction]) -> float:
-    """Return the ratio of the largest and the smallest focal length in the largest model, or 1."""
-    cameras = {image.camera_id for image in _registered(models[0])} if models else ()
+def focal_length_spread(models: list[pycolmap.Reconstruction], with_dropped: bool = False) -> float:
+    """Return the ratio of the largest and the smallest focal length in the largest model, or 1.
+
+    Args:
+        models: the largest first.
+        with_dropped: also count its images that were dropped.
+    """
+    if not models:
+        return 1.0
+    images = models[0].images.values() if with_dropped else _registered(models[0])
+    cameras = {image.camera_id for image in images}
     focal_lengths = [models[0].cameras[i].mean_focal_length() for i in cameras]
     return max(focal_lengths) / min(focal_lengths) if focal_lengths else 1.0

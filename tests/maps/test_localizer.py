@@ -160,7 +160,8 @@ def test_names_with_spaces(by_model, plane, tmp_path, run):
     model.write(tmp_path / "my model")
     given = ("--map_images", images, "--query_images", new, "--outputs", outputs)
     given += ("--feature", "sift_sv16")
-    run(*given, *(("--map", tmp_path / "my model") if by_model else ()))
+    of_photos_alone = ("--camera_mode", "single")
+    run(*given, *(("--map", tmp_path / "my model") if by_model else of_photos_alone))
     summary, rows = outcome(outputs / "queries-new_ones")
     row = rows["I am 4.png"]
     assert row["status"] == "localized" and row["retrieved"].startswith("a b/my ")

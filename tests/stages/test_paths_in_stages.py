@@ -63,7 +63,8 @@ def chain(aachen_layout, tmp_path):
         ),
         (
             reconstruction,
-            dict(sfm_dir=out / "new", image_dir=images, pairs=pairs, image_list=listed, **both),
+            dict(sfm_dir=out / "new", image_dir=images, pairs=pairs, image_list=listed, **both)
+            | dict(accept_partial=True),
         ),
         (
             pairs_from_retrieval,
