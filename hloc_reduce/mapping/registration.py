@@ -126,17 +126,17 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
     registered = number - len(missing)
     factor = doubtful(spread, number) if state["alike"] else 1.0
     is_partial = registered < ENOUGH * number or len(state["parts"]) > 1
-    doubt = f" {_doubt(factor)}" if factor > SPREAD else ""
+    accept = f"{_doubt(factor)} {ACCEPT}" if factor > SPREAD else ACCEPT
     message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
     if not accept_partial:
         if registered < LEAST * number:
-            raise InputError(f"{message}{doubt} {ACCEPT}")
+            raise InputError(f"{message} {accept}")
         if registered < LEAST * (number + len(left_out)):
             raise InputError(
                 f"Only {registered} of {number + len(left_out)} photos are in the map. Left out: "
                 f"{cli.some(sorted(left_out), NAMED)}, because they are mirrored, or their size, "
                 "focal length or principal point is not that of the others. Use photos as the "
-                f"camera took them.{doubt} {ACCEPT}"
+                f"camera took them. {accept}"
             )
     if is_partial:
         logger.warning(message)
@@ -147,8 +147,8 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
             *(len(missing), number, cli.some(missing, NAMED)),
             f" {_left_out(implausible, missing)}" if implausible else "",
         )
-    if doubt and not accept_partial:
-        raise InputError(f"{doubt.strip()} {ACCEPT}")
+    if factor > SPREAD and not accept_partial:
+        raise InputError(accept)
     if state["alike"] and factor == 1 and not is_partial:
         logger.info(
             "EXIF data do not say which images share a camera, so each has its own. If one "
