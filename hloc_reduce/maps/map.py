@@ -20,7 +20,7 @@ from ..utils import colmap
 from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import STORAGES
 from ..utils.files import replacing
-from ..utils.h5 import file_provenance, open_h5
+from ..utils.h5 import file_provenance, get_dataset, open_h5
 from ..utils.paths import strings_as_paths
 from . import contradictions, cropping, mirrored_photos, precision
 
@@ -199,8 +199,17 @@ class Map:
         mirrored_photos.warn(self.mirrored)
 
     def names(self) -> list[str]:
-        """List the images that have a pose."""
-        return sorted(image.name for image in colmap.read_model(self.sfm).images.values())
+        """List the images that have a pose.
+
+        Raises:
+            InputError: if the model is broken, or an image lacks its features.
+        """
+        names = sorted(image.name for image in colmap.read_model(self.sfm).images.values())
+        with open_h5(self.features) as features, open_h5(self.descriptors) as descriptors:
+            for name in names:
+                get_dataset(features, name, "keypoints")
+                get_dataset(descriptors, name, "global_descriptor")
+        return names
 
 
 def models(names: Iterable[str]) -> set[str]:

@@ -12,7 +12,8 @@ from . import interrupts
 
 # packages that an installation for a robot leaves out
 LEFT_OUT = ("kornia", "sklearn", "torch")
-NEAREST = 8  # names shown in place of an unknown one
+# an unknown name is answered by all that are known, or by the nearest ones of many
+MANY, NEAREST = 30, 8
 
 
 class InputError(ValueError):
@@ -55,13 +56,17 @@ def run(main: Callable[[], None]) -> None:
 
 
 def choose(kind: str, name: str, names: Iterable[str]) -> str:
-    """Return `name` if it is one of `names`, else raise an InputError with the nearest names."""
+    """Return `name` if it is one of `names`, else raise an InputError.
+
+    It names all of them, or the nearest of many; the nearest first.
+    """
     names = list(names)
     if name not in names:
         by_lower = {known.lower(): known for known in names}
-        near = difflib.get_close_matches(str(name).lower(), by_lower, n=NEAREST, cutoff=0)
+        number = NEAREST if len(names) > MANY else max(1, len(names))
+        near = difflib.get_close_matches(str(name).lower(), by_lower, n=number, cutoff=0)
         shown = ", ".join(by_lower[lower] for lower in near) or "none"
-        there_are = "There are" if len(names) <= NEAREST else f"The nearest of {len(names)}"
+        there_are = f"The nearest of {len(names)}" if len(names) > MANY else "There are"
         raise InputError(f"Unknown {kind} '{name}'. {there_are}: {shown}.")
     return name
 

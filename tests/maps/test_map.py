@@ -5,6 +5,7 @@ import os
 import shutil
 
 import cv2
+import h5py
 import pycolmap
 import pytest
 from command import outcome, state
@@ -188,6 +189,14 @@ def test_a_map_with_a_broken_file_is_refused_before_any_work(place, tmp_path, ru
             file.write_bytes(damaged)
             message = refused(*given)
             assert str(file) in message or str(file.parent) in message, name
+        assert not (tmp_path / "x").exists()
+        file.write_bytes(content)
+    for name in ("feats-dog-sift_sv16.h5", f"{stem}.h5"):
+        file = folder / name
+        content = file.read_bytes()
+        with h5py.File(file, "a") as opened:
+            del opened["db/1.png"]
+        assert f"db/1.png is not in the file {file}." in refused(*given)
         assert not (tmp_path / "x").exists()
         file.write_bytes(content)
     run(*given)

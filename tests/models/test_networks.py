@@ -190,7 +190,7 @@ def test_networks_of_a_file(tmp_path):
 def test_an_unknown_model_is_answered_by_all_that_are_valid():
     with pytest.raises(InputError, match="There are: aliked-n16"):
         extractors.load({"name": "aliked", "model_name": "aliked-n18"})
-    with pytest.raises(InputError, match="The nearest of 14: T48"):
+    with pytest.raises(InputError, match="There are: T48"):
         extractors.load({"name": "edgepoint2", "model_name": "T64"})
 
 
