@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 
 from ..utils import colmap
-from ..utils.cli import InputError
 from ..utils.files import replacing
+from ..utils.images import UnreadableImage
 from ..utils.parsers import to_line
 from .exif import WELL_KNOWN, exif_camera
 
@@ -58,7 +58,7 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         of the map whose size no map photo has: their EXIF data do not say what was cut off.
 
     Raises:
-        InputError: if the image cannot be read.
+        UnreadableImage: if the image cannot be read.
     """
     exif, has_focal_length = None, False
     if isinstance(image, np.ndarray):
@@ -86,13 +86,13 @@ def infer_all(
     """Infer the intrinsics of the photos of a folder, see `infer`; skip unreadable ones.
 
     Raises:
-        InputError: if `strict` and an image cannot be read.
+        UnreadableImage: if `strict`.
     """
     inferred = {}
     for name in names:
         try:
             inferred[name] = infer(image_dir / name, of_map)
-        except InputError:
+        except UnreadableImage:
             if strict:
                 raise
     return inferred

@@ -78,7 +78,8 @@ class Localizer:
             and the pose with it, may be wrong, in a few words each, and `seconds` by stage.
 
         Raises:
-            InputError: if the image cannot be read, or the camera has another size.
+            UnreadableImage: if the image cannot be read.
+            InputError: if the camera has another size.
         """
         image = image if isinstance(image, np.ndarray) else Path(image)
         seconds: dict[str, float] = {}

@@ -14,6 +14,7 @@ from hloc_reduce import Localizer, maps
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.utils import cli, parsers
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.images import UnreadableImage
 from pipelines import aachen, localize
 
 PIPELINE = localize
@@ -140,6 +141,12 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, caplog, r
     for wrong in (pixels.astype(float), pixels[None], np.zeros((0, 3), np.uint8)):
         with pytest.raises(InputError, match="uint8"):
             localizer.localize(wrong)
+    content = (photos / "guess.png").read_bytes()
+    for name, left in (("cut.png", content[:2000]), ("text.png", b"text"), ("empty.png", b"")):
+        (photos / name).write_bytes(left)
+    for name in ("cut.png", "text.png", "empty.png", "absent.png"):
+        with pytest.raises(UnreadableImage, match=f"Cannot read image .*{name}"):
+            localizer.localize(photos / name)
 
 
 @pytest.mark.parametrize("by_model", [True, False])

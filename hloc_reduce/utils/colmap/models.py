@@ -14,6 +14,7 @@ import pycolmap
 
 from ..cli import InputError
 from ..files import replacing
+from ..images import UnreadableImage
 from ..parsers import CAMERA_MODELS, check_names
 
 if TYPE_CHECKING:
@@ -196,12 +197,12 @@ def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
         longer side.
 
     Raises:
-        InputError: when the image cannot be read.
+        UnreadableImage: when the image cannot be read.
     """
     try:
         camera = pycolmap.infer_camera_from_image(image)
     except Exception:  # RuntimeError or ValueError, depending on the version
         broken, absent = "it is not an image, or it is truncated", "No such file or directory"
         reason = broken if Path(image).exists() else absent
-        raise InputError(f"Cannot read image {image}: {reason}.") from None
+        raise UnreadableImage(f"Cannot read image {image}: {reason}.") from None
     return camera, camera.has_prior_focal_length
