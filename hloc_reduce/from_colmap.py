@@ -170,7 +170,7 @@ def _check_model(
     images = [model.images[i] for i in model.reg_image_ids()]
     if missing := sorted(image.name for image in images if image.name not in database.images):
         raise InputError(
-            f"{database.path} is of another model: it has no {len(missing)} of {len(images)} "
+            f"{database.path} is of another model: it lacks {len(missing)} of {len(images)} "
             f"images: {cli.some(missing, 3)}."
         )
     others = [i.name for i in images if keypoints.get(i.name, 0) != i.num_points2D()]

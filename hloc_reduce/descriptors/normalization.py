@@ -35,8 +35,11 @@ def detect(descriptors: np.ndarray) -> str:
     Raises:
         InputError: when they are not descriptors of SIFT, or may be of either.
     """
-    if descriptors.shape[1] != 128 or not len(descriptors) or (descriptors < 0).any():
-        raise InputError("There are no SIFT descriptors: 128 numbers of at least 0 are expected.")
+    number, dim = descriptors.shape
+    if dim != 128 or not number or (descriptors < 0).any():
+        found = "numbers below 0" if dim == 128 else f"{dim} numbers"
+        given = f"these have {found}" if number else "there are none"
+        raise InputError(f"SIFT descriptors are 128 numbers of at least 0; {given}.")
     if (descriptors == 0).mean() < FEW_ZEROS:
         return "rootsift"
     mean = descriptors.sum(axis=1).mean()

@@ -102,7 +102,7 @@ def test_wrong_input(colmap_files, tmp_path, refused):
     assert "choose a feature of colmap_sift" in refused(*given, "--feature", "sift_sv32")
     content = database.read_bytes()
     for change, message in (
-        ("UPDATE images SET name = 'x.png' WHERE image_id = 2", "it has no 1 of 4 images"),
+        ("UPDATE images SET name = 'x.png' WHERE image_id = 2", "it lacks 1 of 4 images"),
         ("UPDATE keypoints SET rows = rows - 1", "the numbers of keypoints of 4 of 4 images"),
         ("UPDATE keypoints SET data = zeroblob(16 * rows)", "the positions of keypoints of 4"),
     ):

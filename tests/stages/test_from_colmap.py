@@ -85,7 +85,7 @@ def test_a_log_beside_the_database_is_read(found, tmp_path):
         ("DELETE FROM descriptors", "has no descriptors"),
         ("DELETE FROM descriptors WHERE image_id = 1", "lacks the descriptors of 1 of 2 images"),
         ("UPDATE descriptors SET data = x'00'", "are truncated"),
-        ("UPDATE descriptors SET cols = 64, data = zeroblob(64 * rows)", "no SIFT descriptors"),
+        ("UPDATE descriptors SET cols = 64, data = zeroblob(64 * rows)", "these have 64 numbers"),
         ("ALTER TABLE descriptors ADD type INTEGER DEFAULT 1", "descriptors of ALIKED_N16ROT"),
         ("ALTER TABLE descriptors ADD type INTEGER DEFAULT 9", "descriptors of type 9"),
     ],

@@ -64,8 +64,12 @@ def test_normalizations_are_told_apart():
     for name, descriptors in found.items():
         assert detect(descriptors) == name
         np.testing.assert_allclose(to_colmap_sift(descriptors, name), expected, atol=0.015)
-    for wrong in (-expected, expected[:, :64], expected[:0]):
-        with pytest.raises(InputError, match="no SIFT descriptors"):
+    for wrong, message in (
+        (-expected, "these have numbers below 0"),
+        (expected[:, :64], "these have 64 numbers"),
+        (expected[:0], "there are none"),
+    ):
+        with pytest.raises(InputError, match=message):
             detect(wrong)
     between = expected * (7.35 / expected.sum(axis=1, keepdims=True))
     with pytest.raises(InputError, match="may be L2 or L1_ROOT"):
@@ -171,7 +175,7 @@ def test_an_old_model_localizes_with_reduced_features(aachen_layout, tmp_path, m
         (("--feature", "colmap_sift_sv32", "--storage", "uint3"), "uint3"),
         (("--feature", "colmap_sift_sv32", "--normalization", "L3"), "L3"),
         (("--feature", "sift_sv32", "--normalization", "L2"), "is for features of colmap_sift"),
-        (("--feature", "colmap_sift_sv32", "--features", "signed.h5"), "no SIFT descriptors"),
+        (("--feature", "colmap_sift_sv32", "--features", "signed.h5"), "numbers below 0"),
         (("--feature", "colmap_sift_sv32", "--features", "text.h5"), "text.h5"),
     ],
 )
