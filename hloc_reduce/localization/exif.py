@@ -9,6 +9,7 @@ from PIL import Image
 MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769  # EXIF tags
 ZOOM, FOCAL_35MM, FOCAL_LENGTH = 0xA404, 0xA405, 0x920A
 WIDTH, HEIGHT = 0xA002, 0xA003  # as the camera wrote it
+FOCAL_PLANE = 0xA20E  # its pixels in a unit of length, which say how large they are
 MAX_ZOOM = 1.01
 RESHAPED = 1.02  # ratio of aspect ratios: a copy of another size differs by rounding only
 MAX_RATIO = 10.0  # of width and height in EXIF data: others are nonsense
@@ -25,6 +26,9 @@ class ExifCamera(NamedTuple):
         zoomed: digitally, which changes the intrinsics but not always the focal length in EXIF.
         cropped: or stretched: the photo has another ratio of width and height than its EXIF data
             say, or is square, which hardly any camera takes.
+        scale: by which COLMAP's focal length in pixels is to be multiplied. COLMAP computes it from
+            the size of the camera's pixels, if EXIF data give that and no focal length in 35 mm
+            film. Those of a photo that was made smaller are larger.
     """
 
     model: str
@@ -32,6 +36,7 @@ class ExifCamera(NamedTuple):
     size: tuple[int, int]
     zoomed: bool
     cropped: bool = False
+    scale: float = 1.0
 
     @property
     def name(self) -> str:
@@ -53,32 +58,36 @@ def exif_camera(image: Path) -> ExifCamera | None:
         make, model = (str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL))
         focal_length = float(more.get(FOCAL_35MM) or more.get(FOCAL_LENGTH) or 0)
         zoom = float(more.get(ZOOM) or 1)
-        taken = [more.get(tag) for tag in (WIDTH, HEIGHT)]
+        taken = _sides([more.get(tag) for tag in (WIDTH, HEIGHT)])
+        by_pixels = not more.get(FOCAL_35MM) and float(more.get(FOCAL_PLANE) or 0) > 0
     except Exception:  # Pillow raises many types for broken data
         return None
     if not (model and focal_length > 0):
         return None
     name, lens = f"{make} {model}", f"{make} {model} {focal_length:g} mm"
-    return ExifCamera(name, lens, size, zoom > MAX_ZOOM, _is_cropped(size, taken))
+    scale = max(size) / taken[1] if by_pixels and taken else 1.0
+    return ExifCamera(name, lens, size, zoom > MAX_ZOOM, _is_cropped(size, taken), scale)
 
 
-def _is_cropped(size: tuple[int, int], taken: Sequence[object]) -> bool:
-    """Tell whether a size is square or has another aspect ratio than one in EXIF data.
+def _sides(taken: Sequence[object]) -> tuple[float, float] | None:
+    """Return the shorter and the longer side in EXIF data, None if they cannot be right.
 
-    A size in EXIF data that cannot be right tells nothing.
+    Photos may have been turned.
     """
-    aspect = max(size) / min(size)
-    if aspect < RESHAPED:
-        return True
     try:
-        width, height = (float(value) for value in taken)  # type: ignore[arg-type]
+        shorter, longer = sorted(float(value) for value in taken)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):
-        return False
-    if not (min(width, height) > 0 and max(width, height) <= MAX_RATIO * min(width, height)):
-        return False
-    # photos may have been turned
-    ratio = aspect * min(width, height) / max(width, height)
-    return not 1 / RESHAPED <= ratio <= RESHAPED
+        return None
+    return (shorter, longer) if 0 < longer <= MAX_RATIO * shorter else None
+
+
+def _is_cropped(size: tuple[int, int], taken: tuple[float, float] | None) -> bool:
+    """Tell whether a size is square or has another aspect ratio than one in EXIF data, if known."""
+    aspect = max(size) / min(size)
+    if aspect < RESHAPED or taken is None:
+        return aspect < RESHAPED
+    shorter, longer = taken
+    return not 1 / RESHAPED <= aspect * shorter / longer <= RESHAPED
 
 
 def of_another_size(image_dir: Path, names: Iterable[str]) -> list[str]:

@@ -75,6 +75,8 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
     if exif is not None and not is_cut and exif.name in of_map.known:
         return of_map.known[exif.name], "map"
     if has_focal_length and not is_cut:
+        if exif is not None:
+            colmap.scale_focal_length(camera, exif.scale)
         return camera, "EXIF"
     camera.has_prior_focal_length = False
     return camera, "guess" if has_size and not is_cut else "unknown"

@@ -10,7 +10,7 @@ from ..localization.intrinsics import GUESSED_FOCAL
 from ..utils import colmap
 
 # what the provenance of what is made from such a database says of its cameras
-ZOOMED = "cameras of their own, as cropped and square ones have"
+ZOOMED = "cameras of their own, as cropped and square ones have; copies scaled"
 
 
 def import_images(
@@ -23,7 +23,8 @@ def import_images(
     """Create a COLMAP database with images, and cameras guessed from their EXIF data.
 
     In the mode AUTO, images with a digital zoom, or of another shape than their EXIF data say, get
-    guessed cameras of their own: the focal lengths in EXIF data may be those without the zoom. Not
+    guessed cameras of their own: the focal lengths in EXIF data may be those without the zoom. The
+    focal lengths of images that were made smaller are corrected, see `exif.ExifCamera.scale`. Not
     if `image_options` give parameters.
 
     Args:
@@ -36,25 +37,32 @@ def import_images(
     Raises:
         InputError: for an unknown option, or an image that COLMAP skips.
     """
-    options, untold = image_options or {}, set()
-    if camera_mode == pycolmap.CameraMode.AUTO and not options.get("camera_params"):
-        found = {name: exif_camera(image_dir / name) for name in names}
-        untold = {name for name, camera in found.items() if camera and not camera.is_original}
+    options = image_options or {}
+    if options.get("camera_params"):
+        colmap.import_images(database, image_dir, names, camera_mode, options)
+        return
+    found = {name: exif_camera(image_dir / name) for name in names}
+    is_auto = camera_mode == pycolmap.CameraMode.AUTO
+    untold = {name for name, exif in found.items() if is_auto and exif and not exif.is_original}
     if rest := [name for name in names if name not in untold]:
         colmap.import_images(database, image_dir, rest, camera_mode, options)
-    if not untold:
-        return
-    mode, factor = pycolmap.CameraMode.PER_IMAGE, options.get("default_focal_length_factor")
-    colmap.import_images(database, image_dir, sorted(untold), mode, options)
+    if untold:
+        mode = pycolmap.CameraMode.PER_IMAGE
+        colmap.import_images(database, image_dir, sorted(untold), mode, options)
+    guess = options.get("default_focal_length_factor") or GUESSED_FOCAL
     with colmap.open_database(database) as opened:
-        for image in opened.read_all_images():
-            if image.name in untold:
-                camera = opened.read_camera(image.camera_id)
-                params, side = camera.params.copy(), max(camera.width, camera.height)
-                params[camera.focal_length_idxs()] = (factor or GUESSED_FOCAL) * side
-                camera.params = params.tolist()
+        first = {image.camera_id: image.name for image in reversed(opened.read_all_images())}
+        for camera_id, name in first.items():
+            camera, exif = opened.read_camera(camera_id), found[name]
+            if name in untold:
+                wanted = guess * max(camera.width, camera.height)
+                colmap.scale_focal_length(camera, wanted / camera.mean_focal_length())
                 camera.has_prior_focal_length = False
-                opened.update_camera(camera)
+            elif exif and camera.has_prior_focal_length and exif.scale != 1:
+                colmap.scale_focal_length(camera, exif.scale)
+            else:
+                continue
+            opened.update_camera(camera)
 
 
 def write(

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from hloc_reduce.localization import exif, intrinsics
 from hloc_reduce.localization.intrinsics import MapCameras
@@ -34,10 +35,18 @@ def map_of(cameras: list[int]) -> pycolmap.Reconstruction:
     return reconstruction
 
 
-def write_photo(path, make="Maker", focal_35mm=36, size=(480, 360), zoom=None, taken=None):
+def write_photo(
+    path, make="Maker", focal_35mm=36, size=(480, 360), zoom=None, taken=None, pixels_per_inch=None
+):
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = make, "Phone 1"
-    exif.get_ifd(0x8769)[0xA405] = focal_35mm
+    if focal_35mm is not None:
+        exif.get_ifd(0x8769)[0xA405] = focal_35mm
+    if pixels_per_inch is not None:
+        exif.get_ifd(0x8769)[0x920A] = 25  # mm
+        # a fraction, as cameras write it
+        exif.get_ifd(0x8769)[0xA20E] = IFDRational(1000 * pixels_per_inch, 1000)
+        exif.get_ifd(0x8769)[0xA210] = 2  # inches
     if zoom is not None:
         exif.get_ifd(0x8769)[0xA404] = zoom
     if taken is not None:
@@ -57,6 +66,23 @@ def test_the_camera_of_a_map_is_known_again(tmp_path):
     for changed in ({"make": "Other"}, {"focal_35mm": 50}, {"size": (360, 480)}):
         write_photo(tmp_path / "new.jpg", **changed)
         assert intrinsics.infer(tmp_path / "new.jpg", known)[1] == "EXIF"
+
+
+@pytest.mark.parametrize(
+    ("size", "taken", "focal_length"),
+    [
+        ((480, 360), (480, 360), 500),
+        ((240, 180), (480, 360), 250),  # made smaller
+        ((180, 240), (480, 360), 250),  # and turned
+    ],
+)
+def test_the_size_of_a_pixel_is_that_of_the_camera(size, taken, focal_length, tmp_path):
+    write_photo(tmp_path / "0.jpg", focal_35mm=None, size=size, taken=taken, pixels_per_inch=508)
+    camera, source = intrinsics.infer(tmp_path / "0.jpg", MapCameras({}, set()))
+    assert source == "EXIF" and camera.mean_focal_length() == pytest.approx(focal_length, rel=0.01)
+    write_photo(tmp_path / "0.jpg", size=size, taken=taken, pixels_per_inch=508)
+    camera, _ = intrinsics.infer(tmp_path / "0.jpg", MapCameras({}, set()))
+    assert camera.mean_focal_length() == pytest.approx(max(size) * 1.04, rel=0.01)  # by 36 mm
 
 
 @pytest.mark.parametrize(
@@ -99,7 +125,7 @@ def test_broken_exif_data_tell_nothing(content, tmp_path):
     "taken", [(None, 3), ((4, 4), 3), (b"\0\1", 3), ("wide", 3), (float("nan"), 3), (-4, 3)]
 )
 def test_odd_sizes_in_exif_data_tell_nothing(taken):
-    assert not exif._is_cropped((480, 360), taken)
+    assert not exif._is_cropped((480, 360), exif._sides(taken))
 
 
 def test_a_camera_of_few_photos_or_of_several_models_is_not_known(tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from hloc_reduce.mapping import database
 from hloc_reduce.utils import colmap
@@ -50,6 +51,23 @@ def test_cropped_photos_have_cameras_of_their_own(photos):
     found = cameras(photos / "1.db")
     assert found["a.jpg"].camera_id != found["b.jpg"].camera_id
     assert not found["b.jpg"].has_prior_focal_length
+
+
+@pytest.mark.parametrize("mode", ["AUTO", "SINGLE", "PER_IMAGE"])
+def test_focal_lengths_of_smaller_copies(photos, mode):
+    """The size of a pixel in EXIF data is that of the camera: 25 mm are 100 of its pixels."""
+    for name in ("a.jpg", "b.jpg"):
+        exif = Image.open(photos / name).getexif()
+        of_photo = exif.get_ifd(0x8769)
+        del of_photo[0xA405]
+        of_photo[0x920A], of_photo[0xA20E], of_photo[0xA210] = 25, IFDRational(101600, 1000), 2
+        of_photo[0xA002], of_photo[0xA003] = 160, 120
+        Image.new("RGB", (40, 30)).save(photos / name, exif=exif)
+    path, mode = photos / "1.db", pycolmap.CameraMode.__members__[mode]
+    database.import_images(path, photos, ["a.jpg", "b.jpg"], mode)
+    for camera in cameras(path).values():
+        assert camera.has_prior_focal_length
+        assert camera.mean_focal_length() == pytest.approx(25, rel=0.01)  # 100 of 160 pixels
 
 
 def test_all_are_zoomed(photos):
