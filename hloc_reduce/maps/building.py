@@ -28,7 +28,7 @@ from ..runtime import provenance
 from ..runtime.outputs import RunFolder
 from ..utils import cli, colmap
 from ..utils.parsers import parse_pairs, write_pairs
-from . import contradictions, cropping, mirrored_photos, precision
+from . import contradictions, cropping, mirrored_photos, misfits, precision
 from .map import FINISHED, RETRIEVAL, SFM, Map, keep_projection, models, write
 
 # suffixes of the models of later attempts
@@ -84,6 +84,10 @@ class Building:
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
         uncertain = precision.find(sfm) if model is None else {}
+        fitting_badly = []
+        if model is None:
+            verified = colmap.read_verified(self.folder.path / folder / "database.db")
+            fitting_badly = misfits.find(sfm, verified)
         names = {sfm.images[i].name for i in sfm.reg_image_ids()}
         cropped = exif.cropped(self.image_dir, names) if model is None else []
         cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
@@ -101,6 +105,7 @@ class Building:
             images=len({*self.names, *self.unlike_others}),
             images_contradicting_others=contradicting,
             images_of_uncertain_position=uncertain,
+            images_fitting_badly=fitting_badly,
             doubtful_focal_lengths=spread,
             gain_of_free_principal_points=fit.gain,
             images_altered=fit.altered,

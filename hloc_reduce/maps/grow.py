@@ -215,6 +215,7 @@ def _commit(
         "images_added": sorted(({*content.get("images_added", ())} | {*added}) - {*removed}),
         "images_contradicting_others": contradicting,
         "images_of_uncertain_position": uncertain,
+        "images_fitting_badly": [name for name in built.fitting_badly if name not in removed],
         "gain_of_free_principal_points": fit.gain,
         "images_altered": fit.altered,
         "images_cropped": sorted({*built.cropped} - {*removed}),

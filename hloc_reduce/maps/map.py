@@ -22,7 +22,7 @@ from ..utils.codes import STORAGES
 from ..utils.files import replacing
 from ..utils.h5 import file_provenance, get_dataset, open_h5
 from ..utils.paths import strings_as_paths
-from . import contradictions, cropping, mirrored_photos, precision
+from . import contradictions, cropping, mirrored_photos, misfits, precision
 
 FINISHED = "map.json"  # is written last
 FINGERPRINTS = "fingerprints.json"
@@ -50,6 +50,7 @@ class Map:
         num_images: images with a pose.
         contradicting: images whose poses contradict the others.
         uncertain: images whose positions are uncertain, see `precision.find`.
+        fitting_badly: images whose matches fit their poses badly, see `misfits.find`.
         doubtful_focal_lengths: their ratio if it makes the map doubtful, 1 otherwise, see
             `registration.check`.
         cropping: how much better the images fit with other intrinsics.
@@ -93,6 +94,7 @@ class Map:
         self.contradicting = list(content.get("images_contradicting_others", []))
         found = content.get("images_of_uncertain_position", {}).items()
         self.uncertain = {str(name): float(share) for name, share in found}
+        self.fitting_badly = list(content.get("images_fitting_badly", []))
         self.doubtful_focal_lengths = float(content.get("doubtful_focal_lengths", 1))
         gain = float(content.get("gain_of_free_principal_points", 0))
         self.cropping = cropping.Fit(gain, list(content.get("images_altered", [])))
@@ -185,6 +187,7 @@ class Map:
         reasons = {
             f"focal lengths that differ by a factor of {factor:.2f}": factor > 1,
             "photos that others place elsewhere": self.contradicting,
+            "photos whose matches fit their poses badly": self.fitting_badly,
             "photos that may be cropped or enlarged": is_cropped,
         }
         found = [reason for reason, is_one in reasons.items() if is_one]
@@ -194,6 +197,7 @@ class Map:
         """Warn of what may be wrong with the map, as was found when it was built."""
         registration.warn(self.doubtful_focal_lengths)
         contradictions.warn(self.contradicting)
+        misfits.warn(self.fitting_badly)
         precision.warn(self.uncertain)
         cropping.warn(self.cropping, self.unlike_others, self.cropped)
         mirrored_photos.warn(self.mirrored)
@@ -269,6 +273,7 @@ def write(
         "images_with_pose": reconstruction.num_reg_images(),
         "images_contradicting_others": [],
         "images_of_uncertain_position": {},
+        "images_fitting_badly": [],
         "doubtful_focal_lengths": 1.0,
         "gain_of_free_principal_points": 0.0,
         "images_altered": [],

@@ -58,10 +58,12 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
     content = json.loads((moved / "map.json").read_text())
     assert content.pop("gain_of_free_principal_points") == 0 and "may be cropped" not in caplog.text
     assert content.pop("images_altered") == [] and content.pop("doubtful_focal_lengths") == 1
+    assert content.pop("images_fitting_badly") == []
     gain = {"gain_of_free_principal_points": 0.2}
     for more, said in (
         ({}, ""),
         ({"doubtful_focal_lengths": 1.36}, "lengths differ by a factor of 1.36"),
+        ({"images_fitting_badly": ["db/3.png"]}, "worse than those of the others: db/3.png."),
         (gain, "may be cropped"),
         (gain | {"images_altered": ["db/2.png"]}, "than the others: db/2.png"),
     ):

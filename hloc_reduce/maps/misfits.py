@@ -1,0 +1,69 @@
+"""Find photos of a map of photos alone whose matches fit their poses badly."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pycolmap
+
+from .. import logger
+from ..localization.projection import photo_scale
+from ..mapping.epipolar import EVIDENCE, Pair, epipolar_errors
+from ..utils import cli, colmap
+
+# A right pose is about as precise as the keypoints: its matches are a few tenths of a pixel from
+# their epipolar lines. Where bundle adjustment has traded a turn for a move, or something large has
+# moved, they are one to nine pixels away, which the mapper's thresholds still allow.
+FAR = 1.0  # pixels
+TIMES = 3.0  # what is typical of the map, or of SHARP
+SHARP = 0.3  # pixels
+STRONG = 0.5  # share of the matches of a photo's strongest pair, from which another one counts
+
+
+def find(sfm: pycolmap.Reconstruction, verified: Mapping[Pair, np.ndarray]) -> list[str]:
+    """Find photos whose verified matches are much farther from their epipolar lines than others'.
+
+    A pair of photos is measured by the median distance, and a photo by the best one of its pairs
+    with many matches: wrong matches of some pairs do not count against it.
+
+    Args:
+        sfm: the map.
+        verified: the matches (M, 2) of pairs that agree with a two-view geometry.
+
+    Returns:
+        Their names, the worst first.
+    """
+    images = {sfm.images[i].name: sfm.images[i] for i in sfm.reg_image_ids()}
+    rays, pixels = {}, {}
+    for name, image in images.items():
+        camera = sfm.cameras[image.camera_id]
+        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        rays[name] = colmap.cam_from_img(camera, keypoints)
+        pixels[name] = camera.cam_from_img_threshold(photo_scale(camera))
+    pairs: dict[str, list[tuple[int, float]]] = {}  # of an image: matches, median distance
+    for (name0, name1), rows in verified.items():
+        if len(rows) < EVIDENCE or not {name0, name1} <= images.keys():
+            continue
+        relative = images[name1].cam_from_world() * images[name0].cam_from_world().inverse()
+        errors = epipolar_errors(relative, rays[name0][rows[:, 0]], rays[name1][rows[:, 1]])
+        distance = np.maximum(errors[0] / pixels[name0], errors[1] / pixels[name1])
+        for name in (name0, name1):
+            pairs.setdefault(name, []).append((len(rows), float(np.median(distance))))
+    best = {}
+    for name, measured in pairs.items():
+        enough = STRONG * max(number for number, _ in measured)
+        best[name] = min(median for number, median in measured if number >= enough)
+    if not best:
+        return []
+    limit = max(FAR, TIMES * max(SHARP, float(np.median([*best.values()]))))
+    return sorted((name for name in best if best[name] > limit), key=lambda name: -best[name])
+
+
+def warn(names: list[str]) -> None:
+    """Warn of photos whose matches fit their poses badly, if there are any."""
+    if names:
+        logger.warning(
+            "The map may be wrong: the matches of these photos fit their poses much worse than "
+            "those of the others: %s. They may be misplaced, or something large has moved. More "
+            "photos between them and the others help, or leave them out. map.json lists them all.",
+            cli.some(names),
+        )

@@ -1,0 +1,44 @@
+"""Photos of a map whose matches fit their poses badly."""
+
+import numpy as np
+import pytest
+from row_of_photos import row
+
+from hloc_reduce.mapping.epipolar import misplaced
+from hloc_reduce.maps import misfits
+
+
+@pytest.mark.parametrize(
+    ("turned", "worst"),
+    [
+        ({}, []),
+        ({2: 0.02}, []),
+        ({2: 0.25}, ["2.jpg"]),  # two pixels
+        ({2: 0.25, 4: -0.4}, ["4.jpg", "2.jpg"]),
+    ],
+)
+def test_photos_that_fit_badly_are_named(turned, worst, caplog):
+    """The mapper and `misplaced` tolerate four pixels."""
+    model, keypoints, verified = row(turned)
+    assert misplaced(model, keypoints, verified) == []
+    assert misfits.find(model, verified) == worst
+    misfits.warn(worst)
+    assert all(name in caplog.text for name in worst) and bool(caplog.text) == bool(worst)
+
+
+def test_wrong_matches_of_weaker_pairs_do_not_count():
+    model, _, verified = row({})
+    wrong = np.stack([np.arange(29), np.roll(np.arange(29), 7)], axis=1)
+    for pair in verified:
+        if "2.jpg" in pair and "3.jpg" not in pair:
+            verified[pair] = wrong
+    assert misfits.find(model, verified) == []
+    verified[("3.jpg", "2.jpg")] = wrong  # no pair of it is right
+    assert misfits.find(model, verified) == ["2.jpg"]
+
+
+def test_few_matches_tell_nothing():
+    model, _, verified = row({2: 0.25})
+    assert misfits.find(model, {pair: rows[:14] for pair, rows in verified.items()}) == []
+    assert misfits.find(model, {}) == []
+    assert misfits.find(model, {("0.jpg", "absent.jpg"): verified[("1.jpg", "0.jpg")]}) == []
