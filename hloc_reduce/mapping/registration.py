@@ -104,29 +104,36 @@ def _doubt(spread: float) -> str:
     )
 
 
-def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -> float:
+def check(
+    sfm_dir: Path,
+    accept_partial: bool,
+    left_out: Collection[str] = (),
+    doubts: Collection[str] = (),
+) -> float:
     """Report which images are missing from a model.
 
     Args:
         sfm_dir: folder of the model.
-        accept_partial: whether it may have fewer than half of the images, or focal lengths that
-            differ by a factor above `SPREAD`.
+        accept_partial: whether it may have fewer than half of the images, focal lengths that
+            differ by a factor above `SPREAD`, or `doubts`.
         left_out: images that it was not to have; they are reported elsewhere.
+        doubts: further reasons why it may be wrong, in sentences.
 
     Returns:
         The ratio of the largest to the least focal length if one camera may have taken all images,
         and they differ so much that the model may be wrong; 1 otherwise.
 
     Raises:
-        InputError: if it has fewer than half of the images, or one camera may have taken all and
-            their focal lengths differ too much, unless `accept_partial`.
+        InputError: if it has fewer than half of the images, one camera may have taken all and
+            their focal lengths differ too much, or there are doubts, unless `accept_partial`.
     """
     state = provenance.read(sfm_dir / REGISTRATION)
     missing, number, spread = state["missing"], state["images"], state.pop("spread", 1.0)
     registered = number - len(missing)
     factor = doubtful(spread, number) if state["alike"] else 1.0
     is_partial = registered < ENOUGH * number or len(state["parts"]) > 1
-    accept = f"{_doubt(factor)} {ACCEPT}" if factor > SPREAD else ACCEPT
+    doubts = [*([_doubt(factor)] if factor > SPREAD else []), *doubts]
+    accept = " ".join([*doubts, ACCEPT])
     message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
     if not accept_partial:
         if registered < LEAST * number:
@@ -147,7 +154,7 @@ def check(sfm_dir: Path, accept_partial: bool, left_out: Collection[str] = ()) -
             *(len(missing), number, cli.some(missing, NAMED)),
             f" {_left_out(implausible, missing)}" if implausible else "",
         )
-    if factor > SPREAD and not accept_partial:
+    if doubts and not accept_partial:
         raise InputError(accept)
     if state["alike"] and factor == 1 and not is_partial:
         logger.info(

@@ -8,6 +8,7 @@ import pycolmap
 from .. import logger
 from ..localization.projection import photo_scale
 from ..mapping.epipolar import EVIDENCE, Pair, epipolar_errors
+from ..mapping.registration import NAMED
 from ..utils import cli, colmap
 
 # A right pose is about as precise as the keypoints: its matches are a few tenths of a pixel from
@@ -58,12 +59,16 @@ def find(sfm: pycolmap.Reconstruction, verified: Mapping[Pair, np.ndarray]) -> l
     return sorted((name for name in best if best[name] > limit), key=lambda name: -best[name])
 
 
+def doubt(names: list[str]) -> str:
+    """Say that a map may be wrong because the matches of photos fit their poses badly."""
+    return (
+        "The map may be wrong: the matches of these photos fit their poses much worse than those "
+        f"of the others: {cli.some(names, NAMED)}. They may be misplaced, or something large has "
+        "moved. Leave them out, or add photos between them and the others."
+    )
+
+
 def warn(names: list[str]) -> None:
     """Warn of photos whose matches fit their poses badly, if there are any."""
     if names:
-        logger.warning(
-            "The map may be wrong: the matches of these photos fit their poses much worse than "
-            "those of the others: %s. They may be misplaced, or something large has moved. More "
-            "photos between them and the others help, or leave them out. map.json lists them all.",
-            cli.some(names),
-        )
+        logger.warning(doubt(names))

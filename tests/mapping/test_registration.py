@@ -22,6 +22,17 @@ def register(folder, number, images, **changed):
     (folder / registration.REGISTRATION).write_text(json.dumps(state | changed))
 
 
+def test_doubts_are_refused(tmp_path):
+    register(tmp_path, 16, 16)
+    with pytest.raises(InputError, match=r"^One\. Two\. To use .* --accept_partial\.$"):
+        registration.check(tmp_path, False, doubts=["One.", "Two."])
+    registration.check(tmp_path, True, doubts=["One."])
+    register(tmp_path, 4, 16, alike=True, spread=1.5)
+    message = r"Only 4 of 16 photos .* by a factor of 1\.50\. .* One\. To use"
+    with pytest.raises(InputError, match=message):
+        registration.check(tmp_path, False, doubts=["One."])
+
+
 @pytest.mark.parametrize("number", [8, 14, 16])
 @pytest.mark.parametrize("spread", [1.02, 1.18, 1.36])
 def test_focal_lengths_that_differ_are_doubted_however_many_are_missing(

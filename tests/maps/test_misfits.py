@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from row_of_photos import row
 
+from hloc_reduce import maps
 from hloc_reduce.mapping.epipolar import misplaced
 from hloc_reduce.maps import misfits
+from pipelines import localize
+
+PIPELINE = localize
 
 
 @pytest.mark.parametrize(
@@ -42,3 +46,16 @@ def test_few_matches_tell_nothing():
     assert misfits.find(model, {pair: rows[:14] for pair, rows in verified.items()}) == []
     assert misfits.find(model, {}) == []
     assert misfits.find(model, {("0.jpg", "absent.jpg"): verified[("1.jpg", "0.jpg")]}) == []
+
+
+def test_such_a_map_is_refused_unless_it_is_accepted(plane, tmp_path, monkeypatch, run, refused):
+    outputs = tmp_path / "outputs"
+    given = ("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
+    monkeypatch.setattr(maps.building.misfits, "find", lambda *_: ["3.png"])
+    message = refused(*given)
+    assert "of the others: 3.png." in message and "--accept_partial" in message
+    assert not (outputs / "map/map.json").exists()
+    run(*given, "--accept_partial")
+    built = maps.Map(outputs / "map")
+    assert built.fitting_badly == ["3.png"]
+    assert built.doubts == ["photos whose matches fit their poses badly"]
