@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from . import logger
-from .mapping.database import ZOOMED, import_images
+from .mapping.database import CAMERAS, import_images
 from .mapping.overlays import drop_overlays
 from .pairs_from_retrieval import rank, read_global, similarity
 from .runtime import provenance
@@ -181,7 +181,7 @@ def _verify(
             "features": file_provenance(feature_file),
             "matches": file_provenance(match_file),
             "camera_mode": camera_mode.name,
-            "zoomed": ZOOMED,
+            "inferred": CAMERAS,
         }
     before = provenance.read(path)
     known = before.get("pairs", {}) if before.get("made_from") == made_from else {}

@@ -158,7 +158,8 @@ def main(
     """
     wanted = Queries.find(query_images, queries, built, strict)
     names = wanted.names
-    map_names = built.names()  # a broken map is found before photos are read
+    map_names = built.names()
+    built.check_features(map_names)  # a broken map is found before photos are read
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
     photos = Photos(outputs / MADE_FROM, built, query_images, names)

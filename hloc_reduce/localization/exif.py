@@ -1,18 +1,21 @@
 """What the EXIF data of photos tell about their intrinsics."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import pycolmap
 from PIL import Image
 
 MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769  # EXIF tags
 ZOOM, FOCAL_35MM, FOCAL_LENGTH = 0xA404, 0xA405, 0x920A
 WIDTH, HEIGHT = 0xA002, 0xA003  # as the camera wrote it
-FOCAL_PLANE = 0xA20E  # its pixels in a unit of length, which say how large they are
+FOCAL_PLANE, UNIT = 0xA20E, 0xA210  # pixels of the sensor in a unit of length
+UNITS = {2: 25.4, 3: 10.0}  # millimetres
 MAX_ZOOM = 1.01
 RESHAPED = 1.02  # ratio of aspect ratios: a copy of another size differs by rounding only
 MAX_RATIO = 10.0  # of width and height in EXIF data: others are nonsense
+SAME = 0.01  # relative difference of focal lengths that are the same
 WELL_KNOWN = 3  # images from which the map knows the intrinsics of their camera
 
 
@@ -26,9 +29,8 @@ class ExifCamera(NamedTuple):
         zoomed: digitally, which changes the intrinsics but not always the focal length in EXIF.
         cropped: or stretched: the photo has another ratio of width and height than its EXIF data
             say, or is square, which hardly any camera takes.
-        scale: by which COLMAP's focal length in pixels is to be multiplied. COLMAP computes it from
-            the size of the camera's pixels, if EXIF data give that and no focal length in 35 mm
-            film. Those of a photo that was made smaller are larger.
+        full_size: the longer side of the photo as the camera wrote it, and its focal length, both
+            in pixels, if EXIF data give the size of the sensor's pixels; else 0.
     """
 
     model: str
@@ -36,7 +38,7 @@ class ExifCamera(NamedTuple):
     size: tuple[int, int]
     zoomed: bool
     cropped: bool = False
-    scale: float = 1.0
+    full_size: tuple[float, float] = (0.0, 0.0)
 
     @property
     def name(self) -> str:
@@ -59,14 +61,44 @@ def exif_camera(image: Path) -> ExifCamera | None:
         focal_length = float(more.get(FOCAL_35MM) or more.get(FOCAL_LENGTH) or 0)
         zoom = float(more.get(ZOOM) or 1)
         taken = _sides([more.get(tag) for tag in (WIDTH, HEIGHT)])
-        by_pixels = not more.get(FOCAL_35MM) and float(more.get(FOCAL_PLANE) or 0) > 0
     except Exception:  # Pillow raises many types for broken data
         return None
     if not (model and focal_length > 0):
         return None
     name, lens = f"{make} {model}", f"{make} {model} {focal_length:g} mm"
-    scale = max(size) / taken[1] if by_pixels and taken else 1.0
-    return ExifCamera(name, lens, size, zoom > MAX_ZOOM, _is_cropped(size, taken), scale)
+    full_size = (taken[1], _in_pixels(more)) if taken else (0.0, 0.0)
+    return ExifCamera(name, lens, size, zoom > MAX_ZOOM, _is_cropped(size, taken), full_size)
+
+
+def _in_pixels(more: Mapping[int, Any]) -> float:
+    """Return the focal length in pixels of the sensor, 0 if EXIF data do not tell."""
+    try:
+        return float(more[FOCAL_LENGTH]) * float(more[FOCAL_PLANE]) / UNITS[more[UNIT]]
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return 0.0
+
+
+def correct(camera: pycolmap.Camera, exif: ExifCamera) -> bool:
+    """Correct the focal length that COLMAP inferred for a photo that was made smaller.
+
+    If EXIF data give no focal length in 35 mm film, COLMAP may take the size of the sensor's pixels
+    for that of the photo's, which are larger.
+
+    Args:
+        camera: of the photo, changed in place.
+        exif: of the photo.
+
+    Returns:
+        Whether it was wrong.
+    """
+    side, focal_length = exif.full_size
+    wrong = abs(camera.mean_focal_length() - focal_length) < SAME * focal_length
+    if not (wrong and exif.is_original and max(exif.size) < side):
+        return False
+    params = camera.params.copy()
+    params[list(camera.focal_length_idxs())] *= max(exif.size) / side
+    camera.params = params.tolist()
+    return True
 
 
 def _sides(taken: Sequence[object]) -> tuple[float, float] | None:

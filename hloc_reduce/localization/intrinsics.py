@@ -11,7 +11,7 @@ from ..utils import colmap
 from ..utils.files import replacing
 from ..utils.images import UnreadableImage
 from ..utils.parsers import to_line
-from .exif import WELL_KNOWN, exif_camera
+from .exif import WELL_KNOWN, correct, exif_camera
 
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
 _REFINED = {"refinement": {"refine_focal_length": True}}
@@ -76,7 +76,7 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         return of_map.known[exif.name], "map"
     if has_focal_length and not is_cut:
         if exif is not None:
-            colmap.scale_focal_length(camera, exif.scale)
+            correct(camera, exif)
         return camera, "EXIF"
     camera.has_prior_focal_length = False
     return camera, "guess" if has_size and not is_cut else "unknown"

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from ..localization.exif import exif_camera
+from ..localization.exif import correct, exif_camera
 from ..localization.intrinsics import GUESSED_FOCAL
 from ..utils import colmap
 
 # what the provenance of what is made from such a database says of its cameras
-ZOOMED = "cameras of their own, as cropped and square ones have; copies scaled"
+CAMERAS = "of zooms, crops and squares: their own; of photos that were made smaller: scaled"
 
 
 def import_images(
@@ -24,8 +24,8 @@ def import_images(
 
     In the mode AUTO, images with a digital zoom, or of another shape than their EXIF data say, get
     guessed cameras of their own: the focal lengths in EXIF data may be those without the zoom. The
-    focal lengths of images that were made smaller are corrected, see `exif.ExifCamera.scale`. Not
-    if `image_options` give parameters.
+    focal length of a camera whose first image was made smaller is corrected, see `exif.correct`.
+    Parameters in `image_options` are taken as they are.
 
     Args:
         database: the file.
@@ -55,12 +55,11 @@ def import_images(
         for camera_id, name in first.items():
             camera, exif = opened.read_camera(camera_id), found[name]
             if name in untold:
-                wanted = guess * max(camera.width, camera.height)
-                colmap.scale_focal_length(camera, wanted / camera.mean_focal_length())
+                params = camera.params.copy()
+                params[camera.focal_length_idxs()] = guess * max(camera.width, camera.height)
+                camera.params = params.tolist()
                 camera.has_prior_focal_length = False
-            elif exif and camera.has_prior_focal_length and exif.scale != 1:
-                colmap.scale_focal_length(camera, exif.scale)
-            else:
+            elif exif is None or not correct(camera, exif):
                 continue
             opened.update_camera(camera)
 

@@ -47,7 +47,7 @@ MISFIT = 0.1
 ALMOST = 0.9  # times as many points with one camera as with several
 # what the provenance of a model says of how it was chosen
 RULES = {
-    "zoomed": databases.ZOOMED,
+    "inferred": databases.CAMERAS,
     "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
     "points": f"{MORE} times as many where focal lengths differ",
     "doubtful": f"from {DOUBTFUL}, misfit {MISFIT}, {ALMOST} times as many points",

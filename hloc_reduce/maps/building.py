@@ -80,8 +80,9 @@ class Building:
             self.names = self._kept
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
-            verified = colmap.read_verified(self.folder.path / folder / "database.db")
-            fitting_badly = misfits.find(sfm, verified)
+            with self.folder.stage("judge_matches"):
+                verified = colmap.read_verified(self.folder.path / folder / "database.db")
+                fitting_badly = misfits.find(sfm, verified)
             spread = self._check(folder, sfm, fit, fitting_badly)
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])

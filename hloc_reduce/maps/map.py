@@ -206,14 +206,16 @@ class Map:
         """List the images that have a pose.
 
         Raises:
-            InputError: if the model is broken, or an image lacks its features.
+            InputError: if the model is broken.
         """
-        names = sorted(image.name for image in colmap.read_model(self.sfm).images.values())
+        return sorted(image.name for image in colmap.read_model(self.sfm).images.values())
+
+    def check_features(self, names: Iterable[str]) -> None:
+        """Raise an InputError if an image lacks its features or its global descriptor."""
         with open_h5(self.features) as features, open_h5(self.descriptors) as descriptors:
             for name in names:
                 get_dataset(features, name, "keypoints")
                 get_dataset(descriptors, name, "global_descriptor")
-        return names
 
 
 def models(names: Iterable[str]) -> set[str]:

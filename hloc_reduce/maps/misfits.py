@@ -14,10 +14,10 @@ from ..utils import cli, colmap
 # A right pose is about as precise as the keypoints: its matches are a few tenths of a pixel from
 # their epipolar lines. Where bundle adjustment has traded a turn for a move, or something large has
 # moved, they are one to nine pixels away, which the mapper's thresholds still allow.
-FAR = 1.0  # pixels
-TIMES = 3.0  # what is typical of the map, or of SHARP
+FAR = 1.0  # pixels, of the reduced photo; a photo fits badly beyond it
+TIMES = 3.0  # and beyond this multiple of the median of all photos, or of SHARP if that is larger
 SHARP = 0.3  # pixels
-STRONG = 0.5  # share of the matches of a photo's strongest pair, from which another one counts
+STRONG = 0.5  # pairs count that have this share of the matches of the photo's strongest pair
 
 
 def find(sfm: pycolmap.Reconstruction, verified: Mapping[Pair, np.ndarray]) -> list[str]:
@@ -27,7 +27,7 @@ def find(sfm: pycolmap.Reconstruction, verified: Mapping[Pair, np.ndarray]) -> l
     with many matches: wrong matches of some pairs do not count against it.
 
     Args:
-        sfm: the map.
+        sfm: the map, whose images have all keypoints.
         verified: the matches (M, 2) of pairs that agree with a two-view geometry.
 
     Returns:
@@ -47,6 +47,7 @@ def find(sfm: pycolmap.Reconstruction, verified: Mapping[Pair, np.ndarray]) -> l
         relative = images[name1].cam_from_world() * images[name0].cam_from_world().inverse()
         errors = epipolar_errors(relative, rays[name0][rows[:, 0]], rays[name1][rows[:, 1]])
         distance = np.maximum(errors[0] / pixels[name0], errors[1] / pixels[name1])
+        distance = np.nan_to_num(distance, nan=np.inf, posinf=np.inf)  # of points without a ray
         for name in (name0, name1):
             pairs.setdefault(name, []).append((len(rows), float(np.median(distance))))
     best = {}
@@ -64,7 +65,7 @@ def doubt(names: list[str]) -> str:
     return (
         "The map may be wrong: the matches of these photos fit their poses much worse than those "
         f"of the others: {cli.some(names, NAMED)}. They may be misplaced, or something large has "
-        "moved. Leave them out, or add photos between them and the others."
+        "moved. Build the map again without them, or with more photos between them and the others."
     )
 
 

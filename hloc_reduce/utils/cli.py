@@ -58,7 +58,7 @@ def run(main: Callable[[], None]) -> None:
 def choose(kind: str, name: str, names: Iterable[str]) -> str:
     """Return `name` if it is one of `names`, else raise an InputError.
 
-    It names all of them, or the nearest of many; the nearest first.
+    The message lists the names, the nearest first: all of up to `MANY`, else the `NEAREST`.
     """
     names = list(names)
     if name not in names:

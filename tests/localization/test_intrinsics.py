@@ -43,8 +43,8 @@ def write_photo(
     if focal_35mm is not None:
         exif.get_ifd(0x8769)[0xA405] = focal_35mm
     if pixels_per_inch is not None:
-        exif.get_ifd(0x8769)[0x920A] = 25  # mm
-        # a fraction, as cameras write it
+        # fractions, as cameras write them
+        exif.get_ifd(0x8769)[0x920A] = IFDRational(250, 10)  # mm
         exif.get_ifd(0x8769)[0xA20E] = IFDRational(1000 * pixels_per_inch, 1000)
         exif.get_ifd(0x8769)[0xA210] = 2  # inches
     if zoom is not None:
@@ -83,6 +83,42 @@ def test_the_size_of_a_pixel_is_that_of_the_camera(size, taken, focal_length, tm
     write_photo(tmp_path / "0.jpg", size=size, taken=taken, pixels_per_inch=508)
     camera, _ = intrinsics.infer(tmp_path / "0.jpg", MapCameras({}, set()))
     assert camera.mean_focal_length() == pytest.approx(max(size) * 1.04, rel=0.01)  # by 36 mm
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"size": (300, 360), "cropped": True},  # leaves the focal length as it is
+        {"size": (480, 360), "zoomed": True},
+        {"size": (960, 720)},  # the size in EXIF data is wrong
+        {"full_size": (960.0, 800.0)},  # COLMAP's is by other data
+        {"full_size": (0.0, 0.0)},
+        {"full_size": (float("inf"), float("nan"))},
+    ],
+)
+def test_focal_lengths_that_are_not_corrected(changed):
+    told = {"size": (480, 360), "zoomed": False, "full_size": (960.0, 500.0)}
+    given = exif.ExifCamera("Maker Phone 1", "Maker Phone 1 25 mm", **{**told, **changed})
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=480, height=360, params=[500, 9, 9, 0])
+    assert exif.correct(camera, given) is False and camera.params[0] == 500
+    right = exif.ExifCamera("Maker Phone 1", "Maker Phone 1 25 mm", **told)
+    assert exif.correct(camera, right) is True and camera.params[0] == 250
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({}, 500),
+        ({0xA210: 3}, 1270),  # centimetres
+        ({0xA210: 1}, 0),
+        ({0xA210: None}, 0),
+        ({0xA20E: (1, 2)}, 0),
+        ({0x920A: "wide"}, 0),
+    ],
+)
+def test_the_focal_length_in_pixels_of_the_sensor(changed, expected):
+    tags = {0x920A: 25, 0xA20E: 508.0, 0xA210: 2, **changed}
+    assert exif._in_pixels(tags) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

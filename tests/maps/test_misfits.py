@@ -30,6 +30,31 @@ def test_photos_that_fit_badly_are_named(turned, worst, caplog):
     assert all(name in caplog.text for name in worst) and bool(caplog.text) == bool(worst)
 
 
+def test_what_is_typical_of_the_map_counts():
+    """All photos are turned by about a pixel; only one of them by three times as much."""
+    small = {0: 0.1, 1: -0.1, 2: 0.1, 3: -0.1, 4: 0.1, 5: -0.1}
+    for turned, worst in ((small, []), (small | {2: 0.3}, []), (small | {2: 0.6}, ["2.jpg"])):
+        model, _, verified = row(turned)
+        # pairs that are turned in the same way fit
+        across = {
+            pair: rows for pair, rows in verified.items() if (int(pair[0][0]) + int(pair[1][0])) % 2
+        }
+        assert misfits.find(model, across) == worst
+
+
+def test_a_point_without_a_ray_does_not_hide_a_photo(monkeypatch):
+    model, _, verified = row({2: 0.25})
+    project = misfits.colmap.cam_from_img
+
+    def without_one(camera, keypoints):
+        rays = project(camera, keypoints)
+        rays[7] = np.inf
+        return rays
+
+    monkeypatch.setattr(misfits.colmap, "cam_from_img", without_one)
+    assert misfits.find(model, verified) == ["2.jpg"]
+
+
 def test_wrong_matches_of_weaker_pairs_do_not_count():
     model, _, verified = row({})
     wrong = np.stack([np.arange(29), np.roll(np.arange(29), 7)], axis=1)

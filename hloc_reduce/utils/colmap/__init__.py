@@ -27,7 +27,6 @@ from .models import (
     infer_camera,
     point3D_ids,
     read_model,
-    scale_focal_length,
     visibility,
     write_part,
 )

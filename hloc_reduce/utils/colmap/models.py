@@ -189,13 +189,6 @@ def cam_from_img(camera: pycolmap.Camera, points2D: np.ndarray) -> np.ndarray:
     return np.nan_to_num(np.asarray(points, np.float64), nan=np.inf)
 
 
-def scale_focal_length(camera: pycolmap.Camera, factor: float) -> None:
-    """Multiply the focal lengths of a camera by a factor."""
-    params = camera.params.copy()
-    params[list(camera.focal_length_idxs())] *= factor
-    camera.params = params.tolist()
-
-
 def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
     """Guess the intrinsics of a photo: SIMPLE_RADIAL, with the focal length of its EXIF data.
 
