@@ -92,8 +92,9 @@ def correct(camera: pycolmap.Camera, exif: ExifCamera) -> bool:
         Whether it was wrong.
     """
     side, focal_length = exif.full_size
-    wrong = abs(camera.mean_focal_length() - focal_length) < SAME * focal_length
-    if not (wrong and exif.is_original and max(exif.size) < side):
+    if not (camera.has_prior_focal_length and exif.is_original and max(exif.size) < side):
+        return False
+    if not abs(camera.mean_focal_length() - focal_length) < SAME * focal_length:
         return False
     params = camera.params.copy()
     params[list(camera.focal_length_idxs())] *= max(exif.size) / side

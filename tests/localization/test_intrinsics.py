@@ -100,8 +100,10 @@ def test_focal_lengths_that_are_not_corrected(changed):
     told = {"size": (480, 360), "zoomed": False, "full_size": (960.0, 500.0)}
     given = exif.ExifCamera("Maker Phone 1", "Maker Phone 1 25 mm", **{**told, **changed})
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=480, height=360, params=[500, 9, 9, 0])
-    assert exif.correct(camera, given) is False and camera.params[0] == 500
     right = exif.ExifCamera("Maker Phone 1", "Maker Phone 1 25 mm", **told)
+    assert exif.correct(camera, right) is False  # it is guessed
+    camera.has_prior_focal_length = True
+    assert exif.correct(camera, given) is False and camera.params[0] == 500
     assert exif.correct(camera, right) is True and camera.params[0] == 250
 
 
