@@ -35,7 +35,8 @@ suite: $(VENV)/installed $(OLD)/installed
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(WORKERS)
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
 	OMP_NUM_THREADS=1 PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest $(WORKERS) \
-		tests/models/test_dog.py tests/mapping tests/localization/test_intrinsics.py $(STAGES_OF_COLMAP:%=tests/stages/test_%.py) \
+		tests/models/test_dog.py tests/mapping tests/localization/test_intrinsics.py \
+		$(STAGES_OF_COLMAP:%=tests/stages/test_%.py) \
 		tests/maps/test_localizer.py \
 		tests/maps/test_compact.py::test_a_file_localizes_as_its_map \
 		tests/maps/test_compact.py::test_files_of_stages \

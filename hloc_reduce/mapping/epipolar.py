@@ -1,6 +1,6 @@
 """Matches of photos against their poses, by epipolar geometry."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 import pycolmap
@@ -32,25 +32,39 @@ def agreeing(
     Returns:
         From pair to (M,) bool.
     """
-    poses, rays, thresholds = {}, {}, {}
+    images, thresholds = list(images), {}
     for image in images:
-        name, camera = image.name, image.camera
-        assert camera is not None  # it belongs to a model
-        poses[name] = image.cam_from_world()
-        rays[name] = colmap.cam_from_img(camera, keypoints[name])
-        pixels = MAX_ERROR * (1 if uncertainty is None else uncertainty[name])
-        thresholds[name] = camera.cam_from_img_threshold(pixels)
-    found = {}
+        assert image.camera is not None  # it belongs to a model
+        pixels = MAX_ERROR * (1 if uncertainty is None else uncertainty[image.name])
+        thresholds[image.name] = image.camera.cam_from_img_threshold(pixels)
+    return {
+        (name0, name1): (errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])
+        for (name0, name1), errors0, errors1 in errors_of_pairs(images, keypoints, matches)
+    }
+
+
+def errors_of_pairs(
+    images: Iterable[pycolmap.Image],
+    keypoints: Mapping[str, np.ndarray],
+    matches: Mapping[Pair, np.ndarray],
+) -> Iterator[tuple[Pair, np.ndarray, np.ndarray]]:
+    """Yield pairs, and how far their matches lie from the epipolar lines of the poses.
+
+    Args:
+        images: with poses.
+        keypoints: (N, 2) of each image, COLMAP's pixels.
+        matches: (M, 2) of pairs; those of other images are left out.
+    """
+    poses, rays = {}, {}
+    for image in images:
+        assert image.camera is not None  # it belongs to a model
+        poses[image.name] = image.cam_from_world()
+        rays[image.name] = colmap.cam_from_img(image.camera, keypoints[image.name])
     for (name0, name1), indices in matches.items():
-        if not {name0, name1} <= poses.keys():
-            continue
-        errors0, errors1 = epipolar_errors(
-            poses[name1] * poses[name0].inverse(),
-            rays[name0][indices[:, 0]],
-            rays[name1][indices[:, 1]],
-        )
-        found[name0, name1] = (errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])
-    return found
+        if {name0, name1} <= poses.keys():
+            relative = poses[name1] * poses[name0].inverse()
+            points = rays[name0][indices[:, 0]], rays[name1][indices[:, 1]]
+            yield (name0, name1), *epipolar_errors(relative, *points)
 
 
 def misplaced(

@@ -132,7 +132,8 @@ def check(
     registered = number - len(missing)
     factor = doubtful(spread, number) if state["alike"] else 1.0
     is_partial = registered < ENOUGH * number or len(state["parts"]) > 1
-    doubts = [*([_doubt(factor)] if factor > SPREAD else []), *doubts]
+    if factor > SPREAD:
+        doubts = [_doubt(factor), *doubts]
     accept = " ".join([*doubts, ACCEPT])
     message = shortfall(sfm_dir / REGISTRATION, **state, left_out=len(left_out))
     if not accept_partial:

@@ -7,9 +7,9 @@ import pycolmap
 
 from .. import logger
 from ..localization.projection import photo_scale
-from ..mapping.epipolar import EVIDENCE, Pair, epipolar_errors
+from ..mapping.epipolar import EVIDENCE, Pair, errors_of_pairs
 from ..mapping.registration import NAMED
-from ..utils import cli, colmap
+from ..utils import cli
 
 # A right pose is about as precise as the keypoints: its matches are a few tenths of a pixel from
 # their epipolar lines. Where bundle adjustment has traded a turn for a move, or something large has
@@ -33,23 +33,19 @@ def find(sfm: pycolmap.Reconstruction, verified: Mapping[Pair, np.ndarray]) -> l
     Returns:
         Their names, the worst first.
     """
-    images = {sfm.images[i].name: sfm.images[i] for i in sfm.reg_image_ids()}
-    rays, pixels = {}, {}
-    for name, image in images.items():
+    images = [sfm.images[i] for i in sfm.reg_image_ids()]
+    keypoints, pixels = {}, {}
+    for image in images:
         camera = sfm.cameras[image.camera_id]
-        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-        rays[name] = colmap.cam_from_img(camera, keypoints)
-        pixels[name] = camera.cam_from_img_threshold(photo_scale(camera))
+        keypoints[image.name] = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        pixels[image.name] = camera.cam_from_img_threshold(photo_scale(camera))
+    evidence = {pair: rows for pair, rows in verified.items() if len(rows) >= EVIDENCE}
     pairs: dict[str, list[tuple[int, float]]] = {}  # of an image: matches, median distance
-    for (name0, name1), rows in verified.items():
-        if len(rows) < EVIDENCE or not {name0, name1} <= images.keys():
-            continue
-        relative = images[name1].cam_from_world() * images[name0].cam_from_world().inverse()
-        errors = epipolar_errors(relative, rays[name0][rows[:, 0]], rays[name1][rows[:, 1]])
-        distance = np.maximum(errors[0] / pixels[name0], errors[1] / pixels[name1])
+    for (name0, name1), errors0, errors1 in errors_of_pairs(images, keypoints, evidence):
+        distance = np.maximum(errors0 / pixels[name0], errors1 / pixels[name1])
         distance = np.nan_to_num(distance, nan=np.inf, posinf=np.inf)  # of points without a ray
         for name in (name0, name1):
-            pairs.setdefault(name, []).append((len(rows), float(np.median(distance))))
+            pairs.setdefault(name, []).append((len(distance), float(np.median(distance))))
     best = {}
     for name, measured in pairs.items():
         enough = STRONG * max(number for number, _ in measured)

@@ -7,6 +7,7 @@ from row_of_photos import row
 from hloc_reduce import maps
 from hloc_reduce.mapping.epipolar import misplaced
 from hloc_reduce.maps import misfits
+from hloc_reduce.utils import colmap
 from pipelines import localize
 
 PIPELINE = localize
@@ -44,14 +45,14 @@ def test_what_is_typical_of_the_map_counts():
 
 def test_a_point_without_a_ray_does_not_hide_a_photo(monkeypatch):
     model, _, verified = row({2: 0.25})
-    project = misfits.colmap.cam_from_img
+    project = colmap.cam_from_img
 
     def without_one(camera, keypoints):
         rays = project(camera, keypoints)
         rays[7] = np.inf
         return rays
 
-    monkeypatch.setattr(misfits.colmap, "cam_from_img", without_one)
+    monkeypatch.setattr(colmap, "cam_from_img", without_one)
     assert misfits.find(model, verified) == ["2.jpg"]
 
 
