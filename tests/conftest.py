@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -23,6 +24,11 @@ from hloc_reduce.utils import cli, colmap, downloads
 from pipelines import batch
 
 SHARED = Path(__file__).parents[2] / "shared"
+
+# All tests but test_gpu.py run on a CPU, where equal results are equal to the bit. Kept in the
+# environment, which workers of pytest-xdist inherit.
+GPUS = os.environ.setdefault("TESTED_GPUS", os.environ.get("CUDA_VISIBLE_DEVICES", "0"))
+os.environ["CUDA_VISIBLE_DEVICES"] = ""
 
 
 @pytest.fixture(scope="session", autouse=True)

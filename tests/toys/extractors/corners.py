@@ -16,8 +16,8 @@ class Corners(Extractor):
         corners = [
             (x, y) for y in (margin, height - 1 - margin) for x in (margin, width - 1 - margin)
         ]
-        descriptors = torch.eye(4) + image.mean()
+        descriptors = torch.eye(4, device=image.device) + image.mean()
         return {
-            "keypoints": torch.tensor([corners], dtype=torch.float32),
+            "keypoints": torch.tensor([corners], dtype=torch.float32, device=image.device),
             "descriptors": torch.nn.functional.normalize(descriptors, dim=0)[None],
         }

@@ -12,7 +12,7 @@ class InOrder(Matcher):
 
     def _forward(self, data: dict) -> dict:
         n, m = (data[f"descriptors{i}"].shape[2] for i in (0, 1))
-        matches = torch.full((1, n), -1)
         number = min(n, m, self.conf["number"])
-        matches[0, :number] = torch.arange(number)
+        matches = torch.arange(n, device=data["descriptors0"].device)[None]
+        matches[:, number:] = -1
         return {"matches0": matches, "matching_scores0": (matches >= 0).float()}

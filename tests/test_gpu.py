@@ -1,0 +1,78 @@
+"""Features and matches that were computed on a GPU are those of a CPU."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import conftest
+import cv2
+import h5py
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+PHOTOS = ("0.png", "1.png", "2.png")
+# what differs does so by rounding: of keypoints and matches that are nearly equal
+SAME = 0.99
+
+
+def run(gpus: str, *arguments: object) -> int:
+    """Run Python with the GPUs that a value of CUDA_VISIBLE_DEVICES names."""
+    command = [sys.executable, *map(str, arguments)]
+    environment = os.environ | {"CUDA_VISIBLE_DEVICES": gpus}
+    return subprocess.run(command, env=environment, cwd=Path(__file__).parents[1]).returncode
+
+
+@pytest.fixture(scope="module", autouse=True)
+def gpu() -> None:
+    if run(conftest.GPUS, "-c", "import torch; raise SystemExit(not torch.cuda.is_available())"):
+        pytest.skip("this machine has no GPU")
+
+
+@pytest.fixture
+def photos(tmp_path, textured) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for i, name in enumerate(PHOTOS):
+        turn = cv2.getRotationMatrix2D((160, 120), 4 * i, 1 + 0.05 * i)
+        cv2.imwrite(str(folder / name), cv2.warpAffine(textured, turn, (320, 240)))
+    return folder
+
+
+def places(image: h5py.Group) -> np.ndarray:
+    """Return what tells keypoints apart, with their scales and orientations if they have them."""
+    keys = [key for key in ("keypoints", "scales", "oris") if key in image]
+    return np.column_stack([image[key][()] for key in keys])
+
+
+@pytest.mark.parametrize(
+    ("feature", "matcher"),
+    [("colmap_sift_sv64", "NN-ratio"), ("sift_sv32", "NN-ratio"), ("mini32", "NN-mutual")],
+)
+def test_a_gpu_finds_what_a_cpu_finds(photos, tmp_path, feature, matcher):
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("0.png 1.png\n0.png 2.png\n1.png 2.png\n")
+    features, matches = {}, {}
+    for device, gpus in (("cpu", ""), ("gpu", conftest.GPUS)):
+        features[device] = tmp_path / f"{device}.h5"
+        matches[device] = tmp_path / f"{device}-matches.h5"
+        stage = ("-m", "hloc_reduce.extract_features", "--image_dir", photos, "--conf", feature)
+        assert run(gpus, *stage, "--feature_path", features[device]) == 0
+        # of the same features
+        stage = ("-m", "hloc_reduce.match_features", "--pairs", pairs, "--conf", matcher)
+        files = ("--features", features["cpu"], "--matches", matches[device])
+        assert run(gpus, *stage, *files, "--export_dir", tmp_path) == 0
+    with h5py.File(features["cpu"]) as cpu, h5py.File(features["gpu"]) as gpu:
+        for name in PHOTOS:
+            distance, nearest = cKDTree(places(cpu[name])).query(places(gpu[name]))
+            found = distance < 0.1
+            assert found.mean() > SAME
+            ours, theirs = (file[name]["descriptors"][()].T.astype(float) for file in (gpu, cpu))
+            cosines = (ours[found] * theirs[nearest[found]]).sum(axis=1)
+            assert np.quantile(cosines, 1 - SAME) > 0.999
+    with h5py.File(matches["cpu"]) as cpu, h5py.File(matches["gpu"]) as gpu:
+        for name0, name1 in (line.split() for line in pairs.read_text().splitlines()):
+            ours, theirs = (file[name0][name1]["matches0"][()] for file in (gpu, cpu))
+            assert (theirs >= 0).sum() > 100
+            assert (ours == theirs).mean() > SAME
