@@ -47,12 +47,13 @@ def main(
     their EXIF data, are dropped from the model.
     If images are missing (of more than 100 images, more than a fifth), further attempts follow, and
     the model with the most images is kept: an attempt with lower thresholds and, for up to 30
-    images, some with other initial pairs. With `camera_mode` AUTO, if at most two thirds of the
-    images are in the model, or focal lengths differ by more than a factor of 1.2, and one camera
-    may have taken all of them, the mapper runs with one shared camera. Its model is kept if it has
-    at least 1.5 times as many images, or 1.5 times as many points where focal lengths differ. It
-    also runs and is kept if focal lengths differ by more than a factor of 1.05, although all images
-    fit with one camera, and 0.9 times as many points are found.
+    images, some with other initial pairs, as many at once as there are cores. With `camera_mode`
+    AUTO, if at most two thirds of the images are in the model, or focal lengths differ by more than
+    a factor of 1.2, and one camera may have taken all of them, the mapper runs with one shared
+    camera. Its model is kept if it has at least 1.5 times as many images, or 1.5 times as many
+    points where focal lengths differ. It also runs and is kept if focal lengths differ by more than
+    a factor of 1.05, although all images fit with one camera, and 0.9 times as many points are
+    found.
 
     Args:
         sfm_dir: folder of the new COLMAP model; a model made from the same inputs is read instead.

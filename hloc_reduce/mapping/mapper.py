@@ -2,15 +2,18 @@
 
 import copy
 import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
 
 from .. import logger
-from ..runtime import provenance
+from ..runtime import parallel, provenance
 from ..utils import cli, colmap
+from ..utils.interrupts import interruptible
 from . import copies, epipolar
 from . import database as databases
 from .adjustment import adjusted_error, with_one_camera
@@ -140,24 +143,24 @@ class Mapper:
 
     def run(self, database: Path, once: bool) -> Models:
         """Return the plausible models of the best attempt; stop when enough images are in one."""
-        cameras, folder = colmap.read_cameras(database), self.folder / "models"
-        evidence = cameras, self.keypoints, colmap.read_verified(database)
+        evidence = colmap.read_cameras(database), self.keypoints, colmap.read_verified(database)
         number = len(self.names)
         enough = number if number <= FEW else ENOUGH * number
         enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
 
         def attempted(changed: dict) -> Models:
             options = colmap.mapper_options(changed)
-            found = colmap.incremental_mapping(
-                database, self.image_dir, folder, options, self.verbose
-            )
-            shutil.rmtree(folder, ignore_errors=True)
+            with TemporaryDirectory(dir=self.folder) as folder:
+                copied = Path(shutil.copy(database, folder))  # the mapper opens it for writing
+                found = colmap.incremental_mapping(
+                    copied, self.image_dir, Path(folder) / "models", options, self.verbose
+                )
             return keep_plausible(found, *evidence)
 
         best: Models = [], {}
         attempts = self.attempts[:1] if once else self.attempts
-        for attempt, changed in enumerate(attempts, start=1):
-            best = max(best, attempted(changed), key=lambda both: _size(both[0]))
+        for attempt, models_of_it in enumerate(_in_turn(attempted, attempts), start=1):
+            best = max(best, models_of_it, key=lambda both: _size(both[0]))
             registered = _size(best[0])[0]
             logger.info(
                 "Attempt %d of up to %d: %d of %d images reconstructed.",
@@ -177,6 +180,14 @@ class Mapper:
             if _size(others)[0] >= _size(models)[0]:
                 return others, more | dropped
         return best
+
+
+def _in_turn(attempted: Callable[[dict], Models], attempts: list[dict]) -> Iterator[Models]:
+    """Yield the models of attempts in turn: after the first, as many at once as there are cores."""
+    cores = parallel.cores()
+    batches = (attempts[i : i + cores] for i in range(1, len(attempts), cores))
+    for batch in (attempts[:1], *batches):
+        yield from interruptible(list, parallel.ordered("attempt", attempted, batch))
 
 
 def _matched(database: Path) -> set[str]:

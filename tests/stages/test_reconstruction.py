@@ -1,5 +1,7 @@
 """Poses and points from matches alone."""
 
+import time
+
 import cv2
 import h5py
 import numpy as np
@@ -10,6 +12,7 @@ from command import state
 
 from hloc_reduce import match_features, reconstruction
 from hloc_reduce.mapping import plausibility
+from hloc_reduce.runtime import parallel
 from hloc_reduce.utils import colmap, parsers
 from hloc_reduce.utils.cli import InputError
 
@@ -64,6 +67,7 @@ def test_reconstruction_from_matches_alone(scene, matched, tmp_path):
 
 def test_further_attempts_where_images_are_missing(scene, matched, tmp_path, monkeypatch):
     """With one camera for all, which the scene has, and with lower thresholds."""
+    monkeypatch.setattr(parallel, "cores", lambda: 1)
     names, pairs, matches = matched
     attempts, mapping = [], colmap.incremental_mapping
 
@@ -94,6 +98,43 @@ def test_further_attempts_where_images_are_missing(scene, matched, tmp_path, mon
         own = {"min_model_size": 5}
         reconstruction.main(tmp_path / "no", *arguments, image_list=names, mapper_options=own)
     assert attempts == [(6, 30)]
+
+
+def test_attempts_at_once_find_the_same(scene, matched, tmp_path, monkeypatch, caplog):
+    """Whichever ends first, the first attempt that registers all images counts."""
+    names, pairs, matches = matched
+    mapping, level = colmap.incremental_mapping, pycolmap.logging.minloglevel
+    attempts = []
+
+    def one_is_missing(database, image_dir, output, options, verbose):
+        attempt = options.random_seed, options.mapper.abs_pose_min_num_inliers
+        attempts.append(attempt)
+        time.sleep(0.2 / len(attempts))  # later ones end earlier
+        models = mapping(database, image_dir, output, options, verbose)
+        if attempt != (2, 30):
+            models[0].deregister_frame(models[0].find_image_with_name(names[0]).frame_id)
+        return models
+
+    monkeypatch.setattr(colmap, "incremental_mapping", one_is_missing)
+    arguments = (scene.images, pairs, scene.features, matches, pycolmap.CameraMode.PER_IMAGE)
+    found, logs = [], []
+    for cores, number in ((1, 5), (3, 7)):
+        monkeypatch.setattr(parallel, "cores", lambda cores=cores: cores)
+        attempts.clear()
+        caplog.clear()
+        found.append(reconstruction.main(tmp_path / f"{cores}", *arguments, image_list=names))
+        logs.append([text for text in caplog.messages if text.startswith("Attempt")])
+        assert len(attempts) == number and attempts[0] == (0, 30)
+    assert logs[0] == logs[1] and logs[0][-1].endswith("6 of 6 images reconstructed.")
+    assert pycolmap.logging.minloglevel == level
+    one, other = found
+    assert one.num_reg_images() == other.num_reg_images() == 6
+    for image_id in one.reg_image_ids():
+        poses = [model.images[image_id].cam_from_world().matrix() for model in found]
+        np.testing.assert_array_equal(*poses)
+    assert sorted(path.name for path in (tmp_path / "1").iterdir()) == sorted(
+        path.name for path in (tmp_path / "3").iterdir()
+    )
 
 
 @pytest.mark.parametrize("kept", [5, 4])
@@ -157,6 +198,7 @@ def test_one_camera_for_focal_lengths_that_differ_little(
     scene, matched, tmp_path, monkeypatch, caplog, enlarged
 ):
     """If all images fit with it; two of 11 frames of one camera were 9 to 12 % off without it."""
+    monkeypatch.setattr(parallel, "cores", lambda: 1)
     names, pairs, matches = matched
     generator, mapping = np.random.default_rng(0), colmap.incremental_mapping
     with h5py.File(scene.features, "r+") as file:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ import pycolmap
 from ..interrupts import interruptible
 from ..parsers import parse_pairs, write_pairs
 from .databases import full_disk, open_database, parse_options
+
+_lock = Lock()
+_levels: list[int] = []  # those of COLMAP's log before each running block of `_log`
 
 
 def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
@@ -105,13 +109,20 @@ def incremental_mapping(
 def _log(
     verbose: bool, least: pycolmap.logging.Level = pycolmap.logging.Level.WARNING
 ) -> Iterator[None]:
-    """Show COLMAP's log of a block if `verbose`, else messages of at least the level `least`."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.INFO if verbose else least)
+    """Show COLMAP's log of a block if `verbose`, else messages of at least the level `least`.
+
+    Such blocks may overlap; the log is as before when the last one ends.
+    """
+    with _lock:
+        _levels.append(pycolmap.logging.minloglevel)
+        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.INFO if verbose else least)
     try:
         yield
     finally:
-        pycolmap.logging.minloglevel = level
+        with _lock:
+            level = _levels.pop()
+            if not _levels:
+                pycolmap.logging.minloglevel = level
 
 
 def estimate_pose(
