@@ -20,6 +20,9 @@ CLEAR = 0.25  # inlier ratio above which the matches of single images are not tr
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 ROUNDS = 3  # of estimation from the inliers among all matches
 RIVAL_SAMPLE = 500  # matches, at most, from which a rival is estimated
+# ratio of the confidence with the map's typical intrinsics to that with estimated ones, from which
+# the camera of the map has probably taken the photo
+TYPICAL = 0.98
 
 
 def estimate(
@@ -37,6 +40,8 @@ def estimate(
     If few of all matches agree with a pose, RANSAC may have missed the right one. So the most
     similar matches of each image are tried by themselves, too: those of an image that shows the
     same place agree much more often. The pose with the highest confidence among all matches wins.
+    If it is trusted although its intrinsics were guessed, and the map's typical ones fit as well,
+    it is estimated with these.
 
     Args:
         points2D: (M, 2) image points of all matches, COLMAP's pixels.
@@ -44,7 +49,8 @@ def estimate(
         images: of each map image the indices of its matches, the most similar first.
         camera: intrinsics.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement"; under
-            "photo", whether it may be "cropped", or the range of the map's "focal_lengths".
+            "photo", whether it may be "cropped", or the range of the map's "focal_lengths" and its
+            typical "camera", see `intrinsics.refinement`.
         gate: what a pose must have to be trusted.
         thorough: try the matches of single images, too.
         workers: threads that estimate poses; the result does not depend on their number.
@@ -61,7 +67,15 @@ def estimate(
         best, doubt = calibrate(matches, first)
         poses += rivals.result() if rivals and best is first else _rivals(matches, best)
     best = replace(best, agreement=agreement(best.inliers, images))
-    return replace(best, refusal=refusal(matches, best, poses, gate, doubt))
+    best = replace(best, refusal=refusal(matches, best, poses, gate, doubt))
+    same_camera = matches.with_typical_camera
+    if same_camera is None or best.cam_from_world is None or best.refusal is not None:
+        return best
+    # all matches of the map have determined its intrinsics better than those of one photo can
+    typical = _estimate(same_camera, np.flatnonzero(best.inliers))
+    if typical.confidence < TYPICAL * best.confidence:
+        return best
+    return replace(typical, agreement=agreement(typical.inliers, images))
 
 
 def _rivals(matches: Matches, pose: Pose) -> list[Pose]:

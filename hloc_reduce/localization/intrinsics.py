@@ -1,7 +1,9 @@
 """Intrinsics of queries without a list: those of the map's camera, from EXIF data, or guessed."""
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -35,12 +37,14 @@ class MapCameras(NamedTuple):
         models: `exif.ExifCamera.model` of all cameras that took its photos.
         focal_lengths: the least and the largest of its cameras, in longer sides; None if the map
             does not know.
+        typical: of each size of its photos, the median intrinsics of their cameras.
     """
 
     known: dict[str, pycolmap.Camera]
     sizes: set[tuple[int, int]]
     models: Collection[str] = ()
     focal_lengths: tuple[float, float] | None = None
+    typical: Mapping[tuple[int, int], pycolmap.Camera] = MappingProxyType({})
 
 
 def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera, str]:
@@ -110,13 +114,17 @@ def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict
 
     Returns:
         Those of `REFINEMENTS`; for a "guess" also the `focal_lengths` in pixels of the map's
-        cameras. A photo that has another one may have been cropped and enlarged.
+        cameras, as a photo that has another one may have been cropped and enlarged; and the typical
+        `camera` of map photos of its size, see `to_list`, which may have taken it, too.
     """
     options = REFINEMENTS[source]
     if source != "guess" or of_map.focal_lengths is None:
         return options
     side = max(camera.width, camera.height)
-    return options | {"photo": {"focal_lengths": [side * f for f in of_map.focal_lengths]}}
+    photo: dict = {"focal_lengths": [side * f for f in of_map.focal_lengths]}
+    if typical := of_map.typical.get((camera.width, camera.height)):
+        photo["camera"] = to_list(typical)
+    return options | {"photo": photo}
 
 
 def of_cameras(cameras: Iterable[pycolmap.Camera]) -> MapCameras:
@@ -124,7 +132,21 @@ def of_cameras(cameras: Iterable[pycolmap.Camera]) -> MapCameras:
     cameras = list(cameras)
     sizes = {(camera.width, camera.height) for camera in cameras}
     found = [camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras]
-    return MapCameras({}, sizes, focal_lengths=(min(found), max(found)) if found else None)
+    lengths = (min(found), max(found)) if found else None
+    return MapCameras({}, sizes, focal_lengths=lengths, typical=_typical(cameras))
+
+
+def _typical(cameras: Sequence[pycolmap.Camera]) -> dict[tuple[int, int], pycolmap.Camera]:
+    """Return the median of the cameras of each size, of the model that most of them have."""
+    alike: dict[tuple[int, int], list[pycolmap.Camera]] = {}
+    for camera in cameras:
+        alike.setdefault((camera.width, camera.height), []).append(camera)
+    found = {}
+    for (width, height), same in alike.items():
+        ((model, _),) = Counter(camera.model.name for camera in same).most_common(1)
+        params = np.median([one.params for one in same if one.model.name == model], axis=0)
+        found[width, height] = from_list([model, width, height, *params.tolist()])
+    return found
 
 
 def of_map(
@@ -158,11 +180,12 @@ def of_map(
 
 
 def merged(first: MapCameras, second: MapCameras) -> MapCameras:
-    """Return what two groups of photos of a map tell; the first one's known cameras count."""
+    """Return what two groups of photos of a map tell; the first one's cameras count."""
     models = {*first.models, *second.models}
     ranges = [cameras.focal_lengths for cameras in (first, second) if cameras.focal_lengths]
     lengths = (min(low for low, _ in ranges), max(high for _, high in ranges)) if ranges else None
-    return MapCameras(second.known | first.known, first.sizes | second.sizes, models, lengths)
+    known, typical = second.known | first.known, {**second.typical, **first.typical}
+    return MapCameras(known, first.sizes | second.sizes, models, lengths, typical)
 
 
 def to_dict(cameras: MapCameras) -> dict:
@@ -172,7 +195,13 @@ def to_dict(cameras: MapCameras) -> dict:
         "sizes": sorted(cameras.sizes),
         "camera_models": sorted(cameras.models),
         "focal_lengths": cameras.focal_lengths,
+        "typical_cameras": [to_list(one) for _, one in sorted(cameras.typical.items())],
     }
+
+
+def typical_of(lists: Iterable[list]) -> dict[tuple[int, int], pycolmap.Camera]:
+    """Return the typical cameras in lists from `to_list`, by their sizes."""
+    return {(one.width, one.height): one for one in map(from_list, lists)}
 
 
 def to_list(camera: pycolmap.Camera) -> list:

@@ -1,11 +1,12 @@
 """A pose with the matches that agree with it, and how poses compare."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
 
 from .confidence import RIVAL
+from .intrinsics import from_list
 from .projection import POSE
 
 MAX_ERROR = 12.0  # pixels, pycolmap's default
@@ -77,6 +78,17 @@ class Matches:
         low, high = photo.get("focal_lengths", (0, np.inf))
         fits = low / ZOOMED <= pose.camera.mean_focal_length() <= ZOOMED * high
         return bool(photo.get("cropped")) or not fits
+
+    @property
+    def with_typical_camera(self) -> "Matches | None":
+        """The same matches with the map's typical intrinsics, None if there are none."""
+        values = self.config.get("photo", {}).get("camera")
+        if values is None:
+            return None
+        estimation = {**self.config.get("estimation", {}), "estimate_focal_length": False}
+        refinement = {**self.config.get("refinement", {}), "refine_focal_length": False}
+        config = {"estimation": estimation, "refinement": refinement}
+        return replace(self, camera=from_list(values), config=config)
 
     @property
     def is_focal_length_guessed(self) -> bool:

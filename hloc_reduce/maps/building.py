@@ -91,7 +91,7 @@ class Building:
         cropped = exif.cropped(self.image_dir, names) if model is None else []
         cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
         if fit.gain > cropping.GAIN:
-            cameras = cameras._replace(known={})  # they may be wrong
+            cameras = cameras._replace(known={}, typical={})  # they may be wrong
         written = write(
             *(self.folder.path, conf, sfm, cameras),
             feature=feature,

@@ -143,7 +143,10 @@ class CompactMap:
         sizes = {(int(width), int(height)) for width, height in metadata["sizes"]}
         known = {str(name): _camera(values) for name, values in metadata["known"].items()}
         models, focal = {str(m) for m in metadata["models"]}, metadata.get("focal_lengths")
-        self.cameras = intrinsics.MapCameras(known, sizes, models, intrinsics.to_range(focal))
+        typical = {(c.width, c.height): c for c in map(_camera, metadata.get("typical", []))}
+        self.cameras = intrinsics.MapCameras(
+            *(known, sizes, models, intrinsics.to_range(focal), typical)
+        )
 
     def _read_projection(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
         self.projection: bytes | None = None

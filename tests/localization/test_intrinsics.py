@@ -221,7 +221,10 @@ def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):
     for size in ((360, 480), (480, 360)):
         camera, source = intrinsics.infer(np.zeros(size, np.uint8), known)
         found = dict(intrinsics.refinement(camera, source, known))
-        assert found.pop("photo")["focal_lengths"] == pytest.approx([500, 500])
+        photo = found.pop("photo")
+        assert photo["focal_lengths"] == pytest.approx([500, 500])
+        typical = ["SIMPLE_RADIAL", 480, 360, *PARAMS]
+        assert photo.get("camera") == (typical if size == (360, 480) else None)
         assert found == intrinsics.REFINEMENTS["guess"]
     assert intrinsics.refinement(camera, "unknown", known) == intrinsics.REFINEMENTS["unknown"]
     before = known._replace(focal_lengths=None)  # a map of an earlier version
@@ -229,6 +232,32 @@ def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):
     for wrong in ([1], [2, 1], [0, 1], [1, float("nan")], ["a", "b"]):
         with pytest.raises(ValueError):
             intrinsics.to_range(wrong)
+
+
+def test_the_typical_camera_is_the_median_of_each_size():
+    def camera(model: str, width: int, *params: float) -> pycolmap.Camera:
+        return pycolmap.Camera(model=model, width=width, height=360, params=params)
+
+    found = intrinsics.of_cameras(
+        [
+            *(
+                camera("SIMPLE_RADIAL", 480, f, 240, 180, k)
+                for f, k in ((490, 0), (500, 1), (700, 2))
+            ),
+            camera("SIMPLE_PINHOLE", 480, 100, 240, 180),
+            camera("SIMPLE_PINHOLE", 640, 600, 320, 180),
+        ]
+    )
+    assert {*found.typical} == found.sizes == {(480, 360), (640, 360)}
+    assert found.typical[480, 360].params.tolist() == [500, 240, 180, 1]
+    content = intrinsics.to_dict(found)
+    again = intrinsics.typical_of(content["typical_cameras"])
+    assert [*map(intrinsics.to_list, again.values())] == content["typical_cameras"]
+    other = intrinsics.of_cameras([camera("SIMPLE_PINHOLE", 640, 700, 320, 180)])
+    for first, second, focal_length in ((found, other, 600), (other, found, 700)):
+        typical = intrinsics.merged(first, second).typical
+        assert {*typical} == found.sizes
+        assert typical[640, 360].mean_focal_length() == focal_length
 
 
 def test_intrinsics_in_a_list_are_the_same():
