@@ -115,7 +115,7 @@ def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict
     Returns:
         Those of `REFINEMENTS`; for a "guess" also the `focal_lengths` in pixels of the map's
         cameras, as a photo that has another one may have been cropped and enlarged; and the typical
-        `camera` of map photos of its size, see `to_list`, which may have taken it, too.
+        `camera` of map photos of its size, upright or turned, which may have taken it, too.
     """
     options = REFINEMENTS[source]
     if source != "guess" or of_map.focal_lengths is None:
@@ -124,7 +124,17 @@ def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict
     photo: dict = {"focal_lengths": [side * f for f in of_map.focal_lengths]}
     if typical := of_map.typical.get((camera.width, camera.height)):
         photo["camera"] = to_list(typical)
+    elif typical := of_map.typical.get((camera.height, camera.width)):
+        photo["camera"] = to_list(_turned(typical))
     return options | {"photo": photo}
+
+
+def _turned(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """Return intrinsics for photos by a camera that is held upright instead of across."""
+    params = camera.params.copy()
+    for indices in (camera.focal_length_idxs(), camera.principal_point_idxs()):
+        params[[*indices]] = params[[*indices][::-1]]
+    return from_list([camera.model.name, camera.height, camera.width, *params.tolist()])
 
 
 def of_cameras(cameras: Iterable[pycolmap.Camera]) -> MapCameras:

@@ -223,8 +223,9 @@ def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):
         found = dict(intrinsics.refinement(camera, source, known))
         photo = found.pop("photo")
         assert photo["focal_lengths"] == pytest.approx([500, 500])
-        typical = ["SIMPLE_RADIAL", 480, 360, *PARAMS]
-        assert photo.get("camera") == (typical if size == (360, 480) else None)
+        focal_length, x, y, distortion = PARAMS
+        centre = (x, y) if size == (360, 480) else (y, x)
+        assert photo["camera"] == ["SIMPLE_RADIAL", *size[::-1], focal_length, *centre, distortion]
         assert found == intrinsics.REFINEMENTS["guess"]
     assert intrinsics.refinement(camera, "unknown", known) == intrinsics.REFINEMENTS["unknown"]
     before = known._replace(focal_lengths=None)  # a map of an earlier version
