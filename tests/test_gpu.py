@@ -68,6 +68,7 @@ def test_a_gpu_finds_what_a_cpu_finds(photos, tmp_path, feature, matcher):
             distance, nearest = cKDTree(places(cpu[name])).query(places(gpu[name]))
             found = distance < 0.1
             assert found.mean() > SAME
+            assert len(np.unique(nearest[found])) > SAME * len(cpu[name]["keypoints"])
             ours, theirs = (file[name]["descriptors"][()].T.astype(float) for file in (gpu, cpu))
             cosines = (ours[found] * theirs[nearest[found]]).sum(axis=1)
             assert np.quantile(cosines, 1 - SAME) > 0.999

@@ -161,7 +161,11 @@ def _of_stages(sfm: Path, features: Path, global_descriptors: Path | None, featu
     model = colmap.read_model(sfm)
     return Source(
         *(model, name, conf, features_confs.matcher_of(conf)),
-        *(descriptors, vocabulary, intrinsics.of_cameras(model.cameras.values())),
+        *(
+            descriptors,
+            vocabulary,
+            intrinsics.of_cameras(image.camera for image in model.images.values()),
+        ),
     )
 
 

@@ -12,7 +12,7 @@ import torch
 from ..descriptors import DIM
 from ..light.noise import reduce_noise
 from ..utils.base_model import BaseModel, dynamic_load
-from ..utils.cli import InputError, choose
+from ..utils.cli import InputError
 from ..utils.hloc import is_installed
 from ..utils.images import in_original, resized
 
@@ -134,14 +134,13 @@ def load(conf: dict) -> Extractor:
     """
     name = str(conf.get("name"))
     ours = [module.name for module in pkgutil.iter_modules(__path__)]
-    if name not in ours:
-        if is_installed() or name.startswith("hloc."):
-            return load({"name": "hloc", "conf": conf})
-        try:
-            choose("extractor", name, ours)
-        except InputError as error:
-            raise InputError(f"{error} Those of hloc need an installed hloc.") from None
-    return dynamic_load(sys.modules[__name__], name, Extractor)(conf)
+    if name not in ours and (is_installed() or name.startswith("hloc.")):
+        return load({"name": "hloc", "conf": conf})
+    try:
+        extractor = dynamic_load(sys.modules[__name__], name, Extractor)
+    except InputError as error:
+        raise InputError(f"{error} hloc's own extractors need hloc to be installed.") from None
+    return extractor(conf)
 
 
 def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:

@@ -9,7 +9,7 @@ import pycolmap
 
 from ..utils import colmap
 from .calibration import calibrate
-from .confidence import MIN_MATCHES, RIVAL, Gate, agreement, confidence
+from .confidence import MIN_MATCHES, RIVAL, Gate, agreement, confidence, uncertainty
 from .pose import Matches, Pose, quality
 from .projection import FOCAL, POSE, reprojection_errors
 from .refusals import refusal
@@ -20,9 +20,10 @@ CLEAR = 0.25  # inlier ratio above which the matches of single images are not tr
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 ROUNDS = 3  # of estimation from the inliers among all matches
 RIVAL_SAMPLE = 500  # matches, at most, from which a rival is estimated
-# ratio of the confidence with the map's typical intrinsics to that with estimated ones, from which
-# the camera of the map has probably taken the photo
-TYPICAL = 0.98
+# The lens of the map's photos has probably taken a photo if its focal length is within this many
+# standard deviations of the estimated one, and the confidence at least this multiple of that with
+# estimated intrinsics.
+LIKELY, TYPICAL = 2.0, 0.98
 
 
 def estimate(
@@ -40,8 +41,8 @@ def estimate(
     If few of all matches agree with a pose, RANSAC may have missed the right one. So the most
     similar matches of each image are tried by themselves, too: those of an image that shows the
     same place agree much more often. The pose with the highest confidence among all matches wins.
-    If it is trusted although its intrinsics were guessed, and the map's typical ones fit as well,
-    it is estimated with these.
+    If it is trusted although its intrinsics were guessed, and the lens of the map's photos fits as
+    well, it is estimated with that.
 
     Args:
         points2D: (M, 2) image points of all matches, COLMAP's pixels.
@@ -49,8 +50,8 @@ def estimate(
         images: of each map image the indices of its matches, the most similar first.
         camera: intrinsics.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement"; under
-            "photo", whether it may be "cropped", or the range of the map's "focal_lengths" and its
-            typical "camera", see `intrinsics.refinement`.
+            "photo", whether it may be "cropped", or the map's "focal_lengths" and "typical" lens,
+            see `intrinsics.refinement`.
         gate: what a pose must have to be trusted.
         thorough: try the matches of single images, too.
         workers: threads that estimate poses; the result does not depend on their number.
@@ -68,14 +69,29 @@ def estimate(
         poses += rivals.result() if rivals and best is first else _rivals(matches, best)
     best = replace(best, agreement=agreement(best.inliers, images))
     best = replace(best, refusal=refusal(matches, best, poses, gate, doubt))
-    same_camera = matches.with_typical_camera
-    if same_camera is None or best.cam_from_world is None or best.refusal is not None:
-        return best
-    # all matches of the map have determined its intrinsics better than those of one photo can
-    typical = _estimate(same_camera, np.flatnonzero(best.inliers))
-    if typical.confidence < TYPICAL * best.confidence:
-        return best
-    return replace(typical, agreement=agreement(typical.inliers, images))
+    return _with_typical_lens(matches, best, images, poses, gate) or best
+
+
+def _with_typical_lens(
+    matches: Matches, pose: Pose, images: list[np.ndarray], others: list[Pose], gate: Gate
+) -> Pose | None:
+    """Estimate a trusted pose with the lens of the map's photos; return None if that fits worse.
+
+    All photos of a map determine their lens better than the matches of one more photo do.
+    """
+    known = matches.with_typical_lens()
+    if known is None or pose.refusal is not None or pose.cam_from_world is None:
+        return None
+    inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
+    deviation = uncertainty(*inliers, pose.cam_from_world, pose.camera, pose.degrees_of_freedom)
+    ratio = pose.camera.mean_focal_length() / known.camera.mean_focal_length()
+    if abs(np.log(ratio)) > LIKELY * deviation.focal_length:
+        return None
+    typical = _estimate(known, np.flatnonzero(pose.inliers))
+    if typical.confidence < TYPICAL * pose.confidence:
+        return None
+    typical = replace(typical, agreement=agreement(typical.inliers, images))
+    return None if refusal(known, typical, others, gate, None) else typical
 
 
 def _rivals(matches: Matches, pose: Pose) -> list[Pose]:

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass, replace
 from math import comb, log10
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
 from ..utils.cli import InputError, Parser
-from .projection import POSE, photo_scale, project, reprojection_errors
+from .projection import FOCAL, POSE, photo_scale, project, reprojection_errors
 
 SOLUTIONS = 4  # poses that a minimal sample may have
 THRESHOLDS = 8  # inlier thresholds that are tried, from FINEST to RANSAC's
@@ -129,13 +130,27 @@ def _log10_tail(successes: int, trials: int, probability: float) -> float:
     return float(-trials * divergence / np.log(10))
 
 
+class Uncertainty(NamedTuple):
+    """Standard deviations, infinite if the inliers do not determine a pose.
+
+    Args:
+        position: in units of the inliers' median depth.
+        rotation: in degrees.
+        focal_length: of its logarithm; 0 if it is known.
+    """
+
+    position: float
+    rotation: float
+    focal_length: float
+
+
 def uncertainty(
     points2D: np.ndarray,
     points3D: np.ndarray,
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
     degrees_of_freedom: int = POSE,
-) -> tuple[float, float]:
+) -> Uncertainty:
     """Estimate how precisely inliers determine a pose, to first order from their errors.
 
     More than INDEPENDENT inliers do not make it more precise.
@@ -146,29 +161,31 @@ def uncertainty(
         cam_from_world: the pose.
         camera: intrinsics.
         degrees_of_freedom: the number of unknown parameters, see `projection`.
-
-    Returns:
-        The standard deviations of the position, in units of the inliers' median depth, and of the
-        rotation in degrees; infinite if the inliers do not determine the pose.
     """
+    nothing = Uncertainty(np.inf, np.inf, np.inf)
     local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
     _, derivatives = project(local / np.median(local[:, 2]))
     jacobian = camera.mean_focal_length() * np.concatenate(derivatives, axis=1)
     jacobian = jacobian[:degrees_of_freedom].T
     equations, unknowns = jacobian.shape
     if equations <= unknowns:
-        return np.inf, np.inf
+        return nothing
     errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
     measured = (errors**2).sum() / (equations - unknowns)
     noise = max((LEAST_NOISE * photo_scale(camera)) ** 2, measured)
     try:
         variance = noise * np.diag(np.linalg.inv(jacobian.T @ jacobian))
     except np.linalg.LinAlgError:
-        return np.inf, np.inf
+        return nothing
     variance = variance * max(1, len(points2D) / INDEPENDENT)
     if not (variance > 0).all():
-        return np.inf, np.inf
-    return float(np.sqrt(variance[3:6].sum())), float(np.degrees(np.sqrt(variance[:3].sum())))
+        return nothing
+    rotation, position, focal_length = variance[:3], variance[3:POSE], variance[POSE:FOCAL]
+    return Uncertainty(
+        position=float(np.sqrt(position.sum())),
+        rotation=float(np.degrees(np.sqrt(rotation.sum()))),
+        focal_length=float(np.sqrt(focal_length.sum())),
+    )
 
 
 def focal_lengths(camera: pycolmap.Camera, guessed: bool) -> tuple[float, float]:

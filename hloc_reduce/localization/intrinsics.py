@@ -1,6 +1,5 @@
 """Intrinsics of queries without a list: those of the map's camera, from EXIF data, or guessed."""
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -12,9 +11,12 @@ import pycolmap
 from ..utils import colmap
 from ..utils.files import replacing
 from ..utils.images import UnreadableImage
-from ..utils.parsers import to_line
+from ..utils.parsers import parse_camera, to_line
 from .exif import WELL_KNOWN, correct, exif_camera
 
+# models with SIMPLE_RADIAL's distortion, and perhaps more
+RADIAL = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"
+UNLIKE = 1.05  # ratio of focal lengths of photos that no typical lens has taken
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
 _REFINED = {"refinement": {"refine_focal_length": True}}
 _GUESSED = {"estimation": {"estimate_focal_length": True}, **_REFINED}
@@ -28,6 +30,13 @@ REFINEMENTS = {
 }
 
 
+class Lens(NamedTuple):
+    """A focal length in longer sides of the photos, and the distortion of SIMPLE_RADIAL."""
+
+    focal_length: float
+    distortion: float
+
+
 class MapCameras(NamedTuple):
     """What a map tells about the intrinsics of other photos.
 
@@ -37,14 +46,15 @@ class MapCameras(NamedTuple):
         models: `exif.ExifCamera.model` of all cameras that took its photos.
         focal_lengths: the least and the largest of its cameras, in longer sides; None if the map
             does not know.
-        typical: of each size of its photos, the median intrinsics of their cameras.
+        typical: of each size of which it has several photos, the longer side first, their lens, if
+            that is much the same in all of them.
     """
 
     known: dict[str, pycolmap.Camera]
     sizes: set[tuple[int, int]]
     models: Collection[str] = ()
     focal_lengths: tuple[float, float] | None = None
-    typical: Mapping[tuple[int, int], pycolmap.Camera] = MappingProxyType({})
+    typical: Mapping[tuple[int, int], Lens] = MappingProxyType({})
 
 
 def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera, str]:
@@ -114,49 +124,47 @@ def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict
 
     Returns:
         Those of `REFINEMENTS`; for a "guess" also the `focal_lengths` in pixels of the map's
-        cameras, as a photo that has another one may have been cropped and enlarged; and the typical
-        `camera` of map photos of its size, upright or turned, which may have taken it, too.
+        cameras, as a photo that has another one may have been cropped and enlarged; and the
+        `typical` lens of map photos of its size, upright or turned, if there is one.
     """
     options = REFINEMENTS[source]
     if source != "guess" or of_map.focal_lengths is None:
         return options
     side = max(camera.width, camera.height)
     photo: dict = {"focal_lengths": [side * f for f in of_map.focal_lengths]}
-    if typical := of_map.typical.get((camera.width, camera.height)):
-        photo["camera"] = to_list(typical)
-    elif typical := of_map.typical.get((camera.height, camera.width)):
-        photo["camera"] = to_list(_turned(typical))
+    if lens := of_map.typical.get(_size(camera)):
+        photo["typical"] = [*lens]
     return options | {"photo": photo}
 
 
-def _turned(camera: pycolmap.Camera) -> pycolmap.Camera:
-    """Return intrinsics for photos by a camera that is held upright instead of across."""
-    params = camera.params.copy()
-    for indices in (camera.focal_length_idxs(), camera.principal_point_idxs()):
-        params[[*indices]] = params[[*indices][::-1]]
-    return from_list([camera.model.name, camera.height, camera.width, *params.tolist()])
+def _size(camera: pycolmap.Camera) -> tuple[int, int]:
+    """Return the longer and the shorter side."""
+    return max(camera.width, camera.height), min(camera.width, camera.height)
 
 
 def of_cameras(cameras: Iterable[pycolmap.Camera]) -> MapCameras:
-    """Return what cameras of a map tell about the intrinsics of other photos."""
+    """Return what photos of a map tell about the intrinsics of others, from the camera of each."""
     cameras = list(cameras)
     sizes = {(camera.width, camera.height) for camera in cameras}
     found = [camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras]
     lengths = (min(found), max(found)) if found else None
-    return MapCameras({}, sizes, focal_lengths=lengths, typical=_typical(cameras))
-
-
-def _typical(cameras: Sequence[pycolmap.Camera]) -> dict[tuple[int, int], pycolmap.Camera]:
-    """Return the median of the cameras of each size, of the model that most of them have."""
     alike: dict[tuple[int, int], list[pycolmap.Camera]] = {}
     for camera in cameras:
-        alike.setdefault((camera.width, camera.height), []).append(camera)
-    found = {}
-    for (width, height), same in alike.items():
-        ((model, _),) = Counter(camera.model.name for camera in same).most_common(1)
-        params = np.median([one.params for one in same if one.model.name == model], axis=0)
-        found[width, height] = from_list([model, width, height, *params.tolist()])
-    return found
+        alike.setdefault(_size(camera), []).append(camera)
+    lenses = {size: _typical(same) for size, same in alike.items()}
+    typical = {size: lens for size, lens in lenses.items() if lens is not None}
+    return MapCameras({}, sizes, focal_lengths=lengths, typical=typical)
+
+
+def _typical(cameras: Sequence[pycolmap.Camera]) -> Lens | None:
+    """Return the median lens of photos of one size; None for few, unlike or other ones."""
+    if len(cameras) < WELL_KNOWN or not {camera.model.name for camera in cameras} <= {*RADIAL}:
+        return None
+    found = [camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras]
+    if max(found) > UNLIKE * min(found):
+        return None
+    distortion = [[*camera.params[camera.extra_params_idxs()], 0.0][0] for camera in cameras]
+    return Lens(float(np.median(found)), float(np.median(distortion)))
 
 
 def of_map(
@@ -185,7 +193,7 @@ def of_map(
         for name, ids in found.items()
         if len(ids) >= WELL_KNOWN and len(set(ids)) == 1
     }
-    cameras = [reconstruction.cameras[i] for i in {image.camera_id for image in photos}]
+    cameras = [reconstruction.cameras[image.camera_id] for image in photos]
     return of_cameras(cameras)._replace(known=known, models=models)
 
 
@@ -205,13 +213,24 @@ def to_dict(cameras: MapCameras) -> dict:
         "sizes": sorted(cameras.sizes),
         "camera_models": sorted(cameras.models),
         "focal_lengths": cameras.focal_lengths,
-        "typical_cameras": [to_list(one) for _, one in sorted(cameras.typical.items())],
+        "typical": to_rows(cameras.typical),
     }
 
 
-def typical_of(lists: Iterable[list]) -> dict[tuple[int, int], pycolmap.Camera]:
-    """Return the typical cameras in lists from `to_list`, by their sizes."""
-    return {(one.width, one.height): one for one in map(from_list, lists)}
+def to_rows(typical: Mapping[tuple[int, int], Lens]) -> list[list]:
+    """Return typical lenses as JSON values: longer and shorter side, focal length, distortion."""
+    return [[*size, *lens] for size, lens in sorted(typical.items())]
+
+
+def from_rows(rows: Iterable[Sequence]) -> dict[tuple[int, int], Lens]:
+    """Return the lenses in rows from `to_rows`; raise a ValueError if they are wrong."""
+    typical = {}
+    for longer, shorter, focal_length, distortion in rows:
+        lens = Lens(float(focal_length), float(distortion))
+        if not (np.isfinite(lens).all() and lens.focal_length > 0):
+            raise ValueError(f"a lens of {lens}")
+        typical[int(longer), int(shorter)] = lens
+    return typical
 
 
 def to_list(camera: pycolmap.Camera) -> list:
@@ -234,10 +253,9 @@ def to_lists(queries: Sequence[tuple[str, pycolmap.Camera | None]]) -> dict[str,
     return {name: None if camera is None else to_list(camera) for name, camera in queries}
 
 
-def from_list(values: list) -> pycolmap.Camera:
-    """Return the intrinsics in a list from `to_list`."""
-    model, width, height, *params = values
-    return pycolmap.Camera(model=model, width=width, height=height, params=params)
+def from_list(values: Sequence) -> pycolmap.Camera:
+    """Return the intrinsics in a list from `to_list`; raise a ValueError if they are wrong."""
+    return parse_camera([str(value) for value in values])
 
 
 def write_queries(cameras: Mapping[str, tuple[pycolmap.Camera, str]], path: Path) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pycolmap
 
 from .confidence import RIVAL
-from .intrinsics import from_list
 from .projection import POSE
 
 MAX_ERROR = 12.0  # pixels, pycolmap's default
@@ -22,7 +21,7 @@ class Pose:
 
     Args:
         cam_from_world: the pose, None if there is none.
-        camera: intrinsics, refined if the configuration says so.
+        camera: intrinsics, estimated if the configuration says so.
         inliers: (M,) bool.
         confidence: -log10 of the number of such poses that are expected by chance.
         agreement: the largest share of an image's matches that agree, minus one standard deviation.
@@ -79,16 +78,18 @@ class Matches:
         fits = low / ZOOMED <= pose.camera.mean_focal_length() <= ZOOMED * high
         return bool(photo.get("cropped")) or not fits
 
-    @property
-    def with_typical_camera(self) -> "Matches | None":
-        """The same matches with the map's typical intrinsics, None if there are none."""
-        values = self.config.get("photo", {}).get("camera")
-        if values is None:
+    def with_typical_lens(self) -> "Matches | None":
+        """Return the same matches with the lens of the map's photos, None if it is not known."""
+        if (lens := self.config.get("photo", {}).get("typical")) is None:
             return None
+        width, height = self.camera.width, self.camera.height
+        focal_length, distortion = lens
+        params = [focal_length * max(width, height), width / 2, height / 2, distortion]
+        camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
         estimation = {**self.config.get("estimation", {}), "estimate_focal_length": False}
         refinement = {**self.config.get("refinement", {}), "refine_focal_length": False}
         config = {"estimation": estimation, "refinement": refinement}
-        return replace(self, camera=from_list(values), config=config)
+        return replace(self, camera=camera, config=config)
 
     @property
     def is_focal_length_guessed(self) -> bool:

@@ -9,7 +9,7 @@ import pycolmap
 from ..utils.cli import InputError
 from ..utils.files import naming, replacing
 from . import mirrored
-from .intrinsics import from_list, to_list
+from .intrinsics import to_list
 from .references import Reference
 
 RECORDS = 19  # the version of the content of records, and of the gate
@@ -25,8 +25,9 @@ def pose_of(record: dict) -> pycolmap.Rigid3d | None:
 
 
 def camera_of(record: dict) -> pycolmap.Camera:
-    """Return the refined intrinsics in a record."""
-    return from_list(record["camera"])
+    """Return the intrinsics in a record; those of a pose that is not trusted may be absurd."""
+    model, width, height, *params = record["camera"]
+    return pycolmap.Camera(model=model, width=width, height=height, params=params)
 
 
 def read_records(path: Path) -> dict[str, dict]:

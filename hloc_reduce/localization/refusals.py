@@ -64,7 +64,7 @@ def imprecision(matches: Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d) 
         reason = "its principal point is far from the centre, and without its intrinsics its"
         limits.append((ALL, CROPPED, reason))
     for freedom, (far, turned), reason in limits:
-        position, rotation = uncertainty(*inliers, cam_from_world, pose.camera, freedom)
+        position, rotation, _ = uncertainty(*inliers, cam_from_world, pose.camera, freedom)
         hint = "; known intrinsics would help" if matches.is_focal_length_free else ""
         if position > far * MAX_POSITION or rotation > turned * MAX_ROTATION:
             return (

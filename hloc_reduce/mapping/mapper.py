@@ -4,6 +4,7 @@ import copy
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -148,19 +149,20 @@ class Mapper:
         enough = number if number <= FEW else ENOUGH * number
         enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
 
-        def attempted(changed: dict) -> Models:
+        def attempted(changed: dict, alone: bool = True) -> Models:
             options = colmap.mapper_options(changed)
             with TemporaryDirectory(dir=self.folder) as folder:
-                copied = Path(shutil.copy(database, folder))  # the mapper opens it for writing
+                # the mapper opens it for writing
+                own = database if alone else Path(shutil.copy(database, folder))
                 found = colmap.incremental_mapping(
-                    copied, self.image_dir, Path(folder) / "models", options, self.verbose
+                    own, self.image_dir, Path(folder) / "models", options, self.verbose
                 )
             return keep_plausible(found, *evidence)
 
         best: Models = [], {}
         attempts = self.attempts[:1] if once else self.attempts
-        for attempt, models_of_it in enumerate(_in_turn(attempted, attempts), start=1):
-            best = max(best, models_of_it, key=lambda both: _size(both[0]))
+        for attempt, found in enumerate(_in_turn(attempted, attempts), start=1):
+            best = max(best, found, key=lambda both: _size(both[0]))
             registered = _size(best[0])[0]
             logger.info(
                 "Attempt %d of up to %d: %d of %d images reconstructed.",
@@ -182,12 +184,13 @@ class Mapper:
         return best
 
 
-def _in_turn(attempted: Callable[[dict], Models], attempts: list[dict]) -> Iterator[Models]:
+def _in_turn(attempted: Callable[..., Models], attempts: list[dict]) -> Iterator[Models]:
     """Yield the models of attempts in turn: after the first, as many at once as there are cores."""
     cores = parallel.cores()
     batches = (attempts[i : i + cores] for i in range(1, len(attempts), cores))
     for batch in (attempts[:1], *batches):
-        yield from interruptible(list, parallel.ordered("attempt", attempted, batch))
+        attempt = partial(attempted, alone=len(batch) == 1)
+        yield from interruptible(list, parallel.ordered("attempt", attempt, batch))
 
 
 def _matched(database: Path) -> set[str]:

@@ -19,7 +19,7 @@ from ..localization import intrinsics
 from ..utils.cli import InputError, choose
 from ..utils.codes import CODED, FLOATS, QUANTIZED, STORAGES, check_levels, restore
 from ..utils.files import replacing
-from ..utils.parsers import check_names, parse_camera
+from ..utils.parsers import check_names
 from . import points as points_of_map
 from . import signs
 
@@ -89,7 +89,7 @@ class CompactMap:
         count = len(names)
         self._rotations = _array(tensors, "rotations", np.float32, (count, 4))
         self._translations = _array(tensors, "translations", np.float64, (count, 3))
-        cameras = [_camera(values) for values in metadata["cameras"]]
+        cameras = [intrinsics.from_list(values) for values in metadata["cameras"]]
         used = _array(tensors, "camera_of_image", np.uint32, (count,))
         self.camera_number = dict(zip(names, used.tolist(), strict=True))
         self.camera_of = {name: cameras[i] for name, i in self.camera_number.items()}
@@ -141,11 +141,12 @@ class CompactMap:
         self.matcher = choose("matcher", metadata["matcher"], matchers_confs.confs)
         self.doubts = [str(doubt) for doubt in metadata.get("doubts", [])]
         sizes = {(int(width), int(height)) for width, height in metadata["sizes"]}
-        known = {str(name): _camera(values) for name, values in metadata["known"].items()}
+        known = metadata["known"].items()
         models, focal = {str(m) for m in metadata["models"]}, metadata.get("focal_lengths")
-        typical = {(c.width, c.height): c for c in map(_camera, metadata.get("typical", []))}
+        typical = intrinsics.from_rows(metadata.get("typical", []))
         self.cameras = intrinsics.MapCameras(
-            *(known, sizes, models, intrinsics.to_range(focal), typical)
+            {str(name): intrinsics.from_list(values) for name, values in known},
+            *(sizes, models, intrinsics.to_range(focal), typical),
         )
 
     def _read_projection(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
@@ -283,11 +284,6 @@ def check_model(model: dict, feature: str) -> None:
     octave = (base.get("options") or {}).get("first_octave", 0)
     if not octave >= LEAST_OCTAVE:
         raise InputError(f"Compact maps cannot have {feature}: its first_octave is {octave}.")
-
-
-def _camera(values: list) -> pycolmap.Camera:
-    """Return the intrinsics in a list; raise a ValueError if they are wrong."""
-    return parse_camera([str(value) for value in values])
 
 
 def _array(

@@ -112,7 +112,7 @@ def _cameras(
 ) -> intrinsics.MapCameras:
     """Return what a map, and the EXIF data of its photos, if any, tell about intrinsics."""
     if image_dir is None:
-        return intrinsics.of_cameras(reference.cameras.values())
+        return intrinsics.of_cameras(image.camera for image in reference.images.values())
     if not any((image_dir / name).is_file() for name in names):
         raise InputError(
             f"{image_dir} has none of the {len(names)} images of the model, such as {names[0]}: "

@@ -225,7 +225,10 @@ def _commit(
         "points3D": sfm.num_points3D(),
     }
     if cameras is not None:
-        content |= intrinsics.to_dict(intrinsics.merged(built.cameras, cameras))
+        cameras = intrinsics.merged(built.cameras, cameras)
+        if fit.gain > cropping.GAIN:
+            cameras = cameras._replace(known={}, typical={})  # they may be wrong
+        content |= intrinsics.to_dict(cameras)
     provenance.write(built.folder / FINISHED, content)
 
 

@@ -110,7 +110,7 @@ class Map:
             {(int(width), int(height)) for width, height in content.get("sizes", [])},
             {str(model) for model in content.get("camera_models", [])},
             intrinsics.to_range(content.get("focal_lengths")),
-            intrinsics.typical_of(content.get("typical_cameras", [])),
+            intrinsics.from_rows(content.get("typical", [])),
         )
         conf = dict(content["conf"])
         conf |= {key: dict(conf[key]) for key in ("model", "preprocessing")}

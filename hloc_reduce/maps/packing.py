@@ -72,7 +72,7 @@ def encode(
         "sizes": sorted(source.cameras.sizes),
         "models": sorted(source.cameras.models),
         "focal_lengths": source.cameras.focal_lengths,
-        "typical": [intrinsics.to_list(one) for _, one in sorted(source.cameras.typical.items())],
+        "typical": intrinsics.to_rows(source.cameras.typical),
         "doubts": source.doubts,
     }
     _add_images(tensors, metadata, points, source.model)

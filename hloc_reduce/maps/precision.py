@@ -34,7 +34,7 @@ def find(sfm: pycolmap.Reconstruction) -> dict[str, float]:
         points3D = np.array([sfm.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3)
         camera = sfm.cameras[image.camera_id]
         freedom = POSE if taken[image.camera_id] >= MANY else FOCAL
-        position, _ = uncertainty(points2D, points3D, image.cam_from_world(), camera, freedom)
+        position, *_ = uncertainty(points2D, points3D, image.cam_from_world(), camera, freedom)
         if position > MAX_POSITION:
             found[image.name] = float(position)
     return dict(sorted(found.items(), key=lambda item: -item[1]))

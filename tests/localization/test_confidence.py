@@ -149,7 +149,7 @@ def test_uncertainty_is_the_spread_of_poses(free):
     depth = 8
     measured = np.sqrt(np.var(centres[1:], axis=0).sum()) / depth
     noisy = keypoints + 2 * generator.standard_normal(keypoints.shape)
-    expected, _ = uncertainty(noisy, points, TRUE, CAMERA, 8 if free else 6)
+    expected, *_ = uncertainty(noisy, points, TRUE, CAMERA, 8 if free else 6)
     assert 0.6 < expected / measured < 1.6
 
 
@@ -164,14 +164,14 @@ def test_inliers_that_do_not_fix_the_pose_are_refused():
     assert "known intrinsics would help" not in found.refusal
     its_matches = Matches(keypoints, points, CAMERA, FREE)
     assert "known intrinsics would help" in imprecision(its_matches, found, TRUE)
-    assert uncertainty(keypoints[:3], points[:3], TRUE, CAMERA) == (np.inf, np.inf)
+    assert uncertainty(keypoints[:3], points[:3], TRUE, CAMERA) == (np.inf, np.inf, np.inf)
 
 
 @pytest.mark.parametrize(("uncertain", "is_refused"), [(0.029, False), (0.031, True)])
 def test_a_position_is_certain_to_3_percent(monkeypatch, uncertain, is_refused):
     keypoints, points = matches(20, 0)
     found = solve(keypoints, points)
-    monkeypatch.setattr(refusals, "uncertainty", lambda *_: (uncertain, 0.1))
+    monkeypatch.setattr(refusals, "uncertainty", lambda *_: (uncertain, 0.1, 0.0))
     its_matches = Matches(keypoints, points, CAMERA, {})
     reason = imprecision(its_matches, found, TRUE)
     assert ("% of the distance (at most 3 %)" in (reason or "")) == is_refused

@@ -1,5 +1,6 @@
 """Intrinsics of photos that no list gives."""
 
+import json
 import re
 from pathlib import Path
 
@@ -216,16 +217,14 @@ def test_photos_of_another_shape_than_exif_data_say(tmp_path):
 
 def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):
     """A crop that was enlarged has the size of the map's photos, but a longer focal length."""
-    known = intrinsics.of_map(map_of([1, 2]), tmp_path)
+    known = intrinsics.of_map(map_of([1, 2, 2]), tmp_path)
     assert known.focal_lengths == (PARAMS[0] / 480, PARAMS[0] / 480)
     for size in ((360, 480), (480, 360)):
         camera, source = intrinsics.infer(np.zeros(size, np.uint8), known)
         found = dict(intrinsics.refinement(camera, source, known))
         photo = found.pop("photo")
         assert photo["focal_lengths"] == pytest.approx([500, 500])
-        focal_length, x, y, distortion = PARAMS
-        centre = (x, y) if size == (360, 480) else (y, x)
-        assert photo["camera"] == ["SIMPLE_RADIAL", *size[::-1], focal_length, *centre, distortion]
+        assert photo["typical"] == [500 / 480, -0.05]
         assert found == intrinsics.REFINEMENTS["guess"]
     assert intrinsics.refinement(camera, "unknown", known) == intrinsics.REFINEMENTS["unknown"]
     before = known._replace(focal_lengths=None)  # a map of an earlier version
@@ -235,34 +234,49 @@ def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):
             intrinsics.to_range(wrong)
 
 
-def test_the_typical_camera_is_the_median_of_each_size():
-    def camera(model: str, width: int, *params: float) -> pycolmap.Camera:
-        return pycolmap.Camera(model=model, width=width, height=360, params=params)
-
-    found = intrinsics.of_cameras(
-        [
-            *(
-                camera("SIMPLE_RADIAL", 480, f, 240, 180, k)
-                for f, k in ((490, 0), (500, 1), (700, 2))
-            ),
-            camera("SIMPLE_PINHOLE", 480, 100, 240, 180),
-            camera("SIMPLE_PINHOLE", 640, 600, 320, 180),
-        ]
+def photos_of(*cameras: tuple) -> MapCameras:
+    """Return what photos tell, from the model, size and parameters of the camera of each."""
+    made = (
+        pycolmap.Camera(model=model, width=width, height=height, params=params)
+        for model, width, height, params in cameras
     )
-    assert {*found.typical} == found.sizes == {(480, 360), (640, 360)}
-    assert found.typical[480, 360].params.tolist() == [500, 240, 180, 1]
-    content = intrinsics.to_dict(found)
-    again = intrinsics.typical_of(content["typical_cameras"])
-    assert [*map(intrinsics.to_list, again.values())] == content["typical_cameras"]
-    other = intrinsics.of_cameras([camera("SIMPLE_PINHOLE", 640, 700, 320, 180)])
-    for first, second, focal_length in ((found, other, 600), (other, found, 700)):
+    return intrinsics.of_cameras(made)
+
+
+def test_the_typical_lens_is_the_median_of_photos_of_a_size():
+    upright = [("SIMPLE_RADIAL", 360, 480, [f, 180, 240, k]) for f, k in ((490, 0), (500, 1))]
+    across = ("OPENCV", 480, 360, [509, 511, 240, 180, 2, 0, 0, 0])
+    few = ("SIMPLE_PINHOLE", 640, 480, [600, 320, 240])
+    found = photos_of(*upright, across, few, few)
+    assert found.sizes == {(360, 480), (480, 360), (640, 480)}
+    assert found.typical == {(480, 360): (500 / 480, 1)}
+    for other in (
+        ("SIMPLE_PINHOLE", 480, 360, [540, 240, 180]),  # another zoom
+        ("OPENCV_FISHEYE", 480, 360, [500, 500, 240, 180, 0, 0, 0, 0]),
+    ):
+        assert photos_of(*upright, across, other).typical == {}
+    rows = intrinsics.to_dict(found)["typical"]
+    assert intrinsics.from_rows(json.loads(json.dumps(rows))) == found.typical
+    longer = photos_of(*3 * [("SIMPLE_PINHOLE", 480, 360, [505, 240, 180])], *3 * [few])
+    for first, second in ((found, longer), (longer, found)):
         typical = intrinsics.merged(first, second).typical
-        assert {*typical} == found.sizes
-        assert typical[640, 360].mean_focal_length() == focal_length
+        assert typical == {**second.typical, **first.typical} and len(typical) == 2
+
+
+@pytest.mark.parametrize(
+    "row",
+    [[480, 360, 1], [480, 360, 0, 0], [480, 360, "x", 0], [1, 2, 1, float("nan")], [[], 1, 1, 1]],
+)
+def test_wrong_rows_of_typical_lenses(row):
+    with pytest.raises((ValueError, TypeError)):
+        intrinsics.from_rows([row])
 
 
 def test_intrinsics_in_a_list_are_the_same():
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=480, height=360, params=PARAMS)
-    again = intrinsics.from_list(intrinsics.to_list(camera))
+    again = intrinsics.from_list(json.loads(json.dumps(intrinsics.to_list(camera))))
     assert again.model == camera.model and (again.width, again.height) == (480, 360)
     assert again.params.tolist() == PARAMS
+    for wrong in ([], ["PINHOLE", 480, 360], ["NO", 480, 360, 1], [*intrinsics.to_list(camera), 1]):
+        with pytest.raises(ValueError):
+            intrinsics.from_list(wrong)

@@ -271,7 +271,7 @@ def test_a_pose_of_all_parameters_is_as_precise_as_measured():
         centres.append(pose.inverse().translation)
         assert inliers.all() and lens.width == start.width and same is points2D
     measured = np.sqrt(np.var(centres, axis=0).sum()) / 8
-    expected, _ = uncertainty(points2D, points3D, pose, lens, ALL)
+    expected, *_ = uncertainty(points2D, points3D, pose, lens, ALL)
     expected /= np.sqrt(len(points2D) / INDEPENDENT)  # here the errors of all are independent
     assert 0.6 < expected / measured < 1.6
     assert resect(points2D[:9], points3D[:9], POSE, camera, 12.0, ALL) is None

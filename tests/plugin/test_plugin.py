@@ -104,7 +104,7 @@ def test_a_missing_hloc_is_named(monkeypatch, forgotten):
         monkeypatch.setattr(f"hloc_reduce.{module}.is_installed", lambda: False)
     with pytest.raises(InputError, match="hloc is not installed: pip install"):
         hloc_reduce.register()
-    with pytest.raises(InputError, match="Unknown extractor 'disk'.*need an installed hloc"):
+    with pytest.raises(InputError, match="Unknown extractor 'disk'.*need hloc to be installed"):
         extractors.load({"name": "disk"})
     with pytest.raises(InputError, match="hloc is not installed"):
         extractors.load({"name": "hloc.dog"})

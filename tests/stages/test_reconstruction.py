@@ -109,7 +109,7 @@ def test_attempts_at_once_find_the_same(scene, matched, tmp_path, monkeypatch, c
     def one_is_missing(database, image_dir, output, options, verbose):
         attempt = options.random_seed, options.mapper.abs_pose_min_num_inliers
         attempts.append(attempt)
-        time.sleep(0.2 / len(attempts))  # later ones end earlier
+        time.sleep(0.2 / len(attempts))  # later ones tend to end earlier
         models = mapping(database, image_dir, output, options, verbose)
         if attempt != (2, 30):
             models[0].deregister_frame(models[0].find_image_with_name(names[0]).frame_id)

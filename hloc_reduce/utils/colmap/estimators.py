@@ -111,7 +111,7 @@ def _log(
 ) -> Iterator[None]:
     """Show COLMAP's log of a block if `verbose`, else messages of at least the level `least`.
 
-    Such blocks may overlap; the log is as before when the last one ends.
+    Blocks that show the same may overlap; the log is as before when the last one ends.
     """
     with _lock:
         _levels.append(pycolmap.logging.minloglevel)

@@ -1,0 +1,82 @@
+"""Queries without intrinsics, of the size of the map's photos: perhaps by their lens."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hloc_reduce.localization import absolute_pose, intrinsics
+from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.localization.pose import Pose
+
+POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04])), [0.3, 0.1, 8.0])
+GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
+LENS = intrinsics.Lens(900 / 1280, -0.05)
+
+
+def camera_of(*params: float) -> pycolmap.Camera:
+    return pycolmap.Camera(model="SIMPLE_RADIAL", width=1280, height=960, params=params)
+
+
+def solve(
+    typical: intrinsics.Lens | None, number: int, depth: float, seed: int = 3, gate: Gate = GATE
+) -> tuple[Pose, float]:
+    """Return the pose of a query by LENS, and its position error as a share of the distance."""
+    generator = np.random.default_rng(seed)
+    pixels = generator.uniform([40, 40], [1240, 920], (number, 2))
+    rays = camera_of(900, 640, 480, LENS.distortion).cam_from_img(pixels)
+    distances = generator.uniform(8 - depth, 8 + depth, (number, 1))
+    points = POSE.inverse() * (np.column_stack([rays, np.ones(number)]) * distances)
+    pixels += 0.7 * generator.standard_normal((number, 2))
+    photo: dict = {"focal_lengths": [800, 1000]}
+    if typical is not None:
+        photo["typical"] = [*typical]
+    config = {**intrinsics.REFINEMENTS["guess"], "photo": photo}
+    guess = camera_of(1536, 640, 480, 0)
+    found = absolute_pose.estimate(pixels, points, [np.arange(number)], guess, config, gate)
+    moved = found.cam_from_world * POSE.inverse()
+    return found, float(np.linalg.norm(moved.translation)) / 8
+
+
+def test_the_typical_lens_is_taken_where_it_fits():
+    """One of 12 unedited photos was 5.7 % off, by a focal length that was 3 % too long."""
+    free, error = solve(None, 30, 0.2)
+    found, its_error = solve(LENS, 30, 0.2)
+    assert free.refusal is None and free.camera.mean_focal_length() != 900
+    assert found.refusal is None and found.camera.params.tolist() == [900, 640, 480, -0.05]
+    assert its_error < 0.005 < 0.02 < error
+    assert found.agreement == free.agreement
+
+
+@pytest.mark.parametrize("number, depth", [(30, 0.5), (20, 1), (300, 0.5), (300, 3)])
+@pytest.mark.parametrize("zoom, distortion", [(1.05, -0.05), (0.92, -0.05), (1, 0.2)])
+def test_an_unlike_lens_is_not_taken(number, depth, zoom, distortion):
+    """By the confidence alone, one whose focal length is 5 % off would fit few matches."""
+    other = intrinsics.Lens(zoom * LENS.focal_length, distortion)
+    taken = 0
+    for seed in range(6):
+        free, _ = solve(None, number, depth, seed)
+        found, _ = solve(other, number, depth, seed)
+        assert found.refusal == free.refusal
+        taken += found.camera.params.tolist() != free.camera.params.tolist()
+    assert taken <= (1 if number < 300 else 0)
+
+
+def test_the_typical_lens_does_not_make_up_for_a_flat_scene():
+    """The photo may be by another lens, so its own one must be determined."""
+    free, _ = solve(None, 30, 0.1)
+    assert "do not fix the pose" in free.refusal
+    assert solve(LENS, 30, 0.1)[0].refusal == free.refusal
+
+
+def test_a_pose_with_the_typical_lens_is_judged(monkeypatch):
+    """If it is refused, the one with the estimated lens stays."""
+    judge = absolute_pose.refusal
+    monkeypatch.setattr(
+        absolute_pose,
+        "refusal",
+        lambda matches, *others: None if matches.is_focal_length_free else judge(matches, *others),
+    )
+    strict = Gate(min_inliers=31, min_agreement=((0, 0.0),))
+    free, _ = solve(None, 30, 0.2)
+    found, _ = solve(LENS, 30, 0.2, gate=strict)
+    assert found.refusal is None and found.camera.params.tolist() == free.camera.params.tolist()
