@@ -130,6 +130,11 @@ def test_a_file_localizes_as_its_map(built, tmp_path, run):
     pose, found = Localizer(file).localize(photo)
     assert max(pose_error(pose, expected)) < 0.02
     assert found["num_inliers"] > 0.7 * info["num_inliers"] and found["reason"] is None
+    [lens] = maps.Map(folder).cameras.typical.values()
+    for one in (info, found):  # no list has its intrinsics, but the map's photos have its size
+        assert one["intrinsics"] == "guess"
+        assert one["camera"].params[0] == lens.focal_length * 360
+        assert one["camera"].params[3] == lens.distortion
 
     outputs = tmp_path / "of_file"
     new = ("--map", file, "--query_images", images / "query/day", "--outputs", outputs)
@@ -141,6 +146,7 @@ def test_a_file_localizes_as_its_map(built, tmp_path, run):
     assert int(rows["a.png"]["num_inliers"]) == found["num_inliers"]
     unpacked = maps.Map(outputs / "map")
     assert unpacked.feature == "colmap_sift_sv32" and unpacked.storage == "uint4"
+    assert unpacked.cameras == maps.Map(folder).cameras
     model = pycolmap.Reconstruction(unpacked.sfm)
     assert model.compute_mean_reprojection_error() < 0.01
     again = (outputs / "map/map.json").stat().st_mtime_ns
