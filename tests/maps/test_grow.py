@@ -74,6 +74,17 @@ def test_doubts_end_with_the_photos_that_raised_them(grown, tmp_path, run, caplo
     assert [content[key] for key in of_photos] == [[BASE[1]], [BASE[1]]]
 
 
+@pytest.mark.parametrize("gain", [0.0, 0.5])
+def test_a_map_whose_intrinsics_may_be_wrong_tells_none(gain, grown, run):
+    """Else queries would be localized with the lens of its photos, or of new ones."""
+    folder, new, model = grown
+    content = provenance.read(folder / "map.json")
+    assert content["typical"]
+    provenance.write(folder / "map.json", content | {"gain_of_free_principal_points": gain})
+    run("--map", folder, "--add_images", new, "--add_model", model)
+    assert bool(provenance.read(folder / "map.json")["typical"]) == (gain == 0)
+
+
 @pytest.mark.parametrize("key", ["images_mirrored", "images_unlike_others"])
 def test_a_photo_that_was_left_out_is_added_and_removed(key, grown, tmp_path, run):
     folder, new, model = grown
