@@ -24,8 +24,8 @@ from .run import check_queries
 SOURCES = {
     "map": "those of the map's camera, according to their EXIF data",
     "EXIF": "from EXIF data and refined with the pose",
-    "guess": "guessed and estimated with the pose, or those of the map's photos",
-    "unknown": "guessed and estimated, of sizes that no map photo has: perhaps cropped",
+    "guess": "guessed and estimated with the pose, or those of the map's photos if they fit",
+    "unknown": "guessed and estimated with the pose, of no map photo's size: perhaps cropped",
 }
 LISTED = "queries_with_intrinsics.txt"  # written for a folder of queries
 NOT_IN_NAMES = r"[^\w.-]+"  # characters of a glob

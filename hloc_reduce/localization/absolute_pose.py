@@ -9,9 +9,17 @@ import pycolmap
 
 from ..utils import colmap
 from .calibration import calibrate
-from .confidence import MIN_MATCHES, RIVAL, Gate, agreement, confidence, uncertainty
+from .confidence import (
+    INDEPENDENT,
+    MIN_MATCHES,
+    RIVAL,
+    Gate,
+    agreement,
+    confidence,
+    uncertainty,
+)
 from .pose import Matches, Pose, quality
-from .projection import FOCAL, POSE, reprojection_errors
+from .projection import ALL, FOCAL, POSE, reprojection_errors
 from .refusals import refusal
 
 SEED = 0
@@ -20,10 +28,10 @@ CLEAR = 0.25  # inlier ratio above which the matches of single images are not tr
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 ROUNDS = 3  # of estimation from the inliers among all matches
 RIVAL_SAMPLE = 500  # matches, at most, from which a rival is estimated
-# The lens of the map's photos has probably taken a photo if its focal length is within this many
-# standard deviations of the estimated one, and the confidence at least this multiple of that with
-# estimated intrinsics.
-LIKELY, TYPICAL = 2.0, 0.98
+# The lens of the map's photos has probably taken a photo if the confidence with it is at least this
+# multiple of that with estimated intrinsics, and its focal length is within this many standard
+# deviations of the estimated one, or the inliers fit better.
+CONFIDENCE_RATIO, DEVIATIONS = 0.98, 2.0
 
 
 def estimate(
@@ -75,20 +83,31 @@ def estimate(
 def _with_typical_lens(
     matches: Matches, pose: Pose, images: list[np.ndarray], others: list[Pose], gate: Gate
 ) -> Pose | None:
-    """Estimate a trusted pose with the lens of the map's photos; return None if that fits worse.
+    """Estimate a trusted pose anew with the lens of the map's photos.
 
     All photos of a map determine their lens better than the matches of one more photo do.
+
+    Returns:
+        None if the lens is not known, may not have taken the photo, or gives no trusted pose.
     """
     known = matches.with_typical_lens()
-    if known is None or pose.refusal is not None or pose.cam_from_world is None:
+    if known is None or pose.cam_from_world is None or pose.refusal is not None:
+        return None
+    if matches.may_be_cropped(pose) or pose.degrees_of_freedom == ALL:
         return None
     inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
-    deviation = uncertainty(*inliers, pose.cam_from_world, pose.camera, pose.degrees_of_freedom)
-    ratio = pose.camera.mean_focal_length() / known.camera.mean_focal_length()
-    if abs(np.log(ratio)) > LIKELY * deviation.focal_length:
-        return None
+    view = pose.cam_from_world, pose.camera
     typical = _estimate(known, np.flatnonzero(pose.inliers))
-    if typical.confidence < TYPICAL * pose.confidence:
+    if typical.cam_from_world is None or typical.confidence < CONFIDENCE_RATIO * pose.confidence:
+        return None
+    ratio = pose.camera.mean_focal_length() / known.camera.mean_focal_length()
+    deviation = uncertainty(*inliers, *view, pose.degrees_of_freedom).focal_length
+    deviation /= max(1, pose.num_inliers / INDEPENDENT) ** 0.5  # a bent map bends no lens
+    errors, _ = reprojection_errors(*inliers, *view)
+    its_errors, _ = reprojection_errors(*inliers, typical.cam_from_world, typical.camera)
+    # an estimated focal length may be off by more if it makes up for a distortion
+    is_better = (its_errors**2).sum() <= (errors**2).sum()
+    if not (is_better or abs(np.log(ratio)) <= DEVIATIONS * deviation):
         return None
     typical = replace(typical, agreement=agreement(typical.inliers, images))
     return None if refusal(known, typical, others, gate, None) else typical

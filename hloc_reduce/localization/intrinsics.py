@@ -12,11 +12,13 @@ from ..utils import colmap
 from ..utils.files import replacing
 from ..utils.images import UnreadableImage
 from ..utils.parsers import parse_camera, to_line
+from .confidence import FOCAL_LENGTHS
 from .exif import WELL_KNOWN, correct, exif_camera
 
-# models with SIMPLE_RADIAL's distortion, and perhaps more
-RADIAL = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"
-UNLIKE = 1.05  # ratio of focal lengths of photos that no typical lens has taken
+# A lens is typical of photos whose cameras have one of these models, and whose focal lengths and
+# distortions are at most this ratio and this difference apart.
+PLAIN = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL"
+ALIKE = 1.05, 0.1
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
 _REFINED = {"refinement": {"refine_focal_length": True}}
 _GUESSED = {"estimation": {"estimate_focal_length": True}, **_REFINED}
@@ -157,14 +159,19 @@ def of_cameras(cameras: Iterable[pycolmap.Camera]) -> MapCameras:
 
 
 def _typical(cameras: Sequence[pycolmap.Camera]) -> Lens | None:
-    """Return the median lens of photos of one size; None for few, unlike or other ones."""
-    if len(cameras) < WELL_KNOWN or not {camera.model.name for camera in cameras} <= {*RADIAL}:
+    """Return the median lens of photos of one size; None if they are few or their lenses differ."""
+    if len(cameras) < WELL_KNOWN or not {camera.model.name for camera in cameras} <= {*PLAIN}:
         return None
-    found = [camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras]
-    if max(found) > UNLIKE * min(found):
-        return None
+    longer, _ = _size(cameras[0])
+    focal_lengths = [camera.params[camera.focal_length_idxs()] / longer for camera in cameras]
+    found = np.concatenate(focal_lengths)
     distortion = [[*camera.params[camera.extra_params_idxs()], 0.0][0] for camera in cameras]
-    return Lens(float(np.median(found)), float(np.median(distortion)))
+    ratio, difference = ALIKE
+    if found.max() > ratio * found.min() or np.ptp(distortion) > difference:
+        return None
+    low, high = FOCAL_LENGTHS
+    lens = Lens(float(np.median(found)), float(np.median(distortion)))
+    return lens if low <= lens.focal_length <= high else None
 
 
 def of_map(
@@ -198,12 +205,14 @@ def of_map(
 
 
 def merged(first: MapCameras, second: MapCameras) -> MapCameras:
-    """Return what two groups of photos of a map tell; the first one's cameras count."""
+    """Return what two groups of photos of a map tell, without typical lenses.
+
+    If both know a camera, the first one's counts.
+    """
     models = {*first.models, *second.models}
     ranges = [cameras.focal_lengths for cameras in (first, second) if cameras.focal_lengths]
     lengths = (min(low for low, _ in ranges), max(high for _, high in ranges)) if ranges else None
-    known, typical = second.known | first.known, {**second.typical, **first.typical}
-    return MapCameras(known, first.sizes | second.sizes, models, lengths, typical)
+    return MapCameras(second.known | first.known, first.sizes | second.sizes, models, lengths)
 
 
 def to_dict(cameras: MapCameras) -> dict:
@@ -223,12 +232,15 @@ def to_rows(typical: Mapping[tuple[int, int], Lens]) -> list[list]:
 
 
 def from_rows(rows: Iterable[Sequence]) -> dict[tuple[int, int], Lens]:
-    """Return the lenses in rows from `to_rows`; raise a ValueError if they are wrong."""
+    """Return the lenses in rows from `to_rows`; raise a ValueError or TypeError for wrong ones."""
     typical = {}
-    for longer, shorter, focal_length, distortion in rows:
-        lens = Lens(float(focal_length), float(distortion))
-        if not (np.isfinite(lens).all() and lens.focal_length > 0):
-            raise ValueError(f"a lens of {lens}")
+    for longer, shorter, *values in rows:
+        lens = Lens(*map(float, values))
+        low, high = FOCAL_LENGTHS
+        if not (longer >= shorter > 0 and low <= lens.focal_length <= high):
+            raise ValueError(f"photos of {longer}x{shorter} pixels by a {lens}")
+        if not np.isfinite([longer, lens.distortion]).all():
+            raise ValueError(f"numbers that are not finite: {[longer, *lens]}")
         typical[int(longer), int(shorter)] = lens
     return typical
 

@@ -39,9 +39,8 @@ def localize(
         pose: `reason`, why the pose is not trusted, None if it is; `confidence`, at least 0, and
         `agreement`, see `confidence`; `num_inliers`; `num_matches`, matches with a 3D point, and
         `num_correspondences`, the different ones of these (M); `num_without_point`, the other
-        matches; `camera`, the intrinsics, estimated if `config` says so; `db`, the best retrieved
-        image; `keypoints` (M,), indices of the query's; `point3D_ids` (M,); `points3D` (M, 3);
-        `inliers` (M,) bool.
+        matches; `camera`, the intrinsics of the pose; `db`, the best retrieved image; `keypoints`
+        (M,), indices of the query's; `point3D_ids` (M,); `points3D` (M, 3); `inliers` (M,) bool.
     """
     solved = []
     for names in reference.clusters(list(matches)) if matches else [[]]:

@@ -224,11 +224,13 @@ def _commit(
         "images_unlike_others": sorted({*built.unlike_others} - {*added} - {*removed}),
         "points3D": sfm.num_points3D(),
     }
-    if cameras is not None:
-        cameras = intrinsics.merged(built.cameras, cameras)
-        if fit.gain > cropping.GAIN:
-            cameras = cameras._replace(known={}, typical={})  # they may be wrong
-        content |= intrinsics.to_dict(cameras)
+    told = built.cameras if cameras is None else intrinsics.merged(built.cameras, cameras)
+    if fit.gain > cropping.GAIN:
+        told = told._replace(known={}, typical={})  # they may be wrong
+    else:
+        images = (image for image in sfm.images.values() if image.name not in fit.altered)
+        told = told._replace(typical=intrinsics.of_cameras(i.camera for i in images).typical)
+    content |= intrinsics.to_dict(told)
     provenance.write(built.folder / FINISHED, content)
 
 

@@ -68,7 +68,8 @@ class Localizer:
         Args:
             image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
             camera: its intrinsics; default: those of the map's camera if it took the photo, by its
-                EXIF data, else from EXIF data or guessed, and estimated with the pose.
+                EXIF data; else from EXIF data or guessed, and estimated with the pose, or those of
+                the map's photos if these fit a guess.
 
         Returns:
             The pose, camera from world, in the units of the map, or None if the photo cannot be

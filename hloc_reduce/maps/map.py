@@ -74,7 +74,7 @@ class Map:
         self.folder = folder
         try:
             self._read(json.loads((folder / FINISHED).read_text()))
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
             if not folder.is_dir():
                 raise no_folder(folder) from None
             inner = folder / "map"

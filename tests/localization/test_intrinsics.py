@@ -244,28 +244,35 @@ def photos_of(*cameras: tuple) -> MapCameras:
 
 
 def test_the_typical_lens_is_the_median_of_photos_of_a_size():
-    upright = [("SIMPLE_RADIAL", 360, 480, [f, 180, 240, k]) for f, k in ((490, 0), (500, 1))]
-    across = ("OPENCV", 480, 360, [509, 511, 240, 180, 2, 0, 0, 0])
+    upright = [
+        ("SIMPLE_RADIAL", 360, 480, [f, 180, 240, k]) for f, k in ((490, -0.02), (500, 0.02))
+    ]
+    across = ("PINHOLE", 480, 360, [508, 512, 240, 180])
     few = ("SIMPLE_PINHOLE", 640, 480, [600, 320, 240])
     found = photos_of(*upright, across, few, few)
     assert found.sizes == {(360, 480), (480, 360), (640, 480)}
-    assert found.typical == {(480, 360): (500 / 480, 1)}
+    assert found.typical == {(480, 360): (504 / 480, 0)}
     for other in (
         ("SIMPLE_PINHOLE", 480, 360, [540, 240, 180]),  # another zoom
+        ("SIMPLE_RADIAL", 480, 360, [500, 240, 180, 0.1]),
+        ("PINHOLE", 480, 360, [500, 540, 240, 180]),
+        ("RADIAL", 480, 360, [500, 240, 180, 0, 0]),
         ("OPENCV_FISHEYE", 480, 360, [500, 500, 240, 180, 0, 0, 0, 0]),
     ):
         assert photos_of(*upright, across, other).typical == {}
+    assert photos_of(*3 * [("SIMPLE_PINHOLE", 480, 360, [5000, 240, 180])]).typical == {}
     rows = intrinsics.to_dict(found)["typical"]
     assert intrinsics.from_rows(json.loads(json.dumps(rows))) == found.typical
-    longer = photos_of(*3 * [("SIMPLE_PINHOLE", 480, 360, [505, 240, 180])], *3 * [few])
-    for first, second in ((found, longer), (longer, found)):
-        typical = intrinsics.merged(first, second).typical
-        assert typical == {**second.typical, **first.typical} and len(typical) == 2
+    assert intrinsics.merged(found, found).typical == {}  # together they might differ
 
 
 @pytest.mark.parametrize(
     "row",
-    [[480, 360, 1], [480, 360, 0, 0], [480, 360, "x", 0], [1, 2, 1, float("nan")], [[], 1, 1, 1]],
+    [
+        *([480, 360, 1], [480, 360, 0, 0], [480, 360, "x", 0], [480, 360, 1, float("nan")]),
+        *([[], 1, 1, 1], [360, 480, 1, 0], [480, -1, 1, 0], [float("inf"), 1, 1, 0], [1]),
+        *([480, 360, 1e9, 0], [480, 360, 1, 0, 0]),
+    ],
 )
 def test_wrong_rows_of_typical_lenses(row):
     with pytest.raises((ValueError, TypeError)):

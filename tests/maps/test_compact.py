@@ -343,6 +343,8 @@ def nan(array):
         (None, None, {"cameras": [["NONE", 1, 1]]}),
         (None, None, {"cameras": [["PINHOLE", 9, 9, float("nan"), 1, 1, 1]]}),
         (None, None, {"known": {"a": ["PINHOLE", 9, 9, 1]}}),
+        (None, None, {"typical": [[9, 9, float("nan"), 0]]}),
+        (None, None, {"typical": 5}),
         (None, None, {"signs": 0}),
         (None, None, {"feature": "a\0b"}),
         ("vocabulary", lambda a: a * np.float16(np.nan), {}),

@@ -80,9 +80,11 @@ def test_a_map_whose_intrinsics_may_be_wrong_tells_none(gain, grown, run):
     folder, new, model = grown
     content = provenance.read(folder / "map.json")
     assert content["typical"]
-    provenance.write(folder / "map.json", content | {"gain_of_free_principal_points": gain})
+    lens, wrong = content["typical"], [[360, 270, 0.7, 0.0]]
+    changed = {"gain_of_free_principal_points": gain, "typical": wrong}
+    provenance.write(folder / "map.json", content | changed)
     run("--map", folder, "--add_images", new, "--add_model", model)
-    assert bool(provenance.read(folder / "map.json")["typical"]) == (gain == 0)
+    assert provenance.read(folder / "map.json")["typical"] == ([] if gain else lens)
 
 
 @pytest.mark.parametrize("key", ["images_mirrored", "images_unlike_others"])

@@ -162,6 +162,11 @@ def test_a_broken_map_is_refused(place, tmp_path, run, refused):
         ("conf", {"output": "x"}),
         ("conf", {**sound["conf"], "model": {"projection": "../x.safetensors"}}),
         ("points3D", None),
+        ("cameras", []),
+        ("cameras", {"a": ["PINHOLE", 9, 9]}),
+        ("sizes", [[1e999, 1]]),
+        ("typical", [[480, 360, 1e9, 0]]),
+        ("typical", [[480, 360, 10**400, 0]]),
     ):
         file.write_text(json.dumps({**sound, key: value}))
         with pytest.raises(InputError, match=r"no sound map.json|Unknown matcher"):
