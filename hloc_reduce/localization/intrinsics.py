@@ -15,10 +15,10 @@ from ..utils.parsers import parse_camera, to_line
 from .confidence import FOCAL_LENGTHS
 from .exif import WELL_KNOWN, correct, exif_camera
 
-# A lens is typical of photos whose cameras have one of these models, and whose focal lengths and
-# distortions are at most this ratio and this difference apart.
+# A lens is typical of photos whose cameras have one of these models, if the logarithms of their
+# focal lengths, their distortions and principal points differ by at most this.
 PLAIN = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL"
-ALIKE = 1.05, 0.1
+ALIKE = 0.05, 0.1, 0.02, 0.02
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
 _REFINED = {"refinement": {"refine_focal_length": True}}
 _GUESSED = {"estimation": {"estimate_focal_length": True}, **_REFINED}
@@ -33,10 +33,18 @@ REFINEMENTS = {
 
 
 class Lens(NamedTuple):
-    """A focal length in longer sides of the photos, and the distortion of SIMPLE_RADIAL."""
+    """What photos of one size by a camera have in common.
+
+    Args:
+        focal_length: in longer sides.
+        distortion: that of SIMPLE_RADIAL.
+        x, y: the principal point, as shares of width and height.
+    """
 
     focal_length: float
     distortion: float
+    x: float = 0.5
+    y: float = 0.5
 
 
 class MapCameras(NamedTuple):
@@ -48,8 +56,8 @@ class MapCameras(NamedTuple):
         models: `exif.ExifCamera.model` of all cameras that took its photos.
         focal_lengths: the least and the largest of its cameras, in longer sides; None if the map
             does not know.
-        typical: of each size of which it has several photos, the longer side first, their lens, if
-            that is much the same in all of them.
+        typical: of each size of which it has several photos, (width, height), their lens, if that
+            is much the same in all of them.
     """
 
     known: dict[str, pycolmap.Camera]
@@ -134,14 +142,12 @@ def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict
         return options
     side = max(camera.width, camera.height)
     photo: dict = {"focal_lengths": [side * f for f in of_map.focal_lengths]}
-    if lens := of_map.typical.get(_size(camera)):
+    size = camera.width, camera.height
+    if lens := of_map.typical.get(size):
         photo["typical"] = [*lens]
+    elif lens := of_map.typical.get(size[::-1]):  # the principal point depends on which way
+        photo["typical"] = [*lens._replace(x=0.5, y=0.5)]
     return options | {"photo": photo}
-
-
-def _size(camera: pycolmap.Camera) -> tuple[int, int]:
-    """Return the longer and the shorter side."""
-    return max(camera.width, camera.height), min(camera.width, camera.height)
 
 
 def of_cameras(cameras: Iterable[pycolmap.Camera]) -> MapCameras:
@@ -152,7 +158,7 @@ def of_cameras(cameras: Iterable[pycolmap.Camera]) -> MapCameras:
     lengths = (min(found), max(found)) if found else None
     alike: dict[tuple[int, int], list[pycolmap.Camera]] = {}
     for camera in cameras:
-        alike.setdefault(_size(camera), []).append(camera)
+        alike.setdefault((camera.width, camera.height), []).append(camera)
     lenses = {size: _typical(same) for size, same in alike.items()}
     typical = {size: lens for size, lens in lenses.items() if lens is not None}
     return MapCameras({}, sizes, focal_lengths=lengths, typical=typical)
@@ -162,16 +168,24 @@ def _typical(cameras: Sequence[pycolmap.Camera]) -> Lens | None:
     """Return the median lens of photos of one size; None if they are few or their lenses differ."""
     if len(cameras) < WELL_KNOWN or not {camera.model.name for camera in cameras} <= {*PLAIN}:
         return None
-    longer, _ = _size(cameras[0])
-    focal_lengths = [camera.params[camera.focal_length_idxs()] / longer for camera in cameras]
-    found = np.concatenate(focal_lengths)
-    distortion = [[*camera.params[camera.extra_params_idxs()], 0.0][0] for camera in cameras]
-    ratio, difference = ALIKE
-    if found.max() > ratio * found.min() or np.ptp(distortion) > difference:
-        return None
+    width, height = cameras[0].width, cameras[0].height
+    lenses = np.array(
+        [
+            (
+                camera.mean_focal_length() / max(width, height),
+                [*camera.params[camera.extra_params_idxs()], 0.0][0],
+                camera.principal_point_x / width,
+                camera.principal_point_y / height,
+            )
+            for camera in cameras
+        ]
+    )
+    ratios = [np.ptp(np.log(camera.params[camera.focal_length_idxs()])) for camera in cameras]
+    spread = np.ptp(lenses, axis=0)
+    spread[0] = max(np.ptp(np.log(lenses[:, 0])), *ratios)
+    lens = Lens(*np.median(lenses, axis=0).tolist())
     low, high = FOCAL_LENGTHS
-    lens = Lens(float(np.median(found)), float(np.median(distortion)))
-    return lens if low <= lens.focal_length <= high else None
+    return lens if (spread <= ALIKE).all() and low <= lens.focal_length <= high else None
 
 
 def of_map(
@@ -227,21 +241,21 @@ def to_dict(cameras: MapCameras) -> dict:
 
 
 def to_rows(typical: Mapping[tuple[int, int], Lens]) -> list[list]:
-    """Return typical lenses as JSON values: longer and shorter side, focal length, distortion."""
+    """Return typical lenses as JSON values: width, height, and the values of a `Lens`."""
     return [[*size, *lens] for size, lens in sorted(typical.items())]
 
 
 def from_rows(rows: Iterable[Sequence]) -> dict[tuple[int, int], Lens]:
     """Return the lenses in rows from `to_rows`; raise a ValueError or TypeError for wrong ones."""
     typical = {}
-    for longer, shorter, *values in rows:
+    for width, height, *values in rows:
         lens = Lens(*map(float, values))
         low, high = FOCAL_LENGTHS
-        if not (longer >= shorter > 0 and low <= lens.focal_length <= high):
-            raise ValueError(f"photos of {longer}x{shorter} pixels by a {lens}")
-        if not np.isfinite([longer, lens.distortion]).all():
-            raise ValueError(f"numbers that are not finite: {[longer, *lens]}")
-        typical[int(longer), int(shorter)] = lens
+        if not (width > 0 < height and low <= lens.focal_length <= high):
+            raise ValueError(f"photos of {width}x{height} pixels by a {lens}")
+        if not np.isfinite([width, height, *lens]).all():
+            raise ValueError(f"numbers that are not finite: {[width, height, *lens]}")
+        typical[int(width), int(height)] = lens
     return typical
 
 

@@ -83,8 +83,8 @@ class Matches:
         if (lens := self.config.get("photo", {}).get("typical")) is None:
             return None
         width, height = self.camera.width, self.camera.height
-        focal_length, distortion = lens
-        params = [focal_length * max(width, height), width / 2, height / 2, distortion]
+        focal_length, distortion, x, y = lens
+        params = [focal_length * max(width, height), x * width, y * height, distortion]
         camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
         estimation = {**self.config.get("estimation", {}), "estimate_focal_length": False}
         refinement = {**self.config.get("refinement", {}), "refine_focal_length": False}

@@ -224,7 +224,7 @@ def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):
         found = dict(intrinsics.refinement(camera, source, known))
         photo = found.pop("photo")
         assert photo["focal_lengths"] == pytest.approx([500, 500])
-        assert photo["typical"] == [500 / 480, -0.05]
+        assert photo["typical"] == [500 / 480, -0.05, 0.5, 0.5]
         assert found == intrinsics.REFINEMENTS["guess"]
     assert intrinsics.refinement(camera, "unknown", known) == intrinsics.REFINEMENTS["unknown"]
     before = known._replace(focal_lengths=None)  # a map of an earlier version
@@ -244,34 +244,40 @@ def photos_of(*cameras: tuple) -> MapCameras:
 
 
 def test_the_typical_lens_is_the_median_of_photos_of_a_size():
-    upright = [
-        ("SIMPLE_RADIAL", 360, 480, [f, 180, 240, k]) for f, k in ((490, -0.02), (500, 0.02))
+    alike = [
+        ("SIMPLE_RADIAL", 480, 360, [490, 240, 180, -0.02]),
+        ("SIMPLE_RADIAL", 480, 360, [500, 246, 180, 0.02]),
+        ("PINHOLE", 480, 360, [508, 512, 249, 183]),
     ]
-    across = ("PINHOLE", 480, 360, [508, 512, 240, 180])
     few = ("SIMPLE_PINHOLE", 640, 480, [600, 320, 240])
-    found = photos_of(*upright, across, few, few)
-    assert found.sizes == {(360, 480), (480, 360), (640, 480)}
-    assert found.typical == {(480, 360): (504 / 480, 0)}
+    found = photos_of(*alike, few, few)
+    assert found.sizes == {(480, 360), (640, 480)} and {*found.typical} == {(480, 360)}
+    assert [*found.typical[480, 360]] == pytest.approx([500 / 480, 0, 246 / 480, 0.5])
     for other in (
         ("SIMPLE_PINHOLE", 480, 360, [540, 240, 180]),  # another zoom
         ("SIMPLE_RADIAL", 480, 360, [500, 240, 180, 0.1]),
-        ("PINHOLE", 480, 360, [500, 540, 240, 180]),
+        ("PINHOLE", 480, 360, [490, 520, 240, 180]),
+        ("PINHOLE", 480, 360, [500, 500, 240, 190]),
         ("RADIAL", 480, 360, [500, 240, 180, 0, 0]),
         ("OPENCV_FISHEYE", 480, 360, [500, 500, 240, 180, 0, 0, 0, 0]),
     ):
-        assert photos_of(*upright, across, other).typical == {}
+        assert photos_of(*alike, other).typical == {}
     assert photos_of(*3 * [("SIMPLE_PINHOLE", 480, 360, [5000, 240, 180])]).typical == {}
     rows = intrinsics.to_dict(found)["typical"]
     assert intrinsics.from_rows(json.loads(json.dumps(rows))) == found.typical
     assert intrinsics.merged(found, found).typical == {}  # together they might differ
+    for size, expected in ((480, 360), (246 / 480, 0.5)), ((360, 480), (0.5, 0.5)):
+        camera, source = intrinsics.infer(np.zeros(size[::-1], np.uint8), found)
+        lens = intrinsics.refinement(camera, source, found)["photo"]["typical"]
+        assert lens[2:] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
     "row",
     [
         *([480, 360, 1], [480, 360, 0, 0], [480, 360, "x", 0], [480, 360, 1, float("nan")]),
-        *([[], 1, 1, 1], [360, 480, 1, 0], [480, -1, 1, 0], [float("inf"), 1, 1, 0], [1]),
-        *([480, 360, 1e9, 0], [480, 360, 1, 0, 0]),
+        *([[], 1, 1, 1], [480, 360, 1, 0, 0, 0, 0], [480, -1, 1, 0], [float("inf"), 1, 1, 0], [1]),
+        *([480, 360, 1e9, 0], [480, 360, 1, 0, float("inf"), 0]),
     ],
 )
 def test_wrong_rows_of_typical_lenses(row):
