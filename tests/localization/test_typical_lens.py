@@ -52,30 +52,30 @@ def test_the_typical_lens_is_taken_where_it_fits():
     assert found.agreement == free.agreement
 
 
-@pytest.mark.parametrize("number, depth", [(30, 0.5), (300, 0.2), (300, 3)])
+@pytest.mark.parametrize("number, depth", [(30, 0.5), (300, 0.2)])
 @pytest.mark.parametrize("zoom, distortion", [(1.03, -0.05), (0.92, -0.05), (1, 0.2)])
 def test_an_unlike_lens_is_not_taken(number, depth, zoom, distortion):
     """By the confidence alone, one whose focal length is 5 % off would fit few matches."""
     other = intrinsics.Lens(zoom * LENS.focal_length, distortion)
     taken = 0
-    for seed in range(6):
+    for seed in range(3):
         free, _ = solve(None, number, depth, seed)
         found, _ = solve(other, number, depth, seed)
         assert found.refusal == free.refusal
         taken += found.camera.params.tolist() != free.camera.params.tolist()
-    assert taken == 0 if number == 300 else taken < 6
+    assert taken == 0 if number == 300 else taken < 3
 
 
-@pytest.mark.parametrize("number, depth", [(30, 0.5), (300, 0.2), (300, 3)])
+@pytest.mark.parametrize("number, depth", [(30, 0.5), (300, 0.2)])
 def test_the_right_lens_is_taken_mostly(number, depth):
     taken = 0
-    for seed in range(6):
+    for seed in range(3):
         free, error = solve(None, number, depth, seed)
         found, its_error = solve(LENS, number, depth, seed)
         if found.camera.params.tolist() == [900, 640, 480, -0.05]:
             taken += 1
             assert its_error < 0.005 and its_error < error + 0.001
-    assert taken >= 4
+    assert taken >= 2
 
 
 def test_the_lens_of_a_photo_that_may_be_cropped_is_estimated():
