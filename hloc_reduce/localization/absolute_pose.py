@@ -102,7 +102,7 @@ def _with_typical_lens(
         return None
     ratio = pose.camera.mean_focal_length() / known.camera.mean_focal_length()
     deviation = uncertainty(*inliers, *view, pose.degrees_of_freedom).focal_length
-    deviation /= max(1, pose.num_inliers / INDEPENDENT) ** 0.5  # a bent map bends no lens
+    deviation /= max(1, pose.num_inliers / INDEPENDENT) ** 0.5  # no allowance for bent maps
     errors, _ = reprojection_errors(*inliers, *view)
     its_errors, _ = reprojection_errors(*inliers, typical.cam_from_world, typical.camera)
     # an estimated focal length may be off by more if it makes up for a distortion
