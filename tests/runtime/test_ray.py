@@ -68,7 +68,9 @@ def test_a_node_is_removed(cluster):
 
 
 @pytest.mark.long
-def test_work_that_uses_a_gpu_is_done_where_one_is(cluster):
+def test_work_that_uses_a_gpu_is_done_where_one_is(cluster, monkeypatch):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")  # a node must not hide the GPU that it pretends
+
     def nodes_of(executor, gpu):
         found = list(executor.map(slow_squares, range(8), 1, gpu))
         assert len(found) == 8
