@@ -159,14 +159,9 @@ def _of_stages(sfm: Path, features: Path, global_descriptors: Path | None, featu
     descriptors = global_descriptors or beside
     vocabulary = vocabulary_of(descriptors)
     model = colmap.read_model(sfm)
-    return Source(
-        *(model, name, conf, features_confs.matcher_of(conf)),
-        *(
-            descriptors,
-            vocabulary,
-            intrinsics.of_cameras(image.camera for image in model.images.values()),
-        ),
-    )
+    cameras = intrinsics.of_cameras(image.camera for image in model.images.values())
+    matcher = features_confs.matcher_of(conf)
+    return Source(model, name, conf, matcher, descriptors, vocabulary, cameras)
 
 
 def _check_dim(source: Source, features: Path, dim: int) -> None:

@@ -9,15 +9,7 @@ import pycolmap
 
 from ..utils import colmap
 from .calibration import calibrate
-from .confidence import (
-    INDEPENDENT,
-    MIN_MATCHES,
-    RIVAL,
-    Gate,
-    agreement,
-    confidence,
-    uncertainty,
-)
+from .confidence import MIN_MATCHES, RIVAL, Gate, agreement, confidence, uncertainty
 from .pose import Matches, Pose, quality
 from .projection import ALL, FOCAL, POSE, reprojection_errors
 from .refusals import refusal
@@ -102,7 +94,6 @@ def _with_typical_lens(
         return None
     ratio = pose.camera.mean_focal_length() / known.camera.mean_focal_length()
     deviation = uncertainty(*inliers, *view, pose.degrees_of_freedom).focal_length
-    deviation /= max(1, pose.num_inliers / INDEPENDENT) ** 0.5  # no allowance for bent maps
     errors, _ = reprojection_errors(*inliers, *view)
     its_errors, _ = reprojection_errors(*inliers, typical.cam_from_world, typical.camera)
     # an estimated focal length may be off by more if it makes up for a distortion

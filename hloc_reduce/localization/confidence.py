@@ -136,7 +136,7 @@ class Uncertainty(NamedTuple):
     Args:
         position: in units of the inliers' median depth.
         rotation: in degrees.
-        focal_length: of its logarithm; 0 if it is known.
+        focal_length: of its logarithm, 0 if it is known; a bent map is not allowed for.
     """
 
     position: float
@@ -153,7 +153,7 @@ def uncertainty(
 ) -> Uncertainty:
     """Estimate how precisely inliers determine a pose, to first order from their errors.
 
-    More than INDEPENDENT inliers do not make it more precise.
+    More than INDEPENDENT inliers do not make the pose more precise.
 
     Args:
         points2D: (M, 2) image points of the inliers, COLMAP's pixels.
@@ -177,13 +177,13 @@ def uncertainty(
         variance = noise * np.diag(np.linalg.inv(jacobian.T @ jacobian))
     except np.linalg.LinAlgError:
         return nothing
-    variance = variance * max(1, len(points2D) / INDEPENDENT)
     if not (variance > 0).all():
         return nothing
+    bent = max(1, len(points2D) / INDEPENDENT)
     rotation, position, focal_length = variance[:3], variance[3:POSE], variance[POSE:FOCAL]
     return Uncertainty(
-        position=float(np.sqrt(position.sum())),
-        rotation=float(np.degrees(np.sqrt(rotation.sum()))),
+        position=float(np.sqrt(bent * position.sum())),
+        rotation=float(np.degrees(np.sqrt(bent * rotation.sum()))),
         focal_length=float(np.sqrt(focal_length.sum())),
     )
 
