@@ -8,9 +8,18 @@ import numpy as np
 import pycolmap
 
 from ..utils import colmap
-from .calibration import calibrate
-from .confidence import MIN_MATCHES, RIVAL, Gate, agreement, confidence, uncertainty
-from .pose import Matches, Pose, quality
+from .calibration import STRETCHED, UNCLEAR_CROPPED, calibrate
+from .confidence import (
+    MAX_POSITION,
+    MAX_ROTATION,
+    MIN_MATCHES,
+    RIVAL,
+    Gate,
+    agreement,
+    confidence,
+    uncertainty,
+)
+from .pose import Matches, Pose, differ, quality
 from .projection import ALL, FOCAL, POSE, reprojection_errors
 from .refusals import refusal
 
@@ -42,7 +51,8 @@ def estimate(
     similar matches of each image are tried by themselves, too: those of an image that shows the
     same place agree much more often. The pose with the highest confidence among all matches wins.
     If it is trusted although its intrinsics were guessed, and the lens of the map's photos fits as
-    well, it is estimated with that.
+    well, it is estimated with that. If its photo seems to be cropped or stretched, and that lens
+    fits about as well with another pose, it is not trusted.
 
     Args:
         points2D: (M, 2) image points of all matches, COLMAP's pixels.
@@ -80,16 +90,21 @@ def _with_typical_lens(
     All photos of a map determine their lens better than the matches of one more photo do.
 
     Returns:
-        None if the lens is not known, may not have taken the photo, or gives no trusted pose.
+        The new pose, or the old one with a refusal. None if the lens is not known, may not have
+        taken the photo, or gives no trusted pose.
     """
     known = matches.with_typical_lens()
     if known is None or pose.cam_from_world is None or pose.refusal is not None:
         return None
-    if matches.may_be_cropped(pose) or pose.degrees_of_freedom == ALL:
+    if matches.may_be_cropped(pose):
         return None
     inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
     view = pose.cam_from_world, pose.camera
     typical = _estimate(known, np.flatnonzero(pose.inliers))
+    if pose.degrees_of_freedom == ALL:
+        fits = typical.confidence >= UNCLEAR_CROPPED * pose.confidence
+        differs = differ(pose, typical, matches.points3D, MAX_POSITION, MAX_ROTATION)
+        return replace(pose, refusal=STRETCHED) if fits and differs else None
     if typical.cam_from_world is None or typical.confidence < CONFIDENCE_RATIO * pose.confidence:
         return None
     ratio = pose.camera.mean_focal_length() / known.camera.mean_focal_length()

@@ -19,6 +19,11 @@ RIGHT = 1.1  # above it, the other intrinsics are right
 # lists are 5 % off
 TOLERANT = 1.2
 
+STRETCHED = (
+    "it may be cropped or stretched: another principal point and aspect ratio fit about as well, "
+    "and the pose differs"
+)
+
 
 def calibrate(matches: Matches, pose: Pose) -> tuple[Pose, str | None]:
     """Test whether other intrinsics than those of a pose fit the matches better.
@@ -118,7 +123,4 @@ def choose(
         assumed, other, points3D, MAX_POSITION, MAX_ROTATION
     ):
         return assumed, None
-    return assumed, (
-        "it may be cropped or stretched: another principal point and aspect ratio fit about as "
-        "well, and the pose differs"
-    )
+    return assumed, STRETCHED

@@ -24,13 +24,19 @@ def solve(
     seed: int = 3,
     gate: Gate = GATE,
     focal_lengths: tuple = (800, 1000),
+    lean: float = 0,
 ) -> tuple[Pose, float]:
-    """Return the pose of a query by LENS, and its position error as a share of the distance."""
+    """Return the pose of a query by LENS, and its position error as a share of the distance.
+
+    In a map that leans, points to the right are farther from the camera, by a share of their x.
+    """
     generator = np.random.default_rng(seed)
     pixels = generator.uniform([40, 40], [1240, 920], (number, 2))
     rays = camera_of(900, 640, 480, LENS.distortion).cam_from_img(pixels)
     distances = generator.uniform(8 - depth, 8 + depth, (number, 1))
-    points = POSE.inverse() * (np.column_stack([rays, np.ones(number)]) * distances)
+    points = np.column_stack([rays, np.ones(number)]) * distances
+    points[:, 2] += lean * points[:, 0]
+    points = POSE.inverse() * points
     pixels += 0.7 * generator.standard_normal((number, 2))
     photo: dict = {"focal_lengths": focal_lengths}
     if typical is not None:
@@ -103,3 +109,19 @@ def test_a_pose_with_the_typical_lens_is_judged(monkeypatch):
     free, _ = solve(None, 30, 0.2)
     found, _ = solve(LENS, 30, 0.2, gate=strict)
     assert found.refusal is None and found.camera.params.tolist() == free.camera.params.tolist()
+
+
+@pytest.mark.parametrize("lean", [0.055, 0.08])
+def test_a_photo_is_not_taken_for_a_stretched_one(lean):
+    """In a bent map another principal point fits a whole photo; a pose was wrong by it."""
+    free, _ = solve(None, 200, 0.5, lean=lean)
+    assert free.refusal is None and free.camera.model == pycolmap.CameraModelId.OPENCV
+    assert "cropped or stretched" in solve(LENS, 200, 0.5, lean=lean)[0].refusal
+
+
+def test_a_photo_that_was_stretched_is_taken_for_one():
+    """Where the typical lens fits much worse, the estimated intrinsics stay."""
+    free, _ = solve(None, 200, 1.5, lean=0.1)
+    found, _ = solve(LENS, 200, 1.5, lean=0.1)
+    assert free.refusal is found.refusal is None
+    assert found.camera.params.tolist() == free.camera.params.tolist()
