@@ -17,6 +17,10 @@ _OTHERS = (
     "3gp avi m4v mkv mov mp4 mpeg mpg mts webm wmv"
 )
 OTHER_SUFFIXES = {f".{name}" for name in _OTHERS.split()}
+CONVERT = (
+    "Convert HEIC photos and keep their EXIF data, for example with: magick mogrify -format jpg "
+    "*.HEIC"
+)
 
 
 def list_images(
@@ -40,13 +44,15 @@ def list_images(
         names = [file.as_posix() for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
         others = [str(file) for file in files if file.suffix.lower() in OTHER_SUFFIXES]
         read = ", ".join(sorted(IMAGE_SUFFIXES))
+        of_phones = {"heic", "heif"} & {Path(other).suffix.lower()[1:] for other in others}
+        hint = f" {CONVERT}" if of_phones else ""
         if not names:
             there_are = f" It has {some(others)}, but only {read} are read." if others else ""
-            raise InputError(f"There is no image in {within}.{there_are}")
+            raise InputError(f"There is no image in {within}.{there_are}{hint}")
         if others:
             logger.warning(
-                "%d photos and videos in %s are ignored, as only %s are read: %s.",
-                *(len(others), within, read, some(others)),
+                "%d photos and videos in %s are ignored, as only %s are read: %s.%s",
+                *(len(others), within, read, some(others), hint),
             )
         return check_names(names, within)
     names = image_names(image_list)

@@ -107,14 +107,15 @@ def test_a_folder_is_no_image(tmp_path):
         read_image(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["a.webp", "a.dng", "a.mp4", "a.MOV"])
+@pytest.mark.parametrize("name", ["a.webp", "a.HEIC", "a.mp4", "a.MOV"])
 def test_photos_and_videos_of_other_types_are_named(name, tmp_path, picture, caplog):
     (tmp_path / name).write_bytes(b"")
     (tmp_path / "notes.txt").write_text("")
     (tmp_path / "folder.png").mkdir()
-    message = f"no image in .* It has {name}, but only .jpeg, .jpg, .png"
-    with pytest.raises(InputError, match=message):
+    message = f"no image in .* It has {name}, but only .jpeg, .jpg, .png are read."
+    with pytest.raises(InputError, match=message) as error:
         list_images(tmp_path)
+    assert ("Convert HEIC photos" in str(error.value)) == (name == "a.HEIC")
     cv2.imwrite(str(tmp_path / "b.png"), picture)
     assert list_images(tmp_path) == ["b.png"]
     assert "1 photos and videos in" in caplog.text and name in caplog.text
