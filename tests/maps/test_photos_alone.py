@@ -26,7 +26,7 @@ def draw_noise(folder, numbers):
     """Write photos that match no other."""
     generator = np.random.default_rng(1)
     for number in numbers:
-        noise = cv2.GaussianBlur(generator.standard_normal((270, 360)), (0, 0), 3)
+        noise = cv2.GaussianBlur(generator.standard_normal((135, 180)), (0, 0), 3)
         cv2.imwrite(str(folder / f"{number}.png"), 128 + 30 * noise / noise.std())
 
 

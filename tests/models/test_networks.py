@@ -285,16 +285,13 @@ def test_dedode_with_random_weights(tmp_path, textured, monkeypatch):
     )
     name, conf = features.get(str(tmp_path / "dedode.yaml"))
     assert name == "dedode"
-    found = extractors.extract(
-        extractors.load(conf["model"]).eval(), tmp_path / "a.png", conf["preprocessing"]
-    )
+    network = extractors.load(conf["model"]).eval()
+    found = extractors.extract(network, tmp_path / "a.png", conf["preprocessing"])
     x, y = found["keypoints"].T
     assert len(x) == 40 and min(x.min(), y.min()) >= 0 and x.max() <= 109 and y.max() <= 74
     np.testing.assert_allclose(x, x.round(), atol=1e-4)  # whole pixels, centres at integers
     np.testing.assert_allclose(np.linalg.norm(found["descriptors"], axis=0), 1, rtol=1e-4)
-    gray = extractors.extract(
-        extractors.load(conf["model"]).eval(), tmp_path / "a.png", {"grayscale": True}
-    )  # textured is gray
+    gray = extractors.extract(network, tmp_path / "a.png", {"grayscale": True})
     np.testing.assert_allclose(gray["keypoints"], found["keypoints"])
 
 
