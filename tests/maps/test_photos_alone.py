@@ -22,11 +22,11 @@ from pipelines import localize
 PIPELINE = localize
 
 
-def draw_noise(folder, numbers):
+def draw_noise(folder, numbers, size=(270, 360)):
     """Write photos that match no other."""
     generator = np.random.default_rng(1)
     for number in numbers:
-        noise = cv2.GaussianBlur(generator.standard_normal((135, 180)), (0, 0), 3)
+        noise = cv2.GaussianBlur(generator.standard_normal(size), (0, 0), 3)
         cv2.imwrite(str(folder / f"{number}.png"), 128 + 30 * noise / noise.std())
 
 
@@ -55,7 +55,7 @@ def test_photos_alone(plane, tmp_path, run):
 def test_fewer_than_half_of_the_photos(plane, tmp_path, monkeypatch, caplog, run, refused):
     """Are refused with their names, and accepted on demand without any work."""
     images, outputs = plane / "images", tmp_path / "outputs"
-    draw_noise(images, range(5, 11))
+    draw_noise(images, range(5, 11), (135, 180))
     build = ("--map_images", images, "--outputs", outputs)
     message = refused(*build)
     assert "Only 5 of 11 photos are in the map. Missing: 10.png, 5.png, 6.png" in message
