@@ -55,7 +55,7 @@ RULES = {
     "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
     "points": f"{MORE} times as many where focal lengths differ",
     "doubtful": f"from {DOUBTFUL}, misfit {MISFIT}, {ALMOST} times as many points",
-    "lenses": "others without the implausible ones",
+    "lenses": "others without the implausible ones, by the best attempt",
     "spread": SPREAD,
     "viewpoints": VIEWPOINTS,
     "misplaced": f"{epipolar.AGREEING} of {epipolar.EVIDENCE} matches or more, {FEWEST} points",
@@ -159,14 +159,15 @@ class Mapper:
                 )
             return keep_plausible(found, *evidence)
 
-        best: Models = [], {}
         attempts = self.attempts[:1] if once else self.attempts
-        for attempt, found in enumerate(_in_turn(attempted, attempts), start=1):
-            best = max(best, found, key=lambda both: _size(both[0]))
+        tried: list[tuple[Models, dict]] = []
+        for found, changed in zip(_in_turn(attempted, attempts), attempts, strict=False):
+            tried.append((found, changed))
+            best, options = max(tried, key=lambda both: _size(both[0][0]))
             registered = _size(best[0])[0]
             logger.info(
                 "Attempt %d of up to %d: %d of %d images reconstructed.",
-                *(attempt, len(attempts), registered, number),
+                *(len(tried), len(attempts), registered, number),
             )
             if registered >= enough:
                 break
@@ -178,7 +179,7 @@ class Mapper:
             # a photo with an implausible lens has bent the model of the others
             logger.info("Trying again without %s.", cli.some(sorted(lenses)))
             names = [name for name in self.names if name not in lenses]
-            others, more = attempted({"image_names": names})
+            others, more = attempted({**options, "image_names": names})
             if _size(others)[0] >= _size(models)[0]:
                 return others, more | dropped
         return best

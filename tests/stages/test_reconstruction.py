@@ -11,7 +11,8 @@ from alignment import similarity
 from command import state
 
 from hloc_reduce import match_features, reconstruction
-from hloc_reduce.mapping import plausibility
+from hloc_reduce.mapping import mapper, plausibility
+from hloc_reduce.mapping.registration import NoModelError
 from hloc_reduce.runtime import parallel
 from hloc_reduce.utils import colmap, parsers
 from hloc_reduce.utils.cli import InputError
@@ -143,10 +144,11 @@ def test_a_photo_with_an_implausible_lens_does_not_bend_the_others(
 ):
     """The others are reconstructed without it, if that loses none of them."""
     names, pairs, matches = matched
-    mapping, tried = colmap.incremental_mapping, []
+    mapping, tried, settings = colmap.incremental_mapping, [], []
 
     def bent(database, image_dir, output, options, verbose):
         tried.append(list(options.image_names))
+        settings.append((options.random_seed, options.num_threads, options.min_model_size))
         models = mapping(database, image_dir, output, options, verbose)
         bad = models[0].find_image_with_name(names[2])
         if not tried[-1]:
@@ -159,9 +161,19 @@ def test_a_photo_with_an_implausible_lens_does_not_bend_the_others(
     arguments = (tmp_path / "sfm", scene.images, pairs, scene.features, matches)
     model = reconstruction.main(*arguments, image_list=names, once=True)
     assert not tried[0] and {*tried[1]} == {*names} - {names[2]}
+    assert {*settings} == {(0, 1, 3)}  # those of the attempt that it replaces
     assert model.num_reg_images() == 5
     assert f"{names[2]} (focal length" in caplog.text
     assert "focal lengths differ" not in caplog.text  # those of the others do not
+
+
+def test_why_no_model_is_plausible_is_said(scene, matched, tmp_path, monkeypatch):
+    names, pairs, matches = matched
+    dropped = dict.fromkeys(names, "focal length 25000")
+    monkeypatch.setattr(mapper, "keep_plausible", lambda *_: ([], dropped))
+    arguments = (tmp_path / "sfm", scene.images, pairs, scene.features, matches)
+    with pytest.raises(NoModelError, match=r"focal lengths in pixels .*\(focal length 25000\)"):
+        reconstruction.main(*arguments, image_list=names, once=True)
 
 
 @pytest.mark.parametrize("is_poor", [True, False])
