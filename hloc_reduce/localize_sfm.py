@@ -91,7 +91,7 @@ def main(
     else:
         if not reference_sfm.is_dir():
             raise InputError(f"There is no COLMAP model folder {reference_sfm}.")
-        inputs.append(reference_sfm / "points3D.bin")
+        inputs += colmap.model_files(reference_sfm)
         written = reference_sfm.stat().st_mtime_ns
         load = partial(_load, reference_sfm, covisibility_clustering, written)
     if refinements:

@@ -22,8 +22,7 @@ from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
 STAMP = "made_from.json"
-PARTS = ("cameras", "frames", "images", "points3D", "rigs")
-MADE_BY_HLOC = {"database.db", *(f"{part}.bin" for part in PARTS)}
+MADE_BY_HLOC = {"database.db", *(f"{part}.bin" for part in colmap.PARTS)}
 
 Pair = tuple[str, str]
 # from pair to all matches and the verified ones, both (M, 2); None for COLMAP to verify
@@ -76,16 +75,14 @@ def main(
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
-    model_files = sorted(reference_model.glob("*.*"))
     verification = {
         "skip_geometric_verification": skip_geometric_verification,
         "estimate_two_view_geometries": estimate_two_view_geometries,
         "min_match_score": min_match_score,
     }
     chosen = {key: value for key, value in verification.items() if value}
-    made_from = provenance.of_inputs(
-        {**options, **chosen}, [*model_files, pairs, features, matches]
-    )
+    inputs = [*colmap.model_files(reference_model), pairs, features, matches]
+    made_from = provenance.of_inputs({**options, **chosen}, inputs)
     if not overwrite and provenance.is_current(sfm_dir / STAMP, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
         return colmap.read_model(sfm_dir)

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 
 from .. import logger
+from ..confs.matchers import confs
 from ..runtime import parallel
 from ..runtime.executors import SERIAL, Executor
 from ..runtime.group_writer import failure_of, failures
@@ -220,11 +221,17 @@ def localize_all(
         said: what the progress bar says.
     """
     with open_h5(matches) as file:
-        gate = gate.of_matches(get_matcher(file), dimension(features))
+        gate = gate.of_matches(get_matcher(file) or _by_name(matches), dimension(features))
     files = features, matches
     work = partial(_localize_chunk, load_reference, *files, config, skip_matches, gate, thorough)
     with closing(executor.map(work, tasks, CHUNK)) as found:
         yield from progress(found, said, "query", len(tasks))
+
+
+def _by_name(matches: Path) -> dict:
+    """Return the configuration of a matcher from the name that hloc gives its match files."""
+    named = (conf["model"] for conf in confs.values() if f"_{conf['output']}_" in matches.name)
+    return next(named, {})
 
 
 def _localize_chunk(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pycolmap
 
-from .. import extract_features, logger, triangulation
+from .. import extract_features, logger
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
@@ -82,7 +82,7 @@ def main(
     if overwrite or not (map_dir / CONF).exists():
         extract_features.check_model(conf)
     images = {name: image_dir / name for name in names}
-    parts = {path.name: path for path in model_files(model)}
+    parts = {path.name: path for path in (colmap.model_files(model) if model else [])}
     fingerprints, found = digests(map_dir, {"images": images, "model": parts})
     made_from = {
         "feature": extract_features.provenance(conf),
@@ -161,9 +161,3 @@ def digests(
         key: {name: fingerprints[f"{key}/{name}"][2] for name in part}
         for key, part in groups.items()
     }
-
-
-def model_files(model: Path | None) -> list[Path]:
-    """Return the files of a COLMAP model, if any."""
-    paths = sorted(model.iterdir()) if model else []
-    return [path for path in paths if path.stem in triangulation.PARTS and path.is_file()]

@@ -18,7 +18,7 @@ from ..utils.codes import STORAGES
 from ..utils.colmap import StoredDatabase
 from ..utils.match_files import check_names
 from ..utils.paths import strings_as_paths
-from .build import begin, claim, digests, model_files
+from .build import begin, claim, digests
 from .map import FINISHED, RETRIEVAL, SFM, Map, keep_projection, write
 
 
@@ -70,7 +70,7 @@ def main(
         check_names(names)
         cameras = _cameras(reference, names, image_dir)
         told = intrinsics.to_dict(cameras)
-        groups = {"database": opened.files(), "model": model_files(model)}
+        groups = {"database": opened.files(), "model": colmap.model_files(model)}
         named = {key: {path.name: path for path in part} for key, part in groups.items()}
         fingerprints, found = digests(map_dir, named)
         made_from = {

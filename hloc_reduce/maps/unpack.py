@@ -9,7 +9,7 @@ from ..confs import features as features_confs
 from ..localization.projection import reprojection_errors
 from ..runtime import provenance
 from ..runtime.group_writer import GroupWriter
-from ..runtime.outputs import CONF, RunFolder
+from ..runtime.outputs import CONF, DELETING, RunFolder
 from ..utils import colmap
 from ..utils.cli import InputError
 from ..utils.files import announce, file_sha256, replacing
@@ -37,7 +37,7 @@ def main(path: Path, map_dir: Path, overwrite: bool = False) -> Map:
     """
     compact = CompactMap(path)
     before = provenance.read(map_dir / CONF)
-    if before and COMPACT not in before:
+    if before and before != DELETING and COMPACT not in before:
         raise InputError(f"{map_dir} is a map of photos, not an unpacked one: use other --outputs.")
     digest = file_sha256(path)
     with RunFolder(map_dir, {COMPACT: digest}, overwrite, inputs=[path]) as folder:

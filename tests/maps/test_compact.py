@@ -16,7 +16,9 @@ from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.maps import points, signs
 from hloc_reduce.maps.compact import CompactMap
 from hloc_reduce.maps.signs import Signs, hadamard, pack
+from hloc_reduce.maps.unpack import COMPACT
 from hloc_reduce.runtime import provenance
+from hloc_reduce.runtime.outputs import CONF, DELETING
 from hloc_reduce.utils import parsers
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize
@@ -373,6 +375,14 @@ def test_a_file_writes_nothing_elsewhere(file, tmp_path):
     assert {path.name for path in (tmp_path / "a").iterdir()} == {"b"}
     assert {path.name for path in (tmp_path / "a/b").iterdir()} == {"map"}
     assert built.features.name == "feats-evil.h5" and not list(tmp_path.glob("*evil*"))
+
+
+def test_an_overwriting_that_was_interrupted_goes_on(file, tmp_path):
+    folder = tmp_path / "map"
+    names = maps.unpack(file, folder).names()
+    provenance.write(folder / CONF, DELETING)
+    assert maps.unpack(file, folder).names() == names
+    assert provenance.read(folder / CONF).keys() == {COMPACT}
 
 
 def test_bad_arguments(built, tmp_path, refused, place):

@@ -207,14 +207,21 @@ def test_the_command_line_of_localization(built, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("conf", "agreement"),
-    [("NN-ratio", AGREEMENT_RATIO), ("NN-mutual", AGREEMENT), (None, AGREEMENT)],
+    ("conf", "name", "agreement"),
+    [
+        ("NN-ratio", None, AGREEMENT_RATIO),
+        ("NN-mutual", None, AGREEMENT),
+        (None, "feats-sift_matches-NN-mutual-ratio.8_pairs-query-netvlad20.h5", AGREEMENT_RATIO),
+        (None, "feats-sift_matches-NN-mutual_pairs-query-netvlad20.h5", AGREEMENT),
+        (None, "feats-sift_matches-superglue_pairs-query-netvlad20.h5", AGREEMENT),
+    ],
 )
-def test_the_gate_knows_the_matcher_by_its_file(built, conf, agreement, monkeypatch):
-    """Match files of hloc do not say which matcher made them."""
+def test_the_gate_knows_the_matcher_by_its_file(built, conf, name, agreement, monkeypatch):
+    """Match files of hloc say only by their names which matcher made them."""
     if conf is None:
         with h5py.File(built.loc_matches, "r+") as file:
             del file.attrs["conf"]
+        built.loc_matches = built.loc_matches.rename(built.loc_matches.with_name(name))
     else:
         conf = match_features.confs[conf]
         match_features.main(

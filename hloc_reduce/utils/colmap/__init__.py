@@ -22,9 +22,11 @@ from .estimators import (
     verify_matches,
 )
 from .models import (
+    PARTS,
     add_image,
     cam_from_img,
     infer_camera,
+    model_files,
     point3D_ids,
     read_model,
     visibility,

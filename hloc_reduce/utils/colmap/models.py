@@ -20,6 +20,13 @@ from ..parsers import CAMERA_MODELS, check_names
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
+PARTS = ("cameras", "frames", "images", "points3D", "rigs")  # files of a model
+
+
+def model_files(path: Path) -> list[Path]:
+    """Return the files of a COLMAP model, binary or text, sorted."""
+    return sorted(file for file in path.iterdir() if file.stem in PARTS and file.is_file())
+
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model, binary or text, with or without rigs and frames.
