@@ -22,7 +22,7 @@ from .utils.cli import InputError
 from .utils.codes import to_integers
 from .utils.feature_files import StoredDescriptors, read_descriptors
 from .utils.h5 import file_provenance, open_h5
-from .utils.match_files import names_to_pair
+from .utils.match_files import check_distinct, names_to_pair
 from .utils.parsers import parse_pairs
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
@@ -70,11 +70,12 @@ def main(
         The match file. Pairs that it has already are skipped.
 
     Raises:
-        InputError: for an image without features, or no path for the matches.
+        InputError: for an image without features, no path for the matches, or images that have the
+            same name in match files.
     """
     if gpu_bytes is not None and gpu_bytes < 1:
         raise InputError(f"--gpu_bytes {gpu_bytes}: at least 1.")
-    number = sum(1 for _ in parse_pairs(pairs))
+    number = _count(pairs)
     if not number:
         raise InputError(f"{pairs} has no pair.")
     feature_path, matches = _paths(conf, pairs, features, export_dir, matches)
@@ -92,6 +93,18 @@ def main(
                 pass
     logger.info("Matches of the pairs %s are in %s.", pairs.name, matches)
     return matches
+
+
+def _count(pairs: Path) -> int:
+    """Count the pairs of a text file, whose images a match file must tell apart."""
+    number, columns = 0, (set[str](), set[str]())
+    for pair in parse_pairs(pairs):
+        number += 1
+        for names, name in zip(columns, pair, strict=True):
+            names.add(name)
+    for names in columns if columns[0].isdisjoint(columns[1]) else [set.union(*columns)]:
+        check_distinct(sorted(names))
+    return number
 
 
 def _paths(

@@ -17,6 +17,7 @@ from hloc_reduce.runtime.outputs import CONF
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.files import is_readable
 from hloc_reduce.utils.images import list_images
+from hloc_reduce.utils.match_files import check_distinct
 from hloc_reduce.utils.parsers import parse_query_lists
 
 from .run import check_queries
@@ -65,6 +66,7 @@ class Queries:
             check_queries(query_images, listed.names, strict)
             return listed
         names = list_images(query_images)
+        check_distinct(names)
         inferred = intrinsics.infer_all(query_images, names, built.cameras, strict)
         refinements = {
             name: intrinsics.refinement(*found, built.cameras) for name, found in inferred.items()

@@ -24,6 +24,7 @@ from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.runtime.versions import versions
 from hloc_reduce.utils.files import write_csv
 from hloc_reduce.utils.images import list_images
+from hloc_reduce.utils.match_files import check_distinct
 from hloc_reduce.utils.parsers import parse_pairs
 
 Thresholds = Mapping[str, tuple[tuple[float, float], ...]]  # of each query list, metres and degrees
@@ -173,7 +174,12 @@ class Run:
 
 
 def check_queries(image_dir: Path, names: list[str], strict: bool) -> None:
-    """Raise an InputError if no query photo exists or, if `strict`, one does not."""
+    """Check the names of queries, and that one of the photos exists or, if `strict`, all do.
+
+    Raises:
+        InputError: if they do not, or if two of the photos have the same name in match files.
+    """
+    check_distinct(names)
     if strict or not any((image_dir / name).is_file() for name in names):
         list_images(image_dir, names)
 

@@ -28,7 +28,7 @@ from ..triangulation import read_matches
 from ..utils import cli
 from ..utils.cli import InputError
 from ..utils.files import announce, delete, is_readable
-from ..utils.match_files import check_names
+from ..utils.match_files import check_distinct
 from ..utils.parsers import parse_pairs
 from . import contradictions
 from .map import FINGERPRINTS, RETRIEVAL, Map
@@ -88,7 +88,7 @@ class Addition:
         self.fingerprints = provenance.fingerprints(files, {})
         digests, before = _digests(self.fingerprints), _digests(known)
         new = self._new(digests, {name: before.get(name) for name in self.inside})
-        check_names([*self.inside, *new])
+        check_distinct([*self.inside, *new])
         images = {name: digests[name] for name in new}
         conf = {"map": self.built.id, "images": images, "num_loc": NUM_LOC, "posed": posed}
         if provenance.read(self.folder / CONF) != conf:

@@ -17,7 +17,7 @@ from ..utils.cli import InputError
 from ..utils.codes import STORAGES
 from ..utils.files import replacing
 from ..utils.images import list_images
-from ..utils.match_files import check_names
+from ..utils.match_files import check_distinct
 from ..utils.paths import strings_as_paths
 from .building import ROUNDS, Building, drop_others
 from .map import FINGERPRINTS, FINISHED, PLACE, Map
@@ -76,7 +76,7 @@ def main(
     if reference is not None and not reference.images:
         raise InputError(f"The model {model} has no images.")
     names = _list(image_dir, reference, accept_partial)
-    check_names(names)
+    check_distinct(names)
     has_points = reference is not None and reference.num_points3D() > 0
     exhaustive = not has_points and len(names) <= MAX_EXHAUSTIVE
     if overwrite or not (map_dir / CONF).exists():

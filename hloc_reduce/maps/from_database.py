@@ -16,7 +16,7 @@ from ..utils import colmap
 from ..utils.cli import InputError, no_folder
 from ..utils.codes import STORAGES
 from ..utils.colmap import StoredDatabase
-from ..utils.match_files import check_names
+from ..utils.match_files import check_distinct
 from ..utils.paths import strings_as_paths
 from .build import begin, claim, digests
 from .map import FINISHED, RETRIEVAL, SFM, Map, keep_projection, write
@@ -67,7 +67,7 @@ def main(
         raise InputError(f"The model {model} has no points: give one that COLMAP reconstructed.")
     with colmap.open_stored(database) as opened:
         names = from_colmap.check(opened, reduction, reference)
-        check_names(names)
+        check_distinct(names)
         cameras = _cameras(reference, names, image_dir)
         told = intrinsics.to_dict(cameras)
         groups = {"database": opened.files(), "model": colmap.model_files(model)}

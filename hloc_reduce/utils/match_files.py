@@ -25,7 +25,7 @@ def name_in_pair(name: str) -> str:
     return name.replace("/", "-")
 
 
-def check_names(names: Iterable[str]) -> None:
+def check_distinct(names: Iterable[str]) -> None:
     """Raise an InputError for two images that have one name in match files, as in hloc's."""
     known: dict[str, str] = {}
     for name in names:

@@ -121,6 +121,11 @@ def test_wrong_input(place, tmp_path, run, refused):
     assert "--num_covis 0" in refused(*build, "--num_covis", 0)
     assert not (outputs / "map").exists()
     run(*build)
+    for name in ("x/1.png", "x-1.png"):
+        (tmp_path / "new/x").mkdir(parents=True, exist_ok=True)
+        shutil.copy(photo, tmp_path / "new" / name)
+    message = refused(*build, "--query_images", tmp_path / "new")
+    assert "x/1.png and x-1.png have the same name in match files" in message
     queries = tmp_path / "list.txt"
     queries.write_text("query/day/gone.png PINHOLE 360 270 375 375 180 135\n")
     new = ("--queries", queries, "--query_images", images)

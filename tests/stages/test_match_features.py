@@ -38,6 +38,33 @@ def test_a_pair_that_is_listed_again_and_reversed_is_matched_once(built, tmp_pat
     assert len(list_h5_names(matches)) == 2
 
 
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        [("x/1.jpg", "db/0.jpg"), ("x-1.jpg", "db/0.jpg")],
+        [("db/0.jpg", "x/1.jpg"), ("db/0.jpg", "x-1.jpg")],
+        [("x/1.jpg", "db/0.jpg"), ("db/0.jpg", "x-1.jpg")],
+    ],
+)
+def test_photos_that_a_match_file_cannot_tell_apart(built, tmp_path, pairs):
+    """The second of them had the matches of the first."""
+    write_pairs(pairs, tmp_path / "pairs.txt")
+    conf, matches = match_features.confs["NN-ratio"], tmp_path / "m.h5"
+    with pytest.raises(InputError, match="x-1.jpg and x/1.jpg have the same name in match files"):
+        match_features.main(conf, tmp_path / "pairs.txt", built.features, matches=matches)
+    assert not matches.exists()
+
+
+def test_names_that_are_alike_in_other_columns_are_no_problem(built, tmp_path):
+    pairs = tmp_path / "pairs.txt"
+    write_pairs([("db-1.jpg", "db/0.jpg"), ("db-1.jpg", "db/1.jpg")], pairs)
+    with h5py.File(built.features, "r+") as file:
+        file.copy("db/2.jpg", "db-1.jpg")
+    conf = match_features.confs["NN-ratio"]
+    matches = match_features.main(conf, pairs, built.features, matches=tmp_path / "m.h5")
+    assert len(list_h5_names(matches)) == 2
+
+
 def test_matches_do_not_overwrite_features(built, tmp_path, monkeypatch, caplog):
     before = built.features.read_bytes()
     pairs = tmp_path / "pairs.txt"
