@@ -245,8 +245,7 @@ class CompactMap:
     def pose(self, name: str) -> pycolmap.Rigid3d:
         """Return the pose of an image, camera from world."""
         i = self._rows[name]
-        rotation = pycolmap.Rotation3d(self._rotations[i].astype(np.float64))
-        return pycolmap.Rigid3d(rotation, self._translations[i])
+        return pycolmap.Rigid3d(rotation_of(self._rotations[i]), self._translations[i])
 
     def __contains__(self, name: str) -> bool:
         return name in self._rows
@@ -267,6 +266,12 @@ class CompactMap:
     def fallback(self, names: list[str]) -> pycolmap.Rigid3d:
         """Return the pose of the first of some images, or without them of the first of all."""
         return self.pose(names[0] if names else self.names[0])
+
+
+def rotation_of(quaternion: np.ndarray) -> pycolmap.Rotation3d:
+    """Return the rotation of a rounded quaternion (4,), x, y, z, w."""
+    exact = quaternion.astype(np.float64)
+    return pycolmap.Rotation3d(exact / np.linalg.norm(exact))
 
 
 def check_model(model: dict, feature: str) -> None:

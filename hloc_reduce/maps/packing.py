@@ -16,7 +16,7 @@ from ..utils.codes import QUANTIZED, STORAGES, store
 from ..utils.files import file_sha256
 from . import points as points_of_map
 from . import signs
-from .compact import VERSION, check_model
+from .compact import VERSION, check_model, rotation_of
 from .points import Points
 
 
@@ -92,10 +92,14 @@ def _add_images(
     images = {image.name: image for image in model.images.values()}
     shown = [images[name] for name in points.names]
     ids = sorted({image.camera_id for image in shown})
-    poses = [image.cam_from_world() for image in shown]
+    quaternions = [image.cam_from_world().rotation.quat for image in shown]
+    rotations = np.array(quaternions, np.float32)
+    # far from the origin, rounded rotations would move the centres, so these stay as they are
+    centers = [image.projection_center() for image in shown]
+    matrices = [rotation_of(quaternion).matrix() for quaternion in rotations]
     tensors["names"] = np.frombuffer("\n".join(points.names).encode(), np.uint8)
-    tensors["rotations"] = np.array([pose.rotation.quat for pose in poses], np.float32)
-    tensors["translations"] = np.array([pose.translation for pose in poses])
+    tensors["rotations"] = rotations
+    tensors["translations"] = -np.einsum("nij,nj->ni", matrices, centers)
     numbers = [ids.index(image.camera_id) for image in shown]
     tensors["camera_of_image"] = np.array(numbers, np.uint32)
     metadata["cameras"] = [intrinsics.to_list(model.cameras[i]) for i in ids]
