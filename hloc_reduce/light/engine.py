@@ -34,6 +34,8 @@ class LightEngine:
         vocabulary: (W, D) float32, of global descriptors.
     """
 
+    takes_codes = True  # as the matcher does, see `matchers.Matcher`
+
     def __init__(self, extract: Extract, matcher: dict, vocabulary: np.ndarray):
         self._extract, self._vocabulary = extract, vocabulary
         self._ratio_threshold = matcher.get("ratio_threshold")

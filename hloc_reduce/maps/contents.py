@@ -19,7 +19,6 @@ from ..pairs_from_retrieval import read_global, similarity
 from ..runtime import parallel
 from ..utils import colmap
 from ..utils.cli import InputError
-from ..utils.codes import FLOATS
 from ..utils.feature_files import dimension, read_descriptors
 from ..utils.h5 import open_h5
 from .compact import CompactMap, is_compact
@@ -28,6 +27,8 @@ from .map import Map
 
 class Engine(Protocol):
     """Computes for a map, see `light.engine.LightEngine` and `maps.engine.TorchEngine`."""
+
+    takes_codes: bool  # of its matcher, see `matchers.Matcher`
 
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
         """Extract the features of a photo, see `extractors.extract`."""
@@ -120,9 +121,7 @@ def _of_folder(path: Path) -> Contents:
     )
     with open_h5(built.features) as file:
         described = {
-            name: engine.prepare(
-                read_descriptors(file, name).restore(unbiased=built.storage not in FLOATS)
-            )
+            name: engine.prepare(read_descriptors(file, name).restore(unbiased=engine.takes_codes))
             for name in names
         }
     shown = {name: np.flatnonzero(reference.point_rows(name) >= 0) for name in names}
@@ -159,7 +158,7 @@ def _of_file(path: Path, onnx: Path | None) -> Contents:
     def match(descriptors: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
         visible = [compact.visible(name) for name in names]
         points = np.unique(np.concatenate([np.zeros(0, np.int64), *visible]))
-        described = compact.descriptors(points, unbiased=compact.storage not in FLOATS)
+        described = compact.descriptors(points, unbiased=engine.takes_codes)
         images = [np.searchsorted(points, part) for part in visible]
         prepared = engine.prepare(descriptors), engine.prepare(described)
         return dict(zip(names, engine.match_points(*prepared, images), strict=True))

@@ -35,7 +35,8 @@ class TorchEngine:
         self._matcher = matchers.load(matcher).eval()
         self._vlad = aggregators.load(RETRIEVAL["model"])
         self._vlad.vocabulary = vocabulary
-        coded = storage not in FLOATS and self._matcher.takes_codes
+        self.takes_codes = self._matcher.takes_codes
+        coded = storage not in FLOATS and self.takes_codes
         # a code is rounded much more than integers are, and they are faster
         self._as_integers = coded and self._device == "cpu"
 

@@ -10,8 +10,11 @@ import pytest
 import torch
 from command import outcome
 
-from hloc_reduce import Localizer, maps
+from hloc_reduce import Localizer, compact, maps
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.maps import contents
+from hloc_reduce.maps.engine import TorchEngine
+from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
 from hloc_reduce.utils import cli, parsers
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.images import UnreadableImage
@@ -186,3 +189,25 @@ def test_names_with_spaces(by_model, plane, tmp_path, run):
         summary, rows = outcome(outputs / "queries-my_list")
         poses = parsers.parse_poses(outputs / "queries-my_list" / summary["poses"])
         assert pose_error(poses["I am 4.png"], true)[0] < 0.02
+
+
+@pytest.mark.parametrize("takes_codes", [True, False])
+def test_only_matchers_that_take_codes_get_them(takes_codes, place, run, monkeypatch):
+    """The others get unit descriptors, as in `match_features`."""
+    build, images, outputs = place
+    run(*build, "--feature", "colmap_sift_sv32", "--storage", "uint2")
+    compact.main(outputs / "place.hlm", outputs / "map")
+    monkeypatch.setattr(NearestNeighbor, "takes_codes", takes_codes)
+    monkeypatch.setattr(contents, "takes", lambda _: False)  # the engine without torch
+    longest, prepare = [], TorchEngine.prepare
+
+    def measured(engine, descriptors):
+        longest.append(np.linalg.norm(descriptors, axis=1).max())
+        return prepare(engine, descriptors)
+
+    monkeypatch.setattr(TorchEngine, "prepare", measured)
+    for path in (outputs / "map", outputs / "place.hlm"):
+        longest.clear()
+        pose, _ = Localizer(path).localize(images / "query/day/a.png")
+        assert pose is not None
+        assert (max(longest) > 1.01) == takes_codes
