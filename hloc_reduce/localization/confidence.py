@@ -163,13 +163,13 @@ def uncertainty(
         degrees_of_freedom: the number of unknown parameters, see `projection`.
     """
     nothing = Uncertainty(np.inf, np.inf, np.inf)
+    equations, unknowns = 2 * len(points2D), degrees_of_freedom
+    if equations <= unknowns:
+        return nothing
     local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
     _, derivatives = project(local / np.median(local[:, 2]))
     jacobian = camera.mean_focal_length() * np.concatenate(derivatives, axis=1)
     jacobian = jacobian[:degrees_of_freedom].T
-    equations, unknowns = jacobian.shape
-    if equations <= unknowns:
-        return nothing
     errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
     measured = (errors**2).sum() / (equations - unknowns)
     noise = max((LEAST_NOISE * photo_scale(camera)) ** 2, measured)

@@ -22,8 +22,8 @@ def find(sfm: pycolmap.Reconstruction) -> dict[str, float]:
         sfm: the map, whose intrinsics were estimated with its poses.
 
     Returns:
-        From name to the standard deviation of the position, as a share of the median distance to
-        the points that the photo sees; the least certain first.
+        From name to the standard deviation of the position, at most 1, as a share of the median
+        depth of the points that the photo sees; the least certain first.
     """
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     taken = Counter(image.camera_id for image in images)
@@ -36,14 +36,17 @@ def find(sfm: pycolmap.Reconstruction) -> dict[str, float]:
         freedom = POSE if taken[image.camera_id] >= MANY else FOCAL
         position, *_ = uncertainty(points2D, points3D, image.cam_from_world(), camera, freedom)
         if position > MAX_POSITION:
-            found[image.name] = float(position)
+            found[image.name] = min(position, 1.0)
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
 def warn(uncertain: dict[str, float]) -> None:
     """Warn of photos whose positions are uncertain, if there are any."""
     if uncertain:
-        named = [f"{name} ({share:.0%})" for name, share in uncertain.items()]
+        named = [
+            f"{name} ({'at least ' * (share == 1)}{100 * share:.0f} %)"
+            for name, share in uncertain.items()
+        ]
         logger.warning(
             "The positions of these photos are uncertain by more than %.0f %% of their distance: "
             "%s. Queries near them may be localized as far off. More photos between them and the "

@@ -1,5 +1,7 @@
 """Photos whose positions the points of a map hardly determine."""
 
+import json
+
 import numpy as np
 import pycolmap
 import pytest
@@ -49,3 +51,16 @@ def test_a_distant_photo_of_a_flat_scene_is_named(distances, depth, one_camera, 
     precision.warn(found)
     assert all(f"{name} (" in caplog.text for name in expected)
     assert bool(caplog.text) == bool(found)
+
+
+def test_a_photo_with_hardly_a_point_is_named(caplog):
+    """JSON has no infinity."""
+    model = seen_from([4, 4, 4, 4], 1)
+    for image_id, kept in ((4, 3), (3, 0)):
+        for i in range(kept, 200):
+            model.delete_observation(image_id, i)
+    found = precision.find(model)
+    assert found["3.jpg"] == found["2.jpg"] == 1
+    precision.warn(found)
+    assert "3.jpg (at least 100 %)" in caplog.text
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
