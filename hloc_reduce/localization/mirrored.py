@@ -16,7 +16,7 @@ import pycolmap
 # agreement and confidence below which poses are doubtful. Those of most mirrored photos have an
 # agreement of at most 0.85 or a confidence of at most 125; two of a castle 0.92 and 432.
 DOUBTFUL = 0.9, 500.0
-SIDED = ("p2", "sx1", "sx2")  # parameters
+SIDED = ("p2", "sx1", "p0", "s0", "s1")  # parameters of OpenCV's models and of Aria's
 
 # from names of queries to files of the features and of the matches of their mirror images
 MirrorImages = Callable[[list[str]], tuple[Path, Path]]
