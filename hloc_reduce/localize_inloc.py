@@ -79,8 +79,7 @@ def main(
     Raises:
         InputError: if an input is missing or broken.
     """
-    if ransac_thresh <= 0:
-        raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
+    stage.check_threshold(ransac_thresh)
     retrieved = parse_retrieval(retrieval)
     if isinstance(queries, Path):
         queries = stage.read_queries(queries)

@@ -73,8 +73,7 @@ def main(
     Raises:
         InputError: if an input is missing or broken, or the map is empty.
     """
-    if ransac_thresh <= 0:
-        raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
+    stage.check_threshold(ransac_thresh)
     config = {"estimation": {"ransac": {"max_error": ransac_thresh}}} | (config or {})
     retrieved = parse_retrieval(retrieval)
     inputs = [retrieval, features, matches]

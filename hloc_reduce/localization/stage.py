@@ -228,6 +228,12 @@ def localize_all(
         yield from progress(found, said, "query", len(tasks))
 
 
+def check_threshold(ransac_thresh: float) -> None:
+    """Raise an InputError for an inlier threshold that is not above 0."""
+    if not ransac_thresh > 0:
+        raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
+
+
 def _by_name(matches: Path) -> dict:
     """Return the configuration of a matcher from the name that hloc gives its match files."""
     named = (conf["model"] for conf in confs.values() if f"_{conf['output']}_" in matches.name)

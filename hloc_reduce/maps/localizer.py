@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from ..localization import intrinsics, mirrored, query
+from ..localization import intrinsics, mirrored, query, stage
 from ..localization.confidence import DEFAULT_GATE, Gate
 from ..localization.query import merged
 from ..localize_sfm import RANSAC_THRESH
@@ -33,7 +33,8 @@ class Localizer:
             `hloc_reduce.export`: features are extracted by ONNX Runtime instead of torch.
 
     Raises:
-        InputError: if it is not a map, or an ONNX file is of another feature.
+        InputError: if it is not a map, an ONNX file is of another feature, or a number is too
+            small.
 
     Example:
         >>> localizer = Localizer("outputs/map")  # doctest: +SKIP
@@ -48,6 +49,9 @@ class Localizer:
         gate: Gate = DEFAULT_GATE,
         onnx: Path | str | None = None,
     ):
+        if num_loc < 1:
+            raise InputError(f"num_loc is {num_loc}: at least 1.")
+        stage.check_threshold(ransac_thresh)
         contents = read(Path(map_dir), None if onnx is None else Path(onnx))
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.workers = parallel.cores()

@@ -211,3 +211,11 @@ def test_only_matchers_that_take_codes_get_them(takes_codes, place, run, monkeyp
         pose, _ = Localizer(path).localize(images / "query/day/a.png")
         assert pose is not None
         assert (max(longest) > 1.01) == takes_codes
+
+
+def test_numbers_that_are_too_small(tmp_path):
+    with pytest.raises(InputError, match="num_loc is 0: at least 1"):
+        Localizer(tmp_path, num_loc=0)
+    for wrong in (0.0, float("nan")):
+        with pytest.raises(InputError, match="ransac_thresh is .*: it must be above 0"):
+            Localizer(tmp_path, ransac_thresh=wrong)
