@@ -42,26 +42,51 @@ def contradicting(
         return []
     distance = common.max() - common
     np.fill_diagonal(distance, 0)
-    joined = average(squareform(distance, checks=False))[:, :2].astype(int)
-    belongs = np.eye(2 * number - 1, number)  # photos to groups
-    for new, pair in enumerate(joined, number):
-        belongs[new] = belongs[pair].sum(axis=0)
-    sizes = belongs.sum(axis=1)
+    linkage = average(squareform(distance, checks=False))
+    joined = linkage[:, :2].astype(int)
+    sizes = np.concatenate([np.ones(number), linkage[:, 3]])
 
     def shares_of(pairs: np.ndarray, sums: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """Return what pairs of groups (P, 2) share of what is expected, inf without evidence."""
         evident = (wanted > 0) & enough(wanted, *sizes[pairs.T])
         return np.divide(sums, wanted, out=np.full_like(sums, np.inf), where=evident)
 
-    pairs, both = joined, belongs[joined]
-    totals = [((both[:, 0] @ values) * both[:, 1]).sum(axis=1) for values in (common, expected)]
+    pairs, totals = joined, [_sums(values, joined) for values in (common, expected)]
     shares = shares_of(pairs, *totals)
     worst = shares.argmin()
     if shares[worst] >= share and apart > 0 and number <= MOST:
+        belongs = np.zeros((len(sizes), number))  # photos to groups
+        for group in range(len(sizes)):
+            belongs[group, _members(group, joined)] = 1
         pairs = np.argwhere(np.triu(belongs @ belongs.T == 0))
         totals = [(belongs @ values @ belongs.T)[tuple(pairs.T)] for values in (common, expected)]
         shares = shares_of(pairs, *totals)
         share, worst = apart, np.where(shares < apart, totals[1], 0).argmax()
     if shares[worst] >= share:
         return []
-    return np.flatnonzero(belongs[min(pairs[worst][::-1], key=sizes.__getitem__)]).tolist()
+    return sorted(_members(min(pairs[worst][::-1], key=sizes.__getitem__), joined))
+
+
+def _sums(values: np.ndarray, joined: np.ndarray) -> np.ndarray:
+    """Return the sums (N - 1,) of values (N, N), symmetric, between the groups that are joined."""
+    number = len(values)
+    between, row = values.copy(), np.arange(2 * number - 1)  # of each group its row in `between`
+    sums = np.empty(len(joined))
+    for new, (first, second) in enumerate(joined):
+        i, j = row[first], row[second]
+        sums[new] = between[i, j]
+        between[i] += between[j]
+        between[:, i] = between[i]
+        row[number + new] = i
+    return sums
+
+
+def _members(group: int, joined: np.ndarray) -> list[int]:
+    """Return the photos of a group: of one photo, or of two groups that are joined (N - 1, 2)."""
+    number, members, groups = len(joined) + 1, [], [group]
+    while groups:
+        if (other := int(groups.pop())) < number:
+            members.append(other)
+        else:
+            groups += joined[other - number].tolist()
+    return members
