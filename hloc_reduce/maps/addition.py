@@ -27,7 +27,9 @@ from ..runtime.outputs import CONF
 from ..triangulation import read_matches
 from ..utils import cli
 from ..utils.cli import InputError
+from ..utils.feature_files import get_image_size
 from ..utils.files import announce, delete, is_readable
+from ..utils.h5 import open_h5
 from ..utils.match_files import check_distinct
 from ..utils.parsers import parse_pairs
 from . import contradictions
@@ -147,15 +149,19 @@ class Addition:
     def place(self, reference: pycolmap.Reconstruction, names: list[str]) -> None:
         """Add photos with the poses of a model."""
         images = {image.name: image for image in reference.images.values()}
-        placed = {
-            name: Placed(
-                *(images[name].cam_from_world(), reference.cameras[images[name].camera_id]),
-                known=True,
-                fixed=True,
-            )
-            for name in names
-        }
-        self._extend(placed, [self._pairs(names, [*self.inside, *names], "posed")])
+        placed, resized = {}, []
+        with open_h5(self.features) as file:
+            for name in names:
+                camera = reference.cameras[images[name].camera_id]
+                width, height = get_image_size(file, name)
+                if (width, height) != (camera.width, camera.height):
+                    resized.append(name)
+                    continue
+                pose = images[name].cam_from_world()
+                placed[name] = Placed(pose, camera, known=True, fixed=True)
+        self._leave_out("of another size than their cameras in the model", resized)
+        if placed:
+            self._extend(placed, [self._pairs([*placed], [*self.inside, *placed], "posed")])
 
     def localize(self, names: list[str]) -> None:
         """Localize photos in the map and add them; then those that are left, in the new map."""

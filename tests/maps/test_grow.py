@@ -210,6 +210,15 @@ def test_a_pose_in_another_frame_is_refused(grown, tmp_path, refused):
     assert names(folder) == BASE
 
 
+def test_a_photo_of_another_size_than_its_camera_is_refused(grown, refused):
+    folder, new, model = grown
+    photo = cv2.imread(str(new / NEW))
+    cv2.imwrite(str(new / NEW), cv2.resize(photo, (180, 135)))
+    message = refused("--map", folder, "--add_images", new, "--add_model", model)
+    assert f"of another size than their cameras in the model: {NEW}." in message
+    assert names(folder) == BASE
+
+
 def _kill(stage: str, folder, new, model) -> None:
     """Add photos in a process that is killed when a stage begins."""
     module, _, name = stage.rpartition(".")
