@@ -20,7 +20,7 @@ from ..utils.codes import CODED, STORAGES
 from ..utils.parsers import read_yaml
 from ..utils.tables import aligned
 
-RECOMMENDED = "colmap_sift_sv64"  # needs no download and runs fastest (docs/features.md)
+RECOMMENDED = "colmap_sift_sv64"  # needs no download (docs/features.md)
 DIMS = (64, 32, 24, 16)
 # the schemes and dimensions of the projections of each base descriptor; and who has a nested one
 PROJECTIONS: dict[str, tuple[tuple[str, ...], tuple[int, ...]]] = {

@@ -19,7 +19,7 @@ ANGLE, DISTANCE = 15.0, 1.5
 REACH = np.sqrt(1 + DISTANCE**2 - 2 * DISTANCE * np.cos(np.radians(ANGLE)))
 # Two groups of photos that share less of the expected points contradict each other, if a photo of
 # one expects enough of them in one of the other, on average. Sound maps share a quarter and more,
-# the two that were merged by mistake 1 and 10 % (docs/results.md).
+# the two that were merged by mistake 1 and 10 % (docs/maps.md).
 SHARE, ENOUGH = 0.15, 100
 # The same for any two groups, also of sides that the mapper did not connect directly: sound maps
 # share a tenth and more, a pillar with two equal sides 0 %.
