@@ -23,6 +23,7 @@ DAMPING = 1e-3  # of the first step
 TINY = 1e-9  # least diagonal of the damping
 ENOUGH = 1e-6  # relative gain of the last step
 FAR = 1e6  # pixels
+BEHIND = 1e6  # the square of a point behind the camera, in units of the noise
 # The search for all parameters: in a sample of SAMPLE matches with errors up to NEAR thresholds, it
 # starts with principal points in the middle and CORNER of width and height away from it.
 SAMPLE, NEAR, CORNER = 400, 5, 0.4
@@ -372,7 +373,7 @@ def _fit(
     free = slice(degrees_of_freedom - POSE)
     for _ in range(EVALUATIONS):
         residuals, derivatives, front = trial.residuals(points2D, points3D)
-        squares = np.where(front, (residuals / noise) ** 2, FAR).ravel()
+        squares = np.where(front, (residuals / noise) ** 2, BEHIND).ravel()
         change = trial.change(start)
         loss = np.log1p(squares).sum() + (change**2).sum()
         if loss < least:
