@@ -66,6 +66,7 @@ def imprecision(matches: Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d) 
     for freedom, (far, turned), reason in limits:
         position, rotation, _ = uncertainty(*inliers, cam_from_world, pose.camera, freedom)
         hint = "; known intrinsics would help" if matches.is_focal_length_free else ""
+        position, rotation = min(position, 1.0), min(rotation, 180.0)  # of infinite ones
         if position > far * MAX_POSITION or rotation > turned * MAX_ROTATION:
             return (
                 f"{reason} position is uncertain by {_up(100 * position):.1f} % of the distance "
