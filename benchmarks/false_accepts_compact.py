@@ -1,0 +1,117 @@
+"""Count wrong poses that are accepted in compact maps, whose matcher is NN-ratio90.
+
+Each map has two thirds of the photos of a COLMAP model. It is packed, and tried with its other
+photos, with these mirrored, and with photos of the other places, all without intrinsics. Prints a
+Markdown table; an interrupted run resumes with the next place.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from hloc_reduce import Localizer, compact, maps
+from hloc_reduce.training.tracks import parse_maps
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.files import replacing
+from hloc_reduce.utils.images import list_images, read_image
+from hloc_reduce.utils.progress import progress
+
+EVERY = 3  # photos, of which one is held out
+WRONG = 0.05, 4.0  # of the median depth of the inliers, degrees
+COLUMNS = ("place", "own", "localized", "wrong", "mirrored", "localized", "others", "localized")
+
+
+def build(images: Path, model: Path, output: Path, feature: str) -> tuple[Path, dict]:
+    """Pack a map of two thirds of the photos of a model; return also the poses of the others."""
+    photos = sorted(colmap.read_model(model).images.values(), key=lambda image: image.name)
+    held_out = {photo.name: photo.cam_from_world() for photo in photos[1::EVERY]}
+    kept = {photo.name for photo in photos} - held_out.keys()
+    part = colmap.write_part(model, kept, output / "model")
+    built = maps.main(output / "map", images, part, feature=feature)
+    compact.main(output / "place.hlm", built.folder)
+    return output / "place.hlm", held_out
+
+
+def is_wrong(pose: pycolmap.Rigid3d, info: dict, truth: pycolmap.Rigid3d) -> bool:
+    """Tell whether a pose is off by more than a share of the distance, or degrees."""
+    difference = pose * truth.inverse()
+    inliers = info["points3D"][info["inliers"]]
+    depth = np.median((truth * inliers)[:, 2])
+    moved = np.linalg.norm(pose.inverse().translation - truth.inverse().translation)
+    return moved > WRONG[0] * depth or np.degrees(difference.rotation.angle()) > WRONG[1]
+
+
+def try_place(
+    name: str, places: dict[str, tuple[Path, Path]], output: Path, args: argparse.Namespace
+) -> dict[str, int]:
+    """Localize photos in the map of a place, and count."""
+    images, model = places[name]
+    path, truth = build(images, model, output, args.feature)
+    localizer = Localizer(path)
+    generator = np.random.default_rng(0)
+    own = generator.permutation(sorted(truth))[: args.trials].tolist()
+    same = next(({*group} for group in args.same if name in group), {name})
+    others = [
+        folder / other
+        for key, (folder, _) in places.items()
+        if key not in same
+        for other in generator.permutation(list_images(folder))[: args.trials]
+    ]
+    counts = {"own": len(own), "own localized": 0, "own wrong": 0, "mirrored": len(own)}
+    counts |= {"mirrored localized": 0, "others": len(others), "others localized": 0}
+    for photo in progress(own, f"Own photos of {name}", "photo"):
+        pixels = read_image(images / photo)
+        pose, info = localizer.localize(images / photo)
+        if pose is not None:
+            counts["own localized"] += 1
+            counts["own wrong"] += bool(is_wrong(pose, info, truth[photo]))
+        flipped, _ = localizer.localize(np.ascontiguousarray(pixels[:, ::-1]))
+        counts["mirrored localized"] += flipped is not None
+    for other in progress(others, f"Photos of others in {name}", "photo"):
+        counts["others localized"] += localizer.localize(other)[0] is not None
+    return counts
+
+
+def _main() -> None:
+    parser = cli.Parser(
+        __doc__,
+        "--map scenes/fox/images:scenes/fox/sparse "
+        "--map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv32",
+    )
+    parser.add_argument(
+        "--map", action="append", default=[], metavar="IMAGES:MODEL", help="may be repeated"
+    )
+    parser.add_argument("--feature", default="colmap_sift_sv32")
+    parser.add_argument("--trials", type=int, default=12, help="photos of each place, per map")
+    parser.add_argument(
+        "--same",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar="PLACE",
+        help="places that see each other, whose photos are not tried as wrong ones",
+    )
+    parser.add_argument("--output", type=Path, default=Path("outputs/false_accepts_compact"))
+    args = parser.parse_args()
+    cli.check_positive(args, "trials")
+    places = parse_maps(args.map)
+    print(f"| {' | '.join(COLUMNS)} |\n| --- |{' ---: |' * (len(COLUMNS) - 1)}")
+    sums = np.zeros(len(COLUMNS) - 1, int)
+    for name in places:
+        folder = args.output / args.feature / name
+        file = folder / f"counts-{args.trials}.json"
+        if not file.exists():
+            counts = try_place(name, places, folder, args)
+            with replacing(file) as temporary:
+                temporary.write_text(json.dumps(counts))
+        row = [*json.loads(file.read_text()).values()]
+        sums += row
+        print(f"| {name} | {' | '.join(map(str, row))} |", flush=True)
+    print(f"| all | {' | '.join(map(str, sums))} |")
+
+
+if __name__ == "__main__":
+    cli.run(_main)
