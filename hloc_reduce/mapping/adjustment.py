@@ -2,10 +2,12 @@
 
 import copy
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pycolmap
 
+from ..localization.projection import POSE, reprojection_errors
 from ..utils import colmap
 from .extension import OPTIONS
 
@@ -51,6 +53,49 @@ def with_one_camera(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 
 def adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool = False) -> float:
     """Adjust a model, in place, and return its mean reprojection error in pixels."""
+    _adjuster(sfm, refine_principal_point).solve()
+    sfm.update_point_3d_errors()
+    return sfm.compute_mean_reprojection_error()
+
+
+def focal_length_deviations(sfm: pycolmap.Reconstruction) -> dict[int, float]:
+    """Estimate how precisely an adjustment of a model determines its focal lengths.
+
+    Poses, points and distortions are as unknown as these.
+
+    Returns:
+        From camera to the standard deviation of its focal length, as a share, to first order from
+        the reprojection errors; infinite if the adjustment does not determine all parameters.
+    """
+    images = [sfm.images[i] for i in sfm.reg_image_ids()]
+    cameras = {image.camera_id: sfm.cameras[image.camera_id] for image in images}
+    squares = np.concatenate([_errors(sfm, image) for image in images]) ** 2
+    redundancy = 2 * len(squares) - 3 * sfm.num_points3D() - POSE * len(images)
+    covariance = colmap.covariance(sfm, _adjuster(sfm))
+    if covariance is None or redundancy <= 0:
+        return dict.fromkeys(cameras, np.inf)
+    found = {}
+    for camera_id, camera in cameras.items():
+        (first, *_) = camera.focal_length_idxs()
+        block = covariance.get_other_params_cov(camera.params)
+        variance = np.nan if block is None else block[first, first]
+        relative = variance / camera.params[first] ** 2
+        found[camera_id] = float(np.sqrt(squares.sum() / redundancy * relative))
+    # of a covariance that is nearly singular, some are wrong by chance
+    return found if all(one < 1 for one in found.values()) else dict.fromkeys(cameras, np.inf)
+
+
+def _errors(sfm: pycolmap.Reconstruction, image: pycolmap.Image) -> np.ndarray:
+    """Return the reprojection errors (M,) of the points that an image sees, in pixels."""
+    seen = [point for point in image.points2D if point.has_point3D()]
+    points2D = np.array([point.xy for point in seen]).reshape(-1, 2)
+    points3D = np.array([sfm.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3)
+    view = image.cam_from_world(), sfm.cameras[image.camera_id]
+    return reprojection_errors(points2D, points3D, *view)[0]
+
+
+def _adjuster(sfm: pycolmap.Reconstruction, refine_principal_point: bool = False) -> Any:
+    """Prepare the adjustment of a whole model."""
     options = OPTIONS.get_global_bundle_adjustment()
     options.refine_principal_point = refine_principal_point
     options.print_summary = False
@@ -61,6 +106,4 @@ def adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool = 
     for image_id in sfm.reg_image_ids():
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, sfm).solve()
-    sfm.update_point_3d_errors()
-    return sfm.compute_mean_reprojection_error()
+    return colmap.bundle_adjuster(sfm, options, config)

@@ -179,10 +179,7 @@ class Map:
 
     @property
     def doubts(self) -> list[str]:
-        """Why its photos may be misplaced, and queries with them, in a few words each.
-
-        Photos of uncertain positions are none of them: these need not be wrong.
-        """
+        """Why its photos may be misplaced, and queries with them, in a few words each."""
         is_cropped = self.cropped or self.cropping.altered or self.cropping.gain > cropping.GAIN
         factor = self.doubtful_focal_lengths
         reasons = {
@@ -190,6 +187,7 @@ class Map:
             "photos that others place elsewhere": self.contradicting,
             "photos whose matches fit their poses badly": self.fitting_badly,
             "photos that may be cropped or enlarged": is_cropped,
+            "photos whose positions are uncertain": self.uncertain,
         }
         found = [reason for reason, is_one in reasons.items() if is_one]
         return found + [doubt for doubt in self._doubts if doubt not in found]

@@ -14,6 +14,8 @@ from .databases import (
     write_reference,
 )
 from .estimators import (
+    bundle_adjuster,
+    covariance,
     estimate_pose,
     incremental_mapping,
     mapper_options,

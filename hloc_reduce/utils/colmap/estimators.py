@@ -105,6 +105,24 @@ def incremental_mapping(
     return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
 
+def bundle_adjuster(
+    sfm: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
+    config: pycolmap.BundleAdjustmentConfig,
+) -> Any:
+    """Prepare a bundle adjustment by Ceres, which versions of pycolmap name differently."""
+    create = getattr(pycolmap, "create_default_ceres_bundle_adjuster", None)
+    return (create or pycolmap.create_default_bundle_adjuster)(options, config, sfm)
+
+
+def covariance(sfm: pycolmap.Reconstruction, adjuster: Any) -> pycolmap.BACovariance | None:
+    """Return the covariance of all that a `bundle_adjuster` estimates, None if it is singular."""
+    options = pycolmap.BACovarianceOptions()
+    options.params = pycolmap.BACovarianceOptionsParams.ALL
+    with _log(False, pycolmap.logging.Level.FATAL):
+        return pycolmap.estimate_ba_covariance(options, sfm, adjuster)
+
+
 @contextmanager
 def _log(
     verbose: bool, least: pycolmap.logging.Level = pycolmap.logging.Level.WARNING
