@@ -21,7 +21,7 @@ TOLERANT = 1.2
 
 STRETCHED = (
     "it may be cropped or stretched: another principal point and aspect ratio fit about as well, "
-    "and the pose differs"
+    "and the pose differs; known intrinsics would help"
 )
 
 

@@ -48,6 +48,7 @@ class Map:
         matcher: key of `confs.matchers`.
         images: folder of the photos.
         num_images: images with a pose.
+        is_partial: whether these are fewer than half of all images.
         contradicting: images whose poses contradict the others.
         uncertain: images whose positions are uncertain, see `precision.find`.
         fitting_badly: images whose matches fit their poses badly, see `misfits.find`.
@@ -91,6 +92,7 @@ class Map:
         self.matcher = choose("matcher", content["matcher"], matchers_confs.confs)
         self.images = Path(content["image_dir"])
         self.num_images = int(content["images_with_pose"])
+        self.is_partial = self.num_images < registration.LEAST * int(content.get("images", 0))
         self.contradicting = list(content.get("images_contradicting_others", []))
         found = content.get("images_of_uncertain_position", {}).items()
         self.uncertain = {str(name): float(share) for name, share in found}
@@ -188,6 +190,7 @@ class Map:
             "photos whose matches fit their poses badly": self.fitting_badly,
             "photos that may be cropped or enlarged": is_cropped,
             "photos whose positions are uncertain": self.uncertain,
+            "fewer than half of its photos": self.is_partial,
         }
         found = [reason for reason, is_one in reasons.items() if is_one]
         return found + [doubt for doubt in self._doubts if doubt not in found]
