@@ -146,6 +146,7 @@ def warn(fit: Fit, unlike_others: Sequence[str] = (), cropped: Sequence[str] = (
             "The photos fit %.0f %% better if their principal points are not in their centres: "
             "they may be cropped, or have wrong focal lengths, and positions may be off by a tenth "
             "of the distance and more. Uncropped photos or a COLMAP model with known intrinsics "
-            "help; so does --camera_mode single, if one camera took all photos and the map has several.",
+            "help; so does --camera_mode single, if one camera took all photos and the map has "
+            "several.",
             100 * fit.gain,
         )
