@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 import pycolmap
 import torch
-from false_accepts_tables import RESHAPED, levels, own_table, plot, table
+from false_accepts_tables import RESHAPED, add_places, levels, own_table, plot, table
 
 from hloc_reduce import extract_features, localize_inloc, maps, projections
 from hloc_reduce.confs import features as features_confs
@@ -398,9 +398,7 @@ def _main() -> None:
         "--map scenes/fox/images:scenes/fox/sparse "
         "--map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv64",
     )
-    parser.add_argument(
-        "--map", action="append", default=[], metavar="IMAGES:MODEL", help="may be repeated"
-    )
+    add_places(parser)
     parser.add_argument(
         "--dataset", type=Path, action="append", default=[], help="in Aachen's or InLoc's layout"
     )
@@ -417,14 +415,6 @@ def _main() -> None:
     parser.add_argument("--trials", type=int, default=85, help="photos of other places, per map")
     parser.add_argument(
         "--seed", type=int, default=0, help="seed of the maps and of the drawn photos"
-    )
-    parser.add_argument(
-        "--same",
-        nargs="+",
-        action="append",
-        default=[],
-        metavar="PLACE",
-        help="places that see each other, whose photos are not tried as wrong ones",
     )
     parser.add_argument("--output", type=Path, default=Path("outputs/false_accepts"))
     args = parser.parse_args()

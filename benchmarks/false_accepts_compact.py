@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from false_accepts_tables import add_places
 
 from hloc_reduce import Localizer, compact, maps
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.files import replacing
 from hloc_reduce.utils.images import list_images, read_image
 from hloc_reduce.utils.progress import progress
@@ -81,23 +83,15 @@ def _main() -> None:
         "--map scenes/fox/images:scenes/fox/sparse "
         "--map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv32",
     )
-    parser.add_argument(
-        "--map", action="append", default=[], metavar="IMAGES:MODEL", help="may be repeated"
-    )
+    add_places(parser)
     parser.add_argument("--feature", default="colmap_sift_sv32")
     parser.add_argument("--trials", type=int, default=12, help="photos of each place, per map")
-    parser.add_argument(
-        "--same",
-        nargs="+",
-        action="append",
-        default=[],
-        metavar="PLACE",
-        help="places that see each other, whose photos are not tried as wrong ones",
-    )
     parser.add_argument("--output", type=Path, default=Path("outputs/false_accepts_compact"))
     args = parser.parse_args()
     cli.check_positive(args, "trials")
     places = parse_maps(args.map)
+    if len(places) < 2:
+        raise InputError("Give two or more --map.")
     print(f"| {' | '.join(COLUMNS)} |\n| --- |{' ---: |' * (len(COLUMNS) - 1)}")
     sums = np.zeros(len(COLUMNS) - 1, int)
     for name in places:

@@ -1,9 +1,10 @@
-"""Tables and the curve of `false_accepts.py`, from the rows of its trials.csv."""
+"""What `false_accepts.py` prints of its trials.csv, and options of both benchmarks."""
 
 from pathlib import Path
 
 import numpy as np
 
+from hloc_reduce.utils.cli import Parser
 from hloc_reduce.utils.files import replacing
 
 LEVELS = (0, 2, 4, 6, 8, 10, 15, 20, 30)
@@ -120,3 +121,18 @@ def plot(rows: list[dict], same: list[set[str]], path: Path) -> None:
     figure.tight_layout()
     with replacing(path) as temporary:
         figure.savefig(temporary, format="svg", metadata={"Date": None})
+
+
+def add_places(parser: Parser) -> None:
+    """Add --map and --same."""
+    parser.add_argument(
+        "--map", action="append", default=[], metavar="IMAGES:MODEL", help="may be repeated"
+    )
+    parser.add_argument(
+        "--same",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar="PLACE",
+        help="places that see each other, whose photos are not tried as wrong ones",
+    )
