@@ -1,7 +1,7 @@
 """Bundle adjustment of a whole model with other cameras than those that it was built with."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,10 @@ import pycolmap
 from ..localization.projection import POSE, reprojection_errors
 from ..utils import colmap
 from .extension import OPTIONS
+
+Model = pycolmap.CameraModelId
+# of cameras whose intrinsics the mapper estimates
+ESTIMATED = {Model.SIMPLE_PINHOLE, Model.PINHOLE, Model.SIMPLE_RADIAL, Model.RADIAL}
 
 
 def with_cameras(
@@ -61,7 +65,8 @@ def adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool = 
 def focal_length_deviations(sfm: pycolmap.Reconstruction) -> dict[int, float]:
     """Estimate how precisely an adjustment of a model determines its focal lengths.
 
-    Poses, points and distortions are as unknown as these.
+    Poses, points and distortions are as unknown as these. Cameras of other models than
+    `ESTIMATED`, which somebody gave, are taken for known.
 
     Returns:
         From camera to the standard deviation of its focal length, as a share, to first order from
@@ -69,9 +74,11 @@ def focal_length_deviations(sfm: pycolmap.Reconstruction) -> dict[int, float]:
     """
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     cameras = {image.camera_id: sfm.cameras[image.camera_id] for image in images}
+    cameras = {i: camera for i, camera in cameras.items() if camera.model in ESTIMATED}
     squares = np.concatenate([_errors(sfm, image) for image in images]) ** 2
+    squares = squares[np.isfinite(squares)]  # not those of points behind a camera
     redundancy = 2 * len(squares) - 3 * sfm.num_points3D() - POSE * len(images)
-    covariance = colmap.covariance(sfm, _adjuster(sfm))
+    covariance = colmap.covariance(sfm, _adjuster(sfm, known={*sfm.cameras} - {*cameras}))
     if covariance is None or redundancy <= 0:
         return dict.fromkeys(cameras, np.inf)
     found = {}
@@ -94,8 +101,12 @@ def _errors(sfm: pycolmap.Reconstruction, image: pycolmap.Image) -> np.ndarray:
     return reprojection_errors(points2D, points3D, *view)[0]
 
 
-def _adjuster(sfm: pycolmap.Reconstruction, refine_principal_point: bool = False) -> Any:
-    """Prepare the adjustment of a whole model."""
+def _adjuster(
+    sfm: pycolmap.Reconstruction,
+    refine_principal_point: bool = False,
+    known: Iterable[int] = (),
+) -> Any:
+    """Prepare the adjustment of a whole model, but for the intrinsics of known cameras."""
     options = OPTIONS.get_global_bundle_adjustment()
     options.refine_principal_point = refine_principal_point
     options.print_summary = False
@@ -105,5 +116,7 @@ def _adjuster(sfm: pycolmap.Reconstruction, refine_principal_point: bool = False
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sfm.reg_image_ids():
         config.add_image(image_id)
+    for camera_id in known:
+        config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     return colmap.bundle_adjuster(sfm, options, config)

@@ -1,5 +1,6 @@
 """Find photos of a map of photos alone whose positions its points hardly determine."""
 
+import copy
 from collections import Counter
 
 import numpy as np
@@ -8,13 +9,15 @@ import pycolmap
 from .. import logger
 from ..localization.confidence import MAX_POSITION, uncertainty
 from ..localization.projection import FOCAL, POSE
-from ..mapping.adjustment import focal_length_deviations
+from ..mapping import extension
+from ..mapping.adjustment import focal_length_deviations, with_cameras
 from ..mapping.plausibility import MANY
 from ..utils import cli
 
 # Photos whose focal lengths a map determines to 2 to 7 % were 5 to 37 % off: the points of a bent
 # map err together, so that its photos are off by a multiple of what independent errors explain.
 BENT = 2.5
+VAGUE = 0.1  # share of the focal length: photos whose points tell it less are not tried with others
 LARGEST = 200  # photos: of more, the focal lengths are not tried
 
 
@@ -35,20 +38,37 @@ def find(sfm: pycolmap.Reconstruction) -> dict[str, float]:
     """
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     taken = Counter(image.camera_id for image in images)
-    deviations = focal_length_deviations(sfm) if len(images) <= LARGEST else {}
-    found = {}
+    several = {camera_id for camera_id, number in taken.items() if number >= MANY}
+    found, vague = {}, []
     for image in images:
         seen = [point for point in image.points2D if point.has_point3D()]
         points2D = np.array([point.xy for point in seen]).reshape(-1, 2)
         points3D = np.array([sfm.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3)
-        camera = sfm.cameras[image.camera_id]
-        freedom = POSE if taken[image.camera_id] >= MANY else FOCAL
-        position, *_ = uncertainty(points2D, points3D, image.cam_from_world(), camera, freedom)
-        if freedom == FOCAL:
-            position = max(position, BENT * deviations.get(image.camera_id, 0.0))
-        if position > MAX_POSITION:
-            found[image.name] = min(position, 1.0)
-    return dict(sorted(found.items(), key=lambda item: -item[1]))
+        view = image.cam_from_world(), sfm.cameras[image.camera_id]
+        own = uncertainty(points2D, points3D, *view, POSE if image.camera_id in several else FOCAL)
+        found[image.name] = own.position
+        if not (own.position < 1 and own.focal_length < VAGUE):
+            vague.append(image.name)
+    if len(images) - len(vague) > 1 and len(images) <= LARGEST:
+        deviations = focal_length_deviations(_without(sfm, vague))
+        for image in images:
+            if image.camera_id in deviations and image.camera_id not in several:
+                together = BENT * deviations[image.camera_id]
+                found[image.name] = max(found[image.name], together)
+    uncertain = {name: min(share, 1.0) for name, share in found.items() if share > MAX_POSITION}
+    return dict(sorted(uncertain.items(), key=lambda item: -item[1]))
+
+
+def _without(sfm: pycolmap.Reconstruction, names: list[str]) -> pycolmap.Reconstruction:
+    """Return a model without some of its photos, whose parameters would make others uncertain."""
+    if not names:
+        return sfm
+    rest = copy.deepcopy(sfm)
+    extension.remove(rest, names)
+    # COLMAP computes no covariance of a model with frames that have no pose
+    return with_cameras(
+        rest, lambda image_id: copy.deepcopy(sfm.cameras[sfm.images[image_id].camera_id])
+    )
 
 
 def warn(uncertain: dict[str, float]) -> None:

@@ -61,14 +61,26 @@ def test_photos_of_uncertain_positions_are_named(
     assert bool(caplog.text) == bool(found)
 
 
-def test_a_photo_with_hardly_a_point_is_named(caplog):
-    """JSON has no infinity."""
-    model = seen_from([4, 4, 4, 4], 1)
-    for image_id, kept in ((4, 3), (3, 0)):
+def test_photos_that_see_little_do_not_make_others_uncertain(caplog):
+    """Some with hardly a point, and one far away that sees a few; JSON has no infinity."""
+    model = seen_from([4, 4, 4, 4, 4, 4, 40], 1)
+    for image_id, kept in ((5, 3), (6, 0), (7, 8)):
         for i in range(kept, 200):
             model.delete_observation(image_id, i)
     found = precision.find(model)
-    assert found["3.jpg"] == found["2.jpg"] == 1
+    assert found.keys() == {"4.jpg", "5.jpg", "6.jpg"} and found["4.jpg"] == found["5.jpg"] == 1
     precision.warn(found)
-    assert "3.jpg (at least 100 %)" in caplog.text
+    assert "4.jpg (at least 100 %)" in caplog.text
     assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
+def test_given_intrinsics_are_known(caplog):
+    """Such as those of a photo that was added with them: their models may be degenerate."""
+    model = seen_from([4, 4, 4, 4, 4, 4], 1)
+    camera = model.cameras[6]
+    focal_length, *centre = camera.params
+    params = [focal_length, focal_length, *centre, *8 * [0.0]]
+    model.cameras[6] = pycolmap.Camera(
+        model="FULL_OPENCV", width=1000, height=800, params=params, camera_id=6
+    )
+    assert precision.find(model) == {}
