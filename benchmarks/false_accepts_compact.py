@@ -6,7 +6,6 @@ Markdown table; an interrupted run resumes with the next place.
 """
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +13,10 @@ import pycolmap
 from false_accepts_tables import add_places
 
 from hloc_reduce import Localizer, compact, maps
+from hloc_reduce.runtime import provenance
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.files import replacing
 from hloc_reduce.utils.images import list_images, read_image
 from hloc_reduce.utils.progress import progress
 
@@ -66,14 +65,14 @@ def try_place(
     counts |= {"mirrored localized": 0, "others": len(others), "others localized": 0}
     for photo in progress(own, f"Own photos of {name}", "photo"):
         pixels = read_image(images / photo)
-        pose, info = localizer.localize(images / photo)
+        pose, info = localizer.localize(pixels)
         if pose is not None:
             counts["own localized"] += 1
             counts["own wrong"] += bool(is_wrong(pose, info, truth[photo]))
         flipped, _ = localizer.localize(np.ascontiguousarray(pixels[:, ::-1]))
         counts["mirrored localized"] += flipped is not None
     for other in progress(others, f"Photos of others in {name}", "photo"):
-        counts["others localized"] += localizer.localize(other)[0] is not None
+        counts["others localized"] += localizer.localize(read_image(other))[0] is not None
     return counts
 
 
@@ -97,11 +96,11 @@ def _main() -> None:
     for name in places:
         folder = args.output / args.feature / name
         file = folder / f"counts-{args.trials}.json"
-        if not file.exists():
+        tried = {"places": sorted(places), "same": args.same}
+        if provenance.read(file).get("tried") != tried:
             counts = try_place(name, places, folder, args)
-            with replacing(file) as temporary:
-                temporary.write_text(json.dumps(counts))
-        row = [*json.loads(file.read_text()).values()]
+            provenance.write(file, {"tried": tried, "counts": counts})
+        row = [*provenance.read(file)["counts"].values()]
         sums += row
         print(f"| {name} | {' | '.join(map(str, row))} |", flush=True)
     print(f"| all | {' | '.join(map(str, sums))} |")

@@ -66,19 +66,18 @@ def imprecision(matches: Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d) 
     for freedom, (far, turned), reason in limits:
         position, rotation, _ = uncertainty(*inliers, cam_from_world, pose.camera, freedom)
         hint = "; known intrinsics would help" if matches.is_focal_length_free else ""
-        position, rotation = min(position, 1.0), min(rotation, 180.0)  # of infinite ones
         if position > far * MAX_POSITION or rotation > turned * MAX_ROTATION:
             return (
-                f"{reason} position is uncertain by {_up(100 * position):.1f} % of the distance "
-                f"(at most {100 * far * MAX_POSITION:.0f} %), its rotation by "
-                f"{_up(rotation):.1f} degrees (at most {turned * MAX_ROTATION:.0f}){hint}"
+                f"{reason} position is uncertain by {_up_to(100, 100 * position)} % of the "
+                f"distance (at most {100 * far * MAX_POSITION:.0f} %), its rotation by "
+                f"{_up_to(180, rotation)} degrees (at most {turned * MAX_ROTATION:.0f}){hint}"
             )
     return None
 
 
-def _up(value: float) -> float:
+def _up_to(most: float, value: float) -> str:
     """Round up to tenths: what is above a limit is not to be printed as the limit."""
-    return np.ceil(10 * value) / 10
+    return f"{np.ceil(10 * value) / 10:.1f}" if value < most else f"at least {most:.0f}"
 
 
 def _down(value: float, digits: int) -> str:

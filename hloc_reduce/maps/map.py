@@ -20,7 +20,7 @@ from ..utils import colmap
 from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import STORAGES
 from ..utils.files import replacing
-from ..utils.h5 import file_provenance, get_dataset, open_h5
+from ..utils.h5 import file_provenance, get_dataset, list_h5_names, open_h5
 from ..utils.paths import strings_as_paths
 from . import contradictions, cropping, mirrored_photos, misfits, precision
 
@@ -48,7 +48,6 @@ class Map:
         matcher: key of `confs.matchers`.
         images: folder of the photos.
         num_images: images with a pose.
-        is_partial: whether these are fewer than half of all images.
         contradicting: images whose poses contradict the others.
         uncertain: images whose positions are uncertain, see `precision.find`.
         fitting_badly: images whose matches fit their poses badly, see `misfits.find`.
@@ -92,10 +91,9 @@ class Map:
         self.matcher = choose("matcher", content["matcher"], matchers_confs.confs)
         self.images = Path(content["image_dir"])
         self.num_images = int(content["images_with_pose"])
-        self.is_partial = self.num_images < registration.LEAST * int(content.get("images", 0))
         self.contradicting = list(content.get("images_contradicting_others", []))
         found = content.get("images_of_uncertain_position", {}).items()
-        self.uncertain = {str(name): float(share) for name, share in found}
+        self.uncertain = {str(name): min(float(share), 1.0) for name, share in found}
         self.fitting_badly = list(content.get("images_fitting_badly", []))
         self.doubtful_focal_lengths = float(content.get("doubtful_focal_lengths", 1))
         gain = float(content.get("gain_of_free_principal_points", 0))
@@ -178,6 +176,11 @@ class Map:
                 f"The map {self.folder} is of --feature {self.feature}{other}. "
                 "Leave it out to localize in this map."
             )
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether fewer than half of its photos have a pose."""
+        return self.num_images < registration.LEAST * len(list_h5_names(self.features))
 
     @property
     def doubts(self) -> list[str]:

@@ -18,8 +18,7 @@ _OTHERS = (
 )
 OTHER_SUFFIXES = {f".{name}" for name in _OTHERS.split()}
 CONVERT = (
-    "Convert HEIC photos and keep their EXIF data, for example with: magick mogrify -format jpg "
-    "*.HEIC"
+    "Convert HEIC photos and keep their EXIF data, for example with: magick mogrify -format jpg"
 )
 
 
@@ -44,8 +43,9 @@ def list_images(
         names = [file.as_posix() for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
         others = [str(file) for file in files if file.suffix.lower() in OTHER_SUFFIXES]
         read = ", ".join(sorted(IMAGE_SUFFIXES))
-        of_phones = {"heic", "heif"} & {Path(other).suffix.lower()[1:] for other in others}
-        hint = f" {CONVERT}" if of_phones else ""
+        suffixes = sorted({Path(other).suffix for other in others})
+        of_phones = [f"*{one}" for one in suffixes if one.lower() in (".heic", ".heif")]
+        hint = f" {CONVERT} {' '.join(of_phones)}" if of_phones else ""
         if not names:
             there_are = f" It has {some(others)}, but only {read} are read." if others else ""
             raise InputError(f"There is no image in {within}.{there_are}{hint}")

@@ -113,7 +113,7 @@ def test_a_pose_with_the_typical_lens_is_judged(monkeypatch):
 
 @pytest.mark.parametrize("lean", [0.055, 0.08])
 def test_a_photo_is_not_taken_for_a_stretched_one(lean):
-    """In a bent map another principal point fits a whole photo; a pose was wrong by it."""
+    """Where the lens of the map's photos gives another pose, neither is trusted."""
     free, _ = solve(None, 200, 0.5, lean=lean)
     assert free.refusal is None and free.camera.model == pycolmap.CameraModelId.OPENCV
     assert "cropped or stretched" in solve(LENS, 200, 0.5, lean=lean)[0].refusal

@@ -116,6 +116,7 @@ def test_photos_and_videos_of_other_types_are_named(name, tmp_path, picture, cap
     with pytest.raises(InputError, match=message) as error:
         list_images(tmp_path)
     assert ("Convert HEIC photos" in str(error.value)) == (name == "a.HEIC")
+    assert name != "a.HEIC" or str(error.value).endswith("-format jpg *.HEIC")
     cv2.imwrite(str(tmp_path / "b.png"), picture)
     assert list_images(tmp_path) == ["b.png"]
     assert "1 photos and videos in" in caplog.text and name in caplog.text
