@@ -7,9 +7,9 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from threading import Lock, local
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from .trace import span
 
@@ -29,7 +29,8 @@ _lock = Lock()
 _of_thread = _OfThread()
 _running = 0  # blocks of `one_thread` in all threads
 _threads: int | None = None  # torch's threads before the first of these
-_blas: threadpool_limits  # ends the limit on BLAS that the first of these has set
+_blas: Any  # ends the limit on BLAS that the first of these has set
+_libraries: tuple[int, ThreadpoolController] | None = None  # and the number of modules before
 
 
 def cores() -> int:
@@ -39,6 +40,15 @@ def cores() -> int:
         return int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
     with _lock:
         return _threads or torch.get_num_threads()
+
+
+def _controller() -> ThreadpoolController:
+    """Find the libraries with threads of their own: again only after an import, as it takes ms."""
+    global _libraries
+    number = len(sys.modules)
+    if _libraries is None or _libraries[0] != number:
+        _libraries = number, ThreadpoolController()
+    return _libraries[1]
 
 
 @contextmanager
@@ -51,7 +61,7 @@ def one_thread() -> Iterator[None]:
     global _running, _threads, _blas
     with _lock:
         if not _running:
-            _blas = threadpool_limits(1, "blas")
+            _blas = _controller().limit(limits=1, user_api="blas")
         _running += 1
         _of_thread.blocks += 1
         torch = sys.modules.get("torch")

@@ -101,6 +101,21 @@ def test_one_thread_of_numpy_in_each_worker():
         assert threads() == {3}
 
 
+def test_libraries_are_found_again_after_an_import(monkeypatch):
+    """It takes 4 ms, of the 300 that a photo is localized in."""
+    found, find = [], parallel.ThreadpoolController
+    monkeypatch.setattr(parallel, "ThreadpoolController", lambda: found.append(1) or find())
+    monkeypatch.setattr(parallel, "_libraries", None)
+    for _ in range(3):
+        with parallel.one_thread():
+            pass
+    assert len(found) == 1
+    monkeypatch.setitem(sys.modules, "imported_meanwhile", sys)
+    with parallel.one_thread():
+        pass
+    assert len(found) == 2
+
+
 def test_an_error_ends_it():
     done = []
 
