@@ -94,11 +94,8 @@ def focal_length_deviations(sfm: pycolmap.Reconstruction) -> dict[int, float]:
 
 def _errors(sfm: pycolmap.Reconstruction, image: pycolmap.Image) -> np.ndarray:
     """Return the reprojection errors (M,) of the points that an image sees, in pixels."""
-    seen = [point for point in image.points2D if point.has_point3D()]
-    points2D = np.array([point.xy for point in seen]).reshape(-1, 2)
-    points3D = np.array([sfm.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3)
     view = image.cam_from_world(), sfm.cameras[image.camera_id]
-    return reprojection_errors(points2D, points3D, *view)[0]
+    return reprojection_errors(*colmap.observed(sfm, image), *view)[0]
 
 
 def _adjuster(

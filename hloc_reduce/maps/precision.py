@@ -3,7 +3,6 @@
 import copy
 from collections import Counter
 
-import numpy as np
 import pycolmap
 
 from .. import logger
@@ -12,7 +11,7 @@ from ..localization.projection import FOCAL, POSE
 from ..mapping import extension
 from ..mapping.adjustment import focal_length_deviations, with_cameras
 from ..mapping.plausibility import MANY
-from ..utils import cli
+from ..utils import cli, colmap
 
 # Photos whose focal lengths a map determines to 2 to 7 % were 5 to 37 % off: the points of a bent
 # map err together, so that its photos are off by a multiple of what independent errors explain.
@@ -41,11 +40,9 @@ def find(sfm: pycolmap.Reconstruction) -> dict[str, float]:
     several = {camera_id for camera_id, number in taken.items() if number >= MANY}
     found, vague = {}, []
     for image in images:
-        seen = [point for point in image.points2D if point.has_point3D()]
-        points2D = np.array([point.xy for point in seen]).reshape(-1, 2)
-        points3D = np.array([sfm.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3)
         view = image.cam_from_world(), sfm.cameras[image.camera_id]
-        own = uncertainty(points2D, points3D, *view, POSE if image.camera_id in several else FOCAL)
+        freedom = POSE if image.camera_id in several else FOCAL
+        own = uncertainty(*colmap.observed(sfm, image), *view, freedom)
         found[image.name] = own.position
         if not (own.position < 1 and own.focal_length < VAGUE):
             vague.append(image.name)

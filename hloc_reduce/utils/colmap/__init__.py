@@ -29,6 +29,7 @@ from .models import (
     cam_from_img,
     infer_camera,
     model_files,
+    observed,
     point3D_ids,
     read_model,
     visibility,

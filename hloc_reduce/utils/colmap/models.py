@@ -136,6 +136,15 @@ def write_part(path: Path, names: Collection[str], output: Path) -> Path:
     return output
 
 
+def observed(
+    model: pycolmap.Reconstruction, image: pycolmap.Image
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the keypoints (M, 2) of an image that show points, and these points (M, 3)."""
+    seen = [point for point in image.points2D if point.has_point3D()]
+    points2D = np.array([point.xy for point in seen]).reshape(-1, 2)
+    return points2D, np.array([model.points3D[p.point3D_id].xyz for p in seen]).reshape(-1, 3)
+
+
 def add_image(
     model: pycolmap.Reconstruction,
     camera: pycolmap.Camera,
