@@ -70,7 +70,7 @@ def unit(generator: np.random.Generator, number: int, dim: int) -> np.ndarray:
 
 def synthesize(places: dict[str, int], path: Path, dim: int, number: int, storage: str) -> None:
     """Write the features of images, given their places in the row, and the ids of landmarks."""
-    made_by = {"synthesized": [dim, number, storage]}
+    made_from = {"synthesized": [dim, number, storage]}
     levels = None
     if storage in CODED:
         import torch  # not at the top, as runs measure memory
@@ -79,7 +79,7 @@ def synthesize(places: dict[str, int], path: Path, dim: int, number: int, storag
 
         drawn = torch.from_numpy(unit(np.random.default_rng(2), 100_000, dim))
         levels = fit(drawn, CODED[storage]).numpy()
-    with GroupWriter(path, made_by) as writer, GroupWriter(shown(path), made_by) as known:
+    with GroupWriter(path, made_from) as writer, GroupWriter(shown(path), made_from) as known:
         for name, place in places.items():
             ids = ids_of(place, number)
             blocks = [  # of 1,000 landmarks, each drawn from a seed of its own

@@ -64,15 +64,15 @@ def main(
     listed = list_h5_names(features) if image_list is None else image_list
     names = [name for name in listed if name not in failed]
     learned_from = "\n".join(vocabulary_images or [])
-    made_by = {
+    made_from = {
         "model": conf["model"],
         "vocabulary": file_sha256(vocabulary)
         if vocabulary
         else hashlib.sha256(learned_from.encode()).hexdigest(),
     }
     with open_h5(features) as file:
-        made_by["features"] = file_provenance(file)
-        with resume_or_replace(output, made_by, overwrite) as writer:
+        made_from["features"] = file_provenance(file)
+        with resume_or_replace(output, made_from, overwrite) as writer:
             todo = [name for name in names if name not in writer]
             if not todo:
                 return output

@@ -234,15 +234,15 @@ def provenance(conf: dict, as_half: bool = True) -> dict:
         InputError: when the projection, its levels or the weights of its base descriptor cannot be
             found.
     """
-    made_by = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
+    made_from = {"model": conf["model"], "preprocessing": conf["preprocessing"], "as_half": as_half}
     if "storage" in conf:
-        made_by["storage"] = conf["storage"]
+        made_from["storage"] = conf["storage"]
     if (projection := conf["model"].get("projection")) is not None:
         # the name only, as the file may be moved
-        made_by["model"] = {**conf["model"], "projection": Path(projection).name}
-        made_by["projection_sha256"] = projections.checksum(projection)
+        made_from["model"] = {**conf["model"], "projection": Path(projection).name}
+        made_from["projection_sha256"] = projections.checksum(projection)
     if features_confs.levels(conf) is not None and projection is None:
-        made_by["levels_sha256"] = projections.checksum(features_confs.level_file(conf) or "")
+        made_from["levels_sha256"] = projections.checksum(features_confs.level_file(conf) or "")
     descriptor = features_confs.descriptor_of(conf["model"])
     if descriptor in list(DESCRIPTORS):  # one from a YAML file may be unhashable
         check_weights(descriptor)
@@ -251,9 +251,9 @@ def provenance(conf: dict, as_half: bool = True) -> dict:
         given = features_confs.base_of(conf["model"]).get("weights")
         weights = fetch_weights(network, given)
         if given or not NETWORKS[network].urls:  # which may be trained anew
-            made_by["weights_sha256"] = file_sha256(weights)
-        made_by["noise_reduction"] = NOISE_REDUCTION
-    return made_by
+            made_from["weights_sha256"] = file_sha256(weights)
+        made_from["noise_reduction"] = NOISE_REDUCTION
+    return made_from
 
 
 def check_model(conf: dict) -> None:

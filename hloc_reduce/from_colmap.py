@@ -136,9 +136,9 @@ def write(
     """
     normalization = normalization or _normalization(database, names)
     cli.choose("normalization", normalization, NORMALIZATIONS)
-    made_by = {"database": made_from, "normalization": normalization, **reduction.provenance}
+    made_from = {"database": made_from, "normalization": normalization, **reduction.provenance}
     read = partial(_read, database, reduction)
-    reduction.write(output, made_by, overwrite, names, read, normalization)
+    reduction.write(output, made_from, overwrite, names, read, normalization)
 
 
 def _check_type(database: StoredDatabase, reduction: Reduction) -> None:

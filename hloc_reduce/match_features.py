@@ -83,8 +83,8 @@ def main(
         raise InputError(f"{matches} is an input of the matching: choose other --matches.")
     feature_paths = feature_path, features_ref or feature_path
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
-        made_by = provenance(conf, file0, file1)
-    with GroupWriter(matches, made_by, overwrite, compression="gzip") as writer:
+        made_from = provenance(conf, file0, file1)
+    with GroupWriter(matches, made_from, overwrite, compression="gzip") as writer:
         listed = progress(parse_pairs(pairs), "Matching", "pair", number)
         todo = unmatched_pairs(listed, writer, ordered=features_ref not in (None, feature_path))
         match = partial(_match, conf, feature_paths, gpu_bytes)
@@ -124,10 +124,10 @@ def _paths(
 
 def provenance(conf: dict, *feature_files: h5py.File) -> dict:
     """Return what determines the matches: the configurations of matcher and features."""
-    made_by = {"model": conf["model"]}
+    made_from = {"model": conf["model"]}
     for i, file in enumerate(feature_files):
-        made_by[f"features{i}"] = file_provenance(file)
-    return made_by
+        made_from[f"features{i}"] = file_provenance(file)
+    return made_from
 
 
 def unmatched_pairs(

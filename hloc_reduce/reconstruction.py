@@ -10,7 +10,7 @@ from .mapping import registration
 from .mapping.mapper import RULES, Mapper, attempts_for
 from .mapping.overlays import drop_overlays
 from .runtime import provenance
-from .triangulation import STAMP, add_options, read_matches, replacing_map
+from .triangulation import MADE_FROM, add_options, read_matches, replacing_map
 from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.h5 import list_h5_names
@@ -101,7 +101,7 @@ def main(
     }
     made_from = provenance.of_inputs({**options, **chosen}, [pairs, features, matches])
     is_whole = bool(provenance.read(sfm_dir / registration.REGISTRATION))
-    if not overwrite and is_whole and provenance.is_current(sfm_dir / STAMP, made_from):
+    if not overwrite and is_whole and provenance.is_current(sfm_dir / MADE_FROM, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
         sfm = colmap.read_model(sfm_dir)
     else:

@@ -75,13 +75,13 @@ def main(
         if reduction.of_colmap:
             normalization = normalization or _normalization(file, names)
             cli.choose("normalization", normalization, NORMALIZATIONS)
-        made_by = {
+        made_from = {
             "reduced": file_provenance(file),
             "normalization": normalization,
             **reduction.provenance,
         }
         read = partial(_read, file, reduction)
-        reduction.write(output, made_by, overwrite, names, read, normalization)
+        reduction.write(output, made_from, overwrite, names, read, normalization)
     logger.info("%d images with %s, %s: %s", len(names), name, storage, output)
     return output
 
@@ -118,10 +118,10 @@ class Reduction:
     @property
     def provenance(self) -> dict:
         """What determines the descriptors, besides those of the base."""
-        made_by = {"feature": self.name, "storage": self._storage}
+        made_from = {"feature": self.name, "storage": self._storage}
         if given := self.conf["model"].get("projection"):
-            made_by["projection_sha256"] = projections.checksum(given)
-        return made_by
+            made_from["projection_sha256"] = projections.checksum(given)
+        return made_from
 
     def check(self, dim: int, place: str) -> None:
         """Raise an InputError if the descriptors of a place are not as long as the base's."""
@@ -149,7 +149,7 @@ class Reduction:
     def write(
         self,
         output: Path,
-        made_by: dict,
+        made_from: dict,
         overwrite: bool,
         names: list[str],
         read: Callable[[list[str]], Iterable[Described]],
@@ -159,14 +159,14 @@ class Reduction:
 
         Args:
             output: the feature file.
-            made_by: its provenance.
+            made_from: its provenance.
             overwrite: reduce all images again.
             names: the images.
             read: reads images.
             normalization: as in `reduce`.
         """
         reduce = partial(self.reduce, normalization)
-        with GroupWriter(output, made_by, overwrite) as writer:
+        with GroupWriter(output, made_from, overwrite) as writer:
             todo = [name for name in names if name not in writer]
             with closing(parallel.ordered("reduce", reduce, read(todo))) as groups:
                 for group in progress(groups, "Reducing features", "image", len(todo)):

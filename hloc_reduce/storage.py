@@ -55,10 +55,10 @@ def main(
         raise InputError(f"{output} cannot be converted to itself: choose another --output.")
     names = list_h5_names(features)
     with open_h5(features) as file:
-        made_by = {"converted": file_provenance(file), "storage": storage}
+        made_from = {"converted": file_provenance(file), "storage": storage}
         if projection is not None:
-            made_by["projection_sha256"] = projections.checksum(projection)
-        with GroupWriter(output, made_by, overwrite) as writer:
+            made_from["projection_sha256"] = projections.checksum(projection)
+        with GroupWriter(output, made_from, overwrite) as writer:
             todo = [name for name in names if name not in writer]
             for name in progress(todo, "Converting features", "image"):
                 arrays, attrs = read_others(file, name)

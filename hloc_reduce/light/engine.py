@@ -17,9 +17,8 @@ def takes(matcher: dict) -> bool:
     return matcher["name"] == "nearest_neighbor" and matcher.get("do_mutual_check", True)
 
 
-def is_colmap_sift(model: dict) -> bool:
-    """Tell whether an extractor's configuration is of COLMAP's SIFT, reduced or not."""
-    base = model.get("base", model)
+def is_colmap_sift(base: dict) -> bool:
+    """Tell whether the configuration of a base extractor is of COLMAP's SIFT."""
     return base["name"] == "dog" and base.get("descriptor") == COLMAP
 
 

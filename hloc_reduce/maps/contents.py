@@ -180,17 +180,16 @@ def _of_file(path: Path, onnx: Path | None) -> Contents:
 
 def _light_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engine | None:
     """Return an engine without torch, None if the map's feature or matcher needs torch."""
-    model = compact.conf["model"]
+    base = features_confs.base_of(compact.conf["model"])
     extract: Extract
     if onnx is not None and not takes(matcher):
         raise InputError(f"{compact.path} has the matcher {compact.matcher}, which needs torch.")
     if not takes(matcher):
         return None
     if onnx is not None:
-        denoise = features_confs.base_of(model).get("denoise", True)
-        extract = OnnxNetwork(onnx, compact.feature, denoise)
-    elif is_colmap_sift(model) and not compact.is_pickled:
-        extract = ColmapSift(model.get("base", model), compact.layers())
+        extract = OnnxNetwork(onnx, compact.feature, base.get("denoise", True))
+    elif is_colmap_sift(base) and not compact.is_pickled:
+        extract = ColmapSift(base, compact.layers())
     else:
         return None
     return LightEngine(extract, matcher, compact.vocabulary)

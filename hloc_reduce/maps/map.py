@@ -164,11 +164,11 @@ class Map:
             InputError: if it is another one, or has the same name but another projection.
         """
         name, conf = features_confs.get(feature, projection, self.storage, self.keypoints)
-        made_by = provenance.read(self.folder / CONF).get("feature")
+        made_from = provenance.read(self.folder / CONF).get("feature")
         known = (
             name == self.feature
-            if made_by is None
-            else made_by == extract_features.provenance(conf)
+            if made_from is None
+            else made_from == extract_features.provenance(conf)
         )
         if not known:
             other = "" if name != self.feature else f", but not of the {name} that it is now"

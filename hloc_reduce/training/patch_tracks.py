@@ -13,7 +13,7 @@ from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
 from .describers import VARIANTS, describe_mirrored, photometric_variant
 from .loop import device
-from .tracks import is_current, parts_of, save, stamp
+from .tracks import is_current, parts_of, provenance_of, save
 
 
 @strings_as_paths
@@ -34,7 +34,7 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
     """
     path = output / f"tracks_{descriptor}.safetensors"
     points = read_points(folder)
-    made_from = stamp(descriptor, seed, [folder / "info.txt", *sheets(folder)])
+    made_from = provenance_of(descriptor, seed, [folder / "info.txt", *sheets(folder)])
     if is_current(path, made_from):
         return path
     describe = Descriptor(descriptor).to(device())

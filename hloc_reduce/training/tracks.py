@@ -146,7 +146,7 @@ def main(
     features, reconstruction = _triangulate(images, model, names, conf, sfm)
 
     tracks = output / f"tracks_{descriptor}.safetensors"
-    made_from = stamp(descriptor, seed, [sfm / "points3D.bin", features])
+    made_from = provenance_of(descriptor, seed, [sfm / "points3D.bin", features])
     if is_current(tracks, made_from):
         return tracks
     complete, matched, keypoints = _observations(reconstruction, features, names)
@@ -238,7 +238,7 @@ def _observations(
     return Completion(reconstruction, in_colmap, matched), matched, keypoints
 
 
-def stamp(descriptor: str, seed: int, inputs: list[Path]) -> dict:
+def provenance_of(descriptor: str, seed: int, inputs: list[Path]) -> dict:
     """Return the provenance of a file for `load`."""
     options = {"variants": describers.VARIANTS, "seed": seed, "descriptor": descriptor, "format": 2}
     return provenance.of_inputs(options, inputs)

@@ -173,8 +173,8 @@ class Shared:
         with ExitStack() as stack:
             features = {}
             for path in paths:
-                made_by = extract_features.provenance(self.confs[path])
-                writer = stack.enter_context(GroupWriter(path, made_by))
+                made_from = extract_features.provenance(self.confs[path])
+                writer = stack.enter_context(GroupWriter(path, made_from))
                 features[path] = {"storage": STORAGES[0], **self.confs[path]}, writer
             extract_features.extract_several(
                 features, self._place.images, self.images(), executor, strict, self.query_names

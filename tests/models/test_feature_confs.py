@@ -101,8 +101,8 @@ def test_a_feature_file_chooses_settings_of_dog(tmp_path):
     assert adaptive["model"]["keypoints"] == "adaptive"
     hloc = features.get(str(path), keypoints="hloc")[1]
     assert hloc["model"]["keypoints"] == "hloc"
-    made_by = [json.dumps(extract_features.provenance(conf)) for conf in (adaptive, hloc)]
-    assert made_by[0] != made_by[1]
+    made_from = [json.dumps(extract_features.provenance(conf)) for conf in (adaptive, hloc)]
+    assert made_from[0] != made_from[1]
     path.write_text("model: {name: dog, descriptor: sift, keypoints: hloc}")
     assert features.get(str(path))[1]["model"]["keypoints"] == "hloc"
 
