@@ -51,7 +51,7 @@ ALIKED = {
     "aliked-t16": (64, (0.0260, 0.1223, 0.0226, 0.0870)),
 }
 
-MINI = ("mini32",)  # this project's own
+MINI = ("mini32", "mini64")  # this project's own
 MINI_SIZE = "L"  # of EdgePoint2's architecture
 WEIGHTS = Path(__file__).parent / "weights"
 

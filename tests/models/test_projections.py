@@ -13,6 +13,7 @@ from torch import nn
 from hloc_reduce import extractors, projections
 from hloc_reduce.confs import features
 from hloc_reduce.extractors.reduced import Reduced
+from hloc_reduce.networks import MINI
 from hloc_reduce.projections import network, released
 from hloc_reduce.projections.files import WEIGHTS
 from hloc_reduce.projections.network import MLP, Projection
@@ -88,10 +89,10 @@ def test_everything_ships_in_25_megabytes():
         for name in features.names(descriptor)
         if "@" not in name
     }
-    expected |= {"xfeat", "edgepoint2_m32", "edgepoint2_m64", "aliked", "mini32"}  # levels
+    expected |= {"xfeat", "edgepoint2_m32", "edgepoint2_m64", "aliked", *MINI}  # levels
     expected |= {f"aliked_{scheme}{dim}" for scheme in ("pca", "sv") for dim in (64, 32, 24, 16)}
     expected -= {"aliked_sv64"}  # no better than pca
-    assert set(projections.names()) == expected and len(expected) == 84
+    assert set(projections.names()) == expected and len(expected) == 85
     assert sum(path.stat().st_size for path in WEIGHTS.iterdir()) < 25e6
 
 
