@@ -1,9 +1,10 @@
 """Tell mirrored photos, which may have a wrong pose on a symmetric facade, from others.
 
 The mirror image of a symmetric facade looks much like the facade itself, so that many matches agree
-with a wrong pose. But fewer do than with the pose of the photo as it was taken. So a query is
-mirrored and localized again; if that pose is likelier, the query was mirrored before. Right poses
-of high confidence, with which most matches agree, need no such test.
+with a wrong pose. As a rule, far more agree with that of the photo as it was taken. So a query is
+mirrored and localized again; if that pose is far likelier, the query was mirrored before. If both
+are likely, neither is trusted: of a courtyard, a map had more points of the facade opposite. Right
+poses of high confidence, with which most matches agree, need no such test.
 """
 
 import copy
@@ -12,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+
+from .confidence import RIVAL
 
 # agreement and confidence below which poses are doubtful. Those of most mirrored photos have an
 # agreement of at most 0.85 or a confidence of at most 125; two of a castle 0.92 and 432.
@@ -42,11 +45,11 @@ def refusal(confidence: float, of_mirror_image: float) -> str | None:
 
     Args:
         confidence: of the pose.
-        of_mirror_image: the confidence of the pose of the mirror image.
+        of_mirror_image: that of the pose of the mirror image.
     """
-    if of_mirror_image <= confidence:
+    if of_mirror_image < RIVAL * confidence:
         return None
     return (
-        f"it is mirrored: the confidence is {confidence:.1f}, that of its mirror image "
+        f"it may be mirrored: the confidence is {confidence:.1f}, that of its mirror image "
         f"{of_mirror_image:.1f}"
     )

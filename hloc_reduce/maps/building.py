@@ -74,7 +74,7 @@ class Building:
         conf = keep_projection(conf, self.folder.path)
         if model is not None and reference is not None:
             folder, sfm, fit = SFM, self._of_model(conf, model, reference), cropping.NOT_TRIED
-            spread, fitting_badly = 1.0, []
+            spread, fitting_badly, uncertain = 1.0, [], {}
         else:
             self.unlike_others = exif.of_another_size(self.image_dir, self.names)
             self.names = self._kept
@@ -83,10 +83,11 @@ class Building:
             with self.folder.stage("judge_matches"):
                 verified = colmap.read_verified(self.folder.path / folder / "database.db")
                 fitting_badly = misfits.find(sfm, verified)
-            spread = self._check(folder, sfm, fit, fitting_badly)
+                uncertain = precision.find(sfm)
+            doubts = [*misfits.doubts(fitting_badly), *precision.doubts(uncertain, sfm)]
+            spread = self._check(folder, sfm, fit, doubts)
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
-        uncertain = precision.find(sfm) if model is None else {}
         names = {sfm.images[i].name for i in sfm.reg_image_ids()}
         cropped = exif.cropped(self.image_dir, names) if model is None else []
         cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
@@ -124,11 +125,10 @@ class Building:
         folder: str,
         sfm: pycolmap.Reconstruction,
         fit: cropping.Fit,
-        fitting_badly: list[str],
+        doubts: list[str],
     ) -> float:
         """Call `registration.check`, and name the photos that may be why the model is refused."""
         sfm_dir = self.folder.path / folder
-        doubts = [misfits.doubt(fitting_badly)] if fitting_badly else []
         try:
             return registration.check(sfm_dir, self.accept_partial, self._left_out, doubts)
         except cli.InputError:

@@ -56,16 +56,18 @@ def find(sfm: pycolmap.Reconstruction, verified: Mapping[Pair, np.ndarray]) -> l
     return sorted((name for name in best if best[name] > limit), key=lambda name: -best[name])
 
 
-def doubt(names: list[str]) -> str:
+def doubts(names: list[str]) -> list[str]:
     """Say that a map may be wrong because the matches of photos fit their poses badly."""
-    return (
+    if not names:
+        return []
+    return [
         "The map may be wrong: the matches of these photos fit their poses much worse than those "
         f"of the others: {cli.some(names, NAMED)}. They may be misplaced, or something large has "
         "moved. Build the map again without them, or with more photos between them and the others."
-    )
+    ]
 
 
 def warn(names: list[str]) -> None:
     """Warn of photos whose matches fit their poses badly, if there are any."""
-    if names:
-        logger.warning(doubt(names))
+    for doubt in doubts(names):
+        logger.warning(doubt)
