@@ -31,8 +31,8 @@ ROUNDS = 3  # of estimation from the inliers among all matches
 RIVAL_SAMPLE = 500  # matches, at most, from which a rival is estimated
 # The lens of the map's photos has probably taken a photo if the confidence with it is at least this
 # multiple of that with estimated intrinsics, and its focal length is within this many standard
-# deviations of the estimated one, or the inliers fit better.
-CONFIDENCE_RATIO, DEVIATIONS = 0.98, 2.0
+# deviations of the estimated one or within this share of it, or the inliers fit better.
+CONFIDENCE_RATIO, DEVIATIONS, SHARE = 0.98, 2.0, 0.025
 
 
 def estimate(
@@ -111,9 +111,10 @@ def _with_typical_lens(
     deviation = uncertainty(*inliers, *view, pose.degrees_of_freedom).focal_length
     errors, _ = reprojection_errors(*inliers, *view)
     its_errors, _ = reprojection_errors(*inliers, typical.cam_from_world, typical.camera)
-    # an estimated focal length may be off by more if it makes up for a distortion
+    # an estimated focal length may be off by more if it makes up for a distortion, or for points
+    # whose errors are alike
     is_better = (its_errors**2).sum() <= (errors**2).sum()
-    if not (is_better or abs(np.log(ratio)) <= DEVIATIONS * deviation):
+    if not (is_better or abs(np.log(ratio)) <= max(DEVIATIONS * deviation, SHARE)):
         return None
     typical = replace(typical, agreement=agreement(typical.inliers, images))
     return None if refusal(known, typical, others, gate, None) else typical

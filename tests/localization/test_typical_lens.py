@@ -59,7 +59,7 @@ def test_the_typical_lens_is_taken_where_it_fits():
 
 
 @pytest.mark.parametrize("number, depth", [(30, 0.5), (300, 0.2)])
-@pytest.mark.parametrize("zoom, distortion", [(1.03, -0.05), (0.92, -0.05), (1, 0.2)])
+@pytest.mark.parametrize("zoom, distortion", [(1.05, -0.05), (0.92, -0.05), (1, 0.2)])
 def test_an_unlike_lens_is_not_taken(number, depth, zoom, distortion):
     """By the confidence alone, one whose focal length is 5 % off would fit few matches."""
     other = intrinsics.Lens(zoom * LENS.focal_length, distortion)
@@ -70,6 +70,13 @@ def test_an_unlike_lens_is_not_taken(number, depth, zoom, distortion):
         assert found.refusal == free.refusal
         taken += found.camera.params.tolist() != free.camera.params.tolist()
     assert taken == 0 if number == 300 else taken < 3
+
+
+def test_many_matches_do_not_exclude_a_lens_that_is_nearly_the_same():
+    """Their errors may be alike: of 638 inliers of a castle, the focal length was 3 % too long."""
+    like = intrinsics.Lens(1.01 * LENS.focal_length, LENS.distortion)
+    found, _ = solve(like, 1200, 0.2)
+    assert found.camera.params.tolist() == [909, 640, 480, -0.05]
 
 
 @pytest.mark.parametrize("number, depth", [(30, 0.5), (300, 0.2)])
