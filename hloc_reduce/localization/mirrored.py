@@ -14,8 +14,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from .confidence import RIVAL
-
 # agreement and confidence below which poses are doubtful. Those of most mirrored photos have an
 # agreement of at most 0.85 or a confidence of at most 125; two of a castle 0.92 and 432.
 DOUBTFUL = 0.9, 500.0
@@ -40,14 +38,15 @@ def mirror(camera: pycolmap.Camera) -> pycolmap.Camera:
     return mirrored
 
 
-def refusal(confidence: float, of_mirror_image: float) -> str | None:
+def refusal(confidence: float, of_mirror_image: float, most: float) -> str | None:
     """Return why a pose is not trusted in view of that of the mirror image, None if it is.
 
     Args:
         confidence: of the pose.
         of_mirror_image: that of the pose of the mirror image.
+        most: the largest share of the first one that this may have, see `Gate`.
     """
-    if of_mirror_image < RIVAL * confidence:
+    if of_mirror_image <= most * confidence:
         return None
     return (
         f"it may be mirrored: the confidence is {confidence:.1f}, that of its mirror image "

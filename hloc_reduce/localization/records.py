@@ -9,10 +9,11 @@ import pycolmap
 from ..utils.cli import InputError
 from ..utils.files import naming, replacing
 from . import mirrored
+from .confidence import Gate
 from .intrinsics import to_list
 from .references import Reference
 
-RECORDS = 19  # the version of the content of records, and of the gate
+RECORDS = 20  # the version of the content of records, and of the gate
 NUMBERS = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
 
 
@@ -93,7 +94,9 @@ def _written(cam_from_world: pycolmap.Rigid3d | None) -> dict:
     }
 
 
-def with_mirror_image(record: dict, other: dict, reference: Reference, names: list[str]) -> dict:
+def with_mirror_image(
+    record: dict, other: dict, reference: Reference, names: list[str], gate: Gate
+) -> dict:
     """Return the record of a localized query after its mirror image was localized, too.
 
     Args:
@@ -101,9 +104,11 @@ def with_mirror_image(record: dict, other: dict, reference: Reference, names: li
         other: of its mirror image.
         reference: the map.
         names: the retrieved images, best first.
+        gate: what a pose must have for the query to be called localized.
     """
     record = {**record, "mirror_image": other["confidence"]}
-    if not (reason := mirrored.refusal(record["confidence"], other["confidence"])):
+    confidences = record["confidence"], other["confidence"]
+    if not (reason := mirrored.refusal(*confidences, gate.max_mirrored)):
         return record
     fallback = reference.fallback(names) or pose_of(record)
     first = next(iter(names), None)

@@ -112,9 +112,11 @@ def main(
         ]
         if mirror_images and tasks:
             files, reference = mirror_images([name for name, _, _ in tasks]), load_reference()
+            gate = _of_matches(gate, *files)
             for name, record in solve(*files, tasks, False, "Trying mirror images"):
                 names = [other for other in retrieved.get(name, []) if other in reference]
-                log.add(name, with_mirror_image(log.records[name], record, reference, names))
+                before = log.records[name]
+                log.add(name, with_mirror_image(before, record, reference, names, gate))
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose_of(record) for name, record in records.items()}
     submitted = {name: known for name, known in poses.items() if known is not None}
@@ -220,9 +222,8 @@ def localize_all(
         thorough: also try matches of single images, as `absolute_pose.estimate` does.
         said: what the progress bar says.
     """
-    with open_h5(matches) as file:
-        gate = gate.of_matches(get_matcher(file) or _by_name(matches), dimension(features))
     files = features, matches
+    gate = _of_matches(gate, *files)
     work = partial(_localize_chunk, load_reference, *files, config, skip_matches, gate, thorough)
     with closing(executor.map(work, tasks, CHUNK)) as found:
         yield from progress(found, said, "query", len(tasks))
@@ -232,6 +233,12 @@ def check_threshold(ransac_thresh: float) -> None:
     """Raise an InputError for an inlier threshold that is not above 0."""
     if not ransac_thresh > 0:
         raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
+
+
+def _of_matches(gate: Gate, features: Path, matches: Path) -> Gate:
+    """Return the gate for the matcher of a match file and descriptors like those of a file."""
+    with open_h5(matches) as file:
+        return gate.of_matches(get_matcher(file) or _by_name(matches), dimension(features))
 
 
 def _by_name(matches: Path) -> dict:

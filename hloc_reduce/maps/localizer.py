@@ -117,7 +117,8 @@ class Localizer:
             matches = self._match(flipped["descriptors"], retrieved)
             camera = mirrored.mirror(camera)
             _, other = self._estimate(flipped, matches, camera, refinement, thorough=False)
-            info["reason"] = mirrored.refusal(info["confidence"], other["confidence"])
+            confidences = info["confidence"], other["confidence"]
+            info["reason"] = mirrored.refusal(*confidences, self.gate.max_mirrored)
             lap("mirror_image")
         info |= {
             "points2D": features["keypoints"][info["keypoints"]],
