@@ -303,7 +303,7 @@ def run(
                 its_camera = mirrored.mirror(its_camera)
                 other_row = localize(place, flipped, its_camera, refinement, thorough=False)
                 values = row["confidence"], other_row["confidence"]
-                row["refusal"] = mirrored.refusal(*values) or ""
+                row["refusal"] = mirrored.refusal(*values, gate) or ""
             cam_from_world = row.pop("cam_from_world")
             row |= outcome(place, row, cam_from_world, truth)
             first = {"feature": feature, "map": place.name, "place": source.name}

@@ -66,7 +66,8 @@ def open_map(
         storage: how descriptors are stored; default: float16.
         keypoints: settings of the DoG detector; default: adaptive.
         accept_partial: build the map without photos that are missing, unreadable or not
-            reconstructed, and even if its focal lengths or matches show that it may be wrong.
+            reconstructed, and even if its focal lengths, positions or matches show that it may be
+            wrong.
         camera_mode: which photos share a camera, as in COLMAP; default: auto.
         database: COLMAP database that the model was made from: its keypoints and descriptors make
             the map. Photos, if given, only tell more about the cameras.

@@ -87,8 +87,8 @@ def add_localization_options(parser: cli.Parser, truth: str, num_loc: int) -> No
         "--accept_partial",
         action="store_true",
         help="build the map without photos that are missing, unreadable or, in a map of photos "
-        "alone, not reconstructed; and use a map whose focal lengths or matches show that it may "
-        "be wrong",
+        "alone, not reconstructed; and use a map whose focal lengths, positions or matches show "
+        "that it may be wrong",
     )
     add_gate_options(parser)
     parser.add_argument("--overwrite", action="store_true", help="recompute existing results")

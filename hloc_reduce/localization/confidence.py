@@ -236,17 +236,18 @@ class Gate:
         min_agreement: pairs, in ascending order, of a confidence and the minimum `agreement` of
             poses with at least this confidence; default: by the matches, see `of_matches`.
         min_agreement_noisy: the same for photos whose noise was reduced.
-        max_mirrored: the maximum confidence of the mirror image, as a share of its own.
+        max_mirrored: the maximum confidence of the mirror image, as a share of its own; default: by
+            the matches.
 
     Raises:
-        InputError: for a confidence that is not finite or a negative number of inliers.
+        InputError: for a confidence that is not finite, or a negative number of inliers or share.
     """
 
     min_confidence: float = 8.0
     min_inliers: int = 8
     min_agreement: Steps | None = None
     min_agreement_noisy: Steps | None = None
-    max_mirrored: float = MIRRORED
+    max_mirrored: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
@@ -255,6 +256,8 @@ class Gate:
             )
         if self.min_inliers < 0:
             raise InputError(f"min_inliers is {self.min_inliers}: at least 0.")
+        if self.max_mirrored is not None and not self.max_mirrored >= 0:
+            raise InputError(f"max_mirrored is {self.max_mirrored}: at least 0.")
 
     def of_matches(self, matcher: dict, dim: int) -> "Gate":
         """Return the gate for a matcher and descriptors.
@@ -263,17 +266,25 @@ class Gate:
             matcher: configuration of the matcher's model.
             dim: dimension of the descriptors.
         """
+        is_strict = (matcher.get("ratio_threshold") or 1) <= STRICT
+        gate = self
+        if self.max_mirrored is None:
+            gate = replace(gate, max_mirrored=MIRRORED_RATIO if is_strict else MIRRORED)
         if self.min_agreement is not None:
-            return self
-        if (matcher.get("ratio_threshold") or 1) > STRICT:
-            return replace(self, min_agreement=AGREEMENT, min_agreement_noisy=AGREEMENT_NOISY)
-        least = AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO
-        return replace(self, min_agreement=least, max_mirrored=MIRRORED_RATIO)
+            return gate
+        if not is_strict:
+            return replace(gate, min_agreement=AGREEMENT, min_agreement_noisy=AGREEMENT_NOISY)
+        return replace(gate, min_agreement=AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO)
 
     def of_photo(self, blur: float) -> "Gate":
         """Return the gate for a photo whose noise was reduced by a blur in pixels, 0 for none."""
         noisy = self.min_agreement_noisy
         return replace(self, min_agreement=noisy) if blur > 0 and noisy else self
+
+    def is_mirrored(self, confidence: float, of_mirror_image: float) -> bool:
+        """Tell from the confidences of a pose and of its mirror image whether neither is sure."""
+        most = MIRRORED if self.max_mirrored is None else self.max_mirrored
+        return of_mirror_image > most * confidence
 
     def least_agreement(self, confidence: float) -> float:
         """Return the least agreement of a pose with a confidence."""

@@ -1,10 +1,10 @@
 """Tell mirrored photos, which may have a wrong pose on a symmetric facade, from others.
 
 The mirror image of a symmetric facade looks much like the facade itself, so that many matches agree
-with a wrong pose. As a rule, far more agree with that of the photo as it was taken. So a query is
-mirrored and localized again; if that pose is far likelier, the query was mirrored before. If both
-are likely, neither is trusted: of a courtyard, a map had more points of the facade opposite. Right
-poses of high confidence, with which most matches agree, need no such test.
+with a wrong pose. Far more agree with that of the photo as it was taken, unless the map lacks the
+wing that it shows. So a query is mirrored and localized again, and trusted only if its mirror image
+has a much lower confidence. Right poses of high confidence, with which most matches agree, need no
+such test.
 """
 
 import copy
@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+
+from .confidence import Gate
 
 # agreement and confidence below which poses are doubtful. Those of most mirrored photos have an
 # agreement of at most 0.85 or a confidence of at most 125; two of a castle 0.92 and 432.
@@ -38,15 +40,15 @@ def mirror(camera: pycolmap.Camera) -> pycolmap.Camera:
     return mirrored
 
 
-def refusal(confidence: float, of_mirror_image: float, most: float) -> str | None:
+def refusal(confidence: float, of_mirror_image: float, gate: Gate) -> str | None:
     """Return why a pose is not trusted in view of that of the mirror image, None if it is.
 
     Args:
         confidence: of the pose.
         of_mirror_image: that of the pose of the mirror image.
-        most: the largest share of the first one that this may have, see `Gate`.
+        gate: what a pose must have to be trusted.
     """
-    if of_mirror_image <= most * confidence:
+    if not gate.is_mirrored(confidence, of_mirror_image):
         return None
     return (
         f"it may be mirrored: the confidence is {confidence:.1f}, that of its mirror image "

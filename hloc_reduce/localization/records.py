@@ -107,8 +107,7 @@ def with_mirror_image(
         gate: what a pose must have for the query to be called localized.
     """
     record = {**record, "mirror_image": other["confidence"]}
-    confidences = record["confidence"], other["confidence"]
-    if not (reason := mirrored.refusal(*confidences, gate.max_mirrored)):
+    if not (reason := mirrored.refusal(record["confidence"], other["confidence"], gate)):
         return record
     fallback = reference.fallback(names) or pose_of(record)
     first = next(iter(names), None)

@@ -75,10 +75,10 @@ def main(
         skip_matches: leave out retrieved images with fewer matches.
         name_parts: as in `parsers.write_poses`.
         executor: does the work; `load_reference` and `config` are pickled for other processes.
-        gate: what a pose must have for the query to be called localized; its agreement, if not
-            given, is that for the matcher and the dimension in the files.
+        gate: what a pose must have for the query to be called localized; what is not given is that
+            for the matcher and the dimension in the files.
         mirror_images: extracts and matches mirror images of queries, whose own poses are refused
-            if those of the mirror images are likelier; default: no query is tested.
+            if those of the mirror images are nearly as likely; default: no query is tested.
 
     Returns:
         A record for each query: `localized`; `reason`, why it is not localized, None if it is;

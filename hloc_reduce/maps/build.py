@@ -58,8 +58,8 @@ def main(
         storage: how descriptors are stored, one of `utils.codes.STORAGES`.
         keypoints: settings of the DoG detector, one of `detectors.dog.KEYPOINTS`.
         accept_partial: do without images that are missing or unreadable; without a model, build a
-            map even if fewer than half of the images are in it, or its focal lengths or matches
-            show that it may be wrong.
+            map even if fewer than half of the images are in it, or its focal lengths,
+            positions or matches show that it may be wrong.
         camera_mode: which images share a camera, without a model.
 
     Returns:

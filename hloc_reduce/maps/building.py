@@ -74,25 +74,26 @@ class Building:
         conf = keep_projection(conf, self.folder.path)
         if model is not None and reference is not None:
             folder, sfm, fit = SFM, self._of_model(conf, model, reference), cropping.NOT_TRIED
-            spread, fitting_badly, uncertain = 1.0, [], {}
         else:
             self.unlike_others = exif.of_another_size(self.image_dir, self.names)
             self.names = self._kept
             folder, conf, sfm = self._of_photos_alone(conf)
             folder, sfm, fit = self._fitting(conf, folder, sfm)
+        names = {sfm.images[i].name for i in sfm.reg_image_ids()}
+        cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
+        if fit.gain > cropping.GAIN:
+            cameras = cameras._replace(known={}, typical={})  # they may be wrong
+        spread, fitting_badly, uncertain = 1.0, [], {}
+        if model is None:
             with self.folder.stage("judge_matches"):
                 verified = colmap.read_verified(self.folder.path / folder / "database.db")
                 fitting_badly = misfits.find(sfm, verified)
                 uncertain = precision.find(sfm)
-            doubts = [*misfits.doubts(fitting_badly), *precision.doubts(uncertain, sfm)]
-            spread = self._check(folder, sfm, fit, doubts)
+            doubts = precision.doubts(uncertain, sfm, cameras.typical)
+            spread = self._check(folder, sfm, fit, [*misfits.doubts(fitting_badly), *doubts])
         with self.folder.stage("judge_poses"):
             contradicting = contradictions.find(sfm, self.matches[conf["output"]])
-        names = {sfm.images[i].name for i in sfm.reg_image_ids()}
         cropped = exif.cropped(self.image_dir, names) if model is None else []
-        cameras = intrinsics.of_map(sfm, self.image_dir, names - {*fit.altered})
-        if fit.gain > cropping.GAIN:
-            cameras = cameras._replace(known={}, typical={})  # they may be wrong
         written = write(
             *(self.folder.path, conf, sfm, cameras),
             feature=feature,

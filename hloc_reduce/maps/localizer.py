@@ -118,7 +118,7 @@ class Localizer:
             camera = mirrored.mirror(camera)
             _, other = self._estimate(flipped, matches, camera, refinement, thorough=False)
             confidences = info["confidence"], other["confidence"]
-            info["reason"] = mirrored.refusal(*confidences, self.gate.max_mirrored)
+            info["reason"] = mirrored.refusal(*confidences, self.gate)
             lap("mirror_image")
         info |= {
             "points2D": features["keypoints"][info["keypoints"]],

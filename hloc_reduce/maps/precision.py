@@ -2,13 +2,12 @@
 
 import copy
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import pycolmap
 
 from .. import logger
 from ..localization.confidence import MAX_POSITION, uncertainty
-from ..localization.intrinsics import of_cameras
 from ..localization.projection import FOCAL, POSE
 from ..mapping import extension
 from ..mapping.adjustment import focal_length_deviations, with_cameras
@@ -20,9 +19,10 @@ from ..utils import cli, colmap
 BENT = 2.5
 VAGUE = 0.1  # share of the focal length: photos whose points tell it less are not tried with others
 LARGEST = 200  # photos: of more, the focal lengths are not tried
-# Share of the photos: a map with more uncertain ones is refused. Of 38 photos localized in such
-# maps of tourists' photos 8 were wrong, of 21 in maps whose photos have a typical lens none.
+# Share of the photos: a map with at least as many uncertain ones is refused. Of 38 photos localized
+# in such maps of tourists' photos 8 were wrong, of 21 in maps with a typical lens none.
 MANY_UNCERTAIN = 0.2
+Size = tuple[int, int]  # width and height in pixels
 HELP = (
     "More photos between them and the others help, or intrinsics: a COLMAP model, EXIF data, or "
     "--camera_mode single if one camera with a fixed zoom took all."
@@ -77,24 +77,30 @@ def _without(sfm: pycolmap.Reconstruction, names: list[str]) -> pycolmap.Reconst
     )
 
 
-def doubts(uncertain: Mapping[str, float], sfm: pycolmap.Reconstruction) -> list[str]:
+def doubts(
+    uncertain: Mapping[str, float], sfm: pycolmap.Reconstruction, typical: Collection[Size]
+) -> list[str]:
     """Say that a map may be wrong because the positions of many photos are uncertain.
 
-    Photos with a typical lens do not count: their focal lengths, estimated one by one, agree.
+    Photos with cameras of their own and a typical lens do not count: their focal lengths, estimated
+    one by one, agree.
+
+    Args:
+        uncertain: as `find` returns it.
+        sfm: the map.
+        typical: sizes (width, height) of photos with a typical lens, see `intrinsics.MapCameras`.
     """
-    cameras = {
-        sfm.images[i].name: sfm.cameras[sfm.images[i].camera_id] for i in sfm.reg_image_ids()
-    }
-    typical = of_cameras(cameras.values()).typical
-    counted = {
-        name: share
-        for name, share in uncertain.items()
-        if (cameras[name].width, cameras[name].height) not in typical
-    }
-    if len(counted) < MANY_UNCERTAIN * len(cameras):
+    ids = {sfm.images[i].name: sfm.images[i].camera_id for i in sfm.reg_image_ids()}
+    taken = Counter(ids.values())
+    counted = {}
+    for name, share in uncertain.items():
+        camera = sfm.cameras[ids[name]]
+        if taken[ids[name]] >= MANY or (camera.width, camera.height) not in typical:
+            counted[name] = share
+    if not counted or len(counted) < MANY_UNCERTAIN * len(ids):
         return []
     return [
-        f"The map may be wrong: the positions of {len(counted)} of its {len(cameras)} photos are "
+        f"The map may be wrong: the positions of {len(counted)} of its {len(ids)} photos are "
         f"uncertain by more than {100 * MAX_POSITION:.0f} % of their distance: {_named(counted)}. "
         f"{HELP}"
     ]

@@ -15,6 +15,7 @@ from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.light import matching, projection
 from hloc_reduce.maps import contents
 from hloc_reduce.maps.compact import CompactMap
+from hloc_reduce.networks import MINI
 from hloc_reduce.utils import match_files
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import to_integers
@@ -150,13 +151,14 @@ def test_features_that_need_torch(place, run, tmp_path):
         assert said in message and "needs torch. Without torch, compact maps" in message
 
 
-def test_networks_run_by_onnx_runtime(place, run, tmp_path):
+@pytest.mark.parametrize("feature", MINI)
+def test_networks_run_by_onnx_runtime(feature, place, run, tmp_path):
     """Their poses are those of torch, but for rounding; also where the sides are no multiples."""
     build, images, outputs = place
-    run(*build, "--feature", "mini32")
+    run(*build, "--feature", feature)
     path, photo = tmp_path / "place.hlm", images / "query/day/a.png"
     compact.main(path, outputs / "map")
-    onnx = export.main("mini32", tmp_path / "mini32.onnx")
+    onnx = export.main(feature, tmp_path / "network.onnx")
     expected, found = Localizer(path), Localizer(path, onnx=onnx)
     assert type(found.engine).__name__ == "LightEngine"
     pixels, camera = read_image(photo), next(iter(expected.reference.camera_of.values()))

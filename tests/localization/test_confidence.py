@@ -351,7 +351,7 @@ def test_a_rival_is_found_in_another_thread(replaced, workers, monkeypatch):
 
 def test_a_gate_of_ones_own_is_kept():
     own = Gate(min_agreement=((0, 0.3), (50, 0.4)))
-    assert own.of_matches({"ratio_threshold": 0.8}, 64) == own
+    assert own.of_matches({"ratio_threshold": 0.8}, 64).min_agreement == own.min_agreement
 
 
 def test_the_size_of_a_photo_changes_nothing():

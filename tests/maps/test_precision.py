@@ -84,3 +84,23 @@ def test_given_intrinsics_are_known(caplog):
         model="FULL_OPENCV", width=1000, height=800, params=params, camera_id=6
     )
     assert precision.find(model) == {}
+
+
+@pytest.mark.parametrize(
+    ("number", "one_camera", "typical", "refused"),
+    [
+        (5, False, [], True),
+        (6, False, [], False),
+        (5, False, [(1000, 800)], False),  # their focal lengths agree
+        (5, False, [(800, 1000)], True),
+        (5, True, [(1000, 800)], True),  # one camera always agrees with itself
+    ],
+)
+def test_a_map_with_many_uncertain_positions_may_be_wrong(number, one_camera, typical, refused):
+    """Six photos by tourists were 5 to 25 % off in maps that only had a warning."""
+    sfm = seen_from([4] * number, 1, one_camera)
+    said = precision.doubts({"0.jpg": 0.07}, sfm, typical)
+    assert bool(said) == refused
+    if refused:
+        assert f"the positions of 1 of its {number} photos are uncertain" in said[0]
+    assert precision.doubts({}, sfm, typical) == []

@@ -5,8 +5,9 @@ import pytest
 from command import outcome, run
 
 from hloc_reduce import Localizer, extract_features
+from hloc_reduce.localization import confidence as confidence_module
 from hloc_reduce.localization import mirrored, refusals
-from hloc_reduce.localization.confidence import DEFAULT_GATE
+from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.localization.records import log_file, read_records
 from hloc_reduce.utils.cli import InputError
 from pipelines import aachen, inloc, localize
@@ -116,8 +117,31 @@ def test_a_run_that_stops_before_the_mirror_images_resumes(place, tmp_path, monk
     ],
 )
 def test_mirror_images_that_fit_nearly_as_well(matcher, confidence, of_mirror_image, expected):
-    most = DEFAULT_GATE.of_matches(matcher, 64).max_mirrored
-    assert bool(mirrored.refusal(confidence, of_mirror_image, most)) == expected
+    gate = DEFAULT_GATE.of_matches(matcher, 64)
+    assert bool(mirrored.refusal(confidence, of_mirror_image, gate)) == expected
+
+
+def test_the_gate_of_a_user_decides_on_mirror_images(place, tmp_path, monkeypatch):
+    """In the pipeline and in memory; the mirror image has 0.7 times the confidence."""
+    build, images, outputs = place
+    monkeypatch.setattr(mirrored, "DOUBTFUL", (1.0, 0.0))
+    monkeypatch.setattr(confidence_module, "MIRRORED", 0.5)
+    new = tmp_path / "new"
+    new.mkdir()
+    (new / "right.png").write_bytes((images / "query/day/a.png").read_bytes())
+    run(monkeypatch, localize, *build, *MATCHER, "--query_images", new)
+    _, rows = outcome(outputs / "queries-new")
+    assert rows["right.png"]["reason"].startswith("it may be mirrored")
+    for gate, trusted in (
+        (DEFAULT_GATE, False),
+        (Gate(max_mirrored=0.9), True),
+        (Gate(max_mirrored=0.9, min_agreement=((0, 0.1),)), True),
+        (Gate(min_agreement=((0, 0.1),)), False),
+    ):
+        pose, _ = Localizer(outputs / "map", gate=gate).localize(new / "right.png")
+        assert (pose is not None) == trusted
+    with pytest.raises(InputError, match="max_mirrored is -1"):
+        Gate(max_mirrored=-1)
 
 
 def test_aachen(aachen_layout, tmp_path, monkeypatch):
