@@ -89,8 +89,8 @@ def test_given_intrinsics_are_known(caplog):
 @pytest.mark.parametrize(
     ("number", "one_camera", "typical", "refused"),
     [
-        (5, False, [], True),
-        (6, False, [], False),
+        (10, False, [], True),
+        (11, False, [], False),
         (5, False, [(1000, 800)], False),  # their focal lengths agree
         (5, False, [(800, 1000)], True),
         (5, True, [(1000, 800)], True),  # one camera always agrees with itself
