@@ -4,6 +4,7 @@ import numpy as np
 
 from ..runtime import parallel
 from ..utils import best_two
+from ..utils.arrays import distinct
 from ..utils.codes import UNIT
 
 TILE = 2**19  # products at once
@@ -124,7 +125,7 @@ def _confirmed(
     limits: tuple[float | None, float | None],
 ) -> np.ndarray:
     """Replace the nearest descriptors1 (K,) of some descriptors0 by -1 unless these are theirs."""
-    wanted = np.unique(forward[forward >= 0])
+    wanted = distinct(forward[forward >= 0])
     backward = np.full(len(descriptors1), -1)
     if len(wanted):
         backward[wanted], _ = nearest(descriptors1[wanted], descriptors0, *limits)

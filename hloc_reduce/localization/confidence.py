@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
+from ..utils.arrays import distinct
 from ..utils.cli import InputError, Parser
 from .projection import FOCAL, POSE, photo_scale, project, reprojection_errors
 
@@ -111,7 +112,7 @@ def _density(points2D: np.ndarray, projected: np.ndarray, camera: pycolmap.Camer
     """Return the probability per pixel that a wrong match projects to image points (N, 2)."""
     uniform = 1 / (camera.width * camera.height)
     rounded = projected[np.isfinite(projected).all(axis=1)].round()
-    complex_numbers = np.unique(rounded @ [1, 1j])  # sorted much faster than rows
+    complex_numbers = distinct(rounded @ [1, 1j])  # sorted much faster than rows
     visible = np.stack([complex_numbers.real, complex_numbers.imag], axis=1)
     if len(visible) <= NEIGHBORS:
         return np.full(len(points2D), uniform)

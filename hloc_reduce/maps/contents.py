@@ -18,6 +18,7 @@ from ..localization.references import Reference, SfmMap
 from ..pairs_from_retrieval import read_global, similarity
 from ..runtime import parallel
 from ..utils import colmap
+from ..utils.arrays import distinct
 from ..utils.cli import InputError
 from ..utils.feature_files import dimension, read_descriptors
 from ..utils.h5 import open_h5
@@ -157,7 +158,7 @@ def _of_file(path: Path, onnx: Path | None) -> Contents:
 
     def match(descriptors: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
         visible = [compact.visible(name) for name in names]
-        points = np.unique(np.concatenate([np.zeros(0, np.int64), *visible]))
+        points = distinct(np.concatenate([np.zeros(0, np.int64), *visible]))
         described = compact.descriptors(points, unbiased=engine.takes_codes)
         images = [np.searchsorted(points, part) for part in visible]
         prepared = engine.prepare(descriptors), engine.prepare(described)
