@@ -20,7 +20,7 @@ from .runtime.group_writer import Arrays, Group, GroupWriter, fill
 from .utils import cli
 from .utils.cli import InputError
 from .utils.codes import to_integers
-from .utils.feature_files import StoredDescriptors, read_descriptors
+from .utils.feature_files import Levels, StoredDescriptors, coded_by, read_descriptors
 from .utils.h5 import file_provenance, open_h5
 from .utils.match_files import check_distinct, names_to_pair
 from .utils.parsers import parse_pairs
@@ -84,6 +84,12 @@ def main(
     feature_paths = feature_path, features_ref or feature_path
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
         made_from = provenance(conf, file0, file1)
+        projections = coded_by(file0), coded_by(file1)
+        if None not in projections and projections[0] != projections[1]:
+            raise InputError(
+                f"The codes in {features_ref} are of another projection than those in "
+                f"{feature_path}."
+            )
     with GroupWriter(matches, made_from, overwrite, compression="gzip") as writer:
         listed = progress(parse_pairs(pairs), "Matching", "pair", number)
         todo = unmatched_pairs(listed, writer, ordered=features_ref not in (None, feature_path))
@@ -232,7 +238,7 @@ class DescriptorCache:
     def __init__(self, max_bytes: int):
         self.max_bytes, self.bytes = max_bytes, 0
         self.kept: OrderedDict[tuple[str, str], Described] = OrderedDict()
-        self.levels: dict[str, tuple[np.ndarray, str]] = {}  # with the first image, by data set
+        self.levels = Levels()
 
     def __call__(self, file: h5py.File, name: str) -> Described:
         """Return the descriptors of an image in an open feature file.
@@ -246,25 +252,13 @@ class DescriptorCache:
             return self.kept[key]
         stored = read_descriptors(file, name)
         restored = stored.restore()  # which checks them
-        self._check(stored)
+        self.levels.check(stored)
         descriptors = restored if stored.is_float else stored
         self.kept[key] = descriptors
         self.bytes += _nbytes(descriptors)
         while self.bytes > self.max_bytes and len(self.kept) > 1:
             self.bytes -= _nbytes(self.kept.popitem(last=False)[1])
         return descriptors
-
-    def _check(self, stored: StoredDescriptors) -> None:
-        """Refuse codes with other levels: they are of another projection."""
-        levels = stored.attrs.get("levels")
-        if levels is None:
-            return
-        known, first = self.levels.setdefault(stored.key, (levels, stored.place))
-        if not np.array_equal(known, levels):
-            raise InputError(
-                f"The codes of {stored.place} have other levels than those of {first}: they are "
-                "of different projections."
-            )
 
 
 def _nbytes(descriptors: Described) -> int:

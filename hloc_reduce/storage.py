@@ -7,14 +7,17 @@ as `descriptors_uint8`, so that hloc reports missing descriptors instead of read
 numbers. What rounding has lost stays lost when descriptors are converted back to floats.
 """
 
+from contextlib import suppress
 from pathlib import Path
+
+import numpy as np
 
 from . import logger, projections
 from .runtime.group_writer import GroupWriter
 from .utils import cli
 from .utils.cli import InputError
 from .utils.codes import CODED, QUANTIZED, STORAGES, store
-from .utils.feature_files import get_descriptors, read_others, stored_descriptors
+from .utils.feature_files import Levels, read_descriptors, read_others
 from .utils.h5 import file_provenance, list_h5_names, open_h5
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
@@ -54,6 +57,7 @@ def main(
     if output.resolve() == features.resolve():
         raise InputError(f"{output} cannot be converted to itself: choose another --output.")
     names = list_h5_names(features)
+    known = Levels() if projection is None else Levels(_levels(projection))
     with open_h5(features) as file:
         made_from = {"converted": file_provenance(file), "storage": storage}
         if projection is not None:
@@ -62,12 +66,12 @@ def main(
             todo = [name for name in names if name not in writer]
             for name in progress(todo, "Converting features", "image"):
                 arrays, attrs = read_others(file, name)
-                found = stored_descriptors(file, name)
-                key = found.name.rpartition("/")[2]
-                if QUANTIZED.get(storage) == key:
-                    stored, own = {key: found[()]}, {key: dict(found.attrs)}
+                found = read_descriptors(file, name)
+                known.check(found)
+                if QUANTIZED.get(storage) == found.key:
+                    stored, own = {found.key: found.array}, {found.key: found.attrs}
                 else:
-                    descriptors = get_descriptors(file, name).T
+                    descriptors = found.restore().T
                     if levels is not None and len(levels) != len(descriptors):
                         raise InputError(
                             f"{features}: the descriptors of {name} are {len(descriptors)}-D, "
@@ -77,6 +81,16 @@ def main(
                 writer.add(name, arrays | stored, attrs | own)
     logger.info("%d images, descriptors as %s: %s", len(names), storage, output)
     return output
+
+
+def _levels(projection: str | Path) -> dict[str, tuple[np.ndarray, str]]:
+    """Return the levels of a projection as `Levels` takes them, of all storages that it has."""
+    found = {}
+    for storage in CODED:
+        with suppress(InputError):
+            levels = projections.levels(projection, storage).astype(np.float16)
+            found[QUANTIZED[storage]] = levels, Path(projection).name
+    return found
 
 
 def _main() -> None:

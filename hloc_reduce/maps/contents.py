@@ -120,11 +120,12 @@ def _of_folder(path: Path) -> Contents:
         *(extractors.load(built.conf["model"]), matcher),
         *(read_vocabulary(built.vocabulary), built.storage),
     )
+    levels, described = built.levels(), {}
     with open_h5(built.features) as file:
-        described = {
-            name: engine.prepare(read_descriptors(file, name).restore(unbiased=engine.takes_codes))
-            for name in names
-        }
+        for name in names:
+            stored = read_descriptors(file, name)
+            levels.check(stored)
+            described[name] = engine.prepare(stored.restore(unbiased=engine.takes_codes))
     shown = {name: np.flatnonzero(reference.point_rows(name) >= 0) for name in names}
     global_descriptors = read_global(built.descriptors, names)
 

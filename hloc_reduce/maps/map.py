@@ -6,6 +6,7 @@ import uuid
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from .. import aggregate_features, extract_features, projections
@@ -18,9 +19,10 @@ from ..runtime import provenance
 from ..runtime.outputs import CONF
 from ..utils import colmap
 from ..utils.cli import InputError, choose, no_folder
-from ..utils.codes import STORAGES
+from ..utils.codes import CODED, QUANTIZED, STORAGES
+from ..utils.feature_files import Levels, read_descriptors
 from ..utils.files import replacing
-from ..utils.h5 import file_provenance, get_dataset, list_h5_names, open_h5
+from ..utils.h5 import file_provenance, get_dataset, iterate_h5_names, list_h5_names, open_h5
 from ..utils.paths import strings_as_paths
 from . import contradictions, cropping, mirrored_photos, misfits, precision
 
@@ -144,6 +146,7 @@ class Map:
             for path in (self.features, self.descriptors):
                 with open_h5(path) as file:
                     file_provenance(file)
+            self._check_levels()
             read_vocabulary(self.vocabulary)
             if projection:
                 projections.load(projection)
@@ -152,6 +155,21 @@ class Map:
                 f"The map {self.folder} is broken: {str(error).rstrip('.')}. Copy it again, or "
                 "build it again with --overwrite."
             ) from None
+
+    def levels(self) -> Levels:
+        """Return what checks that the codes of its images have the levels of its projection."""
+        file = features_confs.level_file(self.conf)
+        if self.storage not in CODED or file is None:
+            return Levels()
+        found = projections.levels(file, self.storage).astype(np.float16)
+        return Levels({QUANTIZED[self.storage]: (found, Path(file).name)})
+
+    def _check_levels(self) -> None:
+        """Raise an InputError if the codes of the first image have others."""
+        with open_h5(self.features) as file:
+            name = next(iterate_h5_names(file.id), None)
+            if name is not None:
+                self.levels().check(read_descriptors(file, name))
 
     def check_feature(self, feature: str, projection: Path | None = None) -> None:
         """Refuse a feature that is not the map's.

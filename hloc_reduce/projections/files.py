@@ -1,5 +1,6 @@
 """The files of projections: shipped, released by the paper's authors, and trained by users."""
 
+import json
 import re
 from pathlib import Path
 
@@ -81,7 +82,8 @@ def levels(projection: str | Path, storage: str) -> np.ndarray:
     key = level_key(storage, prefix)
     try:
         with safe_open(path, "np") as file:
-            return check_levels(file.get_tensor(key), storage)
+            found = check_levels(file.get_tensor(key), storage)
+            dim = int(prefix or json.loads((file.metadata() or {}).get("layers", "[0]"))[-1])
     except SafetensorError:
         said = f"The projection {Path(name).stem}{prefix and '@' + prefix} has no levels"
         if path.suffix != ".safetensors":
@@ -94,8 +96,11 @@ def levels(projection: str | Path, storage: str) -> np.ndarray:
             f"{said} for {storage}: use --storage uint8, or {add} with 'python -m hloc_reduce."
             f"training.levels --projection {'COPY' if is_shipped else path} --map IMAGES:MODEL'."
         ) from None
-    except ValueError as error:
+    except (ValueError, TypeError, IndexError) as error:
         raise InputError(f"{path} has {error}.") from None
+    if len(found) != dim:
+        raise InputError(f"{path} has levels of {len(found)} dimensions, its descriptors {dim}.")
+    return found
 
 
 def checksum(projection: str | Path) -> str:

@@ -1,5 +1,7 @@
 """Feature files in hloc's format."""
 
+import json
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +10,7 @@ import h5py
 import numpy as np
 
 from .cli import InputError
-from .codes import QUANTIZED, restore
+from .codes import CODED, QUANTIZED, restore
 from .h5 import get_array, get_dataset, get_text, iterate_h5_names, open_h5, reading
 
 
@@ -100,6 +102,17 @@ def dimension(features: Path) -> int:
     return 0
 
 
+def coded_by(file: h5py.File) -> str | None:
+    """Return the checksum of the projection whose levels the codes of a file are of, if known."""
+    name = next(iterate_h5_names(file.id), None)
+    if name is None or stored_descriptors(file, name).name.rpartition("_")[2] not in CODED:
+        return None
+    try:
+        return dict(json.loads(get_text(file, "conf", "{}"))).get("projection_sha256")
+    except (TypeError, ValueError):  # a file of others
+        return None
+
+
 @dataclass(frozen=True)
 class StoredDescriptors:
     """The descriptors of an image as a file stores them.
@@ -138,6 +151,30 @@ class StoredDescriptors:
             raise InputError(f"{self.place}: its {self.key} have no {error.args[0]}.") from None
         except (TypeError, ValueError) as error:
             raise InputError(f"{self.place}: its {self.key} have {error}.") from None
+
+
+class Levels:
+    """Checks that codes that are compared have the same levels.
+
+    Args:
+        known: levels (D, 2**bits) by the name of the data set, with what has them; those of other
+            data sets are taken from the first image.
+    """
+
+    def __init__(self, known: Mapping[str, tuple[np.ndarray, str]] | None = None):
+        self._known = dict(known or {})
+
+    def check(self, stored: StoredDescriptors) -> None:
+        """Raise an InputError for codes with other levels: they are of another projection."""
+        levels = stored.attrs.get("levels")
+        if levels is None:
+            return
+        known, first = self._known.setdefault(stored.key, (levels, stored.place))
+        if not np.array_equal(known, levels):
+            raise InputError(
+                f"The codes of {stored.place} have other levels than those of {first}: they are "
+                "of different projections."
+            )
 
 
 def read_descriptors(file: h5py.File, name: str) -> StoredDescriptors:

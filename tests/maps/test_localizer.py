@@ -4,19 +4,21 @@ import shutil
 import sys
 
 import cv2
+import h5py
 import numpy as np
 import pycolmap
 import pytest
 import torch
 from command import outcome
 
-from hloc_reduce import Localizer, compact, maps
+from hloc_reduce import Localizer, compact, maps, projections
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.maps import contents
 from hloc_reduce.maps.engine import TorchEngine
 from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
 from hloc_reduce.utils import cli, parsers
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.h5 import list_h5_names
 from hloc_reduce.utils.images import UnreadableImage
 from pipelines import aachen, localize
 
@@ -211,6 +213,19 @@ def test_only_matchers_that_take_codes_get_them(takes_codes, place, run, monkeyp
         pose, _ = Localizer(path).localize(images / "query/day/a.png")
         assert pose is not None
         assert (max(longest) > 1.01) == takes_codes
+
+
+def test_codes_with_foreign_levels_are_refused(place, run):
+    build, _, outputs = place
+    run(*build, "--feature", "colmap_sift_sv32", "--storage", "uint2")
+    features = next((outputs / "map").glob("feats-*.h5"))
+    other = projections.levels("sift_sv32", "uint2")
+    for names, said in ((slice(-1, None), "^The codes"), (slice(None), "is broken: The codes")):
+        with h5py.File(features, "r+") as file:
+            for name in list_h5_names(features)[names]:
+                file[f"{name}/descriptors_uint2"].attrs["levels"] = other
+        with pytest.raises(InputError, match=f"{said} of db/.* other levels than"):
+            Localizer(outputs / "map")
 
 
 def test_numbers_that_are_too_small(tmp_path):

@@ -111,6 +111,9 @@ def test_features_without_levels_are_refused(projection, tmp_path, monkeypatch, 
     network.save(mlp, metadata, projection, broken)
     with pytest.raises(InputError, match=r"levels of shape \(16, 3\), not \(D, 16\)"):
         projections.levels(projection, "uint4")
+    network.save(mlp, metadata, projection, {"levels.uint2": torch.arange(32.0).reshape(8, 4)})
+    with pytest.raises(InputError, match="has levels of 8 dimensions, its descriptors 16"):
+        projections.levels(projection, "uint2")
     features = tmp_path / "a.h5"
     with h5py.File(features, "w") as file:
         file["a.jpg/descriptors"] = np.eye(16, dtype=np.float16)
@@ -169,3 +172,36 @@ def test_codes_of_different_levels_are_not_matched(projection, tmp_path):
     conf = match_features.confs["NN-ratio"]
     with pytest.raises(InputError, match="other levels than those of a in .* different project"):
         match_features.main(conf, pairs, path, matches=tmp_path / "m.h5")
+
+
+def test_codes_of_another_projection_are_not_converted(projection, tmp_path):
+    path, codes = tmp_path / "a.h5", tmp_path / "codes.h5"
+    with h5py.File(path, "w") as file:
+        file["a.jpg/descriptors"] = np.eye(16, dtype=np.float16)
+    storage.main(path, codes, "uint2", projection=projection)
+    output = tmp_path / "b.h5"
+    for wanted in ("uint2", "uint4"):
+        with pytest.raises(InputError, match="a.jpg in .* other levels than those of sift_sv16"):
+            storage.main(codes, output, wanted, projection="sift_sv16")
+        assert not output.exists()
+        storage.main(codes, tmp_path / f"{wanted}.h5", wanted, projection=projection)
+
+
+def test_codes_of_two_projections_are_not_matched(projection, tmp_path):
+    """Their levels cannot be compared, as one file has 16 and the other 4 a number."""
+    pairs, path = tmp_path / "pairs.txt", tmp_path / "a.h5"
+    pairs.write_text("a b\n")
+    with h5py.File(path, "w") as file:
+        for name in "ab":
+            file[f"{name}/descriptors"] = np.eye(16, dtype=np.float16)
+    conf, matches = match_features.confs["NN-mutual"], tmp_path / "matches.h5"
+    coded = {
+        kind: storage.main(path, tmp_path / f"{kind}.h5", kind, projection=whose)
+        for kind, whose in (("uint4", projection), ("uint2", projection), ("uint1", "sift_sv16"))
+    }
+    match_features.main(conf, pairs, coded["uint4"], matches=matches, features_ref=coded["uint2"])
+    with pytest.raises(InputError, match="The codes in .*uint1.h5 are of another projection"):
+        match_features.main(
+            conf, pairs, coded["uint4"], matches=tmp_path / "m.h5", features_ref=coded["uint1"]
+        )
+    assert not (tmp_path / "m.h5").exists()
