@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 
 from hloc_reduce import projections
+from hloc_reduce.networks import MINI
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,7 +30,8 @@ def test_wheel_is_complete(tmp_path):
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path]
     subprocess.run([*command, source], check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
-    names = set(zipfile.ZipFile(wheel).namelist())
+    sizes = {entry.filename: entry.file_size for entry in zipfile.ZipFile(wheel).infolist()}
+    names = sizes.keys()
     modules = {
         path.relative_to(ROOT).as_posix()
         for folder in ("confs", "hloc_reduce", "pipelines")
@@ -40,6 +42,8 @@ def test_wheel_is_complete(tmp_path):
         f"hloc_reduce/projections/weights/{name}.safetensors" for name in projections.names()
     }
     assert weights and weights <= names
+    for network in MINI:
+        assert sizes[f"hloc_reduce/networks/weights/{network}.safetensors"] < 1e6
     if has_compiler() and platform.system() == "Linux":
         assert any(name.startswith("hloc_reduce/utils/_best_two.") for name in names)
     assert "hloc_reduce/light/vlad_sift_sv64.safetensors" in names

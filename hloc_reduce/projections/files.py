@@ -18,6 +18,7 @@ COMMAND = (
     "python -m hloc_reduce.training --descriptor {descriptor} --scheme {scheme}{dim} "
     "--map IMAGES:MODEL --output weights"
 )
+NAME = re.compile(r"(\w+)_([a-z]+)(\d*)")  # descriptor, scheme, dimension
 # sift_nested@24: the first 24 numbers of sift_nested; an @ in a folder or a suffix is no prefix
 PREFIX = re.compile(r"(.+)@([^@/\\.]+)")
 
@@ -46,8 +47,8 @@ def find(projection: str | Path) -> Path:
         return path
     if name in released.FILES:
         return released.fetch(name)
-    parts = re.fullmatch(r"([a-z]+)_([a-z]+)(\d*)", name)
-    if not parts or parts[1] not in DESCRIPTORS:
+    parts, shipped = NAME.fullmatch(name), filter(None, map(NAME.fullmatch, names()))
+    if not parts or parts[1] not in {*DESCRIPTORS, *(other[1] for other in shipped)}:
         raise InputError(f"There is no projection {name}. Those that ship: {', '.join(names())}.")
     descriptor, scheme, dim = parts.groups()
     command = COMMAND.format(

@@ -103,8 +103,15 @@ def test_what_does_not_ship_says_how_to_train_it():
         projections.load("hardnet_nested@24")
     with pytest.raises(InputError, match="weights/hardnet_nested.safetensors@24"):
         projections.load("hardnet_nested@24")
-    with pytest.raises(InputError, match="There is no projection"):
-        projections.load("sitf_sv64")
+    for name, said in {
+        "aliked_us32": "--descriptor aliked --scheme us --dim 32",
+        "edgepoint2_m64_us32": "--descriptor edgepoint2_m64 --scheme us --dim 32",
+        "colmap_sift_nested": "--descriptor colmap_sift --scheme nested",
+        "sitf_sv64": "There is no projection sitf_sv64",
+        "sitf": "There is no projection sitf",
+    }.items():
+        with pytest.raises(InputError, match=said):
+            projections.load(name)
 
 
 def test_the_first_numbers_of_a_nested_projection(tmp_path):
