@@ -1,11 +1,11 @@
 """Time the matching of image pairs: mutual nearest neighbours with a ratio test.
 
 Compares the nearest_neighbor of the installed hloc (or else the same computation in torch); ours,
-for one pair at a time and for a run of pairs, one per core; a run of pairs stored as uint8, which
-are restored for every pair and matched as integers; exact search by faiss in both directions; and
-the bare matrix product, a lower bound for every search that computes it. Prints milliseconds per
-pair, the least of several rounds in which all take turns, and the speedups over hloc. A tenth of
-the descriptors of a pair match.
+for one pair at a time and for a run of pairs, one per core; runs of pairs stored as uint8 and as
+uint4, which are restored for every pair and matched as integers; exact search by faiss in both
+directions; and the bare matrix product, a lower bound for every search that computes it. Prints
+milliseconds per pair, the least of several rounds in which all take turns, the speedups over hloc,
+and the memory that floats and codes of an image take. A tenth of the descriptors of a pair match.
 """
 
 import sys
@@ -20,16 +20,17 @@ from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
 from hloc_reduce.runtime import parallel
 from hloc_reduce.utils import best_two, cli
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.codes import restore, store, to_integers
+from hloc_reduce.utils.codes import CODED, restore, store, to_integers
 
 RATIO = 0.8
 MATCHING = 0.1  # share of the descriptors
 DIMS = (128, 64, 32, 24, 16)
 
-CODES = "codes, run"
-ROUNDED = 0.02  # share of the matches that rounding to codes may change
+# share of the matches that rounding to codes may change; uint4 changes what is matched
+ROUNDED = {"uint8": 0.02, "uint4": np.inf}
 
 Pair = tuple[torch.Tensor, torch.Tensor]
+Stored = tuple[dict[str, np.ndarray], dict[str, dict]]  # as `codes.store` returns it
 
 
 def make_pair(number: int, dim: int, seed: int, device: str) -> Pair:
@@ -43,6 +44,15 @@ def make_pair(number: int, dim: int, seed: int, device: str) -> Pair:
     second[:matching] = first[:matching] + 0.3 * second[:matching]
     second = torch.nn.functional.normalize(second, dim=1)
     return first.to(device), second[torch.randperm(number, generator=generator)].to(device)
+
+
+def coded(descriptors: torch.Tensor, storage: str) -> Stored:
+    """Store descriptors (N, D); the levels of codes are quantiles."""
+    numbers, levels = descriptors.T.cpu().numpy(), None
+    if storage in CODED:
+        number = 2 ** CODED[storage]
+        levels = np.quantile(numbers, (np.arange(number) + 0.5) / number, axis=1).T
+    return store({"descriptors": numbers}, storage, levels)
 
 
 def hloc_matcher(device: str) -> tuple[str, Callable[[Pair], torch.Tensor]]:
@@ -92,10 +102,6 @@ def methods(data: list[Pair], device: str) -> dict[str, Callable[[list[Pair]], l
     reference, match = hloc_matcher(device)
     ours = NearestNeighbor({"ratio_threshold": RATIO})
     memory = torch.empty(len(data[0][0]), len(data[0][1]), device=device)
-    stored = [
-        tuple(store({"descriptors": part.T.cpu().numpy()}, "uint8") for part in pair)
-        for pair in data
-    ]
     batches = 1 if device == "cpu" else 64
 
     def run(pairs: list[Pair]) -> list:
@@ -104,22 +110,26 @@ def methods(data: list[Pair], device: str) -> dict[str, Callable[[list[Pair]], l
         found = parallel.ordered("match", ours.match, parts, workers)
         return [matches for part in found for matches, _ in part]
 
-    def match_codes(pair: tuple) -> torch.Tensor:
-        integers = (torch.from_numpy(to_integers(restore(*part, unbiased=True))) for part in pair)
-        return ours.match([tuple(integers)])[0][0]
+    def match_codes(pair: list[Stored]) -> torch.Tensor:
+        first, second = (
+            torch.from_numpy(to_integers(restore(*part, unbiased=True))) for part in pair
+        )
+        return ours.match([(first, second)])[0][0]
+
+    def run_codes(storage: str) -> Callable[[list[Pair]], list]:
+        stored = [[coded(part, storage) for part in pair] for pair in data]
+        return lambda _: list(parallel.ordered("match", match_codes, stored))
 
     compared = {
         reference: lambda pairs: [match(pair) for pair in pairs],
         "ours, one pair": lambda pairs: [ours.match([pair])[0][0] for pair in pairs],
         "ours, run": run,
-        CODES: lambda _: list(parallel.ordered("match", match_codes, stored)),
+        **{storage: run_codes(storage) for storage in ROUNDED if device == "cpu"},
         "faiss": lambda pairs: [faiss_both_ways(pair) for pair in pairs],
         "product": lambda pairs: [torch.mm(pair[0], pair[1].T, out=memory) for pair in pairs][:0],
     }
     if device != "cpu" or find_spec("faiss") is None:
         del compared["faiss"]
-    if device != "cpu":
-        del compared[CODES]
     return compared
 
 
@@ -141,7 +151,7 @@ def measure(number: int, dim: int, pairs: int, rounds: int, device: str) -> dict
                 expected = found
             for matches, right in zip(found, expected, strict=False):
                 differing = int((matches.cpu() != right.cpu()).sum())
-                if differing > (ROUNDED * MATCHING * number if name == CODES else 0):
+                if differing > ROUNDED.get(name, 0) * MATCHING * number:
                     print(f"{name}, {dim}: {differing} of {number} differ", file=sys.stderr)
     return seconds
 
@@ -162,19 +172,23 @@ def _main() -> None:
         seconds = measure(args.keypoints, dim, args.pairs, args.rounds, args.device)
         if names is None:
             names = list(seconds)
-            code = next(iter(best_two.instructions()), "torch")
+            code = next(iter(best_two.instructions()), "NumPy")
             size, threads = f"{args.keypoints} x {args.keypoints}", torch.get_num_threads()
             print(f"{size}, {threads} threads, codes with {code}, ms")
             ratios = ["one pair", "run", "run / product"]
-            ratios += ["codes", "run / codes"] if CODES in names else []
+            codes = [name for name in names if name in ROUNDED]
+            ratios += [f"{part}{name}" for name in codes for part in ("/ ", "run / ", "memory / ")]
             print(f"| dimensions | {' | '.join(names + ratios)} |")
             print("| ---: |" + " ---: |" * (len(names) + len(ratios)))
         reference, one, run = (seconds[name] for name in names[:3])
         cells = [f"{1e3 * value:.0f}" for value in seconds.values()]
         cells += [f"{reference / one:.1f}x", f"{reference / run:.1f}x"]
         cells += [f"{run / seconds['product']:.1f}"]
-        if CODES in names:
-            cells += [f"{reference / seconds[CODES]:.1f}x", f"{run / seconds[CODES]:.1f}x"]
+        floats = make_pair(args.keypoints, dim, 0, "cpu")[0]
+        for name in codes:
+            (stored,) = coded(floats, name)[0].values()
+            cells += [f"{reference / seconds[name]:.1f}x", f"{run / seconds[name]:.1f}x"]
+            cells += [f"{floats.numpy().nbytes / stored.nbytes:.0f}x"]
         print(f"| {dim} | {' | '.join(cells)} |", flush=True)
 
 
