@@ -177,7 +177,7 @@ def _main() -> None:
             print(f"{size}, {threads} threads, codes with {code}, ms")
             ratios = ["one pair", "run", "run / product"]
             codes = [name for name in names if name in ROUNDED]
-            ratios += [f"{part}{name}" for name in codes for part in ("/ ", "run / ", "memory / ")]
+            ratios += [f"{part} / {name}" for name in codes for part in (names[0], "run", "memory")]
             print(f"| dimensions | {' | '.join(names + ratios)} |")
             print("| ---: |" + " ---: |" * (len(names) + len(ratios)))
         reference, one, run = (seconds[name] for name in names[:3])

@@ -8,7 +8,7 @@ like those of pipelines.aachen and pipelines.inloc, so an interrupted comparison
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from hloc_reduce.report import runs
 from hloc_reduce.runtime import provenance
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.files import MEGABYTE, write_csv
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned, joined
@@ -39,6 +40,7 @@ def main(
     ground_truth: Path | None = None,
     gate: Gate = DEFAULT_GATE,
     max_mb: Iterable[float] = (),
+    storages: Iterable[str] = STORAGES[:1],
 ) -> dict[str, str]:
     """Localize the queries of a data set with several features, print a table, write a report.
 
@@ -56,9 +58,10 @@ def main(
         gate: what a pose must have for the query to be called localized.
         max_mb: sizes of compact maps in 1,000,000 bytes. Those above the first one that all points
             fit into are left out.
+        storages: how the descriptors of map images are stored, each feature in all of these ways.
 
     Returns:
-        The error message of each feature, and of each size of its map, that failed.
+        The error message of each feature, storage and size of a map that failed.
 
     Raises:
         InputError: for an unknown layout or feature, or if all features failed.
@@ -69,18 +72,22 @@ def main(
     page = page or outputs / "report.html"
     cli.check_folder(outputs)
     cli.check_file(page, "the HTML file")
+    for storage in (storages := list(dict.fromkeys(storages))):
+        cli.choose("storage", storage, STORAGES)
     given = {features_confs.get(feature)[0]: feature for feature in features}
     finished: list[Path] = []
     failed: dict[str, str] = {}
-    for name, feature in given.items():
-        folder = outputs / name
+    for (name, feature), storage in product(given.items(), storages):
+        coded = storage != STORAGES[0]
+        folder = outputs / (f"{name}+{storage}" if coded else name)
         before = provenance.read(folder / "summary.json").get("files", {}).get("ground_truth")
         truth = ground_truth or (before and folder / before)
-        given_to_all = {"retrieval": retrieval, "ground_truth": truth, "gate": gate}
-        run = partial(pipeline, dataset, folder, feature, **given_to_all)
-        finished += _run_sizes(run, name, folder, sizes, failed)
+        options = {"retrieval": retrieval, "ground_truth": truth, "gate": gate, "storage": storage}
+        run = partial(pipeline, dataset, folder, feature, **options)
+        label = f"{name}, {storage}" if coded else name
+        finished += _run_sizes(run, label, folder, sizes, failed)
     if not finished:
-        raise InputError(f"None of {len(failed)} features could be run.")
+        raise InputError(f"None of {len(given)} features could be run.")
     compared = runs.load(finished)
     tables = runs.recall_tables(compared)
     write_csv(rows(tables), outputs / "compare.csv")
@@ -108,7 +115,7 @@ def _run_sizes(
 
     Args:
         run: the pipeline, which takes the options of compact maps.
-        name: the feature.
+        name: the feature, with its storage.
         outputs: its outputs folder.
         sizes: of compact maps, ascending.
         failed: messages of failed runs, to which those of this feature are added.
@@ -234,6 +241,15 @@ def _main() -> None:
     )
     page = "the report (default: <outputs>/report.html)"
     parser.add_argument("-o", "--output", type=Path, dest="page", metavar="OUTPUT", help=page)
+    parser.add_argument(
+        "--storage",
+        nargs="+",
+        default=STORAGES[:1],
+        dest="storages",
+        metavar="STORAGE",
+        help="run each feature with each of these storages of map descriptors: "
+        f"{', '.join(STORAGES)} (default: {STORAGES[0]})",
+    )
     add_retrieval_option(parser)
     parser.add_argument(
         "--ground_truth",

@@ -21,6 +21,7 @@ from ..maps.map import is_map
 from ..runtime.outputs import CONF, SHARED
 from ..utils import cli, colmap
 from ..utils.cli import InputError, no_folder
+from ..utils.codes import QUANTIZED
 from ..utils.files import MEGABYTE
 from ..utils.h5 import open_h5
 from ..utils.parsers import parse_poses, parse_retrieval
@@ -41,8 +42,9 @@ class Run:
         rows: queries.csv by query, counts as int, errors as float or None if unknown.
         records: the record of each query, as from `localization.main`.
         feature: name of the feature.
-        label: the name of the run in a report.
-        family: its feature without the dimension: `sift_sv` for sift_sv64.
+        label: the name of the run in a report, with the size of a compact map, or the storage of
+            a whole one unless that is floats.
+        family: its feature without the dimension: `sift_sv` for sift_sv64; with this storage.
         bytes: size of a descriptor.
         map_bytes: size of the map, None if unknown.
         is_compact: whether the map is one file of `hloc_reduce.compact`.
@@ -67,6 +69,8 @@ class Run:
             self.is_compact = "compact" in self.summary
             if self.is_compact:
                 self.label += f", {int(self.summary['map_bytes']) / MEGABYTE:.3g} MB"
+            elif (stored := self.summary["bytes_per_keypoint"].get("storage")) in QUANTIZED:
+                self.label, self.family = f"{self.label}, {stored}", f"{self.family}, {stored}"
             self.bytes = int(self.summary["bytes_per_keypoint"]["descriptor"])
             self.seconds = float(sum(self.summary["seconds"].values()))
             poses = folder / self.summary["poses"]

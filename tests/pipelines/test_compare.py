@@ -15,6 +15,7 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
     (tmp_path / "broken.yaml").write_text("model: {name: dog, options: {peak_treshold: 1}}")
     given = ("--dataset", aachen_layout, "--outputs", outputs, "--features")
     features = ("sift_sv16", "colmap_sift_sv16", tmp_path / "broken.yaml")
+    coded = ("--storage", "float16", "uint2")
     with pytest.raises(SystemExit) as exit:
         command.run(monkeypatch, compare, *given, *features)
     # one failed, which the others do not suffer from
@@ -50,6 +51,18 @@ def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
     command.run(monkeypatch, compare, *given, "sift_sv16", "-o", page)
     assert page.exists() and len(times) > 10
     assert command.state(outputs / "sift_sv16") == times
+
+    # codes beside floats, with the bytes that they take
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        command.run(monkeypatch, compare, *given, "sift", "sift_sv16", *coded, "-o", page)
+    assert "sift, uint2 failed: sift has no projection" in caplog.text
+    found = [line.split("|")[:2] for line in capsys.readouterr().out.splitlines()[3:]]
+    found = [[cell.strip() for cell in cells] for cells in found]
+    assert found == [["sift", "256"], ["sift_sv16", "32"], ["sift_sv16, uint2", "4"]]
+    assert command.state(outputs / "sift_sv16") == times
+    shown = page.read_text().split("<td><b>sift_sv16, uint2</b></td>")[1]
+    assert shown.index('<td class="n">4</td>') < shown.index("</tr>")
 
 
 def test_sizes_of_maps(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
