@@ -135,6 +135,23 @@ def test_every_feature_describes_patches(feature, base_weights):
     torch.testing.assert_close(again, descriptors[[150, 3]], atol=1e-5, rtol=1e-4)
 
 
+def test_patches_are_rounded_as_a_storage_would():
+    """The fewer bits, the farther from the floats."""
+    patches = torch.rand(200, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    exact = hloc_reduce.describe_patches(patches, "sift_sv32")
+    cosines = []
+    for storage in ("uint8", "uint4", "uint2", "uint1"):
+        rounded = hloc_reduce.describe_patches(patches, "sift_sv32", storage=storage)
+        assert rounded.shape == (200, 32) and rounded.dtype == torch.float32
+        np.testing.assert_allclose(rounded.norm(dim=1), 1, atol=1e-5)
+        cosines.append(float((rounded * exact).sum(dim=1).mean()))
+    assert cosines == sorted(cosines, reverse=True) and cosines[0] > 0.999 and cosines[-1] > 0.5
+    with pytest.raises(InputError, match="Unknown storage 'uint3'"):
+        hloc_reduce.describe_patches(patches, "sift_sv32", storage="uint3")
+    with pytest.raises(InputError, match="sift has no projection, but --storage uint4 needs"):
+        hloc_reduce.describe_patches(patches, "sift", storage="uint4")
+
+
 @pytest.mark.parametrize(
     "patches",
     [
