@@ -118,10 +118,13 @@ def _density(points2D: np.ndarray, projected: np.ndarray, camera: pycolmap.Camer
         return np.full(len(points2D), uniform)
     from scipy.spatial import cKDTree
 
-    # one more, as the nearest one may be the projection of the keypoint's own match
-    distance = cKDTree(visible).query(points2D, k=[NEIGHBORS + 1])[0][:, 0]
     share = NEIGHBORS / len(projected)
-    return np.maximum(uniform, share / (np.pi * np.maximum(distance, 1) ** 2))
+    farthest = np.sqrt(share / (np.pi * uniform))  # beyond it, the density is uniform
+    # one more, as the nearest one may be the projection of the keypoint's own match
+    distance, _ = cKDTree(visible).query(
+        points2D, k=[NEIGHBORS + 1], distance_upper_bound=max(1, farthest)
+    )
+    return np.maximum(uniform, share / (np.pi * np.maximum(distance[:, 0], 1) ** 2))
 
 
 def _log10_tail(successes: int, trials: int, probability: float) -> float:

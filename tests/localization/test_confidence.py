@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from hloc_reduce.localization import absolute_pose, refusals
+from hloc_reduce.localization import confidence as confidence_module
 from hloc_reduce.localization.confidence import (
     DEFAULT_GATE,
     Gate,
@@ -133,6 +134,24 @@ def test_the_tail_is_a_bound(trials, probability):
     for successes in range(trials + 1):
         exact = binom.logsf(successes - 1, trials, probability) / np.log(10)
         assert _log10_tail(successes, trials, probability) >= exact - 1e-9
+
+
+def test_the_density_of_projections_is_that_of_the_nearest():
+    """Found by all distances: of even, crowded and far away projections."""
+    generator = np.random.default_rng(0)
+    projected = np.concatenate(
+        [generator.uniform(0, 900, (300, 2)), generator.normal(500, 9, (300, 2))]
+    )
+    projected[0] = 1e9
+    points2D = generator.uniform(0, 1000, (200, 2))
+    visible = np.unique(projected.round(), axis=0)
+    distance = np.linalg.norm(points2D[:, None] - visible, axis=2)
+    ninth = np.sort(distance, axis=1)[:, confidence_module.NEIGHBORS]
+    expected = confidence_module.NEIGHBORS / 600 / (np.pi * np.maximum(ninth, 1) ** 2)
+    uniform = 1 / (CAMERA.width * CAMERA.height)
+    assert 0.2 < (expected > uniform).mean() < 0.8
+    found = confidence_module._density(points2D, projected, CAMERA)
+    np.testing.assert_allclose(found, np.maximum(expected, uniform))
 
 
 @pytest.mark.parametrize("free", [False, True])
