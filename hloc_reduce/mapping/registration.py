@@ -13,6 +13,7 @@ from .plausibility import (
     FEW,
     FEW_POINTS,
     FEWEST,
+    HINGE,
     MISPLACED,
     SPREAD,
     VIEWPOINTS,
@@ -35,7 +36,10 @@ WHY = {
         "These show another side of the place that looks the same, or a copy of it: from where "
         "COLMAP puts them, they would see many points of the others, but they match few of them"
     ),
-    FEW_POINTS: f"Fewer than {FEWEST} points are left in these, so their poses are not certain",
+    FEW_POINTS: (
+        f"These have fewer than {FEWEST} points, or fewer than {HINGE} where most photos have more "
+        "than eight times as many, so their poses are not certain"
+    ),
 }
 # what to try
 TRIES = {

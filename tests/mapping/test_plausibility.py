@@ -16,23 +16,26 @@ from hloc_reduce.mapping.plausibility import (
 from hloc_reduce.utils import colmap
 
 
-def chain(cameras, places=None):
+def chain(cameras, places=None, links=()):
     """Return a model of images that see points with the next one only, of cameras by number.
 
-    The points are 5 units in front of the images, which are at other places along a line.
+    The points are 5 units in front of the images, which are at other places along a line. Two
+    neighbors share 10 points, or as many as `links` says.
     """
     model = pycolmap.Reconstruction()
     for i, number in enumerate(cameras):
         camera = pycolmap.Camera(
             model="SIMPLE_PINHOLE", width=640, height=480, params=[500, 320, 240], camera_id=number
         )
-        pixels = np.random.default_rng(i).uniform(0, 400, (20, 2))
+        pixels = np.random.default_rng(i).uniform(0, 400, (sum(links or (20,)), 2))
         image = pycolmap.Image(name=f"{i}.jpg", keypoints=pixels, camera_id=number, image_id=i + 1)
         place = np.array([i if places is None else places[i], 0, 0])
         colmap.add_image(model, camera, image, pycolmap.Rigid3d(pycolmap.Rotation3d(), -place))
     for i in range(1, len(cameras)):
-        for j in range(10):
-            elements = [pycolmap.TrackElement(i, 10 + j), pycolmap.TrackElement(i + 1, j)]
+        number, before = (links[i - 1], sum(links[: i - 1])) if links else (10, 0)
+        for j in range(before, before + number):
+            first = j if links else 10 + j
+            elements = [pycolmap.TrackElement(i, first), pycolmap.TrackElement(i + 1, j)]
             model.add_point3D(np.array([0, 0, 5]), pycolmap.Track(elements))
     given = {key: pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
     return model, given
@@ -65,6 +68,22 @@ def test_images_that_lose_their_points_to_such_an_image_have_no_pose_either():
     (found,), dropped = keep_plausible([model], given)
     assert names_of([found]) == [{f"{i}.jpg" for i in range(4)}]
     assert dropped == dict.fromkeys(["4.jpg", "5.jpg"], FEW_POINTS)
+
+
+@pytest.mark.parametrize(
+    ("links", "dropped"),
+    [
+        ((300, 300, 300, 20, 25), ["4.jpg", "5.jpg"]),  # like a hinge
+        ((300, 300, 300, 20, 90), []),  # more points than that
+        ((80, 80, 80, 20, 25), []),  # others have few points, too
+    ],
+)
+def test_images_that_few_points_hold_are_dropped(links, dropped):
+    """Two photos of the back of a bag, 6 degrees off, had 23 and 35 points, the others 1,300."""
+    model, given = chain([1] * 6, links=links)
+    (found,), found_dropped = keep_plausible([model], given)
+    assert found_dropped == dict.fromkeys(dropped, FEW_POINTS)
+    assert found.num_reg_images() == 6 - len(dropped)
 
 
 @pytest.mark.parametrize(
