@@ -263,6 +263,7 @@ def nan(array):
         ("vocabulary", lambda a: a[:, :-1], {}),
         ("descriptors", lambda a: a.astype(np.int64), {}),
         ("rotations", lambda a: 0 * a, {}),
+        ("rotations", lambda a: a + np.float32(np.inf), {}),
         ("names", lambda a: np.frombuffer(b"a\na/b\nc\nd", np.uint8), {}),
         ("names", lambda a: np.frombuffer(b"a\na\nc\nd", np.uint8), {}),
         ("names", lambda a: np.frombuffer(b"/a\nb\nc\nd", np.uint8), {}),
