@@ -131,8 +131,9 @@ def _add_descriptors(tensors: dict, metadata: dict, points: Points, conf: dict) 
 
 def _add_vocabulary(tensors: dict, vocabulary: Path) -> None:
     """Add the vocabulary unless it is the one that ships."""
+    words = read_vocabulary(vocabulary)
     if file_sha256(vocabulary) != file_sha256(VOCABULARY):
-        tensors["vocabulary"] = read_vocabulary(vocabulary).astype(np.float16)
+        tensors["vocabulary"] = words.astype(np.float16)
 
 
 def _add_projection(tensors: dict, metadata: dict, model: dict) -> None:

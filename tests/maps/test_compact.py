@@ -2,16 +2,19 @@
 
 import shutil
 
+import command
 import numpy as np
 import pycolmap
 import pytest
 from command import outcome
 from safetensors.numpy import load_file, save_file
 
-from hloc_reduce import Localizer, compact, maps, projections
+from hloc_reduce import Localizer, aggregate_features, compact, maps, projections
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.light.vlad import read_vocabulary
 from hloc_reduce.maps.compact import CompactMap
 from hloc_reduce.maps.unpack import COMPACT
+from hloc_reduce.pairs_from_retrieval import read_global
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, DELETING
 from hloc_reduce.utils import parsers
@@ -144,6 +147,32 @@ def test_files_of_stages(built, tmp_path):
     ):
         other = maps.Map(folder).features
         compact.main(tmp_path / "a.hlm", sfm=known.sfm, features=other, feature="colmap_sift_sv64")
+
+
+def test_global_descriptors_of_another_file(built, tmp_path, monkeypatch):
+    """The file has these, and the vocabulary beside them."""
+    known = maps.Map(built[0])
+    conf, images = aggregate_features.confs["vlad"], known.names()[:1]
+    small = {**conf, "model": {**conf["model"], "num_words": 3}}
+    other = aggregate_features.main(small, known.features, images, tmp_path / "elsewhere")
+    output = tmp_path / "a.hlm"
+    given = ("--sfm", known.sfm, "--features", known.features, "--feature", "colmap_sift_sv32")
+    given = (*given, "--global_descriptors", other, "--output", output)
+    command.run(monkeypatch, compact, *given)
+    found = CompactMap(output)
+    expected = read_vocabulary(aggregate_features.vocabulary_of(other))
+    np.testing.assert_allclose(found.vocabulary, expected, rtol=1e-3, atol=1e-6)
+    whole = read_global(other, found.names)
+    assert whole.shape == (4, 96) and (found.global_descriptors() * whole).sum(axis=1).min() > 0.6
+    aggregate_features.vocabulary_of(other).unlink()
+    with pytest.raises(InputError, match="is not a vocabulary"):
+        compact.main(
+            output,
+            sfm=known.sfm,
+            features=known.features,
+            feature="colmap_sift_sv32",
+            global_descriptors=other,
+        )
 
 
 @pytest.fixture(scope="module")
