@@ -11,7 +11,7 @@ from safetensors.numpy import load_file, save_file
 
 from hloc_reduce import Localizer, aggregate_features, compact, maps, projections
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.light.vlad import read_vocabulary
+from hloc_reduce.light.vlad import VOCABULARY, read_vocabulary
 from hloc_reduce.maps.compact import CompactMap
 from hloc_reduce.maps.unpack import COMPACT
 from hloc_reduce.pairs_from_retrieval import read_global
@@ -19,6 +19,7 @@ from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, DELETING
 from hloc_reduce.utils import parsers
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.files import file_sha256
 from pipelines import localize
 
 PIPELINE = localize
@@ -173,6 +174,32 @@ def test_global_descriptors_of_another_file(built, tmp_path, monkeypatch):
             feature="colmap_sift_sv32",
             global_descriptors=other,
         )
+
+
+def test_the_vocabulary_that_ships_is_named(place, tmp_path, run):
+    """A file is refused where another one ships; older files do not name it."""
+    build, images, outputs = place
+    run(*build, "--feature", "colmap_sift_sv64")
+    known = maps.Map(outputs / "map")
+    descriptors = aggregate_features.main(
+        *(aggregate_features.confs["vlad"], known.features),
+        export_dir=tmp_path / "elsewhere",
+        vocabulary=VOCABULARY,
+    )
+    shutil.copy(VOCABULARY, aggregate_features.vocabulary_of(descriptors))
+    path = tmp_path / "a.hlm"
+    given = {"sfm": known.sfm, "features": known.features, "feature": "colmap_sift_sv64"}
+    assert "vocabulary" not in compact.main(path, global_descriptors=descriptors, **given)
+    np.testing.assert_array_equal(CompactMap(path).vocabulary, read_vocabulary())
+    assert Localizer(path).localize(images / "query/day/a.png")[0] is not None
+    content = path.read_bytes()
+    name, checksum = b"vocabulary_sha256", file_sha256(VOCABULARY).encode()
+    assert name in content and content.count(checksum) == 1
+    path.write_bytes(content.replace(name, b"an_unknown_number"))
+    CompactMap(path)
+    path.write_bytes(content.replace(checksum, checksum[::-1]))
+    with pytest.raises(InputError, match="a.hlm needs another vocabulary than the one that ships"):
+        CompactMap(path)
 
 
 @pytest.fixture(scope="module")
