@@ -137,7 +137,7 @@ def build(folder: Path) -> dict:
     }
 
 
-def localize(number: int, folder: Path) -> dict:
+def localize(number: int, folder: Path, at_once: bool) -> dict:
     """Open the compact map and localize queries, whose features are given."""
     start = time.perf_counter()
     from hloc_reduce import Localizer
@@ -146,17 +146,22 @@ def localize(number: int, folder: Path) -> dict:
     localizer = Localizer(folder / "place.hlm")
     opened = time.perf_counter()
     resident = current()
+    if at_once:
+        import compact_matching
+
+        localizer._match = compact_matching.at_once(localizer)
     xyz, descriptors = wall(number)
     queries = [synthetic_query(place, xyz, descriptors) for place in places(number)]
     del xyz, descriptors
     before = current()
     stages: dict[str, list[float]] = {stage: [] for stage in STAGES}
-    right = 0
+    right, correspondences = 0, []
     for place, query in zip(places(number), queries, strict=True):
         localizer.engine.extract = lambda image, preprocessing, query=query: dict(query)
         pose, info = localizer.localize(np.zeros((1200, 1600), np.uint8), CAMERA)
         for stage, seconds in stages.items():
             seconds.append(info["seconds"].get(stage, 0.0))
+        correspondences.append(info["num_correspondences"])
         right += pose is not None and abs(pose.translation[0] + place) < 0.05
     return {
         "import_s": imported - start,
@@ -164,6 +169,7 @@ def localize(number: int, folder: Path) -> dict:
         "resident_MB": resident,
         "queries_MB": current() - before,
         **{f"{stage}_s": float(np.mean(seconds)) for stage, seconds in stages.items()},
+        "correspondences": float(np.mean(correspondences)),
         "right": f"{right} of {len(queries)}",
     }
 
@@ -203,6 +209,9 @@ def _main() -> None:
         "--data", type=Path, required=True, help="folder of database_images.txt, a list of images"
     )
     parser.add_argument("--share", type=float, nargs="+", default=[0.01, 0.1], help="of its images")
+    parser.add_argument(
+        "--at_once", action="store_true", help="match with all points at once, not image by image"
+    )
     for hidden in ("--folder", "--stage"):
         parser.add_argument(hidden, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -215,7 +224,7 @@ def _main() -> None:
         stages = {
             "synthesize": lambda: synthesize(some, folder),
             "build": lambda: build(folder),
-            "localize": lambda: localize(len(some), folder),
+            "localize": lambda: localize(len(some), folder, args.at_once),
         }
         print(json.dumps({"images": len(some)} | (stages[args.stage]() or {})))
         return
@@ -224,6 +233,7 @@ def _main() -> None:
         with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as folder:
             for stage in ("synthesize", "build", "localize"):
                 given = ["--data", args.data, "--share", str(share), "--folder", folder]
+                given += ["--at_once"] * args.at_once
                 done = subprocess.run(
                     [sys.executable, __file__, "--stage", stage, *given],
                     stdout=subprocess.PIPE,

@@ -5,9 +5,12 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from hloc_reduce.light.engine import LightEngine
 from hloc_reduce.utils.cli import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -78,3 +81,31 @@ def test_without_hloc_the_comparison_says_what_to_install(monkeypatch):
     stages_of = runpy.run_path(str(ROOT / "benchmarks/against_hloc.py"))["stages_of"]
     with pytest.raises(InputError, match="hloc is not installed: pip install"):
         stages_of("hloc")
+
+
+def test_recall_of_neighbours():
+    """Image 0 shares two points with image 1 and one with image 2; image 3 is alone."""
+    benchmark = runpy.run_path(str(ROOT / "benchmarks/retrieval.py"))
+    shown = [np.array(points) for points in ([7, 8, 9, 20], [7, 8], [9], [5])]
+    common = benchmark["common_points"](shown)
+    expected = [[0, 2, 1, 0], [2, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]]
+    np.testing.assert_array_equal(common, expected)
+    recall = benchmark["recall"]
+    assert recall(common, common, 1) == recall(common, common, 2) == 1
+    alike = common.copy()
+    alike[0] = [9, 0, 1, 2]  # retrieves 3, then 2
+    assert recall(alike, common, 1) == pytest.approx(2 / 3)
+    assert recall(alike, common, 2) == pytest.approx((1 / 2 + 1 + 1) / 3)
+
+
+def test_matching_at_once_gives_each_keypoint_one_point():
+    """Which each image has that shows it."""
+    at_once = runpy.run_path(str(ROOT / "benchmarks/compact_matching.py"))["at_once"]
+    points = np.eye(4, 8, dtype=np.float32)
+    visible = {"a": np.array([0, 2]), "b": np.array([1, 2, 3]), "c": np.array([], int)}
+    compact = SimpleNamespace(visible=visible.get, descriptors=lambda rows, unbiased: points[rows])
+    engine = LightEngine(lambda image: {}, {"name": "nearest_neighbor"}, points)
+    query = points[[2, 3, 0]]
+    found = at_once(SimpleNamespace(engine=engine, reference=compact))(query, ["a", "b", "c"])
+    pairs = {name: sorted(map(tuple, part.tolist())) for name, part in found.items()}
+    assert pairs == {"a": [(0, 1), (2, 0)], "b": [(0, 1), (1, 2)], "c": []}

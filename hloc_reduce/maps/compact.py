@@ -14,11 +14,11 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..light.projection import Layer
 from ..light.projection import read as read_layers
-from ..light.vlad import read_vocabulary
+from ..light.vlad import VOCABULARY, read_vocabulary
 from ..localization import intrinsics
-from ..utils.cli import InputError, choose
+from ..utils.cli import InputError, choose, naming
 from ..utils.codes import CODED, FLOATS, QUANTIZED, STORAGES, check_levels, restore
-from ..utils.files import replacing
+from ..utils.files import file_sha256, replacing
 from ..utils.parsers import check_names
 from . import points as points_of_map
 from . import signs
@@ -68,7 +68,8 @@ class CompactMap:
                 )
             if metadata["version"] == 1:
                 metadata["bits"] = 3 * [metadata["bits"]]
-            self._read(metadata, tensors)
+            with naming(path):
+                self._read(metadata, tensors)
         except FileNotFoundError:
             raise InputError(f"There is no map {path}.") from None
         except InputError:
@@ -105,8 +106,9 @@ class CompactMap:
         self._read_feature(metadata)
         self._read_projection(metadata, tensors)
         self._read_retrieval(metadata, tensors)
-        turned = np.linalg.norm(self._rotations, axis=1) > 0  # no NaN is
-        if not (turned.all() and np.isfinite(self._translations).all()):
+        norms = np.linalg.norm(self._rotations.astype(np.float64), axis=1)
+        finite = np.isfinite(norms).all() and np.isfinite(self._translations).all()
+        if not (finite and norms.min() > 0):
             raise ValueError("numbers that are not finite")
 
     def _read_descriptors(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
@@ -171,6 +173,8 @@ class CompactMap:
         if "vocabulary" in tensors:
             found = _array(tensors, "vocabulary", np.float16, (None, self.dim))
             self.vocabulary = found.astype(np.float32)
+        elif metadata.get("vocabulary_sha256") not in (None, file_sha256(VOCABULARY)):
+            raise InputError(f"{self.path} needs another vocabulary than the one that ships.")
         number, size = self.vocabulary.size, int(metadata["signs"])
         if self.vocabulary.shape[1] != self.dim or not 0 < number <= MAX_GLOBAL:
             raise ValueError(f"a vocabulary of shape {self.vocabulary.shape}")

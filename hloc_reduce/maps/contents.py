@@ -19,7 +19,7 @@ from ..pairs_from_retrieval import read_global, similarity
 from ..runtime import parallel
 from ..utils import colmap
 from ..utils.arrays import distinct
-from ..utils.cli import InputError
+from ..utils.cli import InputError, naming
 from ..utils.feature_files import dimension, read_descriptors
 from ..utils.h5 import open_h5
 from .compact import CompactMap, is_compact
@@ -191,7 +191,8 @@ def _light_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engi
     if onnx is not None:
         extract = OnnxNetwork(onnx, compact.feature, base.get("denoise", True))
     elif is_colmap_sift(base) and not compact.is_pickled:
-        extract = ColmapSift(base, compact.layers())
+        with naming(compact.path):
+            extract = ColmapSift(base, compact.layers())
     else:
         return None
     return LightEngine(extract, matcher, compact.vocabulary)
@@ -203,5 +204,7 @@ def _torch_engine(compact: CompactMap, matcher: dict) -> Engine:
     from .engine import TorchEngine
 
     with TemporaryDirectory() as folder:
-        extractor = extractors.load(compact.write_projection(Path(folder))["model"])
+        model = compact.write_projection(Path(folder))["model"]
+        with naming(compact.path):
+            extractor = extractors.load(model)
     return TorchEngine(extractor, matcher, compact.vocabulary, compact.storage)

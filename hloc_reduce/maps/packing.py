@@ -78,7 +78,7 @@ def encode(
     _add_images(tensors, metadata, points, source.model)
     _add_points(tensors, metadata, points, source.model)
     _add_descriptors(tensors, metadata, points, source.conf)
-    _add_vocabulary(tensors, source.vocabulary)
+    _add_vocabulary(tensors, metadata, source.vocabulary)
     _add_projection(tensors, metadata, source.conf["model"])
     tensors["retrieval"], metadata["signs"] = signs.pack(global_descriptors)
     content = save(tensors, {"map": json.dumps(metadata, sort_keys=True)})
@@ -129,10 +129,13 @@ def _add_descriptors(tensors: dict, metadata: dict, points: Points, conf: dict) 
     metadata |= {"storage": storage, "scale": scale}
 
 
-def _add_vocabulary(tensors: dict, vocabulary: Path) -> None:
-    """Add the vocabulary unless it is the one that ships."""
-    if file_sha256(vocabulary) != file_sha256(VOCABULARY):
-        tensors["vocabulary"] = read_vocabulary(vocabulary).astype(np.float16)
+def _add_vocabulary(tensors: dict, metadata: dict, vocabulary: Path) -> None:
+    """Add the vocabulary, or name the one that ships."""
+    words, shipped = read_vocabulary(vocabulary), file_sha256(VOCABULARY)
+    if file_sha256(vocabulary) == shipped:
+        metadata["vocabulary_sha256"] = shipped
+    else:
+        tensors["vocabulary"] = words.astype(np.float16)
 
 
 def _add_projection(tensors: dict, metadata: dict, model: dict) -> None:

@@ -3,7 +3,8 @@
 import argparse
 import difflib
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,15 @@ def choose(kind: str, name: str, names: Iterable[str]) -> str:
         there_are = f"The nearest of {len(names)}" if len(names) > MANY else "There are"
         raise InputError(f"Unknown {kind} '{name}'. {there_are}: {shown}.")
     return name
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Have each InputError name a file."""
+    try:
+        yield
+    except InputError as error:
+        raise error if str(path) in str(error) else InputError(f"{path}: {error}") from None
 
 
 def check_positive(args: argparse.Namespace, *names: str) -> None:

@@ -1,5 +1,6 @@
 """Localization without torch: the same poses, and nothing that imports it."""
 
+import os
 import subprocess
 import sys
 from importlib.metadata import packages_distributions
@@ -42,21 +43,29 @@ sys.meta_path.insert(0, Absent())
 from hloc_reduce import Localizer
 
 try:
-    pose, info = Localizer(sys.argv[1]).localize(sys.argv[2])
+    localizer, camera = Localizer(sys.argv[1], onnx=sys.argv[4] or None), None
+    if sys.argv[4]:  # a network's features in these few photos do not determine a focal length
+        camera = localizer.reference.camera_of[localizer.names[0]]
+    pose, info = localizer.localize(sys.argv[2], camera)
     print(*pose.rotation.quat, *pose.translation, info["num_inliers"], info["confidence"])
 except InputError as error:
     print(error)
 """
 
 
-def without_torch(path: Path, photo: Path) -> str:
-    """Localize a photo in a process where only what `REQUIREMENTS` names can be imported."""
+def without_torch(path: Path, photo: Path, onnx: Path | None = None, threads: int = 1) -> str:
+    """Localize a photo in a process where only what `REQUIREMENTS` names can be imported.
+
+    With an ONNX file, onnxruntime can be, too.
+    """
     lines = [line for line in REQUIREMENTS.read_text().splitlines() if not line.startswith("#")]
     names = {line.partition(">")[0].lower() for line in lines}
     known = {of for every in packages_distributions().values() for of in every}
-    allowed = {name for name in known if name.lower() in {*names, "cloudpickle", "hloc-reduce"}}
-    command = [sys.executable, "-c", PROGRAM, path, photo, ",".join(allowed)]
-    found = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
+    names |= {"cloudpickle", "hloc-reduce", *(["onnxruntime"] if onnx else [])}
+    allowed = ",".join(name for name in known if name.lower() in names)
+    command = [sys.executable, "-c", PROGRAM, path, photo, allowed, onnx or ""]
+    env = os.environ | {"OMP_NUM_THREADS": str(threads)}
+    found = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=env, timeout=60)
     assert found.returncode == 0, found.stderr
     return found.stdout
 
@@ -81,6 +90,25 @@ def test_localization_without_torch(file, monkeypatch):
     pose, info = localizer.localize(photo)
     np.testing.assert_allclose([*pose.rotation.quat, *pose.translation], values, atol=1e-9)
     assert (info["num_inliers"], info["confidence"]) == (inliers, confidence)
+
+
+def test_one_and_two_threads_give_the_same_pose(file):
+    """To the last digit, without torch and with it."""
+    path, photo = file
+    one, two = (without_torch(path, photo, threads=number) for number in (1, 2))
+    assert one == two and len(one.split()) == 9
+    before, found = torch.get_num_threads(), []
+    try:
+        for number in (1, 2):
+            torch.set_num_threads(number)
+            localizer = Localizer(path)
+            assert localizer.workers == number
+            pose, info = localizer.localize(photo)
+            values = *pose.rotation.quat, *pose.translation, info["num_inliers"]
+            found.append((*map(float, values), float(info["confidence"])))
+    finally:
+        torch.set_num_threads(before)
+    assert found[0] == found[1]
 
 
 def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
@@ -168,6 +196,12 @@ def test_networks_run_by_onnx_runtime(feature, place, run, tmp_path):
         other, its_info = expected.localize(image, camera)
         assert info["num_inliers"] > 0.9 * its_info["num_inliers"] > 50
         assert pose_error(pose, other)[1] < 1
+    if feature == MINI[0]:
+        pose, info = found.localize(photo, found.reference.camera_of[found.names[0]])
+        *values, inliers, _ = map(float, without_torch(path, photo, onnx).split())
+        np.testing.assert_allclose([*pose.rotation.quat, *pose.translation], values, atol=1e-6)
+        assert info["num_inliers"] == inliers
+        assert "needs torch" in without_torch(path, photo)
     for wrong, message in (
         (path.with_name("none.onnx"), "There is no file"),
         (path, "is not a feature of hloc_reduce.export"),

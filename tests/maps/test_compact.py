@@ -2,20 +2,24 @@
 
 import shutil
 
+import command
 import numpy as np
 import pycolmap
 import pytest
 from command import outcome
 from safetensors.numpy import load_file, save_file
 
-from hloc_reduce import Localizer, compact, maps, projections
+from hloc_reduce import Localizer, aggregate_features, compact, maps, projections
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.light.vlad import VOCABULARY, read_vocabulary
 from hloc_reduce.maps.compact import CompactMap
 from hloc_reduce.maps.unpack import COMPACT
+from hloc_reduce.pairs_from_retrieval import read_global
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, DELETING
 from hloc_reduce.utils import parsers
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.files import file_sha256
 from pipelines import localize
 
 PIPELINE = localize
@@ -146,6 +150,58 @@ def test_files_of_stages(built, tmp_path):
         compact.main(tmp_path / "a.hlm", sfm=known.sfm, features=other, feature="colmap_sift_sv64")
 
 
+def test_global_descriptors_of_another_file(built, tmp_path, monkeypatch):
+    """The file has these, and the vocabulary beside them."""
+    known = maps.Map(built[0])
+    conf, images = aggregate_features.confs["vlad"], known.names()[:1]
+    small = {**conf, "model": {**conf["model"], "num_words": 3}}
+    other = aggregate_features.main(small, known.features, images, tmp_path / "elsewhere")
+    output = tmp_path / "a.hlm"
+    given = ("--sfm", known.sfm, "--features", known.features, "--feature", "colmap_sift_sv32")
+    given = (*given, "--global_descriptors", other, "--output", output)
+    command.run(monkeypatch, compact, *given)
+    found = CompactMap(output)
+    expected = read_vocabulary(aggregate_features.vocabulary_of(other))
+    np.testing.assert_allclose(found.vocabulary, expected, rtol=1e-3, atol=1e-6)
+    whole = read_global(other, found.names)
+    assert whole.shape == (4, 96) and (found.global_descriptors() * whole).sum(axis=1).min() > 0.6
+    aggregate_features.vocabulary_of(other).unlink()
+    with pytest.raises(InputError, match="is not a vocabulary"):
+        compact.main(
+            output,
+            sfm=known.sfm,
+            features=known.features,
+            feature="colmap_sift_sv32",
+            global_descriptors=other,
+        )
+
+
+def test_the_vocabulary_that_ships_is_named(place, tmp_path, run):
+    """A file is refused where another one ships; older files do not name it."""
+    build, images, outputs = place
+    run(*build, "--feature", "colmap_sift_sv64")
+    known = maps.Map(outputs / "map")
+    descriptors = aggregate_features.main(
+        *(aggregate_features.confs["vlad"], known.features),
+        export_dir=tmp_path / "elsewhere",
+        vocabulary=VOCABULARY,
+    )
+    shutil.copy(VOCABULARY, aggregate_features.vocabulary_of(descriptors))
+    path = tmp_path / "a.hlm"
+    given = {"sfm": known.sfm, "features": known.features, "feature": "colmap_sift_sv64"}
+    assert "vocabulary" not in compact.main(path, global_descriptors=descriptors, **given)
+    np.testing.assert_array_equal(CompactMap(path).vocabulary, read_vocabulary())
+    assert Localizer(path).localize(images / "query/day/a.png")[0] is not None
+    content = path.read_bytes()
+    name, checksum = b"vocabulary_sha256", file_sha256(VOCABULARY).encode()
+    assert name in content and content.count(checksum) == 1
+    path.write_bytes(content.replace(name, b"an_unknown_number"))
+    CompactMap(path)
+    path.write_bytes(content.replace(checksum, checksum[::-1]))
+    with pytest.raises(InputError, match="a.hlm needs another vocabulary than the one that ships"):
+        CompactMap(path)
+
+
 @pytest.fixture(scope="module")
 def packed() -> list[bytes]:
     return []
@@ -263,6 +319,7 @@ def nan(array):
         ("vocabulary", lambda a: a[:, :-1], {}),
         ("descriptors", lambda a: a.astype(np.int64), {}),
         ("rotations", lambda a: 0 * a, {}),
+        ("rotations", lambda a: a + np.float32(np.inf), {}),
         ("names", lambda a: np.frombuffer(b"a\na/b\nc\nd", np.uint8), {}),
         ("names", lambda a: np.frombuffer(b"a\na\nc\nd", np.uint8), {}),
         ("names", lambda a: np.frombuffer(b"/a\nb\nc\nd", np.uint8), {}),
