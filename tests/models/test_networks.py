@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import h5py
 import kornia
 import numpy as np
 import pytest
@@ -123,6 +124,37 @@ def test_photos_of_one_colour_have_no_keypoints(random_weights):
     found = extractors.extract(model, np.full((640, 640, 3), 77, np.uint8), COLOUR)
     # the padding of convolutions shows near the borders only
     assert not (abs(found["keypoints"] - 319.5) < 100).all(axis=1).any()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (5, 3), (17, 20), (31, 33), (10, 1600)])
+def test_mini32_takes_photos_smaller_than_its_stride(shape):
+    """With the weights that ship."""
+    model = extractors.load(features.confs["mini32"]["model"]).eval()
+    height, width = shape
+    pixels = np.random.default_rng(0).integers(0, 255, (height, width, 3), np.uint8)
+    found = extractors.extract(model, pixels, COLOUR)
+    number = len(found["keypoints"])
+    assert (number > 0) == (height * width > 100)
+    assert found["descriptors"].shape == (32, number) and found["scores"].shape == (number,)
+    assert (found["keypoints"] >= 0).all() and (found["keypoints"] < [width, height]).all()
+    np.testing.assert_allclose(np.linalg.norm(found["descriptors"], axis=0), 1, atol=1e-5)
+
+
+def test_mini32_finds_nothing_in_one_colour(tmp_path, textured):
+    """The file has such photos, without keypoints, beside the others."""
+    for name, pixels in (
+        ("black.png", np.zeros((480, 640, 3), np.uint8)),
+        ("grey.png", np.full((20, 31, 3), 77, np.uint8)),
+        ("white.png", np.full((480, 640, 3), 255, np.uint8)),
+        ("textured.png", textured),
+    ):
+        cv2.imwrite(str(tmp_path / name), pixels)
+    path = extract_features.main(features.confs["mini32"], tmp_path, tmp_path)
+    with h5py.File(path) as file:
+        numbers = {name: file[name]["descriptors"].shape for name in file}
+    assert all(numbers.pop(name) == (32, 0) for name in ("black.png", "grey.png", "white.png"))
+    dim, number = numbers.pop("textured.png")
+    assert not numbers and dim == 32 and number > 200
 
 
 def test_weights_are_checked(random_weights, monkeypatch):
