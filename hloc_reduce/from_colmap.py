@@ -146,8 +146,8 @@ def _check_type(database: StoredDatabase, reduction: Reduction) -> None:
     found = database.descriptor_type()
     if found != SIFT:
         raise InputError(
-            f"{database.path} has descriptors of {found}, not of SIFT: this project has no "
-            "projections for them. Build the map from the photos instead."
+            f"{database.path} has descriptors of {found}; only those of SIFT are read. Build the "
+            "map from the photos instead."
         )
     if not reduction.of_colmap:
         raise InputError(

@@ -57,7 +57,7 @@ def main(
     if output.resolve() == features.resolve():
         raise InputError(f"{output} cannot be converted to itself: choose another --output.")
     names = list_h5_names(features)
-    known = Levels() if projection is None else Levels(_levels(projection))
+    known = None if projection is None else Levels(_levels(projection))
     with open_h5(features) as file:
         made_from = {"converted": file_provenance(file), "storage": storage}
         if projection is not None:
@@ -67,11 +67,12 @@ def main(
             for name in progress(todo, "Converting features", "image"):
                 arrays, attrs = read_others(file, name)
                 found = read_descriptors(file, name)
-                known.check(found)
+                descriptors = found.restore().T  # which checks them
+                if known is not None:
+                    known.check(found)
                 if QUANTIZED.get(storage) == found.key:
                     stored, own = {found.key: found.array}, {found.key: found.attrs}
                 else:
-                    descriptors = found.restore().T
                     if levels is not None and len(levels) != len(descriptors):
                         raise InputError(
                             f"{features}: the descriptors of {name} are {len(descriptors)}-D, "

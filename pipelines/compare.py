@@ -74,6 +74,8 @@ def main(
     cli.check_file(page, "the HTML file")
     for storage in (storages := list(dict.fromkeys(storages))):
         cli.choose("storage", storage, STORAGES)
+    if sizes and len(storages) > 1:
+        raise InputError("Give one --storage with --max_mb.")
     given = {features_confs.get(feature)[0]: feature for feature in features}
     finished: list[Path] = []
     failed: dict[str, str] = {}

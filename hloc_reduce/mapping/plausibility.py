@@ -18,9 +18,9 @@ DOUBTFUL = 1.05  # above it, for few images, if these fit with one
 FEW = 100  # images: further attempts take little time, even for one missing image
 MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
 FEWEST = 8  # points of an image: fewer determine no pose for certain
-# A few points hold an image, or a group, like a hinge: its pose is often wrong by degrees, although
-# it fits them. Of images with fewer than 30 points, and than an eighth of the median of their map,
-# three of four were wrong, in 103 maps.
+# A few points hold an image like a hinge: it fits them, but its pose is often wrong by degrees.
+# Of images with fewer than 30 points, and than an eighth of the median of their map, three of four
+# were wrong, in 103 maps.
 HINGE, SHARE = 30, 1 / 8
 MANY = 3  # images of one camera estimate its focal length better than EXIF data do
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint

@@ -20,9 +20,9 @@ from ..runtime.outputs import CONF
 from ..utils import colmap
 from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import CODED, QUANTIZED, STORAGES
-from ..utils.feature_files import Levels, read_descriptors
+from ..utils.feature_files import Levels, first_descriptors
 from ..utils.files import replacing
-from ..utils.h5 import file_provenance, get_dataset, iterate_h5_names, list_h5_names, open_h5
+from ..utils.h5 import file_provenance, get_dataset, list_h5_names, open_h5
 from ..utils.paths import strings_as_paths
 from . import contradictions, cropping, mirrored_photos, misfits, precision
 
@@ -166,10 +166,11 @@ class Map:
 
     def _check_levels(self) -> None:
         """Raise an InputError if the codes of the first image have others."""
+        if self.storage not in CODED:
+            return
         with open_h5(self.features) as file:
-            name = next(iterate_h5_names(file.id), None)
-            if name is not None:
-                self.levels().check(read_descriptors(file, name))
+            if (first := first_descriptors(file)) is not None:
+                self.levels().check(first)
 
     def check_feature(self, feature: str, projection: Path | None = None) -> None:
         """Refuse a feature that is not the map's.

@@ -84,7 +84,7 @@ def levels(projection: str | Path, storage: str) -> np.ndarray:
     try:
         with safe_open(path, "np") as file:
             found = check_levels(file.get_tensor(key), storage)
-            dim = int(prefix or json.loads((file.metadata() or {}).get("layers", "[0]"))[-1])
+            layers = json.loads((file.metadata() or {}).get("layers", "null"))
     except SafetensorError:
         said = f"The projection {Path(name).stem}{prefix and '@' + prefix} has no levels"
         if path.suffix != ".safetensors":
@@ -97,10 +97,13 @@ def levels(projection: str | Path, storage: str) -> np.ndarray:
             f"{said} for {storage}: use --storage uint8, or {add} with 'python -m hloc_reduce."
             f"training.levels --projection {'COPY' if is_shipped else path} --map IMAGES:MODEL'."
         ) from None
-    except (ValueError, TypeError, IndexError) as error:
+    except ValueError as error:
         raise InputError(f"{path} has {error}.") from None
-    if len(found) != dim:
-        raise InputError(f"{path} has levels of {len(found)} dimensions, its descriptors {dim}.")
+    dim = prefix or (layers[-1] if isinstance(layers, list) and layers else "unknown")
+    if str(len(found)) != str(dim):
+        raise InputError(
+            f"{path} has levels for {len(found)} numbers, but its descriptors have {dim}."
+        )
     return found
 
 

@@ -21,7 +21,7 @@ from ..maps.map import is_map
 from ..runtime.outputs import CONF, SHARED
 from ..utils import cli, colmap
 from ..utils.cli import InputError, no_folder
-from ..utils.codes import QUANTIZED
+from ..utils.codes import FLOATS
 from ..utils.files import MEGABYTE
 from ..utils.h5 import open_h5
 from ..utils.parsers import parse_poses, parse_retrieval
@@ -43,7 +43,7 @@ class Run:
         records: the record of each query, as from `localization.main`.
         feature: name of the feature.
         label: the name of the run in a report, with the size of a compact map, or the storage of
-            a whole one unless that is floats.
+            a whole one unless that is float16.
         family: its feature without the dimension: `sift_sv` for sift_sv64; with this storage.
         bytes: size of a descriptor.
         map_bytes: size of the map, None if unknown.
@@ -65,11 +65,12 @@ class Run:
             self.rows = _read_rows(folder / "queries.csv")
             self.feature = self.label = str(self.summary["feature"])
             self.family = self.label.rstrip("0123456789")
+            stored = self.summary["bytes_per_keypoint"].get("storage", FLOATS[0])
             self.map_bytes: int | None = self.summary.get("map_bytes")
             self.is_compact = "compact" in self.summary
             if self.is_compact:
                 self.label += f", {int(self.summary['map_bytes']) / MEGABYTE:.3g} MB"
-            elif (stored := self.summary["bytes_per_keypoint"].get("storage")) in QUANTIZED:
+            elif stored != FLOATS[0]:
                 self.label, self.family = f"{self.label}, {stored}", f"{self.family}, {stored}"
             self.bytes = int(self.summary["bytes_per_keypoint"]["descriptor"])
             self.seconds = float(sum(self.summary["seconds"].values()))

@@ -104,8 +104,8 @@ def dimension(features: Path) -> int:
 
 def coded_by(file: h5py.File) -> str | None:
     """Return the checksum of the projection whose levels the codes of a file are of, if known."""
-    name = next(iterate_h5_names(file.id), None)
-    if name is None or stored_descriptors(file, name).name.rpartition("_")[2] not in CODED:
+    first = first_descriptors(file)
+    if first is None or first.key.rpartition("_")[2] not in CODED:
         return None
     try:
         return dict(json.loads(get_text(file, "conf", "{}"))).get("projection_sha256")
@@ -185,6 +185,14 @@ def read_descriptors(file: h5py.File, name: str) -> StoredDescriptors:
     with reading(file.filename):
         attrs = dict(dataset.attrs)
     return StoredDescriptors(f"{name} in {file.filename}", key, array, attrs)
+
+
+def first_descriptors(file: h5py.File) -> StoredDescriptors | None:
+    """Read the descriptors of the first image that has sound ones, None if there is none."""
+    for name in iterate_h5_names(file.id):
+        with suppress(InputError):
+            return read_descriptors(file, name)
+    return None
 
 
 def get_descriptors(file: h5py.File, name: str) -> np.ndarray:

@@ -106,6 +106,13 @@ def test_sizes_of_maps(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
     assert command.state(whole) == times and len(times) > 30
 
 
+def test_one_storage_with_sizes(aachen_layout, tmp_path, monkeypatch, caplog):
+    given = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--features", "sift_sv16")
+    sizes = ("--storage", "uint4", "uint2", "--max_mb", 0.1)
+    said = command.refused(monkeypatch, caplog, compare, *given, *sizes)
+    assert said == "Give one --storage with --max_mb."
+
+
 def test_compare_wrong_input(aachen_layout, inloc_layout, tmp_path, monkeypatch, caplog):
     def message(dataset, *features):
         command_line = ("--dataset", dataset, "--outputs", tmp_path / "o", "--features", *features)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from command import refused
+from safetensors.torch import save as serialize
 
 from hloc_reduce import extract_features, match_features, projections, storage
 from hloc_reduce.confs import features as features_confs
@@ -112,8 +113,12 @@ def test_features_without_levels_are_refused(projection, tmp_path, monkeypatch, 
     with pytest.raises(InputError, match=r"levels of shape \(16, 3\), not \(D, 16\)"):
         projections.levels(projection, "uint4")
     network.save(mlp, metadata, projection, {"levels.uint2": torch.arange(32.0).reshape(8, 4)})
-    with pytest.raises(InputError, match="has levels of 8 dimensions, its descriptors 16"):
+    with pytest.raises(InputError, match="has levels for 8 numbers, but its descriptors have 16"):
         projections.levels(projection, "uint2")
+    for layers in ('{"a": 1}', "5", "[]", "["):
+        projection.write_bytes(serialize({"levels.uint1": torch.zeros(16, 2)}, {"layers": layers}))
+        with pytest.raises(InputError, match="mine_sv16.safetensors has "):
+            projections.levels(projection, "uint1")
     features = tmp_path / "a.h5"
     with h5py.File(features, "w") as file:
         file["a.jpg/descriptors"] = np.eye(16, dtype=np.float16)
@@ -187,6 +192,15 @@ def test_codes_of_another_projection_are_not_converted(projection, tmp_path):
         storage.main(codes, tmp_path / f"{wanted}.h5", wanted, projection=projection)
 
 
+def test_codes_without_levels_are_not_converted(projection, tmp_path):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["a.jpg/descriptors_uint2"] = np.zeros((4, 3), np.uint8)
+    for wanted in ({"storage": "float16"}, {"storage": "uint2", "projection": projection}):
+        with pytest.raises(InputError, match="a.jpg in .* have no levels"):
+            storage.main(path, tmp_path / "b.h5", **wanted)
+
+
 def test_codes_of_two_projections_are_not_matched(projection, tmp_path):
     """Their levels cannot be compared, as one file has 16 and the other 4 a number."""
     pairs, path = tmp_path / "pairs.txt", tmp_path / "a.h5"
@@ -199,6 +213,8 @@ def test_codes_of_two_projections_are_not_matched(projection, tmp_path):
         kind: storage.main(path, tmp_path / f"{kind}.h5", kind, projection=whose)
         for kind, whose in (("uint4", projection), ("uint2", projection), ("uint1", "sift_sv16"))
     }
+    with h5py.File(coded["uint2"], "r+") as file:
+        file.create_group("a0")["keypoints"] = np.zeros((1, 2))  # no descriptors, and in no pair
     match_features.main(conf, pairs, coded["uint4"], matches=matches, features_ref=coded["uint2"])
     with pytest.raises(InputError, match="The codes in .*uint1.h5 are of another projection"):
         match_features.main(
