@@ -1,4 +1,4 @@
-"""Count wrong poses that are accepted in compact maps, whose matcher is NN-ratio90.
+"""Count wrong poses that are accepted in compact maps.
 
 Each map has two thirds of the photos of a COLMAP model. It is packed, and tried with its other
 photos, with these mirrored, and with photos of the other places, all without intrinsics. Prints a
@@ -17,6 +17,7 @@ from hloc_reduce.runtime import provenance
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.images import list_images, read_image
 from hloc_reduce.utils.progress import progress
 
@@ -25,15 +26,17 @@ WRONG = 0.05, 4.0  # of the median depth of the inliers, degrees
 COLUMNS = ("place", "own", "localized", "wrong", "mirrored", "localized", "others", "localized")
 
 
-def build(images: Path, model: Path, output: Path, feature: str) -> tuple[Path, dict]:
-    """Pack a map of two thirds of the photos of a model; return also the poses of the others."""
+def build(
+    images: Path, model: Path, path: Path, args: argparse.Namespace
+) -> dict[str, pycolmap.Rigid3d]:
+    """Pack a map of two thirds of the photos of a model; return the poses of the others."""
     photos = sorted(colmap.read_model(model).images.values(), key=lambda image: image.name)
     held_out = {photo.name: photo.cam_from_world() for photo in photos[1::EVERY]}
     kept = {photo.name for photo in photos} - held_out.keys()
-    part = colmap.write_part(model, kept, output / "model")
-    built = maps.main(output / "map", images, part, feature=feature)
-    compact.main(output / "place.hlm", built.folder)
-    return output / "place.hlm", held_out
+    part = colmap.write_part(model, kept, path.parent / "model")
+    built = maps.main(path.parent / "map", images, part, feature=args.feature)
+    compact.main(path, built.folder, storage=args.storage, max_mb=args.max_mb)
+    return held_out
 
 
 def is_wrong(pose: pycolmap.Rigid3d, info: dict, truth: pycolmap.Rigid3d) -> bool:
@@ -46,11 +49,11 @@ def is_wrong(pose: pycolmap.Rigid3d, info: dict, truth: pycolmap.Rigid3d) -> boo
 
 
 def try_place(
-    name: str, places: dict[str, tuple[Path, Path]], output: Path, args: argparse.Namespace
+    name: str, places: dict[str, tuple[Path, Path]], path: Path, args: argparse.Namespace
 ) -> dict[str, int]:
-    """Localize photos in the map of a place, and count."""
+    """Localize photos in the compact map of a place, written to a path, and count."""
     images, model = places[name]
-    path, truth = build(images, model, output, args.feature)
+    truth = build(images, model, path, args)
     localizer = Localizer(path)
     generator = np.random.default_rng(0)
     own = generator.permutation(sorted(truth))[: args.trials].tolist()
@@ -84,6 +87,8 @@ def _main() -> None:
     )
     add_places(parser)
     parser.add_argument("--feature", default="colmap_sift_sv32")
+    parser.add_argument("--storage", choices=STORAGES, help="of the points; as hloc_reduce.compact")
+    parser.add_argument("--max_mb", type=float, help="largest size of a file; all points if absent")
     parser.add_argument("--trials", type=int, default=12, help="photos of each place, per map")
     parser.add_argument("--output", type=Path, default=Path("outputs/false_accepts_compact"))
     args = parser.parse_args()
@@ -94,11 +99,12 @@ def _main() -> None:
     print(f"| {' | '.join(COLUMNS)} |\n| --- |{' ---: |' * (len(COLUMNS) - 1)}")
     sums = np.zeros(len(COLUMNS) - 1, int)
     for name in places:
-        folder = args.output / args.feature / name
-        file = folder / f"counts-{args.trials}.json"
+        kind = "".join(f"-{option}" for option in (args.storage, args.max_mb) if option)
+        path = args.output / args.feature / name / f"place{kind}.hlm"
+        file = path.with_name(f"counts-{args.trials}{kind}.json")
         tried = {"places": sorted(places), "same": args.same}
         if provenance.read(file).get("tried") != tried:
-            counts = try_place(name, places, folder, args)
+            counts = try_place(name, places, path, args)
             provenance.write(file, {"tried": tried, "counts": counts})
         row = [*provenance.read(file)["counts"].values()]
         sums += row

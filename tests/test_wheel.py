@@ -6,12 +6,11 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from pathlib import Path
+
+from package_copy import FOLDERS, ROOT, copy_package
 
 from hloc_reduce import projections
 from hloc_reduce.networks import MINI
-
-ROOT = Path(__file__).parents[1]
 
 
 def has_compiler() -> bool:
@@ -22,11 +21,7 @@ def has_compiler() -> bool:
 
 
 def test_wheel_is_complete(tmp_path):
-    source = tmp_path / "source"
-    for folder in ("confs", "hloc_reduce", "pipelines"):
-        shutil.copytree(ROOT / folder, source / folder)
-    for file in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
-        shutil.copy(ROOT / file, source)
+    source = copy_package(tmp_path / "source")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path]
     subprocess.run([*command, source], check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
@@ -34,7 +29,7 @@ def test_wheel_is_complete(tmp_path):
     names = sizes.keys()
     modules = {
         path.relative_to(ROOT).as_posix()
-        for folder in ("confs", "hloc_reduce", "pipelines")
+        for folder in FOLDERS
         for path in (ROOT / folder).rglob("*.py")
     }
     assert modules <= names

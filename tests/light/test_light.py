@@ -1,14 +1,17 @@
 """Localization without torch: the same poses, and nothing that imports it."""
 
 import os
+import shutil
 import subprocess
 import sys
+import venv
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from package_copy import ROOT, copy_package
 from safetensors.numpy import load, save
 
 from hloc_reduce import Localizer, compact, export, projections
@@ -24,27 +27,29 @@ from hloc_reduce.utils.images import read_image
 from pipelines import localize
 
 PIPELINE = localize
-ROOT = Path(__file__).parents[2]
 REQUIREMENTS = ROOT / "requirements-light.txt"  # what docs/robot.md installs
-PROGRAM = """
+BLOCK = """
 import sys
 from importlib.metadata import packages_distributions
-
-from hloc_reduce.utils.cli import InputError
 
 class Absent:
     def find_spec(self, name, path=None, target=None):
         if name in BLOCKED:
             raise ModuleNotFoundError(f"{name} is not installed")
 
-ALLOWED = sys.argv[3].split(",")
+ALLOWED = sys.argv[4].split(",")
 BLOCKED = {name for name, of in packages_distributions().items() if not {*of} & {*ALLOWED}}
 sys.meta_path.insert(0, Absent())
+"""
+LOCALIZE = """
+import sys
+
 from hloc_reduce import Localizer
+from hloc_reduce.utils.cli import InputError
 
 try:
-    localizer, camera = Localizer(sys.argv[1], onnx=sys.argv[4] or None), None
-    if sys.argv[4]:  # a network's features in these few photos do not determine a focal length
+    localizer, camera = Localizer(sys.argv[1], onnx=sys.argv[3] or None), None
+    if sys.argv[3]:  # a network's features in these few photos do not determine a focal length
         camera = localizer.reference.camera_of[localizer.names[0]]
     pose, info = localizer.localize(sys.argv[2], camera)
     print(*pose.rotation.quat, *pose.translation, info["num_inliers"], info["confidence"])
@@ -63,7 +68,7 @@ def without_torch(path: Path, photo: Path, onnx: Path | None = None, threads: in
     known = {of for every in packages_distributions().values() for of in every}
     names |= {"cloudpickle", "hloc-reduce", *(["onnxruntime"] if onnx else [])}
     allowed = ",".join(name for name in known if name.lower() in names)
-    command = [sys.executable, "-c", PROGRAM, path, photo, allowed, onnx or ""]
+    command = [sys.executable, "-c", BLOCK + LOCALIZE, path, photo, onnx or "", allowed]
     env = os.environ | {"OMP_NUM_THREADS": str(threads)}
     found = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=env, timeout=60)
     assert found.returncode == 0, found.stderr
@@ -90,6 +95,26 @@ def test_localization_without_torch(file, monkeypatch):
     pose, info = localizer.localize(photo)
     np.testing.assert_allclose([*pose.rotation.quat, *pose.translation], values, atol=1e-9)
     assert (info["num_inliers"], info["confidence"]) == (inliers, confidence)
+
+
+@pytest.mark.long
+def test_the_documented_installation_localizes(file, tmp_path):
+    """In a new environment, with the commands of docs/robot.md, without torch."""
+    path, photo = file
+    source = copy_package(tmp_path / "source")
+    for name in ("requirements-light.txt", "constraints.txt"):
+        shutil.copy(ROOT / name, source)
+    documented = (ROOT / "docs/robot.md").read_text().splitlines()
+    install = [line.split()[1:] for line in documented if line.startswith("    pip install")][:2]
+    assert len(install) == 2
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = tmp_path / "venv/bin/python"
+    for command in install:
+        subprocess.run([python, "-m", "pip", *command], cwd=source, check=True, timeout=900)
+    assert subprocess.run([python, "-c", "import torch"], capture_output=True).returncode == 1
+    command = [python, "-c", LOCALIZE, path, photo, ""]
+    found = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=60)
+    assert found.stdout == without_torch(path, photo), found.stderr
 
 
 def test_one_and_two_threads_give_the_same_pose(file):

@@ -1,0 +1,16 @@
+"""A copy of what a package is built from, because a build leaves files in its folder."""
+
+import shutil
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = "confs", "hloc_reduce", "pipelines"
+
+
+def copy_package(target: Path) -> Path:
+    """Copy the source of the package to a new folder, and return that."""
+    for folder in FOLDERS:
+        shutil.copytree(ROOT / folder, target / folder)
+    for file in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        shutil.copy(ROOT / file, target)
+    return target
