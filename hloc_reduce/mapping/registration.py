@@ -29,7 +29,7 @@ LENS = "lens"
 WHY = {
     LENS: (
         "These have focal lengths in pixels or distortions that no lens has, or focal lengths far "
-        "from their EXIF data, so their poses are wrong"
+        "from their EXIF data, so their poses would be wrong"
     ),
     MISPLACED: "Most matches of these contradict the poses that COLMAP found",
     COPY: (
@@ -59,14 +59,12 @@ class NoModelError(InputError):
 
 def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
     """Say that no image could be reconstructed, and what to try."""
-    advice = (
-        "Do enough of them overlap? Take photos from several places, each overlapping the one "
-        "before by about two thirds."
-    )
-    hint = _left_out(dropped, []) if dropped else advice
+    why = _left_out(dropped, []) if dropped else "Do enough of them overlap?"
+    tries = [TRIES[kind] for kind in _kinds(dropped or {})]
+    tries.append("take photos from several places, each overlapping the one before by two thirds")
     return (
         f"COLMAP could not reconstruct the images of {image_dir} from {VIEWPOINTS} viewpoints or "
-        f"more. {hint}"
+        f"more. {why} What to try: {'; '.join(tries)}."
     )
 
 
