@@ -51,6 +51,10 @@ class EdgePoint2(NetworkExtractor):
         """Return the features of an image in tensors of fixed length, see `Extractor.fixed`."""
         return self._compute(image, strongest_fixed)
 
+    def _refined(self, keypoints: torch.Tensor, score_map: torch.Tensor) -> torch.Tensor:
+        """Return keypoints (N, 2) in whole pixels of a score map (H, W), as they are."""
+        return keypoints
+
     def _compute(self, image: torch.Tensor, select: Callable[..., Keypoints]) -> dict:
         """Return the features of an image whose sides are multiples of `stride`."""
         dense, score_map = self.network(image)
@@ -60,7 +64,7 @@ class EdgePoint2(NetworkExtractor):
         grid = (keypoints + 0.5) / size * 2 - 1
         descriptors = grid_sample(dense, grid[None, None], align_corners=False)[0, :, 0]
         return {
-            "keypoints": keypoints[None],
+            "keypoints": self._refined(keypoints, score_map[0, 0])[None],
             "scores": scores[None],
             "descriptors": normalize(descriptors, dim=0)[None],
         }

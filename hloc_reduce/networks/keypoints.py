@@ -74,6 +74,26 @@ def strongest_fixed(
     return torch.stack([index - y * columns, y], dim=1).to(scores.dtype) + border, highest
 
 
+def refined(keypoints: torch.Tensor, scores: torch.Tensor) -> torch.Tensor:
+    """Move maxima of a score map to those of the parabolas through their neighbors.
+
+    Args:
+        keypoints: (N, 2) float x, y in whole pixels, none of them in the outermost ones.
+        scores: (H, W) float.
+
+    Returns:
+        (N, 2) float x, y, each at most half a pixel away.
+    """
+    x, y = keypoints.long().unbind(dim=1)
+    middle = scores[y, x]
+    shifts = []
+    for dx, dy in ((1, 0), (0, 1)):
+        before, after = scores[y - dy, x - dx], scores[y + dy, x + dx]
+        curvature = (2 * middle - before - after).clamp(min=1e-6)
+        shifts.append((after - before) / 2 / curvature)
+    return keypoints + torch.stack(shifts, dim=1).clamp(-0.5, 0.5)
+
+
 def _highest_around(scores: torch.Tensor, radius: int) -> torch.Tensor:
     """Return the highest score around each one (H - 2 radius, W - 2 radius), itself excluded."""
     rows = max_pool2d(scores[None], (1, 2 * radius + 1), stride=1)

@@ -18,7 +18,7 @@ from hloc_reduce import extract_features, extractors, networks
 from hloc_reduce.confs import features
 from hloc_reduce.networks import EDGEPOINT2, NETWORKS, loading
 from hloc_reduce.networks.edgepoint2 import EdgePoint2
-from hloc_reduce.networks.keypoints import strongest, strongest_fixed
+from hloc_reduce.networks.keypoints import refined, strongest, strongest_fixed
 from hloc_reduce.utils import downloads
 from hloc_reduce.utils.cli import InputError
 
@@ -70,6 +70,20 @@ def test_strongest_are_the_highest_strict_maxima():
     assert len(strongest(scores, 2, 0.5, 4, 1)[0]) == 1
     assert len(strongest(scores, 2, 6.0, 4, -1)[0]) == 0
     assert len(strongest(scores[:6, :6], 2, 0.5, 4, -1)[0]) == 0
+
+
+def test_refined_keypoints_are_the_maxima_of_parabolas():
+    y, x = torch.meshgrid(torch.arange(30.0), torch.arange(40.0), indexing="ij")
+    scores = torch.maximum(4 - (x - 10.3) ** 2 - (y - 7.8) ** 2, 3 - (x - 30) ** 2 - (y - 20) ** 2)
+    scores[15, 20] = 50.0  # a single pixel
+    keypoints, _ = strongest(scores, 2, -10.0, 4, 3)
+    assert keypoints.tolist() == [[20, 15], [10, 8], [30, 20]]
+    found = refined(keypoints, scores)
+    torch.testing.assert_close(found[1:], torch.tensor([[10.3, 7.8], [30, 20]]))
+    assert (found[0] - keypoints[0]).abs().max() < 0.5
+    flat = torch.zeros(30, 40)
+    torch.testing.assert_close(refined(keypoints, flat), keypoints)
+    assert refined(keypoints[:0], scores).shape == (0, 2)
 
 
 @pytest.mark.parametrize("number, radius, border", [(20, 2, 4), (4096, 2, 4), (4096, 3, 3)])
