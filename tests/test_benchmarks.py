@@ -109,3 +109,42 @@ def test_matching_at_once_gives_each_keypoint_one_point():
     found = at_once(SimpleNamespace(engine=engine, reference=compact))(query, ["a", "b", "c"])
     pairs = {name: sorted(map(tuple, part.tolist())) for name, part in found.items()}
     assert pairs == {"a": [(0, 1), (2, 0)], "b": [(0, 1), (1, 2)], "c": []}
+
+
+@pytest.fixture
+def repeatability(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return runpy.run_path(str(ROOT / "benchmarks/repeatability.py"))
+
+
+def test_changes_of_photos_say_where_pixels_go(repeatability):
+    """A spot is found where the matrix puts it."""
+    y, x = np.mgrid[:300, :400]
+    for place in ((120.0, 90.0), (300.0, 200.0)):
+        spot = 250 * np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / 200)
+        photo = np.repeat(spot.round().astype(np.uint8)[..., None], 3, axis=2)
+        for name, change in repeatability["CHANGES"].items():
+            changed, matrix = change(photo, np.random.default_rng(0))
+            weight = np.maximum(changed.mean(axis=2) - 0.3 * changed.max(), 0)
+            rows, columns = np.indices(weight.shape)
+            found = [(weight * axis).sum() / weight.sum() for axis in (columns, rows)]
+            np.testing.assert_allclose(found, matrix @ [*place, 1], atol=0.3, err_msg=name)
+
+
+def test_repeated_keypoints_and_right_matches(repeatability):
+    keypoints = np.array([[50, 50], [100, 50], [50, 100], [100, 100], [2, 2]], np.float32)
+    descriptors = np.eye(5, dtype=np.float32)
+    one = {"keypoints": keypoints, "descriptors": descriptors, "scores": np.arange(5.0)}
+    moved = keypoints + np.array([[0.5, 0], [2, 0], [0, 9], [0, 0], [0, 0]], np.float32)
+    other = {"keypoints": moved, "descriptors": descriptors[:, [0, 1, 3, 2, 4]]}
+    photos = (np.zeros((200, 200, 3)),) * 2
+    found = repeatability["compare"](one, other, photos, np.eye(2, 3))
+    assert found.number == found.expected == 4  # the last one is near the sides
+    assert sorted(found.errors.tolist()) == [0, 0.5, 2]  # the third one moved too far
+    assert (found.right, found.matched) == (2, 4)
+    assert found.again.tolist() == [True, True, False, True]
+    assert repeatability["describe"]([found])[1:3] == ["50.0", "0.50"]
+    assert repeatability["rank"]([found]) == ["0.333", "0.333"]
+    nowhere = {key: value[..., :0] for key, value in other.items()}
+    nowhere["keypoints"] = keypoints[:0]
+    assert repeatability["compare"](one, nowhere, photos, np.eye(2, 3)).expected == 0
