@@ -31,7 +31,7 @@ TRIES = 12  # sizes that are tried to come close to a limit
 AIM, CLOSE = 0.998, 0.995  # shares of the limit that are aimed at, and are close enough
 # descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
-FEW = 32  # dimensions from which a number of a descriptor has 2 bits; 4 bits with fewer
+FEW = 32  # dimensions of DoG's features that are stored as uint4; others as uint2
 
 
 @strings_as_paths
@@ -58,8 +58,8 @@ def main(
         feature: name of the feature, or its YAML file.
         matcher: a key of `confs.matchers`; default: the map's, or the feature's, but NN-ratio90
             instead of NN-ratio.
-        storage: of the points' descriptors; default: that of the map if it has codes, else uint2
-            from 32 dimensions on, uint4 for fewer, and float16 without levels.
+        storage: of the points' descriptors; default: that of the map if it has codes, else uint4
+            for up to 32 dimensions of DoG's features, uint2 for others, and float16 without levels.
         max_mb: the size of the file in 1,000,000 bytes; points that images need least are left out.
 
     Returns:
@@ -181,13 +181,16 @@ def _storage(conf: dict, storage: str | None) -> str:
         return storage
     if "storage" in conf:
         return conf["storage"]
-    try:
-        levels = features_confs.levels({**conf, "storage": "uint2"})
-    except InputError:  # there are none
-        levels = None
-    if levels is None:
+    if features_confs.level_file(conf) is None:
         return STORAGES[0]
-    return "uint4" if len(levels) < FEW else "uint2"
+    try:
+        return (
+            "uint2"
+            if features_confs.levels({**conf, "storage": "uint2"}) is not None
+            else STORAGES[0]
+        )
+    except InputError:  # a projection without levels
+        return STORAGES[0]
 
 
 def _encode(

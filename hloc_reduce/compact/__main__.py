@@ -26,8 +26,8 @@ def _main() -> None:
     add(
         "--storage",
         help=f"storage of the points' descriptors, one of {', '.join(STORAGES)} (default: the "
-        f"map's if it stores codes, else uint2 from {FEW} dimensions on, uint4 for fewer, and "
-        f"{STORAGES[0]} without levels)",
+        f"map's if it stores codes, else uint4 for DoG features of up to {FEW} dimensions "
+        "and uint2 for others)",
     )
     add(
         "--max_mb",

@@ -62,7 +62,7 @@ def test_a_file_localizes_as_its_map(built, tmp_path, run):
     assert max(pose_error(poses["a.png"], pose)) < 1e-3
     assert int(rows["a.png"]["num_inliers"]) == found["num_inliers"]
     unpacked = maps.Map(outputs / "map")
-    assert unpacked.feature == "colmap_sift_sv32" and unpacked.storage == "uint2"
+    assert unpacked.feature == "colmap_sift_sv32" and unpacked.storage == "uint4"
     assert unpacked.cameras == maps.Map(folder).cameras
     model = pycolmap.Reconstruction(unpacked.sfm)
     assert model.compute_mean_reprojection_error() < 0.01
@@ -356,14 +356,15 @@ def test_an_overwriting_that_was_interrupted_goes_on(file, tmp_path):
 @pytest.mark.parametrize(
     "feature, storage",
     [
-        ("colmap_sift_sv32", "uint2"),
-        ("colmap_sift_sv16", "uint4"),
+        ("colmap_sift_sv32", "uint4"),
+        ("colmap_sift_sv64", "uint2"),
+        ("xfeat_sv16", "uint2"),
         ("xfeat", "uint2"),
         ("edgepoint2_l32", "float16"),  # no levels ship
         ("sift_nested@24", "uint4"),
     ],
 )
-def test_the_default_storage_depends_on_the_dimension(feature, storage):
+def test_the_default_storage_depends_on_the_feature(feature, storage):
     conf = features_confs.get(feature)[1]
     assert compact._storage(conf, None) == storage
     assert compact._storage({**conf, "storage": "uint8"}, None) == "uint8"
@@ -383,5 +384,5 @@ def test_bad_arguments(built, tmp_path, refused, place):
     compact.main(file, folder)
     new = ("--map", file, "--query_images", images / "query/day", "--outputs", tmp_path / "of_file")
     assert "--feature colmap_sift_sv32" in refused(*new, "--feature", "sift_sv64")
-    assert "built with --storage uint2" in refused(*new, "--storage", "uint8")
+    assert "built with --storage uint4" in refused(*new, "--storage", "uint8")
     assert "leave out --map_images" in refused(*new, "--map_images", images)
