@@ -184,11 +184,9 @@ def _storage(conf: dict, storage: str | None) -> str:
     if features_confs.level_file(conf) is None:
         return STORAGES[0]
     try:
-        return (
-            "uint2"
-            if features_confs.levels({**conf, "storage": "uint2"}) is not None
-            else STORAGES[0]
-        )
+        levels = features_confs.levels({**conf, "storage": "uint4"})
+        few = levels is not None and len(levels) <= FEW
+        return "uint4" if few and not features_confs.network_of(conf["model"]) else "uint2"
     except InputError:  # a projection without levels
         return STORAGES[0]
 
