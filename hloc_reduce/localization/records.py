@@ -125,6 +125,8 @@ def refused(
 class Log:
     """Records of queries, one JSON line each, after a first line with their provenance.
 
+    Until the localization is finished, a query may have a second line, which replaces the first.
+
     Args:
         path: the file.
         made_from: the provenance; stale records are dropped.
@@ -134,22 +136,28 @@ class Log:
     def __init__(self, path: Path, made_from: dict, overwrite: bool):
         self.path = path
         self.records: dict[str, dict] = {}
-        header = json.dumps(made_from, sort_keys=True)
+        self.header = json.dumps(made_from, sort_keys=True)
         lines = [] if overwrite or not path.exists() else path.read_text().split("\n")
-        if lines and lines[0] == header:
+        if lines and lines[0] == self.header:
             # a killed run may have cut off the last line, after the last line end
             self.records = dict(json.loads(line) for line in lines[1:-1])
-        kept = [json.dumps(item) for item in self.records.items()]
-        with replacing(path) as temporary:
-            temporary.write_text("\n".join([header, *kept]) + "\n")
+        self._write()
+
+    def _write(self) -> None:
+        """Replace the file by one with a line for each query."""
+        lines = [json.dumps(item) for item in self.records.items()]
+        with replacing(self.path) as temporary:
+            temporary.write_text("\n".join([self.header, *lines]) + "\n")
 
     def __enter__(self) -> "Log":
         self.file = self.path.open("a")
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
         with naming(self.path):
             self.file.close()
+        if failure is None:
+            self._write()
 
     def add(self, name: str, record: dict) -> None:
         """Add the record of a query."""

@@ -101,7 +101,7 @@ def _implausible(camera: pycolmap.Camera, initial: pycolmap.Camera, number: int)
     low, high = focal_lengths(initial, not initial.has_prior_focal_length or number >= MANY)
     focal_length = camera.mean_focal_length()
     if not low <= focal_length <= high:
-        return f"focal length {focal_length:.0f}"
+        return f"focal length {focal_length:.0f}" if focal_length > 0 else "no focal length fits"
     distortion = max(camera.params[list(camera.extra_params_idxs())], key=abs, default=0.0)
     return f"distortion {distortion:.1f}" if abs(distortion) > MAX_DISTORTION else None
 

@@ -51,6 +51,7 @@ TRIES = {
     ),
     FEW_POINTS: "add photos between those in the map and those that are not",
 }
+ONE_CAMERA = "--camera_mode single, if one camera with a fixed zoom took all photos"
 
 
 class NoModelError(InputError):
@@ -217,5 +218,6 @@ def shortfall(
         said.append(_left_out(implausible, missing))
         tries += [TRIES[kind] for kind in _kinds(implausible)]
     if alike:
-        tries.append("--camera_mode single, if one camera with a fixed zoom took all photos")
+        likely = LENS in _kinds(implausible)  # own focal lengths of photos of one camera
+        tries.insert(0 if likely else len(tries), ONE_CAMERA)
     return f"{' '.join(said)} What to try: {'; '.join(dict.fromkeys(tries))}."

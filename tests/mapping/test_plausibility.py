@@ -108,7 +108,8 @@ def test_focal_lengths_that_no_lens_has(focal_length, is_prior, is_kept):
     assert names_of(found) == [everything if is_kept else everything - {"3.jpg"}]
     spread = {1500.0: 3.0, 700.0: 1.4}[focal_length] if is_kept else 1.0  # of those that are kept
     assert focal_length_spread(found) == spread
-    assert dropped == ({} if is_kept else {"3.jpg": f"focal length {focal_length:.0f}"})
+    said = f"focal length {focal_length:.0f}" if focal_length > 0 else "no focal length fits"
+    assert dropped == ({} if is_kept else {"3.jpg": said})
 
 
 @pytest.mark.parametrize(("distortion", "is_kept"), [(-0.6, True), (4.56, False), (-5.9, False)])
@@ -179,7 +180,7 @@ def test_parts_that_do_not_connect():
     state |= {"implausible": {"i": "distortion 4.6"}, "alike": True}
     message = registration.shortfall(Path("x"), **state)
     assert "no lens has" in message and "i (distortion 4.6)." in message
-    assert "--camera_mode single, if one camera" in message
+    assert "What to try: --camera_mode single, if one camera" in message
     state["implausible"] = {"g": "another side or a copy", "h": "misplaced", "i": "distortion 4.6"}
     message = registration.shortfall(Path("x"), **state)
     assert "no lens has" in message and "i (distortion 4.6)." in message

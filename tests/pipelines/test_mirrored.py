@@ -34,8 +34,10 @@ def mirror(path, of):
 
 def mirror_images(outputs):
     """Return the confidences of the mirror images that were tried."""
-    summary, _ = outcome(outputs)
-    records = read_records(log_file(outputs / summary["poses"]))
+    summary, rows = outcome(outputs)
+    path = log_file(outputs / summary["poses"])
+    records = read_records(path)
+    assert len(path.read_text().splitlines()) == 1 + len(rows)  # each query once
     return {name: record["mirror_image"] for name, record in records.items()}
 
 
