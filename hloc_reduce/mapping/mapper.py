@@ -41,6 +41,9 @@ RELAXED = {
     "init_min_tri_angle": 8.0,
     "abs_pose_min_num_inliers": 15,
 }
+# Not in later attempts: to register an image without points may take 14 s a try with the matches of
+# networks, and hardly registers any that the first attempt does not.
+FALLBACK = "structure_less_registration_fallback"
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
 SEEDS = (1, 2, 3)
 MORE = 1.5  # times as many images show that one camera took all
@@ -66,9 +69,12 @@ RULES = {
 
 def attempts_for(number: int) -> list[dict]:
     """Return the changed mapper options of each attempt to reconstruct a number of images."""
-    attempts: list[dict] = [{}, {"mapper": RELAXED}]
+    known = hasattr(pycolmap.IncrementalPipelineOptions(), FALLBACK)  # since COLMAP 4
+    later: dict = {FALLBACK: False} if known else {}
+    attempts: list[dict] = [{}, {"mapper": RELAXED} | later]
     for seed in SEEDS if number <= VERY_FEW else ():
-        attempts += [{"random_seed": seed}, {"random_seed": seed, "mapper": RELAXED}]
+        seeded = {"random_seed": seed} | later
+        attempts += [seeded, seeded | {"mapper": RELAXED}]
     return attempts
 
 

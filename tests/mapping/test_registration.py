@@ -2,9 +2,11 @@
 
 import json
 
+import pycolmap
 import pytest
 
-from hloc_reduce.mapping import registration
+from hloc_reduce.mapping import mapper, registration
+from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
 
 
@@ -67,3 +69,13 @@ def test_photos_that_are_left_out_are_not_blamed_for_others(number, images, tmp_
         registration.check(tmp_path, False, left_out=["a.jpg", "b.jpg"])
     assert ("2 more are left out" in str(error.value)) == (number == 4)
     assert ("Left out: a.jpg, b.jpg" in str(error.value)) == (number == 7)
+
+
+def test_only_the_first_attempt_registers_images_without_points():
+    """It takes long, and older versions of COLMAP do not do it."""
+    first, *later = mapper.attempts_for(10)
+    assert first == {} and len(later) == 7 and len(mapper.attempts_for(31)) == 2
+    known = hasattr(pycolmap.IncrementalPipelineOptions(), mapper.FALLBACK)
+    for changed in later:
+        assert changed.get(mapper.FALLBACK) is (False if known else None)
+        colmap.mapper_options(changed)
