@@ -2,8 +2,9 @@
 
 Each photo is paired with itself turned, made smaller, noisy or dark, so that the true place of
 every keypoint is known. Prints two Markdown tables. The first one has, for each feature and change,
-the keypoints of the first photo; the share of keypoints that are found again within a pixel of the
-second photo; their median error; and the mutual nearest neighbours that are right. The second one
+the keypoints of the first photo that the second one should show; the share that is found again
+within a pixel of the second photo; the median error of those found within three pixels; and the
+mutual nearest neighbours that are right, also within three pixels. The second one
 tells how well scores rank keypoints of noisy photos by whether they are found again: within each
 photo, and among all photos together, which needs comparable scores. 0.5 would be by chance.
 """
@@ -81,7 +82,7 @@ class Compared:
     """Keypoints of two photos that show the same, and what was found of them.
 
     Args:
-        number: of keypoints of the first photo.
+        number: of keypoints of the first photo that the second one should show.
         expected: number of those that either photo should show again, of the one with fewer.
         errors: (R,) pixels of the second photo, of keypoints that are nearest to each other within
             the limit of a right match.
@@ -129,7 +130,7 @@ def compare(one: dict, other: dict, photos: tuple, matrix: np.ndarray) -> Compar
     second = np.flatnonzero(inside(back, photos[0]) & inside(other["keypoints"], photos[1]))
     if not len(first) or not len(second):
         none = np.zeros(0)
-        return Compared(len(there), 0, none, 0, 0, none, none.astype(bool))
+        return Compared(len(first), 0, none, 0, 0, none, none.astype(bool))
     there, found = there[first], other["keypoints"][second]
     distances, nearest = cKDTree(found).query(there)
     _, nearest_back = cKDTree(there).query(found)

@@ -253,6 +253,8 @@ def provenance(conf: dict, as_half: bool = True) -> dict:
         if given or not NETWORKS[network].urls:  # which may be trained anew
             made_from["weights_sha256"] = file_sha256(weights)
         made_from["noise_reduction"] = NOISE_REDUCTION
+        if version := NETWORKS[network].version:
+            made_from["network_version"] = version
     return made_from
 
 

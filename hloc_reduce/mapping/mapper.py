@@ -41,8 +41,8 @@ RELAXED = {
     "init_min_tri_angle": 8.0,
     "abs_pose_min_num_inliers": 15,
 }
-# Not in later attempts: to register an image without points may take 14 s a try with the matches of
-# networks, and hardly registers any that the first attempt does not.
+# Registering an image without points may take 14 s a try with the matches of networks, and hardly
+# adds any that the first attempt does not have; so later attempts do without.
 FALLBACK = "structure_less_registration_fallback"
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
 SEEDS = (1, 2, 3)

@@ -61,11 +61,11 @@ class NoModelError(InputError):
 def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
     """Say that no image could be reconstructed, and what to try."""
     why = _left_out(dropped, []) if dropped else "Do enough of them overlap?"
-    tries = [TRIES[kind] for kind in _kinds(dropped or {})]
-    tries.append("take photos from several places, each overlapping the one before by two thirds")
+    edited = f"{TRIES[LENS]}; " if LENS in _kinds(dropped or {}) else ""
     return (
         f"COLMAP could not reconstruct the images of {image_dir} from {VIEWPOINTS} viewpoints or "
-        f"more. {why} What to try: {'; '.join(tries)}."
+        f"more. {why} What to try: {edited}take photos from several places, each overlapping the "
+        "one before by two thirds."
     )
 
 

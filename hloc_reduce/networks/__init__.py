@@ -17,6 +17,7 @@ class Network:
         urls: of the weights; none if they ship with this package.
         sha256: of the weights; None where files that differ hold the same weights.
         computes: in that case, what they compute from a test image, see `loading.fingerprint`.
+        version: of what is made of the network's output, part of the provenance of features.
     """
 
     dim: int
@@ -24,6 +25,7 @@ class Network:
     urls: tuple[str, ...] = ()
     sha256: str | None = None
     computes: tuple[float, ...] = ()
+    version: int = 0
 
 
 NOISE_REDUCTION = 3  # the version of `light.noise.reduce_noise`, part of the provenance of features
@@ -53,10 +55,16 @@ ALIKED = {
 
 MINI = ("mini32", "mini64")  # this project's own
 MINI_SIZE = "L"  # of EdgePoint2's architecture
+BETWEEN_PIXELS = 1  # the version with keypoints between pixels
 WEIGHTS = Path(__file__).parent / "weights"
 
 NETWORKS = (
-    {model: Network(int(model.removeprefix("mini")), f"{model}.safetensors") for model in MINI}
+    {
+        model: Network(
+            int(model.removeprefix("mini")), f"{model}.safetensors", version=BETWEEN_PIXELS
+        )
+        for model in MINI
+    }
     | {
         model: Network(
             int(model[1:]),

@@ -159,6 +159,10 @@ def test_no_plausible_image_at_all_is_said():
     assert "no lens has" in message and "a.jpg (focal length 12345)" in message
     assert "What to try: use the photos as the camera wrote them" in message
     assert "enough of them overlap" not in message
+    dropped = dict.fromkeys("ab", registration.MISPLACED) | {"c": registration.FEW_POINTS}
+    message = registration.nothing(Path("photos"), dropped)
+    assert "contradict" in message and "fewer than" in message and "in the map" not in message
+    assert message.endswith("the one before by two thirds.")
 
 
 def test_parts_that_do_not_connect():

@@ -16,6 +16,7 @@ from torch import nn
 
 from hloc_reduce import extract_features, extractors, networks
 from hloc_reduce.confs import features
+from hloc_reduce.extractors.edgepoint2 import EdgePoint2 as EdgePoint2Extractor
 from hloc_reduce.networks import EDGEPOINT2, NETWORKS, loading
 from hloc_reduce.networks.edgepoint2 import EdgePoint2
 from hloc_reduce.networks.keypoints import refined, strongest, strongest_fixed
@@ -152,6 +153,31 @@ def test_mini32_takes_photos_smaller_than_its_stride(shape):
     assert found["descriptors"].shape == (32, number) and found["scores"].shape == (number,)
     assert (found["keypoints"] >= 0).all() and (found["keypoints"] < [width, height]).all()
     np.testing.assert_allclose(np.linalg.norm(found["descriptors"], axis=0), 1, atol=1e-5)
+
+
+def test_keypoints_of_mini32_lie_between_pixels(textured, monkeypatch):
+    """Descriptors and scores are those of the whole pixels that they belong to."""
+    model = extractors.load(features.confs["mini32"]["model"]).eval()
+    found = extractors.extract(model, textured, COLOUR)
+    monkeypatch.setattr(type(model), "_refined", EdgePoint2Extractor._refined)
+    expected = extractors.extract(model, textured, COLOUR)
+    moved = found["keypoints"] - expected["keypoints"]
+    assert len(moved) > 100 and np.abs(moved).max() <= 0.5
+    assert np.mean(np.abs(moved).max(axis=1) > 0.05) > 0.5
+    for key in ("descriptors", "scores"):
+        np.testing.assert_array_equal(found[key], expected[key])
+
+
+def test_features_of_mini32_from_before_are_not_mixed_with_new_ones(tmp_path, textured):
+    """Whose keypoints were in whole pixels."""
+    cv2.imwrite(str(tmp_path / "a.png"), textured)
+    conf = features.confs["mini32"]
+    before = replace(NETWORKS["mini32"], version=0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(NETWORKS, "mini32", before)
+        extract_features.main(conf, tmp_path, tmp_path)
+    with pytest.raises(InputError, match="another configuration .network_version"):
+        extract_features.main(conf, tmp_path, tmp_path)
 
 
 def test_mini32_finds_nothing_in_one_colour(tmp_path, textured):

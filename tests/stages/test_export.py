@@ -50,7 +50,9 @@ def check_network(path: Path, conf: dict, most: int) -> None:
     assert numbers[1] > numbers[2] > 0
 
 
-@pytest.mark.parametrize("name", ["xfeat", pytest.param("aliked_t16", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "name", ["xfeat", "mini64", pytest.param("aliked_t16", marks=pytest.mark.long)]
+)
 def test_a_network(name, run, base_weights, tmp_path):
     base_weights(name)
     path = tmp_path / "network.onnx"
