@@ -86,13 +86,15 @@ def _main() -> None:
         "--map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv32",
     )
     add_places(parser)
-    parser.add_argument("--feature", default="colmap_sift_sv32")
+    parser.add_argument("--feature", default="colmap_sift_sv32", help="local feature")
     parser.add_argument("--storage", choices=STORAGES, help="of the points; as hloc_reduce.compact")
     parser.add_argument("--max_mb", type=float, help="largest size of a file; all points if absent")
     parser.add_argument("--trials", type=int, default=12, help="photos of each place, per map")
     parser.add_argument("--output", type=Path, default=Path("outputs/false_accepts_compact"))
     args = parser.parse_args()
     cli.check_positive(args, "trials")
+    if args.max_mb is not None and not args.max_mb > 0:
+        raise InputError(f"--max_mb {args.max_mb}: it must be above 0.")
     places = parse_maps(args.map)
     if len(places) < 2:
         raise InputError("Give two or more --map.")

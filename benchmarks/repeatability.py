@@ -4,9 +4,9 @@ Each photo is paired with itself turned, made smaller, noisy or dark, so that th
 every keypoint is known. Prints two Markdown tables. The first one has, for each feature and change,
 the keypoints of the first photo that the second one should show; the share that is found again
 within a pixel of the second photo; the median error of those found within three pixels; and the
-mutual nearest neighbours that are right, also within three pixels. The second one
-tells how well scores rank keypoints of noisy photos by whether they are found again: within each
-photo, and among all photos together, which needs comparable scores. 0.5 would be by chance.
+mutual nearest neighbours that are right, also within three pixels. The second one tells how well
+scores rank keypoints of noisy photos by whether they are found again: within each photo, and among
+all photos together, which needs comparable scores. 0.5 would be by chance.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from darken_place import darken, resize
 from keypoints import add_noise
 from scipy.spatial import cKDTree
@@ -22,6 +23,7 @@ from sklearn.metrics import roc_auc_score
 
 from hloc_reduce import extractors
 from hloc_reduce.confs import features
+from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.images import list_images, read_image
 from hloc_reduce.utils.progress import progress
@@ -106,15 +108,6 @@ def inside(points: np.ndarray, photo: np.ndarray) -> np.ndarray:
     return ((points >= MARGIN) & (points <= limits)).all(axis=1)
 
 
-def mutual(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the pairs (M, 2) of mutual nearest neighbours of descriptors (D, N), (D, M)."""
-    similarity = first.T @ second
-    to_second, to_first = similarity.argmax(axis=1), similarity.argmax(axis=0)
-    own = np.arange(len(to_second))
-    kept = to_first[to_second] == own
-    return np.column_stack([own, to_second])[kept]
-
-
 def compare(one: dict, other: dict, photos: tuple, matrix: np.ndarray) -> Compared:
     """Compare the features of a photo with those of the changed photo.
 
@@ -136,12 +129,14 @@ def compare(one: dict, other: dict, photos: tuple, matrix: np.ndarray) -> Compar
     _, nearest_back = cKDTree(there).query(found)
     both = nearest_back[nearest] == np.arange(len(first))
     errors = distances[both & (distances <= RIGHT)]
-    pairs = mutual(one["descriptors"][:, first], other["descriptors"][:, second])
-    apart = np.linalg.norm(there[pairs[:, 0]] - found[pairs[:, 1]], axis=1)
+    described = one["descriptors"][:, first], other["descriptors"][:, second]
+    match = mutual_nearest(*(torch.from_numpy(array.T) for array in described), None)[0].numpy()
+    matched = match >= 0
+    apart = np.linalg.norm(there[matched] - found[match[matched]], axis=1)
     scores = one.get("scores", np.zeros(len(one["keypoints"])))[first]
     right = int((apart <= RIGHT).sum())
     expected = min(len(first), len(second))
-    return Compared(len(first), expected, errors, right, len(pairs), scores, distances <= RIGHT)
+    return Compared(len(first), expected, errors, right, len(apart), scores, distances <= RIGHT)
 
 
 def describe(found: list[Compared]) -> list[str]:
@@ -182,11 +177,11 @@ def _main() -> None:
         names = list_images(folder)
         chosen = np.linspace(0, len(names) - 1, min(args.photos, len(names))).round().astype(int)
         paths += [folder / names[index] for index in chosen]
+    confs = {name: features.get(name)[1] for name in args.feature}
     columns = "feature", "change", "keypoints", "again [%]", "error [px]", "right", "of matches [%]"
     print(f"| {' | '.join(columns)} |\n| --- | --- |{' ---: |' * (len(columns) - 2)}", flush=True)
     ranks = []
-    for name in args.feature:
-        conf = features.get(name)[1]
+    for name, conf in confs.items():
         model = extractors.load(conf["model"]).eval()
         found: dict[str, list[Compared]] = {change: [] for change in CHANGES}
         for number, path in enumerate(progress(paths, name, "photo")):
