@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 confs = features_confs.confs
 CHUNK = 8  # images
+NETWORK_IMAGES = {"cpu": 1, "cuda": 8}  # at once; on a CPU a network uses all cores for one
 BLACK = np.zeros((32, 32), np.uint8)  # extracted instead of an image that cannot be read
 
 
@@ -135,7 +136,8 @@ def _extract(
     """Yield the groups of images for those feature files that lack them.
 
     COLMAP's detector blocks the other threads of its process, so several images are detected in
-    processes and described in threads.
+    processes and described in threads. On a GPU, reading an image takes longer than a network, so
+    several are read, and have their noise estimated, while others are on the GPU.
     """
     import torch
 
@@ -149,7 +151,8 @@ def _extract(
         for path, conf in confs.items()
     }
     detect = next(iter(models.values())).detect
-    workers = min(parallel.cores(), len(items)) if detect else 1
+    at_once = parallel.cores() if detect else min(parallel.cores(), NETWORK_IMAGES[device])
+    workers = min(at_once, len(items))
     with ExitStack() as stack:
         if detect and workers > 1:
             submit = stack.enter_context(processes.pool(workers)).submit

@@ -20,14 +20,17 @@ from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.feature_files import get_blur
 
 
-def test_all_cores_extract_the_same(tmp_path, textured):
-    """Also when an image of the many cannot be read."""
+def test_all_cores_extract_the_same(tmp_path, textured, monkeypatch):
+    """Also when an image of the many cannot be read, and a network's images at once."""
+    monkeypatch.setitem(
+        extract_features.NETWORK_IMAGES, "cpu", extract_features.NETWORK_IMAGES["cuda"]
+    )
     images = []
     for i in range(4):
         images.append(tmp_path / f"{i}.png")
         cv2.imwrite(str(images[-1]), np.roll(textured, 17 * i, axis=1))
     threads = torch.get_num_threads()
-    for name in ("sift_sv16", "colmap_sift"):
+    for name in ("sift_sv16", "colmap_sift", "mini32"):
         extracted = []
         for number in (1, 3):
             torch.set_num_threads(number)
