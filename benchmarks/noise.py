@@ -37,7 +37,9 @@ def blurred_by(blur: str) -> None:
     if blur == AUTOMATIC:
         noise.relative_noise = estimate
     else:
-        noise.relative_noise = lambda _: (float(blur) / noise.BLUR) ** 2
+        sigma = float(blur)
+        needed = max((sigma / noise.BLUR) ** 2, sigma / noise.BLUR_LITTLE)
+        noise.relative_noise = lambda _: needed
 
 
 def _main() -> None:

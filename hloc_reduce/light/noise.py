@@ -9,9 +9,10 @@ CLIPPED = 0.02, 0.98  # blocks of a mean beyond have lost their noise
 # lamps are brighter than this multiple of the median, and this share of the pixels at most
 LAMPS, LAMPS_SHARE = 2.5, 0.02
 STEP = 4  # every fourth row and column tells as much of them, in a tenth of the time
-# standard deviations of the noise, in that of the image, from which it is blurred; and of the blur
-# in pixels for a noise of 1 (docs/results.md)
-NOISY, BLUR = 0.08, 2.8
+NOISY = 0.08  # standard deviation of the noise, in that of the image, from which it is blurred
+# standard deviation in pixels of the blur for a noise of 1; in proportion to the root of the noise,
+# and where there is little, to the noise (docs/results.md)
+BLUR, BLUR_LITTLE = 2.8, 4.8
 
 
 def relative_noise(image: np.ndarray) -> float:
@@ -59,5 +60,6 @@ def reduce_noise(channels: np.ndarray) -> tuple[np.ndarray, float]:
     noise = relative_noise(channels.mean(axis=0))
     if noise < NOISY:
         return channels, 0.0
-    cut, blur = channels.clip(max=lamps(channels)), BLUR * np.sqrt(noise)
+    cut = channels.clip(max=lamps(channels))
+    blur = min(BLUR * np.sqrt(noise), BLUR_LITTLE * noise)
     return np.stack([cv2.GaussianBlur(channel, (0, 0), blur) for channel in cut]), float(blur)
