@@ -1,0 +1,168 @@
+"""Compare the levels of projections with other ways to code the same numbers in as many bytes.
+
+The others are fitted to descriptors of the maps of --fit: `pq` and `opq` are product quantization,
+plain and after a rotation; `rq` is residual quantization (all of faiss, a byte for each part);
+`itq` rotates the numbers so that codes by levels have the least error, and fits the levels to what
+comes out; `signs` keeps a bit of each number, so that both sides coded compare by Hamming distance.
+AP is that of matching_ap.py, on maps that no projection was trained on: with queries as floats, and
+with both sides coded. Prints a Markdown table. Needs faiss-cpu.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from matching_ap import KINDS, draw_all
+from rate import ap, stored
+from torch.nn.functional import normalize
+
+from hloc_reduce import projections
+from hloc_reduce.training import levels, tracks
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.codes import CODED, descriptor_bytes
+from hloc_reduce.utils.progress import progress
+
+ROUNDS = 50  # of `itq`
+Code = Callable[[torch.Tensor], torch.Tensor]  # numbers (N, D) to what their codes stand for
+
+
+def product(numbers: np.ndarray, size: int) -> Code:
+    """Fit a product quantizer of `size` bytes to numbers (N, D)."""
+    import faiss
+
+    return _faiss(faiss.ProductQuantizer(numbers.shape[1], size, 8), numbers)
+
+
+def residual(numbers: np.ndarray, size: int) -> Code:
+    """Fit a residual quantizer of `size` bytes to numbers (N, D)."""
+    import faiss
+
+    return _faiss(faiss.ResidualQuantizer(numbers.shape[1], size, 8), numbers)
+
+
+def rotated_product(numbers: np.ndarray, size: int) -> Code:
+    """Fit a rotation and a product quantizer of `size` bytes to numbers (N, D)."""
+    import faiss
+
+    rotation = faiss.OPQMatrix(numbers.shape[1], size)
+    rotation.train(numbers)
+    code = product(rotation.apply(numbers), size)
+
+    def both(given: torch.Tensor) -> torch.Tensor:
+        coded = code(torch.from_numpy(rotation.apply(given.numpy())))
+        return torch.from_numpy(rotation.reverse_transform(coded.numpy()))
+
+    return both
+
+
+def rotated_levels(numbers: np.ndarray, size: int) -> Code:
+    """Fit a rotation and levels to numbers (N, D), as many bits of each as `size` bytes hold."""
+    dim = numbers.shape[1]
+    storage = next(s for s in CODED if descriptor_bytes(dim, s) == size)
+    given = torch.from_numpy(numbers)
+    rotation = torch.linalg.eigh(torch.cov(given.T)).eigenvectors  # from the principal axes
+    for _ in progress(range(ROUNDS), "Rotating", "round"):
+        turned = given @ rotation
+        table = levels.fit(turned, CODED[storage]).numpy()
+        left, _, right = torch.linalg.svd(given.T @ stored(turned, storage, table))
+        rotation = left @ right
+    table = levels.fit(given @ rotation, CODED[storage]).numpy()
+    return lambda given: stored(given @ rotation, storage, table) @ rotation.T
+
+
+def signs(numbers: np.ndarray, size: int) -> Code:
+    """Return a code of one bit of each number: whether it is positive."""
+    return lambda given: normalize(torch.where(given > 0, 1.0, -1.0), dim=1)
+
+
+QUANTIZERS = {
+    "pq": product,
+    "opq": rotated_product,
+    "rq": residual,
+    "itq": rotated_levels,
+    "signs": signs,
+}
+
+
+def fits(quantizer: str, dim: int, size: int) -> bool:
+    """Tell whether a quantizer can code so many numbers in so many bytes."""
+    if quantizer == "signs":
+        return dim == 8 * size
+    if quantizer == "itq":
+        return any(descriptor_bytes(dim, storage) == size for storage in CODED)
+    return dim % size == 0
+
+
+def _faiss(quantizer, numbers: np.ndarray) -> Code:
+    quantizer.train(numbers)
+
+    def code(given: torch.Tensor) -> torch.Tensor:
+        codes = quantizer.compute_codes(np.ascontiguousarray(given.numpy()))
+        return normalize(torch.from_numpy(quantizer.decode(codes)), dim=1)
+
+    return code
+
+
+def _main() -> None:
+    example = "--map sceaux/images:sceaux/sparse --fit fox/images:fox/sparse --feature sift_sv32"
+    parser = cli.Parser(__doc__, example)
+    add = parser.add_argument
+    where = {"action": "append", "required": True, "metavar": "IMAGES:MODEL"}
+    add("--map", **where, help="map to measure AP on")
+    add("--fit", **where, help="map to fit the others to")
+    add("--feature", nargs="+", default=["sift_sv32"], help="projections that ship")
+    add("--quantizer", nargs="+", default=list(QUANTIZERS), help="what to compare levels with")
+    add("--bytes", type=int, nargs="+", default=[8, 16], help="of a descriptor")
+    add("--cache", type=Path, default=Path("outputs/training/maps"), help="folder for the tracks")
+    add("--draws", type=int, default=1, help="draws of pairs of observations")
+    args = parser.parse_args()
+    cli.check_positive(args, "draws")
+    for quantizer in args.quantizer:
+        cli.choose("quantizer", quantizer, QUANTIZERS)
+    for size in args.bytes:
+        if size < 1:
+            raise InputError(f"--bytes {size}: it must be at least 1.")
+    loaded = {feature: projections.load(feature) for feature in args.feature}
+    print(f"| bytes | feature | code | {' / '.join(KINDS)} | both sides coded |")
+    print("| ---: | --- | --- | ---: | ---: |")
+    for feature, project in loaded.items():
+        _compare(args, feature, project)
+
+
+def _compare(args: argparse.Namespace, feature: str, project: torch.nn.Module) -> None:
+    """Print the rows of a feature."""
+    base = feature.rpartition("_")[0]
+
+    def load(maps: list[str]) -> list[tracks.Tracks]:
+        return [
+            tracks.load(tracks.main(images, model, args.cache / name, base))
+            for name, (images, model) in tracks.parse_maps(maps).items()
+        ]
+
+    pairs = [draw_all(data, args.draws) for data in load(args.map)]
+    with torch.inference_mode():
+        numbers = np.ascontiguousarray(project(levels.sample(load(args.fit))).numpy())
+    for size in args.bytes:
+        codes: dict[str, Code] = {}
+        for storage in CODED:
+            if descriptor_bytes(project.dim, storage) == size:
+                table = projections.levels(feature, storage)
+                codes[f"`{storage}`"] = lambda x, s=storage, t=table: stored(x, s, t)
+        for quantizer in args.quantizer:
+            if fits(quantizer, project.dim, size):
+                codes[quantizer] = QUANTIZERS[quantizer](numbers, size)
+        for name, code in progress(codes.items(), f"{feature}, {size} bytes", "code", len(codes)):
+
+            def coded(base: torch.Tensor, code=code) -> torch.Tensor:
+                return code(project(base))
+
+            values = ap(project, coded, pairs), ap(coded, coded, pairs)
+            cells = (" / ".join(f"{value:.1f}" for value in row) for row in values)
+            print(f"| {size} | {feature} | {name} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    cli.run(_main)
