@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 confs = features_confs.confs
 CHUNK = 8  # images
-NETWORK_IMAGES = {"cpu": 1, "cuda": 8}  # at once; on a CPU a network uses all cores for one
 BLACK = np.zeros((32, 32), np.uint8)  # extracted instead of an image that cannot be read
 
 
@@ -136,8 +135,8 @@ def _extract(
     """Yield the groups of images for those feature files that lack them.
 
     COLMAP's detector blocks the other threads of its process, so several images are detected in
-    processes and described in threads. On a GPU, reading an image takes longer than a network, so
-    several are read, and have their noise estimated, while others are on the GPU.
+    processes and described in threads. Beside a GPU, reading an image takes longer than a network
+    does, so several are read, and have their noise estimated, at once.
     """
     import torch
 
@@ -150,9 +149,8 @@ def _extract(
         path: partial(_store, conf["storage"], features_confs.levels(conf), queries)
         for path, conf in confs.items()
     }
-    detect = next(iter(models.values())).detect
-    at_once = parallel.cores() if detect else min(parallel.cores(), NETWORK_IMAGES[device])
-    workers = min(at_once, len(items))
+    model = next(iter(models.values()))
+    detect, workers = model.detect, _workers(model, device, len(items))
     with ExitStack() as stack:
         if detect and workers > 1:
             submit = stack.enter_context(processes.pool(workers)).submit
@@ -169,6 +167,13 @@ def _extract(
             extracted = stack.enter_context(closing(results))
         for groups in extracted:
             yield from groups
+
+
+def _workers(model: "Extractor", device: str, images: int) -> int:
+    """Return how many of the images are extracted at once."""
+    if model.detect is None:
+        images = min(images, model.gpu_images if device == "cuda" else 1)
+    return min(images, parallel.cores())
 
 
 def _detect_elsewhere(

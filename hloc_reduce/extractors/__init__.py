@@ -4,7 +4,9 @@ import json
 import pkgutil
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import torch
@@ -16,6 +18,7 @@ from ..utils.cli import InputError
 from ..utils.hloc import is_installed
 from ..utils.images import in_original, resized
 
+_gpu = Lock()  # of the thread whose image is in a network
 # from an image (H, W) float32 in [0, 1] to what `utils.colmap.detect_dog` returns
 Detect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -33,6 +36,7 @@ class Extractor(BaseModel):
         detect: detects the keypoints, if that can be done in another process (pickled), separately
             from describing them; `_forward` gets the result as `detected`.
         dim: dimension of the descriptors, as far as it is known.
+        gpu_images: how many threads may give images to one extractor on a GPU.
         stride: what the sides of an image are multiples of in `fixed`.
     """
 
@@ -40,6 +44,7 @@ class Extractor(BaseModel):
     detection_noise = 1.0
     detect: Detect | None = None
     dim = DIM
+    gpu_images = 1
     stride = 1
 
     @property
@@ -79,15 +84,20 @@ class Extractor(BaseModel):
 class NetworkExtractor(Extractor):
     """An extractor that reduces the noise of noisy images if its option `denoise` is set.
 
-    A subclass writes `_extract`, in place of `_forward`, and `fixed`.
+    A subclass writes `_extract`, in place of `_forward`, and `fixed`. On a GPU, one image at a time
+    is in the network, so that its memory does not depend on the number of threads.
     """
+
+    gpu_images = 8
 
     def _forward(self, data: dict) -> dict:
         image, blur = data["image"], 0.0
         if self.conf["denoise"]:
             channels, blur = reduce_noise(image[0].cpu().numpy())
             image = torch.from_numpy(channels)[None].to(image) if blur else image
-        return {**self._extract(image), "blur": torch.tensor([blur])}
+        with _gpu if image.is_cuda else nullcontext():
+            features = self._extract(image)
+        return {**features, "blur": torch.tensor([blur])}
 
     def _extract(self, image: torch.Tensor) -> dict:
         """Return the features of an image (1, C, H, W), as `_forward` returns them."""

@@ -10,8 +10,8 @@ CLIPPED = 0.02, 0.98  # blocks of a mean beyond have lost their noise
 LAMPS, LAMPS_SHARE = 2.5, 0.02
 STEP = 4  # every fourth row and column tells as much of them, in a tenth of the time
 NOISY = 0.08  # standard deviation of the noise, in that of the image, from which it is blurred
-# standard deviation in pixels of the blur for a noise of 1; in proportion to the root of the noise,
-# and where there is little, to the noise (docs/results.md)
+# the blur, a standard deviation in pixels: the smaller of BLUR * sqrt(noise) and
+# BLUR_LITTLE * noise, which are equal at 0.34 (docs/results.md)
 BLUR, BLUR_LITTLE = 2.8, 4.8
 
 

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from hloc_reduce.light import noise
 from hloc_reduce.light.noise import NOISY, reduce_noise, relative_noise
 
 
@@ -55,10 +54,10 @@ def test_only_noisy_photos_are_blurred(textured):
 
 
 def test_little_noise_is_blurred_little(monkeypatch):
-    """Blurred keypoints are less accurate, which much noise is worth, but little is not."""
+    """A blur costs accuracy, which only much noise is worth."""
     image, blurs = np.full((1, 64, 64), 0.5, np.float32), []
     for value in (0.07, 0.1, 0.2, 0.5, 0.9):
-        monkeypatch.setattr(noise, "relative_noise", lambda _, value=value: value)
+        monkeypatch.setattr("hloc_reduce.light.noise.relative_noise", lambda _, v=value: v)
         blurs.append(reduce_noise(image)[1])
     assert blurs == sorted(blurs) and blurs[0] == 0
     assert 0 < blurs[1] < 0.6 and 1.9 < blurs[3] < 2.1

@@ -21,10 +21,8 @@ from hloc_reduce.utils.feature_files import get_blur
 
 
 def test_all_cores_extract_the_same(tmp_path, textured, monkeypatch):
-    """Also when an image of the many cannot be read, and a network's images at once."""
-    monkeypatch.setitem(
-        extract_features.NETWORK_IMAGES, "cpu", extract_features.NETWORK_IMAGES["cuda"]
-    )
+    """Also if a network is given several images at once, and if one of them cannot be read."""
+    monkeypatch.setattr(extract_features, "_workers", lambda *_: torch.get_num_threads())
     images = []
     for i in range(4):
         images.append(tmp_path / f"{i}.png")
@@ -44,9 +42,29 @@ def test_all_cores_extract_the_same(tmp_path, textured, monkeypatch):
                     np.testing.assert_array_equal(array[()], together[image.name][key][()])
     images[3].write_bytes(b"no image")
     torch.set_num_threads(2)
-    with pytest.raises(InputError, match="Cannot read image .*3.png"):
-        extract_features.main(features_confs.confs["sift"], tmp_path, tmp_path / "broken")
+    for name in ("sift", "mini32"):
+        with pytest.raises(InputError, match="Cannot read image .*3.png"):
+            extract_features.main(features_confs.confs[name], tmp_path, tmp_path / "broken")
     torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize(
+    ("feature", "device", "number"),
+    [
+        ("mini32", "cuda", 8),
+        ("mini32", "cpu", 1),
+        ("colmap_sift_sv64", "cuda", 16),
+        ("colmap_sift_sv64", "cpu", 16),
+    ],
+)
+def test_images_at_once(feature, device, number, monkeypatch):
+    """Reading takes long beside a GPU; on a CPU a network uses all cores for an image."""
+    monkeypatch.setattr(parallel, "cores", lambda: 16)
+    model = extractors.load(features_confs.confs[feature]["model"])
+    assert extract_features._workers(model, device, 99) == number
+    assert extract_features._workers(model, device, 1) == 1
+    model.detect, model.gpu_images = None, extractors.Extractor.gpu_images
+    assert extract_features._workers(model, device, 99) == 1  # another's may not be thread-safe
 
 
 def test_several_features_at_once_are_those_of_each(tmp_path, textured, monkeypatch):
