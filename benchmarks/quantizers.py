@@ -2,24 +2,25 @@
 
 The others are fitted to descriptors of the maps of --fit: `pq` and `opq` are product quantization,
 plain and after a rotation; `rq` is residual quantization (all of faiss, a byte for each part);
-`itq` rotates the numbers so that codes by levels have the least error, and fits the levels to what
-comes out; `signs` keeps a bit of each number, so that both sides coded compare by Hamming distance.
+`itq` rotates the numbers so that coding by levels loses less, and fits new levels; `signs` keeps a
+bit of each number, so that both sides coded compare by Hamming distance.
 AP is that of matching_ap.py, on maps that no projection was trained on: with queries as floats, and
 with both sides coded. Prints a Markdown table. Needs faiss-cpu.
 """
 
 import argparse
+import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 from matching_ap import KINDS, draw_all
-from rate import ap, stored
+from rate import ap, load, stored
 from torch.nn.functional import normalize
 
 from hloc_reduce import projections
-from hloc_reduce.training import levels, tracks
+from hloc_reduce.training import levels
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import CODED, descriptor_bytes
@@ -62,14 +63,14 @@ def rotated_levels(numbers: np.ndarray, size: int) -> Code:
     """Fit a rotation and levels to numbers (N, D), as many bits of each as `size` bytes hold."""
     dim = numbers.shape[1]
     storage = next(s for s in CODED if descriptor_bytes(dim, s) == size)
-    given = torch.from_numpy(numbers)
-    rotation = torch.linalg.eigh(torch.cov(given.T)).eigenvectors  # from the principal axes
+    fitted = torch.from_numpy(numbers)
+    rotation = torch.linalg.eigh(torch.cov(fitted.T)).eigenvectors  # from the principal axes
     for _ in progress(range(ROUNDS), "Rotating", "round"):
-        turned = given @ rotation
+        turned = fitted @ rotation
         table = levels.fit(turned, CODED[storage]).numpy()
-        left, _, right = torch.linalg.svd(given.T @ stored(turned, storage, table))
+        left, _, right = torch.linalg.svd(fitted.T @ stored(turned, storage, table))
         rotation = left @ right
-    table = levels.fit(given @ rotation, CODED[storage]).numpy()
+    table = levels.fit(fitted @ rotation, CODED[storage]).numpy()
     return lambda given: stored(given @ rotation, storage, table) @ rotation.T
 
 
@@ -93,7 +94,7 @@ def fits(quantizer: str, dim: int, size: int) -> bool:
         return dim == 8 * size
     if quantizer == "itq":
         return any(descriptor_bytes(dim, storage) == size for storage in CODED)
-    return dim % size == 0
+    return quantizer == "rq" or dim % size == 0
 
 
 def _faiss(quantizer, numbers: np.ndarray) -> Code:
@@ -125,7 +126,13 @@ def _main() -> None:
     for size in args.bytes:
         if size < 1:
             raise InputError(f"--bytes {size}: it must be at least 1.")
+    if not importlib.util.find_spec("faiss"):
+        raise InputError("The quantizers need faiss: pip install faiss-cpu.")
     loaded = {feature: projections.load(feature) for feature in args.feature}
+    for feature, project in loaded.items():
+        for size in args.bytes:
+            if not any(fits(quantizer, project.dim, size) for quantizer in args.quantizer):
+                raise InputError(f"No quantizer codes {feature} in {size} bytes.")
     print(f"| bytes | feature | code | {' / '.join(KINDS)} | both sides coded |")
     print("| ---: | --- | --- | ---: | ---: |")
     for feature, project in loaded.items():
@@ -134,17 +141,11 @@ def _main() -> None:
 
 def _compare(args: argparse.Namespace, feature: str, project: torch.nn.Module) -> None:
     """Print the rows of a feature."""
-    base = feature.rpartition("_")[0]
-
-    def load(maps: list[str]) -> list[tracks.Tracks]:
-        return [
-            tracks.load(tracks.main(images, model, args.cache / name, base))
-            for name, (images, model) in tracks.parse_maps(maps).items()
-        ]
-
-    pairs = [draw_all(data, args.draws) for data in load(args.map)]
+    base = project.metadata["descriptor"]
+    pairs = [draw_all(data, args.draws) for data in load(args.map, base, args.cache)]
+    fitted = levels.sample(load(args.fit, base, args.cache))
     with torch.inference_mode():
-        numbers = np.ascontiguousarray(project(levels.sample(load(args.fit))).numpy())
+        numbers = np.ascontiguousarray(project(fitted).numpy())
     for size in args.bytes:
         codes: dict[str, Code] = {}
         for storage in CODED:

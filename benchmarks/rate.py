@@ -30,6 +30,14 @@ MEASURED = [storage for storage in STORAGES if storage != "float32"]
 Row = tuple[int, str, str, list[float], list[float]]  # bytes, feature, storage, AP twice
 
 
+def load(maps: list[str], descriptor: str, cache: Path) -> list[tracks.Tracks]:
+    """Return the tracks of maps, values of --map or --fit, described by a base descriptor."""
+    return [
+        tracks.load(tracks.main(images, model, cache / name, descriptor))
+        for name, (images, model) in tracks.parse_maps(maps).items()
+    ]
+
+
 def stored(descriptors: torch.Tensor, storage: str, table: np.ndarray | None) -> torch.Tensor:
     """Return descriptors (N, D) as they are read from a file."""
     return torch.from_numpy(restore(*store({"descriptors": descriptors.numpy().T}, storage, table)))
@@ -139,17 +147,10 @@ def _main() -> None:
 
 def _by_ap(args: argparse.Namespace) -> list[Callable]:
     """Measure and print AP; return its panel of the picture."""
-
-    def load(maps: list[str], descriptor: str) -> list[tracks.Tracks]:
-        return [
-            tracks.load(tracks.main(images, model, args.cache / name, descriptor))
-            for name, (images, model) in tracks.parse_maps(maps).items()
-        ]
-
     measured: list[Row] = []
     for descriptor in args.descriptor:
-        pairs = [draw_all(data, args.draws) for data in load(args.map, descriptor)]
-        fitted = levels.sample(load(args.fit, descriptor)) if args.fit else None
+        pairs = [draw_all(data, args.draws) for data in load(args.map, descriptor, args.cache)]
+        fitted = levels.sample(load(args.fit, descriptor, args.cache)) if args.fit else None
         features = load_projections(descriptor, args.projection)
         chosen = {
             name: project
