@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from hloc_reduce.light.engine import LightEngine
 from hloc_reduce.utils.cli import InputError
@@ -148,3 +149,23 @@ def test_repeated_keypoints_and_right_matches(repeatability):
     nowhere = {key: value[..., :0] for key, value in other.items()}
     nowhere["keypoints"] = keypoints[:0]
     assert repeatability["compare"](one, nowhere, photos, np.eye(2, 3)).expected == 0
+
+
+@pytest.mark.parametrize(("name", "size"), [("pq", 8), ("opq", 8), ("rq", 6), ("itq", 8)])
+def test_quantizers_lose_less_with_more_bytes(name, size, monkeypatch):
+    """What a code of more bytes stands for is nearer to what it codes than its signs are."""
+    pytest.importorskip("faiss")
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    quantizers = runpy.run_path(str(ROOT / "benchmarks/quantizers.py"))
+    rng = np.random.default_rng(0)
+    numbers = rng.normal(size=(4000, 32)).astype(np.float32)
+    numbers /= np.linalg.norm(numbers, axis=1, keepdims=True)
+    fitted, others = numbers[:3000], torch.from_numpy(numbers[3000:])
+    code, signs = (
+        quantizers["QUANTIZERS"][kind](fitted, number)
+        for kind, number in ((name, size), ("signs", 4))
+    )
+    assert quantizers["fits"](name, 32, size) and quantizers["fits"]("signs", 32, 4)
+    coded, cosine = code(others), torch.nn.functional.cosine_similarity
+    assert coded.shape == others.shape
+    assert cosine(coded, others).mean() > cosine(signs(others), others).mean() > 0.75
