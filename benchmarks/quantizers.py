@@ -3,9 +3,9 @@
 The others are fitted to descriptors of the maps of --fit: `pq` and `opq` are product quantization,
 plain and after a rotation; `rq` is residual quantization (all of faiss, a byte for each part);
 `itq` rotates the numbers so that coding by levels loses less, and fits new levels; `signs` keeps a
-bit of each number, so that both sides coded compare by Hamming distance.
-AP is that of matching_ap.py, on maps that no projection was trained on: with queries as floats, and
-with both sides coded. Prints a Markdown table. Needs faiss-cpu.
+bit of each number, so that both sides coded compare by Hamming distance. AP is that of
+matching_ap.py, on maps that no projection was trained on: with queries as floats, and with both
+sides coded. Prints a Markdown table. Needs faiss-cpu.
 """
 
 import argparse
@@ -21,6 +21,7 @@ from torch.nn.functional import normalize
 
 from hloc_reduce import projections
 from hloc_reduce.training import levels
+from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import CODED, descriptor_bytes
@@ -89,7 +90,7 @@ QUANTIZERS = {
 
 
 def fits(quantizer: str, dim: int, size: int) -> bool:
-    """Tell whether a quantizer can code so many numbers in so many bytes."""
+    """Tell whether a quantizer can code `dim` numbers in `size` bytes."""
     if quantizer == "signs":
         return dim == 8 * size
     if quantizer == "itq":
@@ -133,17 +134,24 @@ def _main() -> None:
         for size in args.bytes:
             if not any(fits(quantizer, project.dim, size) for quantizer in args.quantizer):
                 raise InputError(f"No quantizer codes {feature} in {size} bytes.")
+    maps, fit = parse_maps(args.map), parse_maps(args.fit, "--fit")
     print(f"| bytes | feature | code | {' / '.join(KINDS)} | both sides coded |")
     print("| ---: | --- | --- | ---: | ---: |")
     for feature, project in loaded.items():
-        _compare(args, feature, project)
+        base = project.metadata["descriptor"]
+        pairs = [draw_all(data, args.draws) for data in load(maps, base, args.cache)]
+        fitted = levels.sample(load(fit, base, args.cache))
+        _compare(args, feature, project, pairs, fitted)
 
 
-def _compare(args: argparse.Namespace, feature: str, project: torch.nn.Module) -> None:
-    """Print the rows of a feature."""
-    base = project.metadata["descriptor"]
-    pairs = [draw_all(data, args.draws) for data in load(args.map, base, args.cache)]
-    fitted = levels.sample(load(args.fit, base, args.cache))
+def _compare(
+    args: argparse.Namespace,
+    feature: str,
+    project: torch.nn.Module,
+    pairs: list[dict[str, list]],
+    fitted: torch.Tensor,
+) -> None:
+    """Print the rows of a feature, on pairs of base descriptors, fitted to others (N, B)."""
     with torch.inference_mode():
         numbers = np.ascontiguousarray(project(fitted).numpy())
     for size in args.bytes:

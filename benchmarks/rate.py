@@ -30,11 +30,11 @@ MEASURED = [storage for storage in STORAGES if storage != "float32"]
 Row = tuple[int, str, str, list[float], list[float]]  # bytes, feature, storage, AP twice
 
 
-def load(maps: list[str], descriptor: str, cache: Path) -> list[tracks.Tracks]:
-    """Return the tracks of maps, values of --map or --fit, described by a base descriptor."""
+def load(maps: dict[str, tuple[Path, Path]], descriptor: str, cache: Path) -> list[tracks.Tracks]:
+    """Return the tracks of maps from `parse_maps`, described by a base descriptor."""
     return [
         tracks.load(tracks.main(images, model, cache / name, descriptor))
-        for name, (images, model) in tracks.parse_maps(maps).items()
+        for name, (images, model) in maps.items()
     ]
 
 
@@ -147,10 +147,11 @@ def _main() -> None:
 
 def _by_ap(args: argparse.Namespace) -> list[Callable]:
     """Measure and print AP; return its panel of the picture."""
+    maps, fit = tracks.parse_maps(args.map), tracks.parse_maps(args.fit, "--fit")
     measured: list[Row] = []
     for descriptor in args.descriptor:
-        pairs = [draw_all(data, args.draws) for data in load(args.map, descriptor, args.cache)]
-        fitted = levels.sample(load(args.fit, descriptor, args.cache)) if args.fit else None
+        pairs = [draw_all(data, args.draws) for data in load(maps, descriptor, args.cache)]
+        fitted = levels.sample(load(fit, descriptor, args.cache)) if fit else None
         features = load_projections(descriptor, args.projection)
         chosen = {
             name: project

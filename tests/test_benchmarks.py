@@ -169,3 +169,15 @@ def test_quantizers_lose_less_with_more_bytes(name, size, monkeypatch):
     coded, cosine = code(others), torch.nn.functional.cosine_similarity
     assert coded.shape == others.shape
     assert cosine(coded, others).mean() > cosine(signs(others), others).mean() > 0.75
+
+
+@pytest.mark.parametrize("script", ["rate.py", "quantizers.py"])
+def test_a_missing_folder_is_said_before_the_table(script, tmp_path):
+    """And with the option that names it."""
+    for folder in ("images", "sparse"):
+        (tmp_path / folder).mkdir()
+    there = f"{tmp_path}/images:{tmp_path}/sparse"
+    command = [sys.executable, ROOT / "benchmarks" / script, "--map", there, "--fit", "x:y"]
+    said = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    assert said.returncode == 2 and "--fit x:y: there is no folder" in said.stderr
+    assert not said.stdout

@@ -79,10 +79,14 @@ def add_map_option(parser: Parser, required: bool) -> None:
     )
 
 
-def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
+def parse_maps(values: list[str], option: str = "--map") -> dict[str, tuple[Path, Path]]:
     """Parse `images:model`, or folders of maps of `pipelines.localize`.
 
     A map is named after the parent of its images folder, or of the folder of the built map.
+
+    Args:
+        values: of the option.
+        option: for messages.
 
     Returns:
         From name to the folders of images and of the COLMAP model.
@@ -98,14 +102,14 @@ def parse_maps(values: list[str]) -> dict[str, tuple[Path, Path]]:
         else:
             before, separator, after = value.rpartition(":")
             if not separator:
-                raise InputError(f"--map {value}: neither a map nor of the form images:model.")
+                raise InputError(f"{option} {value}: neither a map nor of the form images:model.")
             images, model, folder = Path(before), Path(after), Path(before)
         for part in (images, model):
             if not part.is_dir():
-                raise InputError(f"--map {value}: there is no folder {part}.")
+                raise InputError(f"{option} {value}: there is no folder {part}.")
         name = folder.resolve().parent.name
         if name in folders:
-            raise InputError(f"--map {value}: another map is called {name}, too.")
+            raise InputError(f"{option} {value}: another map is called {name}, too.")
         folders[name] = images, model
     return folders
 
