@@ -2,10 +2,11 @@
 
 The others are fitted to descriptors of the maps of --fit: `pq` and `opq` are product quantization,
 plain and after a rotation; `rq` is residual quantization (all of faiss, a byte for each part);
-`itq` rotates the numbers so that coding by levels loses less, and fits new levels; `signs` keeps a
-bit of each number, so that both sides coded compare by Hamming distance. AP is that of
-matching_ap.py, on maps that no projection was trained on: with queries as floats, and with both
-sides coded. Prints a Markdown table. Needs faiss-cpu.
+`itq` rotates the numbers so that coding by levels loses less, and fits new levels; `tcq`, trellis
+coded quantization, finds the level of each number by the last eight bits of the code up to it;
+`signs` keeps a bit of each number, so that both sides coded compare by Hamming distance. AP is
+that of matching_ap.py, on maps that no projection was trained on: with queries as floats, and with
+both sides coded. Prints a Markdown table. Needs faiss-cpu.
 """
 
 import argparse
@@ -28,6 +29,7 @@ from hloc_reduce.utils.codes import CODED, descriptor_bytes
 from hloc_reduce.utils.progress import progress
 
 ROUNDS = 50  # of `itq`
+WINDOW, STEPS, FITTED = 256, 25, 40_000  # of `tcq`: levels of a number, rounds, numbers of a fit
 Code = Callable[[torch.Tensor], torch.Tensor]  # numbers (N, D) to what their codes stand for
 
 
@@ -63,7 +65,7 @@ def rotated_product(numbers: np.ndarray, size: int) -> Code:
 def rotated_levels(numbers: np.ndarray, size: int) -> Code:
     """Fit a rotation and levels to numbers (N, D), as many bits of each as `size` bytes hold."""
     dim = numbers.shape[1]
-    storage = next(s for s in CODED if descriptor_bytes(dim, s) == size)
+    storage = _storage(dim, size)
     fitted = torch.from_numpy(numbers)
     rotation = torch.linalg.eigh(torch.cov(fitted.T)).eigenvectors  # from the principal axes
     for _ in progress(range(ROUNDS), "Rotating", "round"):
@@ -73,6 +75,50 @@ def rotated_levels(numbers: np.ndarray, size: int) -> Code:
         rotation = left @ right
     table = levels.fit(fitted @ rotation, CODED[storage]).numpy()
     return lambda given: stored(given @ rotation, storage, table) @ rotation.T
+
+
+def trellis(numbers: np.ndarray, size: int) -> Code:
+    """Fit a trellis coded quantizer of `size` bytes to numbers (N, D)."""
+    fitted = torch.from_numpy(numbers[:: -(-len(numbers) // FITTED)])
+    bits = CODED[_storage(fitted.shape[1], size)]
+    # neighbours in a trellis need levels that are far from each other: in random order
+    normal = torch.distributions.Normal(fitted.mean(0), fitted.std(0))
+    even = normal.icdf((torch.arange(WINDOW)[:, None] + 0.5) / WINDOW).T
+    order = torch.rand(even.shape, generator=torch.Generator().manual_seed(0)).argsort(1)
+    table = even.gather(1, order)
+    for _ in progress(range(STEPS), "Fitting a trellis", "round"):
+        chosen = _path(fitted, table, bits).T
+        count = torch.zeros_like(table).scatter_add_(1, chosen, torch.ones_like(fitted.T))
+        total = torch.zeros_like(table).scatter_add_(1, chosen, fitted.T)
+        table = torch.where(count > 0, total / count, table)
+    return lambda given: normalize(table.gather(1, _path(given, table, bits).T).T, dim=1)
+
+
+def _path(numbers: torch.Tensor, table: torch.Tensor, bits: int) -> torch.Tensor:
+    """Choose levels with the least squared error by the Viterbi algorithm.
+
+    Args:
+        numbers: (N, D) float32.
+        table: (D, W) levels; the number i has the one whose index is the last log2(W) bits of the
+            code up to i, with zeros before the code.
+        bits: that the code has more at each number.
+
+    Returns:
+        Indices of levels (N, D) int64.
+    """
+    states, branches = table.shape[1] >> bits, 1 << bits
+    cost = torch.full((len(numbers), states), torch.inf)
+    cost[:, 0] = 0
+    dropped = []  # the bits that leave the window
+    for column, own in zip(numbers.T, table, strict=True):
+        cost = cost.repeat_interleave(branches, 1) + (column[:, None] - own) ** 2
+        cost, best = cost.view(-1, branches, states).min(1)
+        dropped.append(best.to(torch.uint8))
+    state, path = cost.argmin(1, keepdim=True), []
+    for best in reversed(dropped):
+        path.append(best.gather(1, state).long() * states + state)
+        state = path[-1] >> bits
+    return torch.cat(path[::-1], 1)
 
 
 def signs(numbers: np.ndarray, size: int) -> Code:
@@ -85,6 +131,7 @@ QUANTIZERS = {
     "opq": rotated_product,
     "rq": residual,
     "itq": rotated_levels,
+    "tcq": trellis,
     "signs": signs,
 }
 
@@ -93,9 +140,14 @@ def fits(quantizer: str, dim: int, size: int) -> bool:
     """Tell whether a quantizer can code `dim` numbers in `size` bytes."""
     if quantizer == "signs":
         return dim == 8 * size
-    if quantizer == "itq":
-        return any(descriptor_bytes(dim, storage) == size for storage in CODED)
+    if quantizer in ("itq", "tcq"):
+        return _storage(dim, size) is not None
     return quantizer == "rq" or dim % size == 0
+
+
+def _storage(dim: int, size: int) -> str | None:
+    """Return the storage that codes `dim` numbers in `size` bytes, if there is one."""
+    return next((s for s in CODED if descriptor_bytes(dim, s) == size), None)
 
 
 def _faiss(quantizer, numbers: np.ndarray) -> Code:

@@ -151,7 +151,9 @@ def test_repeated_keypoints_and_right_matches(repeatability):
     assert repeatability["compare"](one, nowhere, photos, np.eye(2, 3)).expected == 0
 
 
-@pytest.mark.parametrize(("name", "size"), [("pq", 8), ("opq", 8), ("rq", 6), ("itq", 8)])
+@pytest.mark.parametrize(
+    ("name", "size"), [("pq", 8), ("opq", 8), ("rq", 6), ("itq", 8), ("tcq", 8)]
+)
 def test_quantizers_lose_less_with_more_bytes(name, size, monkeypatch):
     """What a code of more bytes stands for is nearer to what it codes than its signs are."""
     pytest.importorskip("faiss")
@@ -169,6 +171,21 @@ def test_quantizers_lose_less_with_more_bytes(name, size, monkeypatch):
     coded, cosine = code(others), torch.nn.functional.cosine_similarity
     assert coded.shape == others.shape
     assert cosine(coded, others).mean() > cosine(signs(others), others).mean() > 0.75
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4])
+def test_a_trellis_finds_the_best_code(bits, monkeypatch):
+    """Of all codes of three numbers, tried one by one."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    path = runpy.run_path(str(ROOT / "benchmarks/quantizers.py"))["_path"]
+    generator = torch.Generator().manual_seed(0)
+    numbers, table = (torch.randn(s, generator=generator) for s in ((50, 3), (3, 256)))
+    codes = torch.cartesian_prod(*[torch.arange(2**bits)] * 3)
+    windows = codes.clone()
+    for i in (1, 2):
+        windows[:, i] |= windows[:, i - 1] << bits & 255
+    errors = torch.cdist(numbers, table.gather(1, windows.T).T)
+    assert torch.equal(path(numbers, table, bits), windows[errors.argmin(1)])
 
 
 @pytest.mark.parametrize("script", ["rate.py", "quantizers.py"])
