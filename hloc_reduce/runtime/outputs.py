@@ -29,7 +29,7 @@ REMEDY = "Choose other --outputs, one folder for each configuration, or --overwr
 
 
 class Lock:
-    """A folder that no other run may write to.
+    """A folder that no other run may write to, in a `with` block or until `release`.
 
     The operating system releases the lock when the process ends, however it ends.
 
@@ -59,6 +59,12 @@ class Lock:
             self.file.truncate(0)
             self.file.write(f"process {os.getpid()} on {platform.node()}")
             self.file.flush()
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
 
     def release(self) -> None:
         """Release the lock."""

@@ -21,6 +21,7 @@ from ..descriptors import DESCRIPTORS
 from ..maps.map import Map, is_map
 from ..runtime import provenance
 from ..runtime.group_writer import resume_or_replace
+from ..runtime.outputs import Lock
 from ..utils import colmap
 from ..utils.cli import InputError, Parser, choose
 from ..utils.colmap import point3D_ids
@@ -137,10 +138,18 @@ def main(
         The file for `load`.
 
     Raises:
-        InputError: for an unknown descriptor, or when the map cannot be read or gives no tracks.
+        InputError: for an unknown descriptor, when the map cannot be read or gives no tracks, or
+            when another run is at work in `output`.
     """
     if conf is None:
         choose("descriptor", descriptor, features_confs.BASES)
+    with Lock(output):
+        return _described(images, model, output, descriptor, seed, conf)
+
+
+def _described(
+    images: Path, model: Path, output: Path, descriptor: str, seed: int, conf: dict | None
+) -> Path:
     _check_source(images, model, output / "source.json")
     patches = conf is None and descriptor in DESCRIPTORS
     found_by = MATCHED if patches else descriptor

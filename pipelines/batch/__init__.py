@@ -57,8 +57,7 @@ def main(
     named, all_jobs = jobs.read(job_file)
     outputs = (outputs or named).resolve()
     cli.check_folder(outputs)
-    lock = Lock(outputs)
-    try:
+    with Lock(outputs):
         done: list[tuple[Shared, dict[Job, dict]]] = []
         for shared in list(plan(all_jobs, outputs)):
             summaries: dict[Job, dict] = {}
@@ -86,8 +85,6 @@ def main(
                     )
                 tables.write(done, outputs)
         rows, text = tables.write(done, outputs)
-    finally:
-        lock.release()
     print(text)
     logger.info("The tables are %s and jobs.txt.", outputs / "jobs.csv")
     return rows

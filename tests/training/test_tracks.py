@@ -11,6 +11,7 @@ import torch
 from interruption import interrupted
 
 from hloc_reduce.confs import features
+from hloc_reduce.runtime.outputs import Lock
 from hloc_reduce.training import describers, tracks
 from hloc_reduce.training.completion import Completion
 from hloc_reduce.utils.cli import InputError
@@ -132,6 +133,13 @@ def test_what_was_described_with_another_seed_is_not_used(undescribed, tmp_path,
     assert len(described) == 4 + 5
     whole = tracks.main(*folders, tmp_path / "whole", seed=1)
     assert path.read_bytes() == whole.read_bytes()
+
+
+def test_two_trainings_at_once_do_not_write_the_same_tracks(undescribed):
+    *_, output = undescribed
+    with Lock(output), pytest.raises(InputError, match="Another run is at work"):
+        tracks.main(*undescribed)
+    tracks.main(*undescribed)
 
 
 def test_a_map_without_tracks_is_refused(plane):
