@@ -32,9 +32,9 @@ COLUMNS = {
 DEGREES = 2.0
 
 
-def rows(folder: Path, centimetres: list[float]) -> list[str]:
-    """Format a row for each query list of a finished run."""
-    summary, lines = json.loads((folder / "summary.json").read_text()), []
+def rows(folder: Path, centimetres: list[float]) -> list[dict[str, str]]:
+    """Return a row, cells by `COLUMNS`, for each query list of a finished run."""
+    summary, listed = json.loads((folder / "summary.json").read_text()), []
     size, seconds = summary["bytes_per_keypoint"], summary["seconds"]
     # pipelines.localize extracts the queries only: its map has features
     photos = summary["queries"] + ("map" not in summary) * summary["map_images"]
@@ -63,14 +63,14 @@ def rows(folder: Path, centimetres: list[float]) -> list[str]:
             "" if extraction is None else f"{extraction / photos:.2f}",
             f"{sum(seconds.values()):.0f}",
         )
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return lines
+        listed.append(dict(zip(COLUMNS, map(str, cells), strict=True)))
+    return listed
 
 
 def by_list(folders: list[Path], centimetres: list[float]) -> list[str]:
     """Format a table with a row for each query list of each run."""
-    lines = [f"| {' | '.join(cells)} |" for cells in (COLUMNS, COLUMNS.values())]
-    return [*lines, *(row for folder in folders for row in rows(folder, centimetres))]
+    found = [row.values() for folder in folders for row in rows(folder, centimetres)]
+    return [f"| {' | '.join(cells)} |" for cells in (COLUMNS, COLUMNS.values(), *found)]
 
 
 def by_place(folders: list[Path]) -> list[str]:
