@@ -35,6 +35,7 @@ from pipelines.layouts import pipeline_of
 # the repository, and the code and the weights in a clone
 EDGEPOINT2 = "HITCSC/EdgePoint2", "edgepoint2.py", "weights/*.pth"
 FEATUREBOOSTER = "SJTU-ViSYS/FeatureBooster", "featurebooster.py", "models/*.pth"
+CONFIG = "config.yaml"  # of FeatureBooster
 BOOSTED = "SIFT+Boost-B"
 BYTES = {BOOSTED: "32"}  # of packed bits
 MATCHER = "NN-mutual"
@@ -62,10 +63,12 @@ class Peer(Extractor):
         try:
             with contextlib.chdir(folder):
                 self.network = (_featurebooster if self.is_boosted else _edgepoint2)(weights)
+        except InputError:
+            raise
         except Exception as error:  # whatever the code of others raises
-            said = str(error).strip().partition("\n")[0].partition(". ")[0].rstrip(".:")
+            said = str(error).strip().partition("\n")[0]
             reason = f"{type(error).__name__}: {said}"
-            raise InputError(f"{folder}: {weights} cannot be loaded ({reason}).") from None
+            raise InputError(f"{folder}: {weights} cannot be loaded ({reason})") from None
         finally:
             sys.path.remove(folder)
 
@@ -102,7 +105,7 @@ def _edgepoint2(weights: str) -> torch.nn.Module:
 def _featurebooster(weights: str) -> torch.nn.Module:
     from featurebooster import FeatureBooster
 
-    network = FeatureBooster(read_yaml(Path("config.yaml"))[weights])
+    network = FeatureBooster(read_yaml(Path(CONFIG))[weights])
     network.load_state_dict(torch.load(f"models/{weights}.pth", "cpu"))
     return network
 
@@ -117,7 +120,7 @@ def add(folder: Path, weights: str) -> str:
     repository, code, files = FEATUREBOOSTER if is_boosted else EDGEPOINT2
     if not folder.is_dir():
         raise cli.no_folder(folder)
-    for part in (code, files):
+    for part in (code, files, *([CONFIG] if is_boosted else [])):
         if not any(folder.glob(part)):
             raise InputError(f"{folder} has no {part}: clone github.com/{repository}.")
     cli.choose("weights", weights, sorted(path.stem for path in folder.glob(files)))
@@ -130,14 +133,13 @@ def add(folder: Path, weights: str) -> str:
     return name
 
 
-def configuration(name: str) -> dict:
-    """Return the configuration of a feature, perhaps with a storage, after a check that it works.
+def configuration(feature: str, storage: str) -> dict:
+    """Return the configuration of a feature after a check that it works.
 
     Raises:
         InputError: when it does not.
     """
-    feature, _, storage = name.partition(":")
-    _, conf = features.get(feature, storage=storage or STORAGES[0])
+    _, conf = features.get(feature, storage=storage)
     features.levels(conf)  # which some storages need
     extractors.load(conf["model"])
     return conf
@@ -161,7 +163,7 @@ def _main() -> None:
     option("--weights", nargs="+", default=["M32", "M64"], help="of EdgePoint2")
     option("--featurebooster", type=Path, help="clone of FeatureBooster")
     option("--feature", nargs="+", default=[], help="of this project; with a storage: mini64:uint2")
-    option("--photos", type=int, default=10, help="photos whose extraction is timed")
+    option("--photos", type=int, default=10, help="photos at most whose extraction is timed")
     option("--threads", type=int, default=2, help="threads of torch and OpenCV")
     option("--outputs", type=Path, default=Path("outputs/peers"), help="folder for the results")
     option("--overwrite", action="store_true", help="recompute existing results")
@@ -176,7 +178,9 @@ def _main() -> None:
         names.append(add(args.featurebooster, BOOSTED))
     if not names:
         raise InputError("Nothing to compare: give --edgepoint2, --featurebooster or --feature.")
-    confs = {name: configuration(name) for name in names}
+    parts = {name: name.partition(":")[::2] for name in names}
+    given = {name: (feature, storage or STORAGES[0]) for name, (feature, storage) in parts.items()}
+    confs = {name: configuration(*given[name]) for name in names}
     cli.check_folder(args.outputs)
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
@@ -186,10 +190,11 @@ def _main() -> None:
         listed = [*place.map_names(), *place.query_names()]
         photos = [place.images / name for name in listed[:: -(-len(listed) // args.photos)]]
         for name, conf in confs.items():
-            outputs = args.outputs / Path(*dataset.resolve().parts[-2:], name.replace(":", "+"))
-            feature, _, storage = name.partition(":")
-            settings = {"storage": storage or STORAGES[0], "overwrite": args.overwrite}
-            pipeline_of(dataset).main(dataset, outputs, feature, matcher=MATCHER, **settings)
+            feature, storage = given[name]
+            folder = f"{Path(feature).stem}+{storage}"
+            outputs = args.outputs / Path(*dataset.resolve().parts[-2:], folder)
+            settings = {"matcher": MATCHER, "storage": storage, "overwrite": args.overwrite}
+            pipeline_of(dataset).main(dataset, outputs, feature, **settings)
             taken = f"{seconds(conf, photos):.2f}"
             for row in rows(outputs, CENTIMETRES):
                 row |= {

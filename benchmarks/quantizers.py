@@ -2,11 +2,11 @@
 
 The others are fitted to descriptors of the maps of --fit: `pq` and `opq` are product quantization,
 plain and after a rotation; `rq` is residual quantization (all of faiss, a byte for each part);
-`itq` rotates the numbers so that coding by levels loses less, and fits new levels; `tcq`, trellis
-coded quantization, finds the level of each number by the last eight bits of the code up to it;
-`signs` keeps a bit of each number, so that both sides coded compare by Hamming distance. AP is
-that of matching_ap.py, on maps that no projection was trained on: with queries as floats, and with
-both sides coded. Prints a Markdown table. Needs faiss-cpu.
+`itq` rotates the numbers so that coding by levels loses less, and fits new levels; with `tcq`,
+trellis coded quantization, the last eight bits of the code up to a number are the index of its
+level; `signs` keeps a bit of each number, so that both sides coded compare by Hamming distance. AP
+is that of matching_ap.py, on maps that no projection was trained on: with queries as floats, and
+with both sides coded. Prints a Markdown table. Needs faiss-cpu.
 """
 
 import argparse
@@ -28,8 +28,9 @@ from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import CODED, descriptor_bytes
 from hloc_reduce.utils.progress import progress
 
-ROUNDS = 50  # of `itq`
-WINDOW, STEPS, FITTED = 256, 25, 40_000  # of `tcq`: levels of a number, rounds, numbers of a fit
+ROUNDS = {"itq": 50, "tcq": 25}
+WINDOW = 256  # levels of a number, with `tcq`
+FITTED = 40_000  # descriptors that a trellis is fitted to
 Code = Callable[[torch.Tensor], torch.Tensor]  # numbers (N, D) to what their codes stand for
 
 
@@ -68,7 +69,7 @@ def rotated_levels(numbers: np.ndarray, size: int) -> Code:
     storage = _storage(dim, size)
     fitted = torch.from_numpy(numbers)
     rotation = torch.linalg.eigh(torch.cov(fitted.T)).eigenvectors  # from the principal axes
-    for _ in progress(range(ROUNDS), "Rotating", "round"):
+    for _ in progress(range(ROUNDS["itq"]), "Rotating", "round"):
         turned = fitted @ rotation
         table = levels.fit(turned, CODED[storage]).numpy()
         left, _, right = torch.linalg.svd(fitted.T @ stored(turned, storage, table))
@@ -86,7 +87,7 @@ def trellis(numbers: np.ndarray, size: int) -> Code:
     even = normal.icdf((torch.arange(WINDOW)[:, None] + 0.5) / WINDOW).T
     order = torch.rand(even.shape, generator=torch.Generator().manual_seed(0)).argsort(1)
     table = even.gather(1, order)
-    for _ in progress(range(STEPS), "Fitting a trellis", "round"):
+    for _ in progress(range(ROUNDS["tcq"]), "Fitting a trellis", "round"):
         chosen = _path(fitted, table, bits).T
         count = torch.zeros_like(table).scatter_add_(1, chosen, torch.ones_like(fitted.T))
         total = torch.zeros_like(table).scatter_add_(1, chosen, fitted.T)
@@ -99,9 +100,9 @@ def _path(numbers: torch.Tensor, table: torch.Tensor, bits: int) -> torch.Tensor
 
     Args:
         numbers: (N, D) float32.
-        table: (D, W) levels; the number i has the one whose index is the last log2(W) bits of the
+        table: (D, W) levels; the index of the level of number i is the last log2(W) bits of the
             code up to i, with zeros before the code.
-        bits: that the code has more at each number.
+        bits: of a number.
 
     Returns:
         Indices of levels (N, D) int64.
@@ -208,10 +209,9 @@ def _compare(
         numbers = np.ascontiguousarray(project(fitted).numpy())
     for size in args.bytes:
         codes: dict[str, Code] = {}
-        for storage in CODED:
-            if descriptor_bytes(project.dim, storage) == size:
-                table = projections.levels(feature, storage)
-                codes[f"`{storage}`"] = lambda x, s=storage, t=table: stored(x, s, t)
+        if storage := _storage(project.dim, size):
+            table = projections.levels(feature, storage)
+            codes[f"`{storage}`"] = lambda x, s=storage, t=table: stored(x, s, t)
         for quantizer in args.quantizer:
             if fits(quantizer, project.dim, size):
                 codes[quantizer] = QUANTIZERS[quantizer](numbers, size)

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from hloc_reduce.light.engine import LightEngine
+from hloc_reduce.training import levels
 from hloc_reduce.utils.cli import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -151,14 +152,18 @@ def test_repeated_keypoints_and_right_matches(repeatability):
     assert repeatability["compare"](one, nowhere, photos, np.eye(2, 3)).expected == 0
 
 
+@pytest.fixture
+def quantizers(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return runpy.run_path(str(ROOT / "benchmarks/quantizers.py"))
+
+
 @pytest.mark.parametrize(
     ("name", "size"), [("pq", 8), ("opq", 8), ("rq", 6), ("itq", 8), ("tcq", 8)]
 )
-def test_quantizers_lose_less_with_more_bytes(name, size, monkeypatch):
+def test_quantizers_lose_less_with_more_bytes(name, size, quantizers):
     """What a code of more bytes stands for is nearer to what it codes than its signs are."""
     pytest.importorskip("faiss")
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    quantizers = runpy.run_path(str(ROOT / "benchmarks/quantizers.py"))
     rng = np.random.default_rng(0)
     numbers = rng.normal(size=(4000, 32)).astype(np.float32)
     numbers /= np.linalg.norm(numbers, axis=1, keepdims=True)
@@ -173,19 +178,28 @@ def test_quantizers_lose_less_with_more_bytes(name, size, monkeypatch):
     assert cosine(coded, others).mean() > cosine(signs(others), others).mean() > 0.75
 
 
-@pytest.mark.parametrize("bits", [1, 2, 4])
-def test_a_trellis_finds_the_best_code(bits, monkeypatch):
-    """Of all codes of three numbers, tried one by one."""
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    path = runpy.run_path(str(ROOT / "benchmarks/quantizers.py"))["_path"]
+@pytest.mark.parametrize(("bits", "dim"), [(1, 8), (2, 5), (4, 2)])
+def test_a_trellis_finds_the_best_code(bits, dim, quantizers):
+    """Of all codes, tried one by one, with 16 levels of a number."""
     generator = torch.Generator().manual_seed(0)
-    numbers, table = (torch.randn(s, generator=generator) for s in ((50, 3), (3, 256)))
-    codes = torch.cartesian_prod(*[torch.arange(2**bits)] * 3)
-    windows = codes.clone()
-    for i in (1, 2):
-        windows[:, i] |= windows[:, i - 1] << bits & 255
+    numbers, table = (torch.randn(size, generator=generator) for size in ((50, dim), (dim, 16)))
+    windows = torch.cartesian_prod(*[torch.arange(2**bits)] * dim)
+    for i in range(1, dim):
+        windows[:, i] |= windows[:, i - 1] << bits & 15
     errors = torch.cdist(numbers, table.gather(1, windows.T).T)
-    assert torch.equal(path(numbers, table, bits), windows[errors.argmin(1)])
+    found = quantizers["_path"](numbers, table, bits)
+    assert torch.equal(found, windows[errors.argmin(1)])
+
+
+def test_a_fitted_trellis_loses_less_than_levels(quantizers):
+    generator = torch.Generator().manual_seed(0)
+    numbers = torch.nn.functional.normalize(torch.randn(6000, 16, generator=generator))
+    fitted, others = numbers[:5000], numbers[5000:]
+    table = levels.fit(fitted, 2).numpy()
+    coded = quantizers["stored"](others, "uint2", table)
+    code = quantizers["trellis"](fitted.numpy(), 4)
+    cosine = torch.nn.functional.cosine_similarity
+    assert cosine(code(others), others).mean() > cosine(coded, others).mean()
 
 
 @pytest.mark.parametrize("script", ["rate.py", "quantizers.py"])

@@ -99,8 +99,8 @@ def test_peers_localize_beside_this_project(aachen_layout, edgepoint2, featurebo
     lines = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()]
     header, _, *rows = (dict(zip(lines[0], line, strict=True)) for line in lines)
     assert "recall [%] at 1 / 2 / 5 / 25 cm" in header and "extraction [s]" in header
-    features = ["`colmap_sift_sv64`, `uint4`", "`EdgePoint2-M32`", "`SIFT+Boost-B`"]
-    assert [row["feature"] for row in rows] == [name for name in features for _ in range(2)]
+    names = ["`colmap_sift_sv64`, `uint4`", "`EdgePoint2-M32`", "`SIFT+Boost-B`"]
+    assert [row["feature"] for row in rows] == [name for name in names for _ in range(2)]
     assert [row["bytes"] for row in rows[::2]] == ["32", "256", "32"]
     assert rows[0]["list"] == f"{aachen_layout}, day"
     for day, night in zip(rows[::2], rows[1::2], strict=True):
@@ -112,8 +112,8 @@ def test_peers_localize_beside_this_project(aachen_layout, edgepoint2, featurebo
     with h5py.File(written) as file:
         (bits, keypoints) = (file["db/0.png"][key][()] for key in ("descriptors", "keypoints"))
     assert bits.shape == (256, len(keypoints)) and np.unique(np.abs(bits)).tolist() == [1 / 16]
-    (ours,) = outputs.rglob("feats-dog-colmap_sift_sv64.h5")
-    with h5py.File(ours) as file:
+    (same,) = outputs.rglob("feats-dog-colmap_sift_sv64.h5")
+    with h5py.File(same) as file:
         np.testing.assert_array_equal(keypoints, file["db/0.png/keypoints"])
 
 

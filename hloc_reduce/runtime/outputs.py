@@ -29,7 +29,7 @@ REMEDY = "Choose other --outputs, one folder for each configuration, or --overwr
 
 
 class Lock:
-    """A folder that no other run may write to, in a `with` block or until `release`.
+    """A folder that no other run may write to, until `release` or the end of a `with` block.
 
     The operating system releases the lock when the process ends, however it ends.
 
@@ -60,8 +60,8 @@ class Lock:
             self.file.write(f"process {os.getpid()} on {platform.node()}")
             self.file.flush()
 
-    def __enter__(self) -> None:
-        pass
+    def __enter__(self) -> "Lock":
+        return self
 
     def __exit__(self, *_: object) -> None:
         self.release()
