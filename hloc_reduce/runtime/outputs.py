@@ -35,12 +35,13 @@ class Lock:
 
     Args:
         folder: created if missing.
+        wait: for another run that has locked it.
 
     Raises:
-        InputError: when it is a file, or another run has locked it.
+        InputError: when it is a file, or another run has locked it and `wait` is false.
     """
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, wait: bool = False):
         make_folder(folder)
         self.file = None
         if not os.access(folder, os.W_OK):  # nobody writes to it
@@ -50,9 +51,12 @@ class Lock:
             fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.file.seek(0)
-            who = self.file.read()
-            self.file.close()
-            raise InputError(f"Another run is at work in {folder} ({who}).") from None
+            who = f"Another run is at work in {folder} ({self.file.read()})."
+            if not wait:
+                self.file.close()
+                raise InputError(who) from None
+            logger.info("%s Waiting for it.", who)
+            fcntl.flock(self.file, fcntl.LOCK_EX)
         except OSError as error:
             logger.warning("%s cannot be locked (%s): start no second run in it.", folder, error)
         with suppress(OSError):  # of a full disk; the folder is locked all the same

@@ -129,7 +129,8 @@ def main(
     Args:
         images: folder of the images.
         model: COLMAP model with their poses.
-        output: folder for all files, which are used again unless they are stale.
+        output: folder for all files, which are used again unless they are stale. If another run is
+            at work in it, this one waits.
         descriptor: the base descriptor; with `conf`, a name for its descriptors.
         seed: of the photometric variants.
         conf: configuration of a feature whose keypoints and descriptors are used instead.
@@ -138,18 +139,18 @@ def main(
         The file for `load`.
 
     Raises:
-        InputError: for an unknown descriptor, when the map cannot be read or gives no tracks, or
-            when another run is at work in `output`.
+        InputError: for an unknown descriptor, or when the map cannot be read or gives no tracks.
     """
     if conf is None:
         choose("descriptor", descriptor, features_confs.BASES)
-    with Lock(output):
+    with Lock(output, wait=True):
         return _described(images, model, output, descriptor, seed, conf)
 
 
 def _described(
     images: Path, model: Path, output: Path, descriptor: str, seed: int, conf: dict | None
 ) -> Path:
+    """Do what `main` does, in a folder that no other run writes to."""
     _check_source(images, model, output / "source.json")
     patches = conf is None and descriptor in DESCRIPTORS
     found_by = MATCHED if patches else descriptor

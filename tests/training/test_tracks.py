@@ -1,6 +1,7 @@
 """Training data from photos with poses: a textured plane seen by five cameras."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import h5py
@@ -135,11 +136,17 @@ def test_what_was_described_with_another_seed_is_not_used(undescribed, tmp_path,
     assert path.read_bytes() == whole.read_bytes()
 
 
-def test_two_trainings_at_once_do_not_write_the_same_tracks(undescribed):
+def test_of_two_trainings_at_once_one_waits(tracked, undescribed, caplog):
     *_, output = undescribed
-    with Lock(output), pytest.raises(InputError, match="Another run is at work"):
-        tracks.main(*undescribed)
-    tracks.main(*undescribed)
+    with ThreadPoolExecutor() as executor, caplog.at_level("INFO", "hloc_reduce"):
+        with Lock(output):
+            other = executor.submit(tracks.main, *undescribed)
+            with pytest.raises(TimeoutError):
+                other.result(timeout=0.5)
+            assert f"Another run is at work in {output}" in caplog.text
+            assert not (output / "tracks_sift.safetensors").exists()
+        path = other.result(timeout=60)
+    assert path.read_bytes() == (tracked / "out" / path.name).read_bytes()
 
 
 def test_a_map_without_tracks_is_refused(plane):
