@@ -60,9 +60,12 @@ def test_recall_in_centimetres_counts_localized_queries_only(tmp_path):
     header = ("query", "list", "status", "position_error_m", "rotation_error_deg")
     lines = [",".join(map(str, row)) for row in (header, *rows)]
     (tmp_path / "queries.csv").write_text("\n".join(lines) + "\n")
-    (tmp_path / "summary.json").write_text(json.dumps(SUMMARY))
+    summary = SUMMARY | {"dataset": "datasets/town"}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
     shown = table(tmp_path, "--centimetres", "1", "5")
     assert "| 25.0 / 50.0 |" in shown.stdout.splitlines()[2]
+    shown = table(tmp_path, "--places", "--centimetres", "1", "5").stdout.splitlines()
+    assert shown[2].endswith("| 52 (2 of 3) | 1,000 | 3,871 | 2 of 3 | 25.0 / 50.0 |")
 
 
 def test_places_are_columns(tmp_path):
