@@ -10,7 +10,7 @@ from .localization import stage
 from .localization.confidence import DEFAULT_GATE, Gate
 from .localization.intrinsics import to_lists
 from .localization.mirrored import MirrorImages
-from .localization.query import merged
+from .localization.query import merged, ransac_options
 from .localization.references import SfmMap
 from .runtime import provenance
 from .runtime.executors import SERIAL, Executor
@@ -53,7 +53,8 @@ def main(
         features: feature file of the queries.
         matches: match file of the pairs.
         results: text file of poses, one line for every query.
-        ransac_thresh: RANSAC inlier threshold in pixels.
+        ransac_thresh: RANSAC inlier threshold in pixels; larger in proportion in photos of more
+            than 1,600 pixels, whose keypoints are less precise.
         covisibility_clustering: localize in each cluster of retrieved images that see common points
             separately, and keep the pose with the highest confidence.
         prepend_camera_name: write `folder/basename` instead of `basename`.
@@ -74,10 +75,11 @@ def main(
         InputError: if an input is missing or broken, or the map is empty.
     """
     stage.check_threshold(ransac_thresh)
-    config = {"estimation": {"ransac": {"max_error": ransac_thresh}}} | (config or {})
+    config = config or {}
     retrieved = parse_retrieval(retrieval)
     inputs = [retrieval, features, matches]
-    options: dict[str, object] = {"config": config}
+    estimation = {"ransac": {"max_error": ransac_thresh}}
+    options: dict[str, object] = {"config": {"estimation": estimation} | config}
     if isinstance(queries, Path):
         inputs += sorted(queries.parent.glob(queries.name))
         listed: Sequence[tuple[str, pycolmap.Camera | None]] = stage.read_queries(queries)
@@ -100,7 +102,7 @@ def main(
     try:
         return stage.main(
             *(load, listed, retrieved, features, matches, results),
-            partial(_config, config, refinements or {}),
+            partial(_config, ransac_thresh, config, refinements or {}),
             provenance.of_inputs(options, [path for path in inputs if path.exists()]),
             overwrite,
             name_parts=None if full_names else 2 if prepend_camera_name else 1,
@@ -118,8 +120,14 @@ def _load(path: Path, covisibility_clustering: bool, written: int) -> SfmMap:
     return SfmMap(colmap.read_model(path), covisibility_clustering)
 
 
-def _config(config: dict, refinements: Mapping[str, dict], name: str, _: pycolmap.Camera) -> dict:
-    return merged(config, refinements.get(name, {}))
+def _config(
+    ransac_thresh: float,
+    config: dict,
+    refinements: Mapping[str, dict],
+    name: str,
+    camera: pycolmap.Camera,
+) -> dict:
+    return merged(ransac_options(ransac_thresh, camera) | config, refinements.get(name, {}))
 
 
 def _main() -> None:
@@ -141,7 +149,7 @@ def _main() -> None:
     parser.add_argument(
         "--prepend_camera_name", action="store_true", help="write folder/basename of each query"
     )
-    stage.add_options(parser, RANSAC_THRESH, "pixels")
+    stage.add_options(parser, RANSAC_THRESH, "pixels, larger in proportion in photos of over 1600")
     stage.run(parser, main)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 
 from . import logger
+from .localization.projection import model_scale
 from .mapping.epipolar import agreeing
 from .runtime import provenance
 from .utils import cli, colmap
@@ -70,8 +71,9 @@ def main(
         InputError: when an input is missing or no point can be triangulated.
     """
     options = {"random_seed": 0, "num_threads": 1, **(mapper_options or {})}
-    mapper = colmap.mapper_options(options)
     reference = colmap.read_model(reference_model)
+    scale = model_scale(reference)
+    mapper = colmap.mapper_options(options, scale)
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
@@ -81,6 +83,8 @@ def main(
         "min_match_score": min_match_score,
     }
     chosen = {key: value for key, value in verification.items() if value}
+    if scale > 1:
+        chosen["scale"] = scale
     inputs = [*colmap.model_files(reference_model), pairs, features, matches]
     made_from = provenance.of_inputs({**options, **chosen}, inputs)
     if not overwrite and provenance.is_current(sfm_dir / MADE_FROM, made_from):

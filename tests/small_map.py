@@ -1,6 +1,12 @@
 """The map of the scene in tests/conftest.py, and the matches of its queries."""
 
+import h5py
+import numpy as np
+
 from hloc_reduce import localize_sfm, match_features, triangulation
+from hloc_reduce.localization.projection import photo_scale
+from hloc_reduce.utils import colmap
+from hloc_reduce.utils.h5 import list_h5_names
 from hloc_reduce.utils.parsers import write_pairs
 
 MATCHER = match_features.confs["NN-ratio"]
@@ -12,6 +18,24 @@ def all_pairs(path, queries=(), skip=()):
     pairs = [(a, b) for a in queries or names for b in names if a != b]
     write_pairs(pairs, path)
     return path
+
+
+def enlarge(scene, factor, noise):
+    """Enlarge the photos, whose keypoints then have a noise in pixels of photos as they were."""
+    generator = np.random.default_rng(0)
+    reference = colmap.read_model(scene.model)
+    (camera,) = reference.cameras.values()
+    camera.rescale(factor)
+    reference.write(scene.model)
+    with h5py.File(scene.features, "a") as file:
+        for name in list_h5_names(scene.features):
+            keypoints = file[f"{name}/keypoints"]
+            moved = keypoints[:] + generator.normal(0, noise, keypoints.shape)
+            keypoints[:] = (moved + 0.5) * factor - 0.5
+            keypoints.attrs["uncertainty"] = photo_scale(camera)
+    intrinsics = camera.width, camera.height, *camera.params
+    line = f"SIMPLE_RADIAL {' '.join(map(str, intrinsics))}"
+    scene.queries.write_text("".join(f"query/{i}.jpg {line}\n" for i in (6, 7)))
 
 
 def build(scene):

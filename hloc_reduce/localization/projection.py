@@ -72,3 +72,9 @@ def photo_scale(camera: pycolmap.Camera) -> float:
     Thresholds in pixels are multiplied by it.
     """
     return max(1.0, max(camera.width, camera.height) / DETECTED)
+
+
+def model_scale(sfm: pycolmap.Reconstruction) -> float:
+    """Return the median `photo_scale` of the images of a model."""
+    scales = [photo_scale(image.camera) for image in sfm.images.values()]
+    return float(np.median(scales or [1.0]))

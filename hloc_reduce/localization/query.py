@@ -8,6 +8,7 @@ import pycolmap
 from . import absolute_pose
 from .confidence import DEFAULT_GATE, RIVAL_BY_OTHERS, Gate
 from .pose import differ
+from .projection import photo_scale
 from .references import Reference
 
 
@@ -117,6 +118,17 @@ def _correspondences(
 def _different(numbers: np.ndarray) -> np.ndarray:
     """Keep the first of equal numbers (N,)."""
     return numbers[np.sort(np.unique(numbers, return_index=True)[1])]
+
+
+def ransac_options(ransac_thresh: float, camera: pycolmap.Camera) -> dict:
+    """Return an inlier threshold as `localize` takes it.
+
+    Args:
+        ransac_thresh: in pixels. A photo of more than 1,600 pixels, whose keypoints are less
+            precise, has a larger one in proportion.
+        camera: intrinsics of the photo.
+    """
+    return {"estimation": {"ransac": {"max_error": ransac_thresh * photo_scale(camera)}}}
 
 
 def merged(config: dict, refinement: dict) -> dict:

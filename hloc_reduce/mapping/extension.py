@@ -6,11 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
+from ..localization.projection import model_scale
 from ..utils import colmap
 from .epipolar import agreeing
 
 ROUNDS = 2  # of completing tracks, adjusting and filtering
-OPTIONS = pycolmap.IncrementalPipelineOptions({"num_threads": 1, "random_seed": 0})
+SETTINGS = {"num_threads": 1, "random_seed": 0}
+OPTIONS = colmap.mapper_options(SETTINGS)
 
 Pair = tuple[str, str]
 
@@ -58,7 +60,8 @@ def extend(
     graph = _graph(model, keypoints, uncertainty, matches)
     observations = pycolmap.ObservationManager(model, graph)
     triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
-    tracks, limits = OPTIONS.get_triangulation(), OPTIONS.get_mapper()
+    options = colmap.mapper_options(SETTINGS, model_scale(model))
+    tracks, limits = options.get_triangulation(), options.get_mapper()
     # the graph has no matches of two images of the model, so that tracks of more look like these
     tracks.ignore_two_view_tracks = False
     for image_id in ids.values():

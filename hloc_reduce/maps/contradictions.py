@@ -11,8 +11,8 @@ from .. import logger
 from ..localization import absolute_pose, intrinsics
 from ..localization.confidence import DEFAULT_GATE
 from ..localization.pose import MAX_ERROR, Pose, differ
-from ..localization.projection import reprojection_errors
-from ..localization.query import merged
+from ..localization.projection import photo_scale, reprojection_errors
+from ..localization.query import merged, ransac_options
 from ..localization.references import SfmMap
 from ..mapping import copies
 from ..runtime import parallel
@@ -121,7 +121,7 @@ def _contradicts(
     points2D = np.array([point.xy for point in image.points2D])[different[:, 0]]
     points3D = reference.points[different[:, 1]]
     errors, _ = reprojection_errors(points2D, points3D, image.cam_from_world(), image.camera)
-    if 2 * (errors <= MAX_ERROR).sum() >= len(errors):
+    if 2 * (errors <= MAX_ERROR * photo_scale(image.camera)).sum() >= len(errors):
         return False
     matches = points2D, points3D, images
 
@@ -129,7 +129,7 @@ def _contradicts(
         placed = Pose(image.cam_from_world(), image.camera, pose.inliers)
         return differ(pose, placed, points3D, FAR, TURNED)
 
-    config: dict = {"estimation": {"ransac": {"max_error": MAX_ERROR}}}
+    config = ransac_options(MAX_ERROR, image.camera)
     pose = absolute_pose.estimate(*matches, image.camera, config, DEFAULT_GATE)
     enough = pose.num_inliers >= DEFAULT_GATE.min_inliers
     if enough and pose.confidence >= DEFAULT_GATE.min_confidence and elsewhere(pose):

@@ -8,7 +8,7 @@ import pycolmap
 
 from ..localization import intrinsics, mirrored, query, stage
 from ..localization.confidence import DEFAULT_GATE, Gate
-from ..localization.query import merged
+from ..localization.query import merged, ransac_options
 from ..localize_sfm import RANSAC_THRESH
 from ..pairs_from_retrieval import rank
 from ..runtime import parallel
@@ -27,7 +27,7 @@ class Localizer:
         map_dir: the folder of a map from `maps.main` or `pipelines.localize`, or a file from
             `hloc_reduce.compact`.
         num_loc: the number of most similar map images that a photo is matched with.
-        ransac_thresh: RANSAC inlier threshold in pixels.
+        ransac_thresh: RANSAC inlier threshold in pixels, as in `localize_sfm`.
         gate: what a pose must have to be trusted.
         onnx: with a file from `hloc_reduce.compact`, the ONNX file of its feature from
             `hloc_reduce.export`: features are extracted by ONNX Runtime instead of torch.
@@ -148,10 +148,9 @@ class Localizer:
         thorough: bool = True,
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Estimate the pose of a photo from its matches, see `localization.query.localize`."""
-        config = {"estimation": {"ransac": {"max_error": self.ransac_thresh}}}
         return query.localize(
             *(self.reference, features["keypoints"], camera, matches),
-            merged(config, refinement),
+            merged(ransac_options(self.ransac_thresh, camera), refinement),
             self.gate.of_photo(float(features["blur"])),
             thorough,
             self.workers,

@@ -14,7 +14,7 @@ from ..confs.retrieval import confs as retrieval_confs
 from ..localization import intrinsics, stage
 from ..localization.confidence import DEFAULT_GATE
 from ..localization.mirrored import mirror
-from ..localization.query import merged
+from ..localization.query import merged, ransac_options
 from ..localization.references import SfmMap
 from ..localize_sfm import RANSAC_THRESH
 from ..mapping import extension
@@ -30,7 +30,6 @@ SHARED = 0.5
 SIMILAR = 20  # photos by which one is localized
 FEWEST = 3  # photos that may tell whether others are mirrored
 CERTAIN = 0.9, 250.0  # least agreement and confidence of the mirror image of a mirrored photo
-CONFIG = {"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}
 
 
 def find(
@@ -131,8 +130,10 @@ class _Judge:
             vocabulary=aggregate_features.vocabulary_of(self.descriptors),
         )
         options = {
-            name: merged(CONFIG, intrinsics.refinement(*found, known))
-            for name, found in inferred.items()
+            name: merged(
+                ransac_options(RANSAC_THRESH, camera), intrinsics.refinement(camera, source, known)
+            )
+            for name, (camera, source) in inferred.items()
         }
         cameras = {name: camera for name, (camera, _) in inferred.items()}
         of_mirrored = {name: mirror(camera) for name, camera in cameras.items()}

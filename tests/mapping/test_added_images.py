@@ -3,7 +3,9 @@
 import numpy as np
 import pycolmap
 import pytest
+import small_map
 
+from hloc_reduce.localization.projection import photo_scale
 from hloc_reduce.mapping import extension
 from hloc_reduce.mapping.extension import Placed
 from hloc_reduce.utils import colmap
@@ -14,8 +16,7 @@ OLD, NEW = [f"db/{i}.jpg" for i in range(4)], ["db/4.jpg", "query/6.jpg"]
 KNOWN = 200  # points that the model has before
 
 
-@pytest.fixture
-def model(scene) -> pycolmap.Reconstruction:
+def build(scene) -> pycolmap.Reconstruction:
     """A model of four images with two thirds of the points."""
     scene.camera = scene.reference.cameras[1]
     with open_h5(scene.features) as file:
@@ -30,6 +31,11 @@ def model(scene) -> pycolmap.Reconstruction:
         elements = [pycolmap.TrackElement(i + 1, row) for i, row in enumerate(rows)]
         made.add_point3D(scene.points[point], pycolmap.Track(elements))
     return made
+
+
+@pytest.fixture
+def model(scene) -> pycolmap.Reconstruction:
+    return build(scene)
 
 
 def matches(scene, pairs) -> dict:
@@ -48,7 +54,7 @@ def extend(scene, model, names, pairs=None, known=True, fixed=False, move=0.0, *
         pairs = [(name, other) for name in names for other in OLD]
     used = {name for pair in pairs for name in pair}
     keypoints = {name: scene.keypoints[name] for name in used}
-    uncertainty = dict.fromkeys(used, 1.0)
+    uncertainty = dict.fromkeys(used, photo_scale(scene.camera))
     extension.extend(model, placed, keypoints, uncertainty, matches(scene, pairs), **options)
 
 
@@ -68,6 +74,14 @@ def test_points_are_extended_and_others_triangulated(scene, model):
     assert set(lengths) == {len(OLD) + len(NEW)}
     assert model.num_cameras() == 1  # their intrinsics are those of the map's camera
     assert extension.count_shared(model, NEW) == dict.fromkeys(NEW, len(scene.points))
+
+
+def test_photos_of_12_megapixels_are_extended_as_smaller_ones(scene):
+    small_map.enlarge(scene, 6.25, 0.4)  # a noise of 2.5 of 4,000 pixels, which is 1 of 1,600
+    scene.reference = colmap.read_model(scene.model)
+    model = build(scene)
+    extend(scene, model, NEW, fixed=True)
+    assert min(extension.count_shared(model, NEW).values()) > 0.95 * len(scene.points)
 
 
 def test_given_poses_stay(scene, model):

@@ -13,17 +13,28 @@ from ..interrupts import interruptible
 from ..parsers import parse_pairs, write_pairs
 from .databases import full_disk, open_database, parse_options
 
+MAX_ERROR = 4.0  # pixels, COLMAP's default
+ERRORS = {  # options of the largest reprojection errors of points
+    "mapper": ("filter_max_reproj_error",),
+    "triangulation": ("complete_max_reproj_error", "merge_max_reproj_error"),
+}
 _lock = Lock()
 _levels: list[int] = []  # those of COLMAP's log before each running block of `_log`
 
 
-def mapper_options(options: dict) -> pycolmap.IncrementalPipelineOptions:
+def mapper_options(options: dict, scale: float = 1.0) -> pycolmap.IncrementalPipelineOptions:
     """Convert a dict to pycolmap's mapper options.
+
+    Args:
+        options: their values by name.
+        scale: by which the largest reprojection errors of points are multiplied, unless given.
 
     Raises:
         InputError: for an unknown option.
     """
-    return parse_options(pycolmap.IncrementalPipelineOptions, options, "mapper")
+    limits = {part: {name: scale * MAX_ERROR for name in names} for part, names in ERRORS.items()}
+    scaled = {part: {**limit, **options.get(part, {})} for part, limit in limits.items()}
+    return parse_options(pycolmap.IncrementalPipelineOptions, {**options, **scaled}, "mapper")
 
 
 def solver_options(options: pycolmap.BundleAdjustmentOptions) -> Any:
