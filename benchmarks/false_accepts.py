@@ -354,7 +354,7 @@ def localize(
 ) -> dict:
     """Localize a query, given its keypoints, matches and gate; its intrinsics may be refined."""
     keypoints, matches, gate = matched
-    config = merged({"estimation": {"ransac": {"max_error": RANSAC_THRESH}}}, refinement)
+    config = merged(query.ransac_options(RANSAC_THRESH, camera), refinement)
     options = config, gate, thorough
     cam_from_world, info = query.localize(place.reference, keypoints, camera, matches, *options)
     depths = [np.nan]
