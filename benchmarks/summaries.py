@@ -2,10 +2,11 @@
 
 With --centimetres, recall is at these position errors and 2 degrees instead of the limits of the
 data set. With --places, a row is a run's folder name, and a column a query list of a data set: mean
-inliers, and how many queries are localized where some are not; with --centimetres, too, there are
-columns for all queries: keypoints of a photo, points of all maps, how many are localized, recall.
-Runs of a batch share features, so only one of them has seconds of extraction. What is no outputs
-folder of a finished run, such as a report beside the folders, is named and left out.
+inliers, and how many queries are localized where some are not. With --centimetres, too, further
+columns are for all places: keypoints of a photo, points, localized queries, and recall of those
+whose pose is known. Runs of a batch share features, so only one of them has seconds of extraction.
+What is no outputs folder of a finished run, such as a report beside the folders, is named and left
+out.
 """
 
 import csv
@@ -110,7 +111,8 @@ def _of_all(runs: list[tuple[Path, dict]], centimetres: list[float]) -> dict[str
     lists = [result for _, summary in runs for result in summary["lists"].values()]
     localized, queries = (sum(each[key] for each in lists) for key in ("localized", "queries"))
     sizes = [summary["bytes_per_keypoint"] for _, summary in runs]
-    keypoints, images = (sum(size.get(key, 0) for size in sizes) for key in ("keypoints", "images"))
+    counted = [size for size in sizes if "images" in size]  # older summaries have none
+    keypoints, images = (sum(size[key] for size in counted) for key in ("keypoints", "images"))
     errors = [error for folder, _ in runs for error in _errors(folder / "queries.csv")]
     return {
         "keypoints": f"{keypoints / images:,.0f}" if images else "",

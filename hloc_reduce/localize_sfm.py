@@ -53,8 +53,8 @@ def main(
         features: feature file of the queries.
         matches: match file of the pairs.
         results: text file of poses, one line for every query.
-        ransac_thresh: RANSAC inlier threshold in pixels; larger in proportion in photos of more
-            than 1,600 pixels, whose keypoints are less precise.
+        ransac_thresh: RANSAC inlier threshold in pixels; larger in proportion in photos whose
+            longer side exceeds 1,600 pixels. A threshold in `config` is taken as it is.
         covisibility_clustering: localize in each cluster of retrieved images that see common points
             separately, and keep the pose with the highest confidence.
         prepend_camera_name: write `folder/basename` instead of `basename`.
@@ -149,7 +149,8 @@ def _main() -> None:
     parser.add_argument(
         "--prepend_camera_name", action="store_true", help="write folder/basename of each query"
     )
-    stage.add_options(parser, RANSAC_THRESH, "pixels, larger in proportion in photos of over 1600")
+    pixels = "pixels for photos of up to 1600 pixels, scaled for larger ones"
+    stage.add_options(parser, RANSAC_THRESH, pixels)
     stage.run(parser, main)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from . import logger
-from .localization.projection import model_scale
+from .localization.projection import median_photo_scale
 from .mapping.epipolar import agreeing
 from .runtime import provenance
 from .utils import cli, colmap
@@ -61,7 +61,9 @@ def main(
             that COLMAP estimates from them, instead of the known poses.
         min_match_score: use only matches with a higher score.
         verbose: show COLMAP's log.
-        mapper_options: of pycolmap's IncrementalPipelineOptions.
+        mapper_options: of pycolmap's IncrementalPipelineOptions. By default the largest
+            reprojection errors are 4 pixels, or larger in proportion if the longer side of photos
+            (the median) exceeds 1,600 pixels.
         overwrite: triangulate again.
 
     Returns:
@@ -71,9 +73,9 @@ def main(
         InputError: when an input is missing or no point can be triangulated.
     """
     options = {"random_seed": 0, "num_threads": 1, **(mapper_options or {})}
+    colmap.mapper_options(options)  # raises for a wrong one
     reference = colmap.read_model(reference_model)
-    scale = model_scale(reference)
-    mapper = colmap.mapper_options(options, scale)
+    pixel_scale = median_photo_scale(image.camera for image in reference.images.values())
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
@@ -83,8 +85,8 @@ def main(
         "min_match_score": min_match_score,
     }
     chosen = {key: value for key, value in verification.items() if value}
-    if scale > 1:
-        chosen["scale"] = scale
+    if pixel_scale > 1:
+        chosen["pixel_scale"] = pixel_scale
     inputs = [*colmap.model_files(reference_model), pairs, features, matches]
     made_from = provenance.of_inputs({**options, **chosen}, inputs)
     if not overwrite and provenance.is_current(sfm_dir / MADE_FROM, made_from):
@@ -105,7 +107,8 @@ def main(
             colmap.verify_matches(database, pairs, verbose)
         logger.info("Triangulating...")
         reconstruction = colmap.triangulate_points(
-            reference, database, image_dir, building, mapper, verbose
+            *(reference, database, image_dir, building),
+            *(colmap.mapper_options(options, pixel_scale), verbose),
         )
         if reconstruction.num_points3D() == 0:
             raise InputError(

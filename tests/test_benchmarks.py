@@ -60,12 +60,25 @@ def test_recall_in_centimetres_counts_localized_queries_only(tmp_path):
     header = ("query", "list", "status", "position_error_m", "rotation_error_deg")
     lines = [",".join(map(str, row)) for row in (header, *rows)]
     (tmp_path / "queries.csv").write_text("\n".join(lines) + "\n")
-    summary = SUMMARY | {"dataset": "datasets/town"}
-    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    (tmp_path / "summary.json").write_text(json.dumps(SUMMARY))
     shown = table(tmp_path, "--centimetres", "1", "5")
     assert "| 25.0 / 50.0 |" in shown.stdout.splitlines()[2]
-    shown = table(tmp_path, "--places", "--centimetres", "1", "5").stdout.splitlines()
-    assert shown[2].endswith("| 52 (2 of 3) | 1,000 | 3,871 | 2 of 3 | 25.0 / 50.0 |")
+
+
+def test_all_places_together(tmp_path):
+    errors = {"town": (0.004, 0.03), "mill": (0.2, 0.004)}
+    more = {"bytes_per_keypoint": {"descriptor": 256, "keypoints": 1000, "images": 4}}
+    for place, summary in (("town", SUMMARY), ("mill", {**SUMMARY, **more, "map_points3D": 129})):
+        folder = tmp_path / place / "sift"
+        folder.mkdir(parents=True)
+        (folder / "summary.json").write_text(json.dumps(summary | {"dataset": place}))
+        lines = [f"{i},night_time,localized,{error},0.1" for i, error in enumerate(errors[place])]
+        header = "query,list,status,position_error_m,rotation_error_deg"
+        (folder / "queries.csv").write_text("\n".join([header, *lines]))
+    shown = table(*tmp_path.glob("*/*"), "--places", "--centimetres", "1", "5").stdout.splitlines()
+    assert shown[0].endswith("| keypoints | points | localized | recall [%] |")
+    # 7,000 keypoints of 10 photos; two of four queries are within a centimetre, three within five
+    assert shown[2].endswith("| 700 | 4,000 | 4 of 6 | 50.0 / 75.0 |")
 
 
 def test_places_are_columns(tmp_path):

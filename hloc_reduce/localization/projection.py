@@ -5,6 +5,8 @@ ratio, principal point (2), skew. The degrees of freedom of an estimation are th
 parameters, the first ones.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 import pycolmap
 
@@ -69,12 +71,11 @@ def project(local: np.ndarray, distortion: float = 0.0) -> tuple[np.ndarray, np.
 def photo_scale(camera: pycolmap.Camera) -> float:
     """Return the size of a pixel of the reduced photo, in which keypoints are detected, in pixels.
 
-    Thresholds in pixels are multiplied by it.
+    Thresholds in pixels are multiplied by it. Features are taken to have the default `resize_max`.
     """
     return max(1.0, max(camera.width, camera.height) / DETECTED)
 
 
-def model_scale(sfm: pycolmap.Reconstruction) -> float:
-    """Return the median `photo_scale` of the images of a model."""
-    scales = [photo_scale(image.camera) for image in sfm.images.values()]
-    return float(np.median(scales or [1.0]))
+def median_photo_scale(cameras: Iterable[pycolmap.Camera]) -> float:
+    """Return the median `photo_scale` of photos, given the camera of each; 1 of none."""
+    return float(np.median([photo_scale(camera) for camera in cameras] or [1.0]))

@@ -121,11 +121,11 @@ def _different(numbers: np.ndarray) -> np.ndarray:
 
 
 def ransac_options(ransac_thresh: float, camera: pycolmap.Camera) -> dict:
-    """Return an inlier threshold as `localize` takes it.
+    """Return the options of `localize` for an inlier threshold.
 
     Args:
-        ransac_thresh: in pixels. A photo of more than 1,600 pixels, whose keypoints are less
-            precise, has a larger one in proportion.
+        ransac_thresh: in pixels, for photos whose longer side is at most 1,600 pixels. That of a
+            larger photo, whose keypoints are less precise, is larger in proportion.
         camera: intrinsics of the photo.
     """
     return {"estimation": {"ransac": {"max_error": ransac_thresh * photo_scale(camera)}}}

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from ..localization.projection import model_scale
+from ..localization.projection import median_photo_scale
 from ..utils import colmap
 from .epipolar import agreeing
 
 ROUNDS = 2  # of completing tracks, adjusting and filtering
 SETTINGS = {"num_threads": 1, "random_seed": 0}
-OPTIONS = colmap.mapper_options(SETTINGS)
+OPTIONS = colmap.mapper_options(SETTINGS)  # without a scale
 
 Pair = tuple[str, str]
 
@@ -60,7 +60,8 @@ def extend(
     graph = _graph(model, keypoints, uncertainty, matches)
     observations = pycolmap.ObservationManager(model, graph)
     triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
-    options = colmap.mapper_options(SETTINGS, model_scale(model))
+    pixel_scale = median_photo_scale(image.camera for image in placed.values())
+    options = colmap.mapper_options(SETTINGS, pixel_scale)
     tracks, limits = options.get_triangulation(), options.get_mapper()
     # the graph has no matches of two images of the model, so that tracks of more look like these
     tracks.ignore_two_view_tracks = False

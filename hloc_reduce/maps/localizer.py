@@ -27,7 +27,8 @@ class Localizer:
         map_dir: the folder of a map from `maps.main` or `pipelines.localize`, or a file from
             `hloc_reduce.compact`.
         num_loc: the number of most similar map images that a photo is matched with.
-        ransac_thresh: RANSAC inlier threshold in pixels, as in `localize_sfm`.
+        ransac_thresh: RANSAC inlier threshold in pixels; larger in proportion in photos whose
+            longer side exceeds 1,600 pixels.
         gate: what a pose must have to be trusted.
         onnx: with a file from `hloc_reduce.compact`, the ONNX file of its feature from
             `hloc_reduce.export`: features are extracted by ONNX Runtime instead of torch.

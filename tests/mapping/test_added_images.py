@@ -3,7 +3,6 @@
 import numpy as np
 import pycolmap
 import pytest
-import small_map
 
 from hloc_reduce.localization.projection import photo_scale
 from hloc_reduce.mapping import extension
@@ -16,7 +15,8 @@ OLD, NEW = [f"db/{i}.jpg" for i in range(4)], ["db/4.jpg", "query/6.jpg"]
 KNOWN = 200  # points that the model has before
 
 
-def build(scene) -> pycolmap.Reconstruction:
+@pytest.fixture
+def model(scene) -> pycolmap.Reconstruction:
     """A model of four images with two thirds of the points."""
     scene.camera = scene.reference.cameras[1]
     with open_h5(scene.features) as file:
@@ -31,11 +31,6 @@ def build(scene) -> pycolmap.Reconstruction:
         elements = [pycolmap.TrackElement(i + 1, row) for i, row in enumerate(rows)]
         made.add_point3D(scene.points[point], pycolmap.Track(elements))
     return made
-
-
-@pytest.fixture
-def model(scene) -> pycolmap.Reconstruction:
-    return build(scene)
 
 
 def matches(scene, pairs) -> dict:
@@ -76,10 +71,14 @@ def test_points_are_extended_and_others_triangulated(scene, model):
     assert extension.count_shared(model, NEW) == dict.fromkeys(NEW, len(scene.points))
 
 
-def test_photos_of_12_megapixels_are_extended_as_smaller_ones(scene):
-    small_map.enlarge(scene, 6.25, 0.4)  # a noise of 2.5 of 4,000 pixels, which is 1 of 1,600
-    scene.reference = colmap.read_model(scene.model)
-    model = build(scene)
+def test_photos_of_12_megapixels_keep_their_points_beside_small_ones(scene, model):
+    """A noise of 2.5 of their 4,000 pixels is one of 1,600, in which keypoints are found."""
+    scene.camera = pycolmap.Camera(scene.camera.todict())
+    scene.camera.rescale(6.25)
+    generator = np.random.default_rng(0)
+    for name in NEW:
+        keypoints = 6.25 * scene.keypoints[name]
+        scene.keypoints[name] = keypoints + generator.normal(0, 2.5, keypoints.shape)
     extend(scene, model, NEW, fixed=True)
     assert min(extension.count_shared(model, NEW).values()) > 0.95 * len(scene.points)
 

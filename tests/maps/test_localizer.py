@@ -13,6 +13,8 @@ from command import outcome
 
 from hloc_reduce import Localizer, compact, maps, projections
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.localization import query
+from hloc_reduce.localization.records import read_records
 from hloc_reduce.maps import contents
 from hloc_reduce.maps.engine import TorchEngine
 from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
@@ -152,6 +154,29 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, caplog, r
     for name in ("cut.png", "text.png", "empty.png", "absent.png"):
         with pytest.raises(UnreadableImage, match=f"Cannot read image .*{name}"):
             localizer.localize(photos / name)
+
+
+def test_large_photos_have_larger_limits_in_files_and_in_memory(place, tmp_path, monkeypatch, run):
+    build, images, outputs = place
+    small = cv2.imread(str(images / "query/day/a.png"))
+    (tmp_path / "new").mkdir()
+    large = tmp_path / "new/large.png"
+    cv2.imwrite(str(large), cv2.resize(small, None, fx=6, fy=6))
+    run(*build, "--query_images", large.parent)
+    (log,) = (outputs / "queries-new").glob("*_logs.jsonl")
+    expected = 12 * 6 * small.shape[1] / 1600
+    assert read_records(log)["large.png"]["max_error"] == pytest.approx(expected)
+
+    used, estimate = [], query.localize
+
+    def spy(reference, keypoints, camera, matches, config, *options):
+        used.append(config["estimation"]["ransac"]["max_error"])
+        return estimate(reference, keypoints, camera, matches, config, *options)
+
+    monkeypatch.setattr(query, "localize", spy)
+    _, info = Localizer(outputs / "map").localize(large)
+    assert used == [pytest.approx(expected)]
+    assert info["num_inliers"] == read_records(log)["large.png"]["num_inliers"] > 8
 
 
 @pytest.mark.parametrize("by_model", [True, False])

@@ -7,7 +7,7 @@ import pytest
 import small_map
 from small_map import all_pairs
 
-from hloc_reduce.utils import cli
+from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.h5 import list_h5_names
 
@@ -128,6 +128,17 @@ def test_a_map_of_hlocs_is_replaced(built):
     assert built.triangulate(sfm).num_points3D() == 300
     with pytest.raises(InputError, match="not replaced"):
         built.triangulate(built.model, overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [({}, 10.0), ({"mapper": {"filter_max_reproj_error": 3.0}}, 3.0), ({"mapper": {}}, 10.0)],
+)
+def test_given_reprojection_errors_are_not_scaled(given, expected):
+    options = colmap.mapper_options(given, 2.5)
+    assert options.mapper.filter_max_reproj_error == expected
+    assert options.triangulation.complete_max_reproj_error == 10.0
+    assert options.triangulation.merge_max_reproj_error == 10.0
 
 
 def test_wrong_mapper_options_are_refused_first(built):

@@ -13,28 +13,32 @@ from ..interrupts import interruptible
 from ..parsers import parse_pairs, write_pairs
 from .databases import full_disk, open_database, parse_options
 
-MAX_ERROR = 4.0  # pixels, COLMAP's default
-ERRORS = {  # options of the largest reprojection errors of points
-    "mapper": ("filter_max_reproj_error",),
-    "triangulation": ("complete_max_reproj_error", "merge_max_reproj_error"),
-}
+REPROJECTION_LIMITS = (  # options that are the largest reprojection errors of points, in pixels
+    ("mapper", "filter_max_reproj_error"),
+    ("triangulation", "complete_max_reproj_error"),
+    ("triangulation", "merge_max_reproj_error"),
+)
 _lock = Lock()
 _levels: list[int] = []  # those of COLMAP's log before each running block of `_log`
 
 
-def mapper_options(options: dict, scale: float = 1.0) -> pycolmap.IncrementalPipelineOptions:
+def mapper_options(options: dict, pixel_scale: float = 1.0) -> pycolmap.IncrementalPipelineOptions:
     """Convert a dict to pycolmap's mapper options.
 
     Args:
         options: their values by name.
-        scale: by which the largest reprojection errors of points are multiplied, unless given.
+        pixel_scale: times COLMAP's largest reprojection errors of points; those in `options` are
+            taken as they are.
 
     Raises:
         InputError: for an unknown option.
     """
-    limits = {part: {name: scale * MAX_ERROR for name in names} for part, names in ERRORS.items()}
-    scaled = {part: {**limit, **options.get(part, {})} for part, limit in limits.items()}
-    return parse_options(pycolmap.IncrementalPipelineOptions, {**options, **scaled}, "mapper")
+    parsed = parse_options(pycolmap.IncrementalPipelineOptions, options, "mapper")
+    for part, name in REPROJECTION_LIMITS:
+        if part not in options or (isinstance(options[part], dict) and name not in options[part]):
+            limits = getattr(parsed, part)
+            setattr(limits, name, pixel_scale * getattr(limits, name))
+    return parsed
 
 
 def solver_options(options: pycolmap.BundleAdjustmentOptions) -> Any:
