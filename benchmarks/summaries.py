@@ -3,7 +3,7 @@
 With --centimetres, recall is at these position errors and 2 degrees instead of the limits of the
 data set. With --places, a row is a run's folder name, and a column a query list of a data set: mean
 inliers, and how many queries are localized where some are not. With --centimetres, too, further
-columns are for all places: keypoints of a photo, points, localized queries, and recall of those
+columns sum up all places: keypoints of a photo, points, localized queries, and recall of those
 whose pose is known. Runs of a batch share features, so only one of them has seconds of extraction.
 What is no outputs folder of a finished run, such as a report beside the folders, is named and left
 out.
@@ -111,11 +111,12 @@ def _of_all(runs: list[tuple[Path, dict]], centimetres: list[float]) -> dict[str
     lists = [result for _, summary in runs for result in summary["lists"].values()]
     localized, queries = (sum(each[key] for each in lists) for key in ("localized", "queries"))
     sizes = [summary["bytes_per_keypoint"] for _, summary in runs]
-    counted = [size for size in sizes if "images" in size]  # older summaries have none
-    keypoints, images = (sum(size[key] for size in counted) for key in ("keypoints", "images"))
+    known = all("images" in size for size in sizes)  # older summaries have none
+    photos = sum(size.get("images", 0) for size in sizes)
+    keypoints = sum(size["keypoints"] for size in sizes) / photos if known else None
     errors = [error for folder, _ in runs for error in _errors(folder / "queries.csv")]
     return {
-        "keypoints": f"{keypoints / images:,.0f}" if images else "",
+        "keypoints": "" if keypoints is None else f"{keypoints:,.0f}",
         "points": f"{sum(summary.get('map_points3D', 0) for _, summary in runs):,}",
         "localized": f"{localized} of {queries}",
         "recall [%]": _percent(errors, centimetres),

@@ -62,8 +62,8 @@ def main(
         min_match_score: use only matches with a higher score.
         verbose: show COLMAP's log.
         mapper_options: of pycolmap's IncrementalPipelineOptions. By default the largest
-            reprojection errors are 4 pixels, or larger in proportion if the longer side of photos
-            (the median) exceeds 1,600 pixels.
+            reprojection errors are 4 pixels, or larger in proportion if the median longer side
+            exceeds 1,600 pixels.
         overwrite: triangulate again.
 
     Returns:
@@ -76,6 +76,7 @@ def main(
     colmap.mapper_options(options)  # raises for a wrong one
     reference = colmap.read_model(reference_model)
     pixel_scale = median_photo_scale(image.camera for image in reference.images.values())
+    mapper = colmap.mapper_options(options, pixel_scale)
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
@@ -107,8 +108,7 @@ def main(
             colmap.verify_matches(database, pairs, verbose)
         logger.info("Triangulating...")
         reconstruction = colmap.triangulate_points(
-            *(reference, database, image_dir, building),
-            *(colmap.mapper_options(options, pixel_scale), verbose),
+            reference, database, image_dir, building, mapper, verbose
         )
         if reconstruction.num_points3D() == 0:
             raise InputError(

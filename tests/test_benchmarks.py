@@ -79,6 +79,10 @@ def test_all_places_together(tmp_path):
     assert shown[0].endswith("| keypoints | points | localized | recall [%] |")
     # 7,000 keypoints of 10 photos; two of four queries are within a centimetre, three within five
     assert shown[2].endswith("| 700 | 4,000 | 4 of 6 | 50.0 / 75.0 |")
+    old = {**SUMMARY, "bytes_per_keypoint": {"descriptor": 256, "keypoints": 6000}}
+    (tmp_path / "town/sift/summary.json").write_text(json.dumps(old | {"dataset": "town"}))
+    shown = table(*tmp_path.glob("*/*"), "--places", "--centimetres", "1", "5").stdout.splitlines()
+    assert shown[2].endswith("|  | 4,000 | 4 of 6 | 50.0 / 75.0 |")
 
 
 def test_places_are_columns(tmp_path):

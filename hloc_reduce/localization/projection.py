@@ -69,7 +69,7 @@ def project(local: np.ndarray, distortion: float = 0.0) -> tuple[np.ndarray, np.
 
 
 def photo_scale(camera: pycolmap.Camera) -> float:
-    """Return the size of a pixel of the reduced photo, in which keypoints are detected, in pixels.
+    """Return how many pixels a pixel of the reduced photo spans, in which keypoints are detected.
 
     Thresholds in pixels are multiplied by it. Features are taken to have the default `resize_max`.
     """
@@ -77,5 +77,5 @@ def photo_scale(camera: pycolmap.Camera) -> float:
 
 
 def median_photo_scale(cameras: Iterable[pycolmap.Camera]) -> float:
-    """Return the median `photo_scale` of photos, given the camera of each; 1 of none."""
+    """Return the median `photo_scale` of photos, given the camera of each; 1 without any."""
     return float(np.median([photo_scale(camera) for camera in cameras] or [1.0]))

@@ -56,11 +56,15 @@ def extend(
             contradict the poses are not used.
         refine_map: adjust the poses of all images, but those that are given, and all points.
     """
+    # the larger one: points must not lose their observations in the larger photos
+    pixel_scale = max(
+        median_photo_scale(image.camera for image in model.images.values()),
+        median_photo_scale(image.camera for image in placed.values()),
+    )
     ids = _add_images(model, placed, keypoints)
     graph = _graph(model, keypoints, uncertainty, matches)
     observations = pycolmap.ObservationManager(model, graph)
     triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
-    pixel_scale = median_photo_scale(image.camera for image in placed.values())
     options = colmap.mapper_options(SETTINGS, pixel_scale)
     tracks, limits = options.get_triangulation(), options.get_mapper()
     # the graph has no matches of two images of the model, so that tracks of more look like these

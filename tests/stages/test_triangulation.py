@@ -132,13 +132,17 @@ def test_a_map_of_hlocs_is_replaced(built):
 
 @pytest.mark.parametrize(
     ("given", "expected"),
-    [({}, 10.0), ({"mapper": {"filter_max_reproj_error": 3.0}}, 3.0), ({"mapper": {}}, 10.0)],
+    [
+        ({}, (10.0, 10.0, 10.0)),
+        ({"mapper": {"filter_max_reproj_error": 3.0}}, (3.0, 10.0, 10.0)),
+        ({"triangulation": {"merge_max_reproj_error": 3.0}}, (10.0, 10.0, 3.0)),
+    ],
 )
 def test_given_reprojection_errors_are_not_scaled(given, expected):
     options = colmap.mapper_options(given, 2.5)
-    assert options.mapper.filter_max_reproj_error == expected
-    assert options.triangulation.complete_max_reproj_error == 10.0
-    assert options.triangulation.merge_max_reproj_error == 10.0
+    complete = options.triangulation.complete_max_reproj_error
+    merge = options.triangulation.merge_max_reproj_error
+    assert (options.mapper.filter_max_reproj_error, complete, merge) == expected
 
 
 def test_wrong_mapper_options_are_refused_first(built):

@@ -27,8 +27,8 @@ def mapper_options(options: dict, pixel_scale: float = 1.0) -> pycolmap.Incremen
 
     Args:
         options: their values by name.
-        pixel_scale: times COLMAP's largest reprojection errors of points; those in `options` are
-            taken as they are.
+        pixel_scale: factor of COLMAP's largest reprojection errors of points; those in `options`
+            are taken as they are.
 
     Raises:
         InputError: for an unknown option.
