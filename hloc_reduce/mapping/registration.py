@@ -162,8 +162,8 @@ def check(
         raise InputError(accept)
     if state["alike"] and factor == 1 and not is_partial:
         logger.info(
-            "EXIF data do not say which images share a camera, so each has its own. If one "
-            "camera with a fixed zoom took all, --camera_mode single gives better poses."
+            "EXIF data do not say which images share a camera, so each has its own. If one camera "
+            "with a fixed zoom took all, --camera_mode single --overwrite gives better poses."
         )
     return factor
 

@@ -26,7 +26,7 @@ MANY_UNCERTAIN = 0.1
 Size = tuple[int, int]  # width and height in pixels
 HELP = (
     "More photos between them and the others help, or intrinsics: a COLMAP model, EXIF data, or "
-    "--camera_mode single if one camera with a fixed zoom took all."
+    "--camera_mode single --overwrite if one camera with a fixed zoom took all."
 )
 
 
