@@ -150,6 +150,8 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
     trainer = SCHEMES[scheme]
     if trainer in (pca, raw):
         return {}
+    if trainer in (sv, nested) and recipe == "best" and descriptor in sv.RIDGES:
+        return {"ridge": sv.RIDGES[descriptor]}
     base = DESCRIPTORS.get(descriptor)
     settings = {
         "hidden": list(base.hidden if base else HIDDEN.get(descriptor, HIDDEN_BY_DEFAULT)),

@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from ..projections.network import MLP, read
-from . import pca
+from . import pca, steady
 from .loop import device, fit
 from .losses import contrastive_loss, distance_loss, triplet_loss
 from .sampling import PairSampler
@@ -50,6 +50,7 @@ OF_NETWORKS = {
 }
 DISTANCE_WEIGHTS = {"hardnet": 3.0}  # beta
 PCA_SHARES = {"xfeat": 0.6}  # of the principal axes in the trained layer (docs/training.md)
+RIDGES = {"aliked": 0.01}  # of the closed form, which is better than training for these bases
 
 
 def train(
@@ -66,6 +67,7 @@ def train(
             parts of a descriptor that are trained to match, too; `begin_with`, name or path of a
             projection to begin with; `temperature`, of the contrastive loss, which replaces the
             triplet loss; `pca_share`, between 0 and 1, of the principal axes in the trained layer.
+            Or only `ridge`: nothing is trained, `steady` finds the layer.
         seed: of the initial weights and the batches.
         checkpoint: file to resume from; the caller deletes it.
         made_from: provenance of the training; a stale checkpoint is ignored.
@@ -73,6 +75,8 @@ def train(
     Returns:
         The trained network.
     """
+    if "ridge" in recipe:
+        return steady.train(maps, dim, recipe["ridge"])
     torch.manual_seed(seed)
     drawing = {key: recipe[key] for key in ("augment", "balanced", "maps_per_batch")}
     sampler = PairSampler(maps, **drawing, seed=seed)

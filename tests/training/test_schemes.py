@@ -33,6 +33,30 @@ def test_a_layer_between_the_trained_one_and_the_axes(tmp_path):
     assert "pca_share" not in training.complete_recipe("nested", "best", "xfeat", "xfeat_nested")
 
 
+def test_steady_axes_leave_out_what_darkness_changes(tmp_path):
+    """Of three loud numbers, the first jumps in the variants; the layer keeps the other two.
+
+    The axes come in order, so that a nested projection is one with fewer dimensions.
+    """
+    generator = np.random.default_rng(0)
+    data = noisy_tracks(300)
+    descriptors = np.zeros(data.descriptors.shape, np.float32)
+    descriptors[..., :3] = generator.standard_normal((len(data.track), 1, 1, 3)) * [9, 3, 2]
+    descriptors[:, :, 1:, 0] += 12 * generator.standard_normal((len(data.track), 2, 3))
+    data.descriptors = descriptors.astype(np.float16)
+    recipe = training.complete_recipe("sv", "best", "aliked", "aliked_sv2")
+    assert recipe == training.complete_recipe("nested", "best", "aliked", "aliked_nested")
+    one, two = (sv.train([data], dim, recipe, 0, tmp_path / "c") for dim in (1, 2))
+    (weight,) = (linear.weight.detach() for linear in two.linears)
+    torch.testing.assert_close(weight.norm(dim=1), torch.ones(2))
+    assert weight[0, 1].abs() > 0.99 and weight[1, 2].abs() > 0.99
+    torch.testing.assert_close(one.linears[0].weight, two.linears[0].weight[:1])
+    (principal,) = (linear.weight.detach() for linear in pca.train([data], 1, {}, 0).linears)
+    assert principal[0, 0].abs() > 0.99
+    centred = two.linears[0](photos(data)).mean(dim=0)
+    torch.testing.assert_close(centred, torch.zeros(2), atol=0.01, rtol=0)
+
+
 def test_paper_recipe_is_the_papers(tmp_path, monkeypatch):
     """Sec. III-D: two hidden layers, 10 epochs of batches of 1,024, Adam from 0.001 to 0."""
     numbers, rates = [], []
