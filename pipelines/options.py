@@ -111,6 +111,7 @@ def parse(parser: cli.Parser) -> dict:
     options = vars(args)
     if options.pop("list_features"):
         print(features_confs.table())
+        print(f"\nDefault: {features_confs.RECOMMENDED}. Which to choose: docs/features.md")
         raise SystemExit(0)
     if options["matcher"] is not None:
         cli.choose("matcher", options["matcher"], matchers_confs.confs)

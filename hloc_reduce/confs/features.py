@@ -20,6 +20,7 @@ from ..utils.codes import CODED, STORAGES
 from ..utils.parsers import read_yaml
 from ..utils.tables import aligned
 
+DOWNLOADED = "downloaded on first use"
 RECOMMENDED = "colmap_sift_sv64"  # needs no download (docs/features.md)
 DIMS = (64, 32, 24, 16)
 # the schemes and dimensions of the projections of each base descriptor; and who has a nested one
@@ -130,15 +131,16 @@ def _weights(model: dict) -> str:
     if projection is None:
         if network := network_of(model):
             is_downloaded = network not in NETWORKS or NETWORKS[network].urls
-            return "downloaded on first use" if is_downloaded else "shipped"
+            return DOWNLOADED if is_downloaded else "shipped"
         descriptor = DESCRIPTORS.get(descriptor_of(model) or "")
         if descriptor is None and model["name"] != "dog":
             return f"see extractors/{model['name']}.py"
-        return "downloaded on first use" if descriptor and descriptor.urls else "none needed"
+        return DOWNLOADED if descriptor and descriptor.urls else "none needed"
     if projections.split_prefix(projection)[0] in projections.names():
-        return "shipped"
+        is_downloaded = _weights(base_of(model)) == DOWNLOADED
+        return f"shipped; base: {DOWNLOADED}" if is_downloaded else "shipped"
     if projection in RELEASED:
-        return "downloaded on first use, released by the paper's authors"
+        return f"{DOWNLOADED}, released by the paper's authors"
     return "to be trained: docs/training.md"
 
 

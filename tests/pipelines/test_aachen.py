@@ -142,6 +142,8 @@ def test_features_are_listed(capsys, run):
     rows = {name: values for name, *values in cells}
     assert list(rows)[:2] == ["feature", "sift"]
     assert rows["sift_sv16"] == ["16", "32", "NN-ratio", "shipped"]
+    assert rows["xfeat_sv32"][-1] == "shipped; base: downloaded on first use"
+    assert lines[-1].startswith("Default: colmap_sift_sv64.")
     assert rows["edgepoint2_m48"] == ["48", "96", "NN-mutual", "downloaded on first use"]
 
 
