@@ -98,8 +98,7 @@ def test_everything_ships_in_25_megabytes():
         if "@" not in name
     }
     expected |= {"xfeat", "edgepoint2_m32", "edgepoint2_m64", "aliked", *MINI}  # levels
-    expected -= {"aliked_sv64"}  # no better than pca
-    assert set(projections.names()) == expected and len(expected) == 94
+    assert set(projections.names()) == expected and len(expected) == 95
     assert sum(path.stat().st_size for path in WEIGHTS.iterdir()) < 25e6
 
 
@@ -111,7 +110,6 @@ def test_what_does_not_ship_says_how_to_train_it():
     with pytest.raises(InputError, match="weights/hardnet_nested.safetensors@24"):
         projections.load("hardnet_nested@24")
     for name, said in {
-        "aliked_sv64": "--descriptor aliked --scheme sv --dim 64",
         "edgepoint2_m64_us32": "--descriptor edgepoint2_m64 --scheme us --dim 32",
         "colmap_sift_nested": "--descriptor colmap_sift --scheme nested",
         "sitf_sv64": "There is no projection sitf_sv64",
