@@ -16,10 +16,15 @@ def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, *_: object) -> 
         InputError: when there are fewer observations than dimensions.
     """
     views = np.concatenate([tracks.descriptors[:, 0, 0] for tracks in maps]).astype(np.float32)
-    if len(views) < dim:
-        raise InputError(f"{len(views)} observations are too few for {dim} dimensions.")
+    check_number(len(views), dim)
     pca = PCA(dim, random_state=seed).fit(views)
     mlp = MLP([views.shape[1], dim])
     mlp.linears[0].weight.data = torch.from_numpy(pca.components_).float()
     mlp.linears[0].bias.data = torch.from_numpy(-pca.components_ @ pca.mean_).float()
     return mlp.eval()
+
+
+def check_number(observations: int, dim: int) -> None:
+    """Raise an InputError when there are fewer observations than dimensions."""
+    if observations < dim:
+        raise InputError(f"{observations} observations are too few for {dim} dimensions.")

@@ -7,7 +7,7 @@ from synthetic_tracks import RECIPE, SMALL, held_out_precision, noisy_tracks, ph
 
 from hloc_reduce.evaluation.ranking import nearest_neighbor_ap
 from hloc_reduce.training import __main__ as training
-from hloc_reduce.training import nested, pca, ss, sv, us
+from hloc_reduce.training import nested, pca, ss, steady, sv, us
 from hloc_reduce.training.losses import distance_loss
 from hloc_reduce.training.sampling import PairSampler
 from hloc_reduce.utils.cli import InputError
@@ -33,28 +33,48 @@ def test_a_layer_between_the_trained_one_and_the_axes(tmp_path):
     assert "pca_share" not in training.complete_recipe("nested", "best", "xfeat", "xfeat_nested")
 
 
-def test_steady_axes_leave_out_what_darkness_changes(tmp_path):
-    """Of three loud numbers, the first jumps in the variants; the layer keeps the other two.
-
-    The axes come in order, so that a nested projection is one with fewer dimensions.
-    """
+def darkened_tracks(number=300):
+    """Of three loud numbers, the first jumps in the variants."""
     generator = np.random.default_rng(0)
-    data = noisy_tracks(300)
+    data = noisy_tracks(number)
     descriptors = np.zeros(data.descriptors.shape, np.float32)
     descriptors[..., :3] = generator.standard_normal((len(data.track), 1, 1, 3)) * [9, 3, 2]
     descriptors[:, :, 1:, 0] += 12 * generator.standard_normal((len(data.track), 2, 3))
     data.descriptors = descriptors.astype(np.float16)
+    return data
+
+
+def test_steady_axes_leave_out_what_darkness_changes(tmp_path):
+    """The axes come in order, so that a nested projection is one with fewer dimensions."""
+    data = darkened_tracks()
     recipe = training.complete_recipe("sv", "best", "aliked", "aliked_sv2")
-    assert recipe == training.complete_recipe("nested", "best", "aliked", "aliked_nested")
     one, two = (sv.train([data], dim, recipe, 0, tmp_path / "c") for dim in (1, 2))
     (weight,) = (linear.weight.detach() for linear in two.linears)
     torch.testing.assert_close(weight.norm(dim=1), torch.ones(2))
-    assert weight[0, 1].abs() > 0.99 and weight[1, 2].abs() > 0.99
+    assert weight[0, 1] > 0.99 and weight[1, 2] > 0.99
     torch.testing.assert_close(one.linears[0].weight, two.linears[0].weight[:1])
     (principal,) = (linear.weight.detach() for linear in pca.train([data], 1, {}, 0).linears)
     assert principal[0, 0].abs() > 0.99
     centred = two.linears[0](photos(data)).mean(dim=0)
     torch.testing.assert_close(centred, torch.zeros(2), atol=0.01, rtol=0)
+
+
+def test_maps_have_equal_weight_in_steady_axes():
+    """However often the observations of a map are repeated."""
+    small, large = darkened_tracks(), with_noise_of(0.3)
+    larger = large.only(np.repeat(np.arange(len(large.track)), 5))
+    once, often = (steady.train([small, other], 16, 0.01).linears[0] for other in (large, larger))
+    torch.testing.assert_close(once.weight, often.weight, atol=1e-3, rtol=0)
+    torch.testing.assert_close(once.bias, often.bias, atol=1e-3, rtol=0)
+
+
+def test_only_the_best_supervised_recipes_of_aliked_are_in_closed_form():
+    recipes = [("sv", "best", "aliked"), ("nested", "best", "aliked"), ("sv", "tune", "aliked")]
+    recipes += [("sv", "paper", "aliked"), ("us", "best", "aliked"), ("ss", "best", "aliked")]
+    recipes += [("sv", "best", "xfeat"), ("sv", "best", "sift"), ("nested", "best", "xfeat")]
+    found = [training.complete_recipe(*recipe, f"{recipe[2]}_sv32") for recipe in recipes]
+    assert found[0] == found[1] == {"ridge": 0.01}
+    assert not any("ridge" in recipe for recipe in found[2:])
 
 
 def test_paper_recipe_is_the_papers(tmp_path, monkeypatch):
@@ -174,6 +194,8 @@ def test_pca_keeps_the_variance():
     )
 
 
-def test_too_few_observations_for_pca():
+def test_too_few_observations():
     with pytest.raises(InputError, match="too few"):
         pca.train([noisy_tracks(2)], 64, {}, 0)
+    with pytest.raises(InputError, match="8 observations are too few for 64"):
+        steady.train([noisy_tracks(2)], 64, 0.01)
