@@ -137,8 +137,8 @@ def _weights(model: dict) -> str:
             return f"see extractors/{model['name']}.py"
         return DOWNLOADED if descriptor and descriptor.urls else "none needed"
     if projections.split_prefix(projection)[0] in projections.names():
-        is_downloaded = _weights(base_of(model)) == DOWNLOADED
-        return f"shipped; base: {DOWNLOADED}" if is_downloaded else "shipped"
+        base_weights = _weights(base_of(model))
+        return f"shipped; base: {DOWNLOADED}" if base_weights == DOWNLOADED else "shipped"
     if projection in RELEASED:
         return f"{DOWNLOADED}, released by the paper's authors"
     return "to be trained: docs/training.md"
