@@ -18,9 +18,14 @@ def train(maps: list[Tracks], dim: int, recipe: dict, seed: int, *_: object) -> 
     views = np.concatenate([tracks.descriptors[:, 0, 0] for tracks in maps]).astype(np.float32)
     check_number(len(views), dim)
     pca = PCA(dim, random_state=seed).fit(views)
-    mlp = MLP([views.shape[1], dim])
-    mlp.linears[0].weight.data = torch.from_numpy(pca.components_).float()
-    mlp.linears[0].bias.data = torch.from_numpy(-pca.components_ @ pca.mean_).float()
+    return layer(pca.components_, pca.mean_)
+
+
+def layer(axes: np.ndarray, mean: np.ndarray) -> MLP:
+    """Return a network of one linear layer: axes (dim, D) of descriptors less their mean (D,)."""
+    mlp = MLP(axes.shape[::-1])
+    mlp.linears[0].weight.data = torch.from_numpy(axes).float()
+    mlp.linears[0].bias.data = torch.from_numpy(-axes @ mean).float()
     return mlp.eval()
 
 

@@ -1,7 +1,6 @@
 """Axes along which points differ and light changes little, in closed form."""
 
 import numpy as np
-import torch
 from scipy.linalg import eigh
 from sklearn.preprocessing import normalize
 
@@ -41,11 +40,7 @@ def train(maps: list[Tracks], dim: int, ridge: float) -> MLP:
     _, columns = eigh(spread, change, subset_by_index=(size - dim, size - 1))
     axes = normalize(np.fliplr(columns).T)
     largest = np.take_along_axis(axes, np.abs(axes).argmax(axis=1, keepdims=True), axis=1)
-    axes *= np.sign(largest)  # eigh leaves the signs open
-    mlp = MLP([size, dim])
-    mlp.linears[0].weight.data = torch.from_numpy(axes).float()
-    mlp.linears[0].bias.data = torch.from_numpy(-axes @ mean).float()
-    return mlp.eval()
+    return pca.layer(axes * np.sign(largest), mean)  # eigh leaves the signs open
 
 
 def _views(tracks: Tracks, variant: int) -> np.ndarray:
