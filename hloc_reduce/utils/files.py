@@ -50,6 +50,8 @@ def replacing(path: Path) -> Iterator[Path]:
     check_file(path)
     make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # an interrupted block, or a killed process of the same number, may have left one
+    temporary.unlink(missing_ok=True)
     try:
         with naming(path):
             yield temporary

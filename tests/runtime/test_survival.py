@@ -1,5 +1,6 @@
 """Runs that are killed or interrupted."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -12,8 +13,9 @@ import numpy as np
 import pytest
 import survival
 
+from hloc_reduce.runtime import group_writer
 from hloc_reduce.runtime.group_writer import GroupWriter
-from hloc_reduce.utils import interrupts
+from hloc_reduce.utils import files, h5, interrupts
 from hloc_reduce.utils.h5 import write_h5
 
 SEED = 0
@@ -28,6 +30,7 @@ import time
 import numpy, pycolmap
 from pathlib import Path
 from hloc_reduce.utils import cli
+from hloc_reduce.runtime import group_writer
 from hloc_reduce.runtime.group_writer import GroupWriter
 
 def main():
@@ -123,6 +126,38 @@ def test_an_h5_file_is_whole_when_an_interrupt_is_heard(tmp_path):
                 signal.raise_signal(signal.SIGINT)
     with h5py.File(tmp_path / "a.h5") as file:
         assert len(file) == 100 and file["99"][999] == 999
+
+
+def test_an_interrupt_at_any_line_loses_no_group(tmp_path):
+    modules = contextlib, files, group_writer, h5, interrupts
+
+    def add(path, moment=None):
+        """Add a group, interrupted at a line of the modules; return the number of lines."""
+        lines = 0
+
+        def trace(frame, event, _):
+            nonlocal lines
+            if frame.f_code.co_filename not in {module.__file__ for module in modules}:
+                return None
+            lines += event == "line"
+            if event == "line" and lines == moment:
+                signal.raise_signal(signal.SIGINT)
+            return trace
+
+        with contextlib.suppress(KeyboardInterrupt), GroupWriter(path, {}) as writer:
+            writer.add("a/b", {"c": np.arange(3)})
+            before = sys.gettrace()
+            sys.settrace(trace)
+            try:
+                writer.added.flush()
+            finally:
+                sys.settrace(before)
+        return lines
+
+    for moment in range(1, add(tmp_path / "whole.h5") + 1):
+        add(path := tmp_path / f"{moment}.h5", moment)
+        with GroupWriter(path, {}) as writer:
+            assert "a/b" in writer, moment
 
 
 @pytest.mark.parametrize("kind, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

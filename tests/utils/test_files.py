@@ -9,6 +9,7 @@ from hloc_reduce.runtime.outputs import Lock
 from hloc_reduce.triangulation import replacing_map
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.files import replacing
+from hloc_reduce.utils.h5 import write_h5
 
 
 def test_replacing_keeps_the_old_file_on_failure(tmp_path):
@@ -20,6 +21,14 @@ def test_replacing_keeps_the_old_file_on_failure(tmp_path):
         raise RuntimeError
     assert path.read_text() == "old"
     assert list(path.parent.iterdir()) == [path]
+
+
+def test_replacing_begins_anew_after_a_killed_process_of_the_same_number(tmp_path):
+    with replacing(tmp_path / "a.h5") as temporary:
+        temporary.write_bytes(b"")
+    temporary.write_bytes(b"half of a file")
+    with replacing(tmp_path / "a.h5") as again, write_h5(again) as file:
+        assert again == temporary and not len(file)
 
 
 def test_replacing_by_the_same_keeps_the_time(tmp_path):
