@@ -124,5 +124,5 @@ def between(trained: MLP, axes: MLP, share: float) -> MLP:
         parameter.data.zero_()
     for one, part in ((trained, 1 - share), (axes, share)):
         for into, value in zip(mlp.parameters(), one.parameters(), strict=True):
-            into.data += part * value.detach() / float(next(one.parameters()).norm())
+            into.data += part * value.detach() / next(one.parameters()).detach().norm()
     return mlp.eval()

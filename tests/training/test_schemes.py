@@ -73,7 +73,7 @@ def test_only_the_best_supervised_recipes_of_aliked_are_in_closed_form():
     recipes += [("sv", "paper", "aliked"), ("us", "best", "aliked"), ("ss", "best", "aliked")]
     recipes += [("sv", "best", "xfeat"), ("sv", "best", "sift"), ("nested", "best", "xfeat")]
     found = [training.complete_recipe(*recipe, f"{recipe[2]}_sv32") for recipe in recipes]
-    assert found[0] == found[1] == {"ridge": 0.01}
+    assert found[0] == found[1] == {"ridge": 0.3}
     assert not any("ridge" in recipe for recipe in found[2:])
 
 
