@@ -148,15 +148,12 @@ def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]
     Raises:
         InputError: when a group has several names, so that it could contain itself.
     """
-    names = []
-
-    def gather(name: bytes, link: h5py.h5l.LinkInfo) -> None:
-        if link.type == h5py.h5l.TYPE_HARD:
-            names.append(name)
-
-    group.links.iterate(gather, info=True)
+    names: list[bytes] = []
+    group.links.iterate(names.append)  # in a function of ours, an interrupt would fail in h5py
     holds_data = False
     for name in names:
+        if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:
+            continue
         child = h5py.h5o.get_info(group, name)
         if child.type == h5py.h5o.TYPE_GROUP:
             path = f"{prefix}{name.decode()}"

@@ -128,10 +128,20 @@ def test_an_h5_file_is_whole_when_an_interrupt_is_heard(tmp_path):
         assert len(file) == 100 and file["99"][999] == 999
 
 
-def test_an_interrupt_at_any_line_loses_no_group(tmp_path):
+def flush(writer):
+    writer.added.flush()
+
+
+def merge(writer):
+    writer._merge()
+
+
+@pytest.mark.parametrize("write", [flush, merge])
+@pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.long)])
+def test_an_interrupt_at_any_line_loses_no_group(step, write, tmp_path):
     modules = contextlib, files, group_writer, h5, interrupts
 
-    def add(path, moment=None):
+    def extend(path, moment=None):
         """Add a group, interrupted at a line of the modules; return the number of lines."""
         lines = 0
 
@@ -144,20 +154,24 @@ def test_an_interrupt_at_any_line_loses_no_group(tmp_path):
                 signal.raise_signal(signal.SIGINT)
             return trace
 
+        with GroupWriter(path, {}) as writer:
+            writer.add("first", {"c": np.arange(3)})
         with contextlib.suppress(KeyboardInterrupt), GroupWriter(path, {}) as writer:
             writer.add("a/b", {"c": np.arange(3)})
+            if write is merge:
+                flush(writer)
             before = sys.gettrace()
             sys.settrace(trace)
             try:
-                writer.added.flush()
+                write(writer)
             finally:
                 sys.settrace(before)
         return lines
 
-    for moment in range(1, add(tmp_path / "whole.h5") + 1):
-        add(path := tmp_path / f"{moment}.h5", moment)
+    for moment in range(1, extend(tmp_path / "whole.h5") + 1, step):
+        extend(path := tmp_path / f"{moment}.h5", moment)
         with GroupWriter(path, {}) as writer:
-            assert "a/b" in writer, moment
+            assert writer.names == {"first", "a/b"}, moment
 
 
 @pytest.mark.parametrize("kind, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
