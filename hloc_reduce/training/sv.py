@@ -50,7 +50,7 @@ OF_NETWORKS = {
 }
 DISTANCE_WEIGHTS = {"hardnet": 3.0}  # beta
 PCA_SHARES = {"xfeat": 0.6}  # of the principal axes in the trained layer (docs/training.md)
-RIDGES = {"aliked": 0.3}  # of the closed form, which finds more inliers than training
+RIDGES = {"aliked": 0.3}  # of the closed form, better than training in the dark
 
 
 def train(

@@ -5,6 +5,7 @@ import filecmp
 import hashlib
 import os
 import shutil
+import uuid
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,9 +50,8 @@ def replacing(path: Path) -> Iterator[Path]:
     announce(path)
     check_file(path)
     make_folder(path.parent)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    # an interrupted block, or a killed process of the same number, may have left one
-    temporary.unlink(missing_ok=True)
+    # of a name of its own: an interrupted block may leave its file until Python forgets the block
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         with naming(path):
             yield temporary

@@ -149,7 +149,8 @@ def iterate_h5_names(group: h5py.h5g.GroupID, prefix: str = "") -> Iterator[str]
         InputError: when a group has several names, so that it could contain itself.
     """
     names: list[bytes] = []
-    group.links.iterate(names.append)  # in a function of ours, an interrupt would fail in h5py
+    # not into a function of ours, in which an interrupt would become an error of h5py's
+    group.links.iterate(names.append)
     holds_data = False
     for name in names:
         if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:

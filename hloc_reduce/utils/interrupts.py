@@ -101,7 +101,7 @@ def uninterrupted() -> Iterator[None]:
     try:
         yield
     finally:
-        for stop, handler in handlers.items():
+        for stop, handler in reversed(handlers.items()):  # Ctrl-C last: until then it waits
             signal.signal(stop, handler)
         for number in came[:1]:
             signal.raise_signal(number)

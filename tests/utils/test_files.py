@@ -9,7 +9,6 @@ from hloc_reduce.runtime.outputs import Lock
 from hloc_reduce.triangulation import replacing_map
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.files import replacing
-from hloc_reduce.utils.h5 import write_h5
 
 
 def test_replacing_keeps_the_old_file_on_failure(tmp_path):
@@ -23,12 +22,16 @@ def test_replacing_keeps_the_old_file_on_failure(tmp_path):
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_replacing_begins_anew_after_a_killed_process_of_the_same_number(tmp_path):
-    with replacing(tmp_path / "a.h5") as temporary:
-        temporary.write_bytes(b"")
-    temporary.write_bytes(b"half of a file")
-    with replacing(tmp_path / "a.h5") as again, write_h5(again) as file:
-        assert again == temporary and not len(file)
+def test_replacing_a_file_while_another_writer_does(tmp_path):
+    path = tmp_path / "a.txt"
+    with replacing(path) as one:
+        one.write_text("one")
+        with replacing(path) as other:
+            assert not other.exists()
+            other.write_text("other")
+        assert path.read_text() == "other"
+    assert path.read_text() == "one"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_replacing_by_the_same_keeps_the_time(tmp_path):
