@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import conftest
@@ -17,10 +18,12 @@ PHOTOS = ("0.png", "1.png", "2.png")
 SAME = 0.99
 
 
-def run(gpus: str, *arguments: object) -> int:
-    """Run Python with the GPUs that a value of CUDA_VISIBLE_DEVICES names."""
+def run(gpus: str, *arguments: object, cores: int | None = None) -> int:
+    """Run Python with the GPUs that a value of CUDA_VISIBLE_DEVICES names, and some cores."""
     command = [sys.executable, *map(str, arguments)]
     environment = os.environ | {"CUDA_VISIBLE_DEVICES": gpus}
+    if cores:
+        environment["OMP_NUM_THREADS"] = str(cores)
     return subprocess.run(command, env=environment, cwd=Path(__file__).parents[1]).returncode
 
 
@@ -46,11 +49,32 @@ def places(image: h5py.Group) -> np.ndarray:
     return np.column_stack([image[key][()] for key in keys])
 
 
+def assert_same(first: Path, second: Path) -> None:
+    """Assert that two feature files of the photos have the same features, up to rounding."""
+    with h5py.File(first) as one, h5py.File(second) as other:
+        for name in PHOTOS:
+            distance, nearest = cKDTree(places(one[name])).query(places(other[name]))
+            found = distance < 0.1
+            assert found.mean() > SAME
+            assert len(np.unique(nearest[found])) > SAME * len(one[name]["keypoints"])
+            ours, theirs = (file[name]["descriptors"][()].T.astype(float) for file in (other, one))
+            cosines = (ours[found] * theirs[nearest[found]]).sum(axis=1)
+            assert np.quantile(cosines, 1 - SAME) > 0.999
+
+
 @pytest.mark.parametrize(
     ("feature", "matcher"),
-    [("colmap_sift_sv64", "NN-ratio"), ("sift_sv32", "NN-ratio"), ("mini32", "NN-mutual")],
+    [
+        ("colmap_sift_sv64", "NN-ratio"),
+        ("sift_sv32", "NN-ratio"),
+        ("mini32", "NN-mutual"),
+        ("xfeat_sv32", "NN-mutual"),
+        ("edgepoint2_m64_sv32", "NN-mutual"),
+        ("aliked_sv32", "NN-mutual"),
+    ],
 )
-def test_a_gpu_finds_what_a_cpu_finds(photos, tmp_path, feature, matcher):
+def test_a_gpu_finds_what_a_cpu_finds(photos, tmp_path, base_weights, feature, matcher):
+    base_weights(feature)
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0.png 1.png\n0.png 2.png\n1.png 2.png\n")
     features, matches = {}, {}
@@ -63,17 +87,21 @@ def test_a_gpu_finds_what_a_cpu_finds(photos, tmp_path, feature, matcher):
         stage = ("-m", "hloc_reduce.match_features", "--pairs", pairs, "--conf", matcher)
         files = ("--features", features["cpu"], "--matches", matches[device])
         assert run(gpus, *stage, *files, "--export_dir", tmp_path) == 0
-    with h5py.File(features["cpu"]) as cpu, h5py.File(features["gpu"]) as gpu:
-        for name in PHOTOS:
-            distance, nearest = cKDTree(places(cpu[name])).query(places(gpu[name]))
-            found = distance < 0.1
-            assert found.mean() > SAME
-            assert len(np.unique(nearest[found])) > SAME * len(cpu[name]["keypoints"])
-            ours, theirs = (file[name]["descriptors"][()].T.astype(float) for file in (gpu, cpu))
-            cosines = (ours[found] * theirs[nearest[found]]).sum(axis=1)
-            assert np.quantile(cosines, 1 - SAME) > 0.999
+    assert_same(features["cpu"], features["gpu"])
     with h5py.File(matches["cpu"]) as cpu, h5py.File(matches["gpu"]) as gpu:
         for name0, name1 in (line.split() for line in pairs.read_text().splitlines()):
             ours, theirs = (file[name0][name1]["matches0"][()] for file in (gpu, cpu))
             assert (theirs >= 0).sum() > 100
             assert (ours == theirs).mean() > SAME
+
+
+@pytest.mark.parametrize("feature", ["mini32", "xfeat_sv32", "aliked_sv32"])
+def test_photos_at_once_are_those_one_by_one(
+    photos: Path, tmp_path: Path, base_weights: Callable[[str], None], feature: str
+) -> None:
+    """Threads read photos, and share the network."""
+    base_weights(feature)
+    for cores in (1, 3):
+        stage = ("-m", "hloc_reduce.extract_features", "--image_dir", photos, "--conf", feature)
+        assert run(conftest.GPUS, *stage, "--export_dir", tmp_path / str(cores), cores=cores) == 0
+    assert_same(*(next((tmp_path / cores).glob("*.h5")) for cores in ("1", "3")))
