@@ -58,7 +58,9 @@ def _main() -> None:
         raise InputError("--cores and --rounds: at least 1.")
     confs = {name: features.get(name)[1] for name in args.feature}
     gpu = torch.cuda.is_available()
-    columns = [f"{cores} core{'s' * (cores > 1)} [ms]" for cores in args.cores] + ["memory [MiB]"] * gpu
+    columns = [f"{cores} core{'s' * (cores > 1)} [ms]" for cores in args.cores]
+    if gpu:
+        columns.append("memory [MiB]")
     print(f"| feature | {' | '.join(columns)} |\n| --- |{' ---: |' * len(columns)}")
     with TemporaryDirectory() as folder:
         images = copied(args.image_dir, Path(folder))
