@@ -150,8 +150,6 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
     trainer = SCHEMES[scheme]
     if trainer in (pca, raw):
         return {}
-    if trainer in (sv, nested) and recipe == "best" and descriptor in sv.RIDGES:
-        return {"ridge": sv.RIDGES[descriptor]}
     base = DESCRIPTORS.get(descriptor)
     settings = {
         "hidden": list(base.hidden if base else HIDDEN.get(descriptor, HIDDEN_BY_DEFAULT)),
@@ -160,8 +158,8 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
     }
     if recipe in ("best", "tune") and descriptor in features_confs.MODELS:
         settings |= trainer.OF_NETWORKS
-        if trainer is sv and recipe == "best" and descriptor in sv.PCA_SHARES:
-            settings["pca_share"] = sv.PCA_SHARES[descriptor]
+    if recipe == "best":
+        settings |= trainer.OF_BASES.get(descriptor, {})
     if recipe == "tune":
         settings |= {"begin_with": name, "begin_with_sha256": projections.checksum(name)}
     return settings

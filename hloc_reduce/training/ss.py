@@ -47,6 +47,7 @@ RECIPES: dict[str, dict] = {
     },
 }
 OF_NETWORKS = sv.OF_NETWORKS
+OF_BASES: dict[str, dict] = {}
 DISTANCE_WEIGHTS: dict[str, float] = {}
 
 

@@ -49,8 +49,11 @@ OF_NETWORKS = {
     "temperature": 0.04,
 }
 DISTANCE_WEIGHTS = {"hardnet": 3.0}  # beta
-PCA_SHARES = {"xfeat": 0.6}  # of the principal axes in the trained layer (docs/training.md)
-RIDGES = {"aliked": 0.3}  # of the closed form, better than training in the dark
+# what "best" has for some bases in addition (docs/training.md)
+OF_BASES: dict[str, dict] = {
+    "xfeat": {"pca_share": 0.6},
+    "aliked": {"ridge": 0.2, "steady_share": 0.6, "steps": 200},
+}
 
 
 def train(
@@ -66,8 +69,9 @@ def train(
             layer begins with the principal axes. Optional: `prefixes`, the lengths of leading
             parts of a descriptor that are trained to match, too; `begin_with`, name or path of a
             projection to begin with; `temperature`, of the contrastive loss, which replaces the
-            triplet loss; `pca_share`, between 0 and 1, of the principal axes in the trained layer.
-            Or only `ridge`: nothing is trained, `steady` finds the layer.
+            triplet loss; `ridge`, with which the only layer begins with the axes of `steady`
+            instead of the principal ones; `pca_share` or, with a ridge, `steady_share`, between 0
+            and 1, of the axes that it began with in the trained layer.
         seed: of the initial weights and the batches.
         checkpoint: file to resume from; the caller deletes it.
         made_from: provenance of the training; a stale checkpoint is ignored.
@@ -75,8 +79,6 @@ def train(
     Returns:
         The trained network.
     """
-    if "ridge" in recipe:
-        return steady.train(maps, dim, recipe["ridge"])
     torch.manual_seed(seed)
     drawing = {key: recipe[key] for key in ("augment", "balanced", "maps_per_batch")}
     sampler = PairSampler(maps, **drawing, seed=seed)
@@ -85,7 +87,7 @@ def train(
     if "begin_with" in recipe:
         mlp, _ = read(recipe["begin_with"])
     elif not recipe["hidden"]:
-        mlp = pca.train(maps, dim, recipe, seed)
+        mlp = _axes(maps, dim, recipe, seed)
     else:
         mlp = MLP([maps[0].descriptors.shape[-1], *recipe["hidden"], dim])
     mlp.train().to(place)
@@ -106,9 +108,15 @@ def train(
 
     fit(mlp, loss, steps, recipe, checkpoint, made_from)
     mlp.eval().cpu()
-    if "pca_share" in recipe:
-        return between(mlp, pca.train(maps, dim, recipe, seed), recipe["pca_share"])
-    return mlp
+    share = recipe.get("steady_share" if "ridge" in recipe else "pca_share")
+    return between(mlp, _axes(maps, dim, recipe, seed), share) if share else mlp
+
+
+def _axes(maps: list[Tracks], dim: int, recipe: dict, seed: int) -> MLP:
+    """Return the axes that a single layer begins with."""
+    if "ridge" in recipe:
+        return steady.train(maps, dim, recipe["ridge"])
+    return pca.train(maps, dim, recipe, seed)
 
 
 def between(trained: MLP, axes: MLP, share: float) -> MLP:

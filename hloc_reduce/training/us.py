@@ -36,6 +36,7 @@ RECIPES: dict[str, dict] = {
     },
 }
 OF_NETWORKS = {"hidden": [], "steps": 1000}  # "best" for the descriptors of networks
+OF_BASES: dict[str, dict] = {}
 DISTANCE_WEIGHTS = {"hardnet": 0.1}  # alpha, unless the recipe has one
 
 

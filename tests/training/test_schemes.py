@@ -18,21 +18,6 @@ def test_supervised_learns_what_tells_points_apart(tmp_path):
     assert held_out_precision(mlp) > held_out_precision() + 0.1
 
 
-def test_a_layer_between_the_trained_one_and_the_axes(tmp_path):
-    """Of equal norms, one share of each; only for the base that gains by it."""
-    recipe = {**RECIPE, "hidden": [], "steps": 20, "temperature": 0.04}
-    data = [noisy_tracks()]
-    trained = sv.train(data, 8, recipe, 0, tmp_path / "c")
-    mixed = sv.train(data, 8, {**recipe, "pca_share": 0.6}, 0, tmp_path / "d")
-    axes = pca.train(data, 8, {}, 0)
-    a, b = (mlp.linears[0].weight / mlp.linears[0].weight.norm() for mlp in (trained, axes))
-    torch.testing.assert_close(mixed.linears[0].weight, 0.4 * a + 0.6 * b)
-    for name, share in (("xfeat", 0.6), ("edgepoint2_m64", None), ("sift", None)):
-        found = training.complete_recipe("sv", "best", name, f"{name}_sv32").get("pca_share")
-        assert found == share
-    assert "pca_share" not in training.complete_recipe("nested", "best", "xfeat", "xfeat_nested")
-
-
 def darkened_tracks(number=300):
     """Of three loud numbers, the first jumps in the variants."""
     generator = np.random.default_rng(0)
@@ -44,11 +29,27 @@ def darkened_tracks(number=300):
     return data
 
 
-def test_steady_axes_leave_out_what_darkness_changes(tmp_path):
+@pytest.mark.parametrize("share", [{"pca_share": 0.6}, {"ridge": 0.1, "steady_share": 0.6}])
+def test_a_layer_between_the_trained_one_and_the_axes(tmp_path, share):
+    """Of equal norms, one share of each."""
+    recipe = {**RECIPE, **share, "hidden": [], "steps": 20, "temperature": 0.04}
+    data = [darkened_tracks()]
+    mixed = sv.train(data, 3, recipe, 0, tmp_path / "c")
+    for key in ("pca_share", "steady_share"):
+        recipe.pop(key, None)
+    trained = sv.train(data, 3, recipe, 0, tmp_path / "d")
+    begun = sv.train(data, 3, {**recipe, "steps": 1, "lr": 0}, 0, tmp_path / "e")
+    axes = steady.train(data, 3, 0.1) if "ridge" in share else pca.train(data, 3, {}, 0)
+    torch.testing.assert_close(begun.linears[0].weight, axes.linears[0].weight)
+    a, b = (mlp.linears[0].weight / mlp.linears[0].weight.norm() for mlp in (trained, axes))
+    assert (a - b).norm() > 0.01
+    torch.testing.assert_close(mixed.linears[0].weight, 0.4 * a + 0.6 * b)
+
+
+def test_steady_axes_leave_out_what_darkness_changes():
     """The axes come in order, so that a nested projection is one with fewer dimensions."""
     data = darkened_tracks()
-    recipe = training.complete_recipe("sv", "best", "aliked", "aliked_sv2")
-    one, two = (sv.train([data], dim, recipe, 0, tmp_path / "c") for dim in (1, 2))
+    one, two = (steady.train([data], dim, 0.3) for dim in (1, 2))
     (weight,) = (linear.weight.detach() for linear in two.linears)
     torch.testing.assert_close(weight.norm(dim=1), torch.ones(2))
     assert weight[0, 1] > 0.99 and weight[1, 2] > 0.99
@@ -68,13 +69,25 @@ def test_maps_have_equal_weight_in_steady_axes():
     torch.testing.assert_close(once.bias, often.bias, atol=1e-3, rtol=0)
 
 
-def test_only_the_best_supervised_recipes_of_aliked_are_in_closed_form():
-    recipes = [("sv", "best", "aliked"), ("nested", "best", "aliked"), ("sv", "tune", "aliked")]
-    recipes += [("sv", "paper", "aliked"), ("us", "best", "aliked"), ("ss", "best", "aliked")]
-    recipes += [("sv", "best", "xfeat"), ("sv", "best", "sift"), ("nested", "best", "xfeat")]
-    found = [training.complete_recipe(*recipe, f"{recipe[2]}_sv32") for recipe in recipes]
-    assert found[0] == found[1] == {"ridge": 0.3}
-    assert not any("ridge" in recipe for recipe in found[2:])
+def test_what_only_the_best_recipes_of_some_bases_have():
+    """Axes that the layer begins with, and their share of it, where they were measured."""
+    of_aliked = {"ridge": 0.2, "steady_share": 0.6}
+    expected = {
+        ("sv", "best", "xfeat"): {"pca_share": 0.6},
+        ("sv", "best", "aliked"): of_aliked,
+        ("nested", "best", "aliked"): of_aliked,
+    }
+    others = [(scheme, "best", "aliked") for scheme in ("us", "ss")]
+    others += [("sv", recipe, "aliked") for recipe in ("paper", "tune")]
+    others += [
+        ("sv", "best", "sift"),
+        ("sv", "best", "edgepoint2_m64"),
+        ("nested", "best", "xfeat"),
+    ]
+    for recipe in [*expected, *others]:
+        found = training.complete_recipe(*recipe, f"{recipe[2]}_sv32")
+        found = {key: found[key] for key in found if key == "ridge" or key.endswith("_share")}
+        assert found == expected.get(recipe, {})
 
 
 def test_paper_recipe_is_the_papers(tmp_path, monkeypatch):
