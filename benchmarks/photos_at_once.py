@@ -1,8 +1,8 @@
 """Time the extraction of a folder of photos with different numbers of cores.
 
 Beside a GPU, a photo is read on each core, up to eight. Prints a Markdown table of the milliseconds
-per photo, from reading it to writing its features, the least of several rounds; and, with a GPU,
-the largest memory of its tensors.
+per photo, from reading it to writing its features, the least of several rounds, in each of which
+the network is loaded once; and, with a GPU, the largest memory of its tensors.
 """
 
 import shutil
