@@ -1,8 +1,8 @@
 """Time the extraction of a folder of photos with different numbers of cores.
 
-Beside a GPU, a photo is read on each core, up to eight. Prints a Markdown table of the milliseconds
+With a GPU, a photo is read on each core, up to eight. Prints a Markdown table of the milliseconds
 per photo, from reading it to writing its features, the least of several rounds, in each of which
-the network is loaded once; and, with a GPU, the largest memory of its tensors.
+the network is loaded once; and, with a GPU, the peak of the memory that torch took there.
 """
 
 import shutil
@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import cv2
 import torch
 
 from hloc_reduce import extract_features
@@ -18,32 +19,32 @@ from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.images import list_images
 
-COPIES = 64  # photos that are extracted in a round, at least
+MIN_PHOTOS = 64  # of a round
 
 
 def measure(images: Path, conf: dict, cores: int, rounds: int) -> float:
     """Return the least seconds per photo of several rounds, after one photo that is not timed."""
     torch.set_num_threads(cores)
+    cv2.setNumThreads(cores)
     names = list_images(images)
     found = []
     with TemporaryDirectory() as folder:
         extract_features.main(conf, images, Path(folder), image_list=names[:1])
-        for _ in range(rounds):
+        for number in range(rounds):
             start = time.perf_counter()
-            extract_features.main(conf, images, Path(folder), image_list=names, overwrite=True)
+            extract_features.main(conf, images, Path(folder, str(number)), image_list=names)
             found.append((time.perf_counter() - start) / len(names))
     return min(found)
 
 
-def copied(images: Path, folder: Path) -> Path:
-    """Copy photos into a folder, more than once if they are few."""
+def copy_photos(images: Path, folder: Path) -> None:
+    """Copy the photos of a folder into another, more than once if they are few."""
     names = list_images(images)
-    for number in range(-(-COPIES // len(names))):
+    for number in range(-(-MIN_PHOTOS // len(names))):
         for name in names:
             copy = folder / str(number) / name
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(images / name, copy)
-    return folder
 
 
 def _main() -> None:
@@ -63,11 +64,11 @@ def _main() -> None:
         columns.append("memory [MiB]")
     print(f"| feature | {' | '.join(columns)} |\n| --- |{' ---: |' * len(columns)}")
     with TemporaryDirectory() as folder:
-        images = copied(args.image_dir, Path(folder))
+        copy_photos(args.image_dir, Path(folder))
         for name, conf in confs.items():
             if gpu:
                 torch.cuda.reset_peak_memory_stats()
-            seconds = [measure(images, conf, cores, args.rounds) for cores in args.cores]
+            seconds = [measure(Path(folder), conf, cores, args.rounds) for cores in args.cores]
             cells = [f"{1000 * value:.1f}" for value in seconds]
             if gpu:
                 cells.append(f"{torch.cuda.max_memory_allocated() / 2**20:,.0f}")

@@ -19,7 +19,7 @@ from scipy.io import savemat
 
 from hloc_reduce import networks
 from hloc_reduce.confs import features
-from hloc_reduce.descriptors import weights
+from hloc_reduce.descriptors import DESCRIPTORS, weights
 from hloc_reduce.utils import cli, colmap, downloads
 from pipelines import batch
 
@@ -71,10 +71,14 @@ def base_weights(monkeypatch, tmp_path_factory) -> Callable[[str], None]:
         monkeypatch.setenv("TORCH_HOME", str(home))
 
     def need(name: str) -> None:
-        network = networks.NETWORKS.get(features.network_of(features.confs[name]["model"]) or "")
+        model = features.confs[name]["model"]
+        network = networks.NETWORKS.get(features.network_of(model) or "")
         if network and not network.urls:  # they ship
             return
-        path = downloads.cache() / network.file if network else weights(name)
+        base = features.descriptor_of(model)
+        path = weights(base) if base in DESCRIPTORS else None
+        if network:
+            path = downloads.cache() / network.file
         if path and not path.is_file():
             pytest.skip(f"the weights {path} are not on this machine")
 

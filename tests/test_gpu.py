@@ -1,9 +1,9 @@
-"""Features and matches that were computed on a GPU are those of a CPU."""
+"""Features and matches on a GPU are those of a CPU, however many photos are extracted at once."""
 
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import conftest
@@ -19,7 +19,7 @@ SAME = 0.99
 
 
 def run(gpus: str, *arguments: object, cores: int | None = None) -> int:
-    """Run Python with the GPUs that a value of CUDA_VISIBLE_DEVICES names, and some cores."""
+    """Run Python with values of CUDA_VISIBLE_DEVICES and, if given, OMP_NUM_THREADS."""
     command = [sys.executable, *map(str, arguments)]
     environment = os.environ | {"CUDA_VISIBLE_DEVICES": gpus}
     if cores:
@@ -49,16 +49,16 @@ def places(image: h5py.Group) -> np.ndarray:
     return np.column_stack([image[key][()] for key in keys])
 
 
-def assert_same(first: Path, second: Path) -> None:
-    """Assert that two feature files of the photos have the same features, up to rounding."""
-    with h5py.File(first) as one, h5py.File(second) as other:
-        for name in PHOTOS:
-            distance, nearest = cKDTree(places(one[name])).query(places(other[name]))
+def assert_same(ours: Path, theirs: Path, names: Iterable[str]) -> None:
+    """Assert that images have the same features in two files, up to rounding."""
+    with h5py.File(ours) as one, h5py.File(theirs) as other:
+        for name in names:
+            distance, nearest = cKDTree(places(other[name])).query(places(one[name]))
             found = distance < 0.1
             assert found.mean() > SAME
-            assert len(np.unique(nearest[found])) > SAME * len(one[name]["keypoints"])
-            ours, theirs = (file[name]["descriptors"][()].T.astype(float) for file in (other, one))
-            cosines = (ours[found] * theirs[nearest[found]]).sum(axis=1)
+            assert len(np.unique(nearest[found])) > SAME * len(other[name]["keypoints"])
+            a, b = (file[name]["descriptors"][()].T.astype(float) for file in (one, other))
+            cosines = (a[found] * b[nearest[found]]).sum(axis=1)
             assert np.quantile(cosines, 1 - SAME) > 0.999
 
 
@@ -73,7 +73,9 @@ def assert_same(first: Path, second: Path) -> None:
         ("aliked_sv32", "NN-mutual"),
     ],
 )
-def test_a_gpu_finds_what_a_cpu_finds(photos, tmp_path, base_weights, feature, matcher):
+def test_a_gpu_finds_what_a_cpu_finds(
+    photos: Path, tmp_path: Path, base_weights: Callable[[str], None], feature: str, matcher: str
+) -> None:
     base_weights(feature)
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0.png 1.png\n0.png 2.png\n1.png 2.png\n")
@@ -87,7 +89,7 @@ def test_a_gpu_finds_what_a_cpu_finds(photos, tmp_path, base_weights, feature, m
         stage = ("-m", "hloc_reduce.match_features", "--pairs", pairs, "--conf", matcher)
         files = ("--features", features["cpu"], "--matches", matches[device])
         assert run(gpus, *stage, *files, "--export_dir", tmp_path) == 0
-    assert_same(features["cpu"], features["gpu"])
+    assert_same(features["gpu"], features["cpu"], PHOTOS)
     with h5py.File(matches["cpu"]) as cpu, h5py.File(matches["gpu"]) as gpu:
         for name0, name1 in (line.split() for line in pairs.read_text().splitlines()):
             ours, theirs = (file[name0][name1]["matches0"][()] for file in (gpu, cpu))
@@ -97,11 +99,21 @@ def test_a_gpu_finds_what_a_cpu_finds(photos, tmp_path, base_weights, feature, m
 
 @pytest.mark.parametrize("feature", ["mini32", "xfeat_sv32", "aliked_sv32"])
 def test_photos_at_once_are_those_one_by_one(
-    photos: Path, tmp_path: Path, base_weights: Callable[[str], None], feature: str
+    tmp_path: Path, textured: np.ndarray, base_weights: Callable[[str], None], feature: str
 ) -> None:
-    """Threads read photos, and share the network."""
+    """Of several sizes, every third one with so much noise that it is reduced."""
     base_weights(feature)
-    for cores in (1, 3):
+    generator, names = np.random.default_rng(0), [f"{i}.png" for i in range(12)]
+    photos, files = tmp_path / "photos", [tmp_path / f"{cores}.h5" for cores in (1, 4)]
+    photos.mkdir()
+    for i, name in enumerate(names):
+        photo = cv2.resize(textured, (320 + 64 * (i % 5), 240 + 32 * (i % 4)))
+        noise = generator.normal(0, 20 if i % 3 == 0 else 0, photo.shape)
+        cv2.imwrite(str(photos / name), (photo + noise).clip(0, 255))
+    for cores, file in zip((1, 4), files, strict=True):
         stage = ("-m", "hloc_reduce.extract_features", "--image_dir", photos, "--conf", feature)
-        assert run(conftest.GPUS, *stage, "--export_dir", tmp_path / str(cores), cores=cores) == 0
-    assert_same(*(next((tmp_path / cores).glob("*.h5")) for cores in ("1", "3")))
+        assert run(conftest.GPUS, *stage, "--feature_path", file, cores=cores) == 0
+    assert_same(*files, names)
+    with h5py.File(files[0]) as file:
+        blurred = [file[name]["keypoints"].attrs["blur"] > 0 for name in names]
+    assert blurred == [i % 3 == 0 for i in range(12)]

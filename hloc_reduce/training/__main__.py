@@ -158,8 +158,8 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
     }
     if recipe in ("best", "tune") and descriptor in features_confs.MODELS:
         settings |= trainer.OF_NETWORKS
-    if recipe == "best":
-        settings |= trainer.OF_BASES.get(descriptor, {})
+        if recipe == "best":
+            settings |= trainer.OF_BASES.get(descriptor, {})
     if recipe == "tune":
         settings |= {"begin_with": name, "begin_with_sha256": projections.checksum(name)}
     return settings

@@ -1,5 +1,6 @@
 """Supervised reduction: pull descriptors of the same point together (Sec. III-C)."""
 
+import copy
 from pathlib import Path
 
 import torch
@@ -39,7 +40,7 @@ RECIPES: dict[str, dict] = {
     },
 }
 RECIPES["tune"] = {**RECIPES["best"], "steps": 1000, "lr": 1e-3}
-# "best" for the descriptors of networks: one layer, which begins with the principal axes
+# "best" and "tune" for the descriptors of networks: one layer
 OF_NETWORKS = {
     "hidden": [],
     "steps": 1000,
@@ -49,7 +50,7 @@ OF_NETWORKS = {
     "temperature": 0.04,
 }
 DISTANCE_WEIGHTS = {"hardnet": 3.0}  # beta
-# what "best" has for some bases in addition (docs/training.md)
+# what "best" also has for some bases (docs/training.md)
 OF_BASES: dict[str, dict] = {
     "xfeat": {"pca_share": 0.6},
     "aliked": {"ridge": 0.2, "steady_share": 0.6, "steps": 200},
@@ -66,12 +67,12 @@ def train(
         dim: number of output dimensions.
         recipe: an entry of `RECIPES` with `hidden`, the sizes of the hidden layers, and
             `distance_weight`, the weight of the distance loss. Without hidden layers, the only
-            layer begins with the principal axes. Optional: `prefixes`, the lengths of leading
-            parts of a descriptor that are trained to match, too; `begin_with`, name or path of a
-            projection to begin with; `temperature`, of the contrastive loss, which replaces the
-            triplet loss; `ridge`, with which the only layer begins with the axes of `steady`
-            instead of the principal ones; `pca_share` or, with a ridge, `steady_share`, between 0
-            and 1, of the axes that it began with in the trained layer.
+            layer begins with the principal axes or, with a `ridge`, with those of `steady`.
+            Optional: `prefixes`, the lengths of leading parts of a descriptor that are trained to
+            match, too; `begin_with`, name or path of a projection to begin with; `temperature`, of
+            the contrastive loss, which replaces the triplet loss; `pca_share` or `steady_share`,
+            between 0 and 1, the weight of those axes in the layer that is returned, the weighted
+            mean of them and the trained layer.
         seed: of the initial weights and the batches.
         checkpoint: file to resume from; the caller deletes it.
         made_from: provenance of the training; a stale checkpoint is ignored.
@@ -90,6 +91,7 @@ def train(
         mlp = _axes(maps, dim, recipe, seed)
     else:
         mlp = MLP([maps[0].descriptors.shape[-1], *recipe["hidden"], dim])
+    initial = copy.deepcopy(mlp)
     mlp.train().to(place)
 
     def loss(step: int) -> torch.Tensor:
@@ -108,8 +110,8 @@ def train(
 
     fit(mlp, loss, steps, recipe, checkpoint, made_from)
     mlp.eval().cpu()
-    share = recipe.get("steady_share" if "ridge" in recipe else "pca_share")
-    return between(mlp, _axes(maps, dim, recipe, seed), share) if share else mlp
+    share = recipe.get("pca_share") or recipe.get("steady_share")
+    return weighted_mean(mlp, initial, share) if share else mlp
 
 
 def _axes(maps: list[Tracks], dim: int, recipe: dict, seed: int) -> MLP:
@@ -119,13 +121,13 @@ def _axes(maps: list[Tracks], dim: int, recipe: dict, seed: int) -> MLP:
     return pca.train(maps, dim, recipe, seed)
 
 
-def between(trained: MLP, axes: MLP, share: float) -> MLP:
-    """Return the layer between two, each scaled to the same norm.
+def weighted_mean(trained: MLP, axes: MLP, share: float) -> MLP:
+    """Return the weighted mean of two layers, whose matrices are scaled to the same norm.
 
     Args:
         trained: a network of one layer.
         axes: another one of the same sizes.
-        share: of `axes`.
+        share: the weight of `axes`.
     """
     mlp = MLP(trained.sizes)
     for parameter in mlp.parameters():

@@ -16,7 +16,14 @@ def assert_equal(network, other):
 CLUSTERED = {**ss.RECIPES["paper"], **SMALL, "cluster_epochs": 2, "per_cluster": 8}
 
 
-@pytest.mark.parametrize(("scheme", "recipe"), [(sv, RECIPE), (ss, CLUSTERED)], ids=["sv", "ss"])
+FROM_AXES = {**RECIPE, "hidden": [], "ridge": 0.1, "steady_share": 0.6}
+
+
+@pytest.mark.parametrize(
+    ("scheme", "recipe"),
+    [(sv, RECIPE), (sv, FROM_AXES), (ss, CLUSTERED)],
+    ids=["sv", "from axes", "ss"],
+)
 def test_training_goes_on_after_a_kill(scheme, recipe, tmp_path, monkeypatch):
     if scheme is ss:
         pytest.importorskip("faiss")

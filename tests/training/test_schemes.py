@@ -29,25 +29,28 @@ def darkened_tracks(number=300):
     return data
 
 
-@pytest.mark.parametrize("share", [{"pca_share": 0.6}, {"ridge": 0.1, "steady_share": 0.6}])
-def test_a_layer_between_the_trained_one_and_the_axes(tmp_path, share):
-    """Of equal norms, one share of each."""
-    recipe = {**RECIPE, **share, "hidden": [], "steps": 20, "temperature": 0.04}
+@pytest.mark.parametrize("added", [{"pca_share": 0.6}, {"ridge": 0.1, "steady_share": 0.6}])
+def test_the_weighted_mean_of_the_trained_layer_and_its_axes(tmp_path, added):
+    recipe = {**RECIPE, **added, "hidden": [], "steps": 20, "temperature": 0.04}
     data = [darkened_tracks()]
-    mixed = sv.train(data, 3, recipe, 0, tmp_path / "c")
+    mean = sv.train(data, 3, recipe, 0, tmp_path / "c")
     for key in ("pca_share", "steady_share"):
         recipe.pop(key, None)
     trained = sv.train(data, 3, recipe, 0, tmp_path / "d")
     begun = sv.train(data, 3, {**recipe, "steps": 1, "lr": 0}, 0, tmp_path / "e")
-    axes = steady.train(data, 3, 0.1) if "ridge" in share else pca.train(data, 3, {}, 0)
-    torch.testing.assert_close(begun.linears[0].weight, axes.linears[0].weight)
-    a, b = (mlp.linears[0].weight / mlp.linears[0].weight.norm() for mlp in (trained, axes))
-    assert (a - b).norm() > 0.01
-    torch.testing.assert_close(mixed.linears[0].weight, 0.4 * a + 0.6 * b)
+    axes = steady.train(data, 3, 0.1) if "ridge" in added else pca.train(data, 3, {}, 0)
+    torch.testing.assert_close(begun.state_dict(), axes.state_dict())
+    a, b = (
+        {key: value / mlp.linears[0].weight.norm() for key, value in mlp.state_dict().items()}
+        for mlp in (trained, axes)
+    )
+    for key, value in mean.state_dict().items():
+        assert (a[key] - b[key]).norm() > 0.001
+        torch.testing.assert_close(value, 0.4 * a[key] + 0.6 * b[key])
 
 
 def test_steady_axes_leave_out_what_darkness_changes():
-    """The axes come in order, so that a nested projection is one with fewer dimensions."""
+    """They come in order: the first of them are those of fewer dimensions."""
     data = darkened_tracks()
     one, two = (steady.train([data], dim, 0.3) for dim in (1, 2))
     (weight,) = (linear.weight.detach() for linear in two.linears)
@@ -69,25 +72,27 @@ def test_maps_have_equal_weight_in_steady_axes():
     torch.testing.assert_close(once.bias, often.bias, atol=1e-3, rtol=0)
 
 
-def test_what_only_the_best_recipes_of_some_bases_have():
-    """Axes that the layer begins with, and their share of it, where they were measured."""
-    of_aliked = {"ridge": 0.2, "steady_share": 0.6}
+def test_recipes_of_the_descriptors_of_networks():
+    """Axes that the layer begins with, and their weight, for the bases that gain by them."""
+    of_aliked = {"ridge": 0.2, "steady_share": 0.6, "steps": 200}
     expected = {
-        ("sv", "best", "xfeat"): {"pca_share": 0.6},
         ("sv", "best", "aliked"): of_aliked,
         ("nested", "best", "aliked"): of_aliked,
+        ("sv", "best", "xfeat"): {"pca_share": 0.6, "steps": 1000},
     }
     others = [(scheme, "best", "aliked") for scheme in ("us", "ss")]
-    others += [("sv", recipe, "aliked") for recipe in ("paper", "tune")]
-    others += [
-        ("sv", "best", "sift"),
-        ("sv", "best", "edgepoint2_m64"),
-        ("nested", "best", "xfeat"),
-    ]
-    for recipe in [*expected, *others]:
-        found = training.complete_recipe(*recipe, f"{recipe[2]}_sv32")
-        found = {key: found[key] for key in found if key == "ridge" or key.endswith("_share")}
-        assert found == expected.get(recipe, {})
+    others += [(scheme, "tune", "aliked") for scheme in ("sv", "nested")]
+    others += [("sv", "tune", "xfeat"), ("nested", "best", "xfeat")]
+    others += [("sv", "best", "edgepoint2_m64")]
+    for scheme, recipe, base in [*expected, *others]:
+        name = f"{base}_nested" if scheme == "nested" else f"{base}_sv32"
+        found = training.complete_recipe(scheme, recipe, base, name)
+        chosen = ("ridge", "steady_share", "pca_share", "steps")
+        found = {key: found[key] for key in chosen if key in found}
+        assert found == expected.get((scheme, recipe, base), {"steps": 1000})
+    for recipe, base in [("paper", "aliked"), ("best", "sift")]:
+        found = training.complete_recipe("sv", recipe, base, f"{base}_sv32")
+        assert not {"ridge", "steady_share", "pca_share"} & found.keys()
 
 
 def test_paper_recipe_is_the_papers(tmp_path, monkeypatch):
