@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 # installed versions are those that CI tested
 PIP_FLAGS ?= --constraint constraints.txt
+# Python compiles modules when it first imports them; most of those installed it never does
+INSTALL = $(BIN)/pip install --quiet --no-compile
 BIN := $(VENV)/bin
 
 # the oldest pycolmap that works, in a folder to import from before the environment's own
@@ -49,12 +51,12 @@ test-long: $(VENV)/installed
 # torch by itself first: a pinned version is a CPU build where an index offers one
 $(VENV)/installed: pyproject.toml setup.py hloc_reduce/utils/best_two.cpp constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet $$(grep '^torch==' constraints.txt)
-	$(BIN)/pip install --quiet $(PIP_FLAGS) --editable '.[dev]'
+	$(INSTALL) $$(grep '^torch==' constraints.txt)
+	$(INSTALL) $(PIP_FLAGS) --editable '.[dev]'
 	touch $@
 
 $(OLD)/installed: $(VENV)/installed
-	$(BIN)/pip install --quiet --no-deps --upgrade --target $(OLD) pycolmap==$(OLDEST)
+	$(INSTALL) --no-deps --upgrade --target $(OLD) pycolmap==$(OLDEST)
 	touch $@
 
 lint: $(VENV)/installed

@@ -185,9 +185,9 @@ def test_quantizers_lose_less_with_more_bytes(name, size, quantizers):
     """What a code of more bytes stands for is nearer to what it codes than its signs are."""
     pytest.importorskip("faiss")
     rng = np.random.default_rng(0)
-    numbers = rng.normal(size=(4000, 32)).astype(np.float32)
+    numbers = rng.normal(size=(1500, 32)).astype(np.float32)
     numbers /= np.linalg.norm(numbers, axis=1, keepdims=True)
-    fitted, others = numbers[:3000], torch.from_numpy(numbers[3000:])
+    fitted, others = numbers[:1200], torch.from_numpy(numbers[1200:])
     code, signs = (
         quantizers["QUANTIZERS"][kind](fitted, number)
         for kind, number in ((name, size), ("signs", 4))

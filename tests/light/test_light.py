@@ -204,7 +204,7 @@ def test_features_that_need_torch(place, run, tmp_path):
         assert said in message and "needs torch. Without torch, compact maps" in message
 
 
-@pytest.mark.parametrize("feature", MINI)
+@pytest.mark.parametrize("feature", [MINI[0], pytest.param(MINI[1], marks=pytest.mark.long)])
 def test_networks_run_by_onnx_runtime(feature, place, run, tmp_path):
     """Their poses are those of torch, but for rounding; also where the sides are no multiples."""
     build, images, outputs = place
