@@ -129,10 +129,9 @@ def weighted_mean(trained: MLP, axes: MLP, share: float) -> MLP:
         axes: another one of the same sizes.
         share: the weight of `axes`.
     """
-    mlp = MLP(trained.sizes)
-    for parameter in mlp.parameters():
-        parameter.data.zero_()
-    for one, part in ((trained, 1 - share), (axes, share)):
-        for into, value in zip(mlp.parameters(), one.parameters(), strict=True):
-            into.data += part * value.detach() / next(one.parameters()).detach().norm()
-    return mlp.eval()
+    mean = copy.deepcopy(axes)
+    norm, norm_of_axes = (next(mlp.parameters()).norm() for mlp in (trained, axes))
+    parts = mean.parameters(), trained.parameters(), axes.parameters()
+    for into, one, other in zip(*parts, strict=True):
+        into.data = ((1 - share) * one / norm + share * other / norm_of_axes).detach()
+    return mean.eval()

@@ -14,8 +14,6 @@ def assert_equal(network, other):
 
 
 CLUSTERED = {**ss.RECIPES["paper"], **SMALL, "cluster_epochs": 2, "per_cluster": 8}
-
-
 FROM_AXES = {**RECIPE, "hidden": [], "ridge": 0.1, "steady_share": 0.6}
 
 
