@@ -21,7 +21,7 @@ from .localization.references import ScanMap, point_group
 from .runtime import provenance
 from .runtime.executors import SERIAL, Executor
 from .runtime.group_writer import Group, GroupWriter, failures, fill
-from .utils import cli
+from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.feature_files import get_image_size, get_keypoints
 from .utils.h5 import open_h5
@@ -142,7 +142,8 @@ def lift_keypoints(
         features: feature file.
         cutouts: names of images.
         output: h5 file, `points3D` (N, 3) float32 in the `point_group` of each cutout: metres in
-            the frame of its scan, NaN where that has no depth. Cutouts in it are skipped.
+            the frame of its scan, NaN where that has no depth, from the attribute `origin` (3,) if
+            there is one. Cutouts in it are skipped.
         overwrite: compute all points again.
         executor: does the work.
 
@@ -175,7 +176,11 @@ def _lift(
             known = np.isfinite(points[:, 0]).mean() if len(points) else 1
             if known < 0.5:
                 logger.warning("%.0f %% of the keypoints of %s have depth.", 100 * known, name)
-            yield None, (point_group(file, name), {"points3D": points.astype(np.float32)}, {})
+            frame = colmap.near_from_world(points[np.isfinite(points[:, 0])])
+            origin = frame.inverse().translation
+            arrays = {"points3D": (points - origin).astype(np.float32)}
+            attrs = {"points3D": {"origin": origin}} if origin.any() else {}
+            yield None, (point_group(file, name), arrays, attrs)
 
 
 def _main() -> None:

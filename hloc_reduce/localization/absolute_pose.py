@@ -52,7 +52,8 @@ def estimate(
     same place agree much more often. The pose with the highest confidence among all matches wins.
     If it is trusted although its intrinsics were guessed, and the lens of the map's photos fits as
     well, it is estimated with that. If its photo seems to be cropped or stretched, and that lens
-    fits about as well with another pose, it is not trusted.
+    fits about as well with another pose, it is not trusted. All poses are estimated and compared
+    in a frame near the points.
 
     Args:
         points2D: (M, 2) image points of all matches, COLMAP's pixels.
@@ -66,7 +67,8 @@ def estimate(
         thorough: try the matches of single images, too.
         workers: threads that estimate poses; the result does not depend on their number.
     """
-    matches = Matches(points2D, points3D, camera, config)
+    near_from_world = colmap.near_from_world(points3D)
+    matches = Matches(points2D, colmap.transformed(near_from_world, points3D), camera, config)
     number = len(matches)
     with ThreadPoolExecutor(workers) as pool:
         poses = [_estimate(matches, np.arange(number))]
@@ -79,7 +81,11 @@ def estimate(
         poses += rivals.result() if rivals and best is first else _rivals(matches, best)
     best = replace(best, agreement=agreement(best.inliers, images))
     best = replace(best, refusal=refusal(matches, best, poses, gate, doubt))
-    return _with_typical_lens(matches, best, images, poses, gate) or best
+    best = _with_typical_lens(matches, best, images, poses, gate) or best
+    if best.cam_from_world is None:
+        return best
+    world_from_near = near_from_world.inverse()
+    return replace(best, cam_from_world=world_from_near.transform_camera_world(best.cam_from_world))
 
 
 def _with_typical_lens(

@@ -130,8 +130,8 @@ class ScanMap:
                 f"{self.file.filename} has no points of the present keypoints of {name} in "
                 f"{self.features.filename}: localize again."
             )
-        points = get_dataset(self.file, group, "points3D")[()].astype(np.float64)
-        pose = self.poses[name]
+        stored, pose = get_dataset(self.file, group, "points3D"), self.poses[name]
+        points = stored[()].astype(np.float64) + stored.attrs.get("origin", 0.0)
         return points @ pose[:3, :3].T + pose[:3, 3]
 
     def __contains__(self, name: str) -> bool:

@@ -57,7 +57,8 @@ def with_one_camera(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 
 def adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool = False) -> float:
     """Adjust a model, in place, and return its mean reprojection error in pixels."""
-    _adjuster(sfm, refine_principal_point).solve()
+    with colmap.near_origin(sfm):
+        _adjuster(sfm, refine_principal_point).solve()
     sfm.update_point_3d_errors()
     return sfm.compute_mean_reprojection_error()
 
@@ -78,7 +79,8 @@ def focal_length_deviations(sfm: pycolmap.Reconstruction) -> dict[int, float]:
     squares = np.concatenate([_errors(sfm, image) for image in images]) ** 2
     squares = squares[np.isfinite(squares)]  # not those of points behind a camera
     redundancy = 2 * len(squares) - 3 * sfm.num_points3D() - POSE * len(images)
-    covariance = colmap.covariance(sfm, _adjuster(sfm, known={*sfm.cameras} - {*cameras}))
+    with colmap.near_origin(sfm):
+        covariance = colmap.covariance(sfm, _adjuster(sfm, known={*sfm.cameras} - {*cameras}))
     if covariance is None or redundancy <= 0:
         return dict.fromkeys(cameras, np.inf)
     found = {}

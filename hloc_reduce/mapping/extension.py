@@ -1,7 +1,7 @@
 """Add images with poses to a COLMAP model: extend its points and triangulate new ones."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -56,6 +56,25 @@ def extend(
             contradict the poses are not used.
         refine_map: adjust the poses of all images, but those that are given, and all points.
     """
+    with colmap.near_origin(model) as near_from_world:
+        near = {
+            name: replace(
+                image, cam_from_world=near_from_world.transform_camera_world(image.cam_from_world)
+            )
+            for name, image in placed.items()
+        }
+        _extend(model, near, keypoints, uncertainty, matches, refine_map)
+
+
+def _extend(
+    model: pycolmap.Reconstruction,
+    placed: Mapping[str, Placed],
+    keypoints: Mapping[str, np.ndarray],
+    uncertainty: Mapping[str, float],
+    matches: Mapping[Pair, np.ndarray],
+    refine_map: bool,
+) -> None:
+    """Add images to a model near the origin, see `extend`."""
     # the larger one: points must not lose their observations in the larger photos
     pixel_scale = max(
         median_photo_scale(image.camera for image in model.images.values()),

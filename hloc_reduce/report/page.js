@@ -72,7 +72,7 @@
     const poses = scene.queries.map((query) => query.pose).filter(Boolean).concat(scene.map);
     const back = poses.reduce((sum, pose) => add(sum, pose.slice(9, 12), -1), [0, 0, 0]);
     const azimuth = Math.atan2(dot(back, north), dot(back, east)) + 0.35;
-    Object.assign(view, { azimuth, elevation: 0.4, distance: 1.5 * scene.radius, target: scene.centre });
+    Object.assign(view, { azimuth, elevation: 0.4, distance: 1.5 * scene.radius, target: [0, 0, 0] });
     redraw();
   }
 

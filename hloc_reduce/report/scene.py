@@ -1,6 +1,7 @@
 """The 3D view of a report: points, map cameras and query cameras."""
 
 import base64
+from collections.abc import Sequence
 
 import numpy as np
 import pycolmap
@@ -24,10 +25,10 @@ def scenes(run: Run) -> dict[str, dict]:
     """Return the 3D view of a run by label, or of each floor, as the scans of each have a frame.
 
     Returns:
-        For each view: `points` (N, 3) float32 in metres and `colours` (N, 3) uint8, in base64;
-        `map`, cameras or scans as (centre, right, down, forward) (12,); `queries`, dicts of `name`,
-        `status`, and the cameras `pose` and `truth` or None; `up`, the vertical; and `centre` and
-        `radius` of what to look at.
+        For each view, with the middle of what to look at as its origin: `points` (N, 3) float32 in
+        metres and `colours` (N, 3) uint8, in base64; `map`, cameras or scans as (centre, right,
+        down, forward) (12,); `queries`, dicts of `name`, `status`, and the cameras `pose` and
+        `truth` or None; `up`, the vertical; and the `radius` of what to look at.
 
     Raises:
         InputError: when the files of the map are missing or broken.
@@ -72,13 +73,21 @@ def _scene(run: Run, cameras: dict[str, list[float]], records: dict[str, dict]) 
     centre = np.mean([np.median(part, axis=0) for part in groups], axis=0)
     radius = max(np.quantile(np.linalg.norm(part - centre, axis=1), 0.9) for part in groups)
     up = -looks[:, 6:9].mean(axis=0)
+
+    def near(camera: Sequence[float] | None) -> list[float] | None:
+        if camera is None:
+            return None
+        return np.round([*(camera[:3] - centre), *camera[3:]], 5).tolist()
+
+    for query in queries:
+        query |= {"pose": near(query["pose"]), "truth": near(query["truth"])}
     return {
-        "points": _packed(points, np.float32),
+        # numbers that the page keeps as float32 would be metres off in UTM
+        "points": _packed(points - centre, np.float32),
         "colours": _packed(colours, np.uint8),
-        "map": np.round(shown, 5).tolist(),
+        "map": [near(camera) for camera in shown],
         "queries": queries,
         "up": (up / (np.linalg.norm(up) or 1)).tolist(),
-        "centre": centre.tolist(),
         "radius": float(radius) or 1.0,
     }
 
@@ -91,8 +100,7 @@ def _packed(array: np.ndarray, kind: type) -> str:
 def _axes(pose: pycolmap.Rigid3d) -> list[float]:
     """Return (centre, right, down, forward) of a camera in the world (12,)."""
     rotation = pose.rotation.matrix()
-    values = [*(-rotation.T @ pose.translation), *rotation.ravel()]
-    return [round(float(value), 5) for value in values]
+    return [*(-rotation.T @ pose.translation).tolist(), *rotation.ravel().tolist()]
 
 
 def _points(run: Run, names: list[str]) -> tuple[np.ndarray, np.ndarray]:

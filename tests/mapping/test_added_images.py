@@ -76,6 +76,20 @@ def test_points_are_extended_and_others_triangulated(scene, model):
     assert extension.count_shared(model, NEW) == dict.fromkeys(NEW, len(scene.points))
 
 
+@pytest.mark.fault(1)
+def test_far_from_the_origin(scene, model):
+    """In UTM coordinates, images find the poses that they are moved away from."""
+    utm = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([448251.0, 5411932.0, 312.0]))
+    model.transform(utm)
+    scene.poses = {name: utm.transform_camera_world(pose) for name, pose in scene.poses.items()}
+    extend(scene, model, NEW, move=0.003)
+    for name in NEW:
+        pose = model.find_image_with_name(name).cam_from_world()
+        moved = pose * scene.poses[name].inverse()
+        assert np.linalg.norm(moved.translation) < 1e-4
+    assert model.num_points3D() == len(scene.points)
+
+
 @pytest.mark.parametrize("large", [OLD, NEW])
 def test_photos_of_12_megapixels_keep_their_points_beside_small_ones(scene, model, large):
     """A noise of 2.5 of their 4,000 pixels is one of 1,600, in which keypoints are found."""

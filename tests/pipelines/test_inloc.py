@@ -9,10 +9,13 @@ import numpy as np
 import pycolmap
 import pytest
 from conftest import SHARED, scan_frame
+from scipy.io import loadmat, savemat
 
 from hloc_reduce import localize_inloc
 from hloc_reduce.datasets import scans
 from hloc_reduce.datasets.inloc import InLoc
+from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.utils.parsers import parse_poses
 from pipelines import inloc
 
 PIPELINE = inloc
@@ -101,6 +104,32 @@ def test_points_are_those_of_the_plane(inloc_layout, tmp_path, run):
             pixels = camera.img_from_cam(xyz @ pose.rotation.matrix().T + pose.translation)
             inside = keypoints[:, 0] > 40
             np.testing.assert_allclose(pixels[inside], keypoints[inside] + 0.5, atol=0.02)
+
+
+@pytest.mark.fault(1)
+def test_a_place_far_from_the_origin(inloc_layout, tmp_path, run):
+    """Scans and floors in UTM coordinates give the poses of those near the origin."""
+    utm = np.array([448251.0, 5411932.0, 312.0])
+    arguments = ("--dataset", inloc_layout, "--feature", "sift_sv32", "--outputs")
+    run(*arguments, tmp_path / "near")
+    for path in inloc_layout.rglob("*.mat"):
+        scan = loadmat(path)["XYZcut"]
+        savemat(path, {"XYZcut": scan + utm})
+    for path in inloc_layout.rglob("*_trans_*.txt"):
+        pose = scans.read_transformation(path)
+        pose[:3, 3] += utm - pose[:3, :3] @ utm
+        rows = [" ".join(map(repr, row)) for row in pose.tolist()]
+        path.write_text("\n".join(["", *["9 9 9 9"] * 4, "", "", *rows, ""]))
+    run(*arguments, tmp_path / "far")
+    near, far = (
+        parse_poses(tmp_path / name / outcome(tmp_path / name)[0]["poses"])
+        for name in ("near", "far")
+    )
+    assert {*near} == {*far} == {"a.JPG", "b.JPG"}
+    moved = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), utm)
+    for name, pose in near.items():
+        position, rotation = pose_error(far[name], moved.transform_camera_world(pose))
+        assert position < 0.001 and rotation < 0.01
 
 
 def test_retrieval_by_hlocs_pairs(inloc_layout, tmp_path, run):

@@ -35,6 +35,7 @@ from .models import (
     visibility,
     write_part,
 )
+from .origin import near_from_world, near_origin, transformed
 from .sift import check_dog_options, detect_dog
 from .stored import SIFT, StoredDatabase, open_stored, shapes
 

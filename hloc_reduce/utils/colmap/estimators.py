@@ -12,6 +12,7 @@ import pycolmap
 from ..interrupts import interruptible
 from ..parsers import parse_pairs, write_pairs
 from .databases import full_disk, open_database, parse_options
+from .origin import near_origin
 
 REPROJECTION_LIMITS = (  # options that are the largest reprojection errors of points, in pixels
     ("mapper", "filter_max_reproj_error"),
@@ -92,16 +93,20 @@ def triangulate_points(
     options: pycolmap.IncrementalPipelineOptions,
     verbose: bool,
 ) -> pycolmap.Reconstruction:
-    """Triangulate the verified matches of a database into `output` with fixed poses.
+    """Triangulate the verified matches of a database with the poses of a model.
 
-    Without any match the model is empty; COLMAP 3.13 would raise a ValueError.
+    The points are added to the model, which is written to `output` and returned. Without any match
+    the model is empty; COLMAP 3.13 would raise a ValueError.
     """
     with open_database(database) as opened:
         if opened.num_inlier_matches() == 0:
             return pycolmap.Reconstruction()
     with _log(verbose), full_disk(output):
-        inputs = reference, database, image_dir, output
-        return interruptible(pycolmap.triangulate_points, *inputs, options=options)
+        with near_origin(reference):
+            inputs = reference, database, image_dir, output
+            interruptible(pycolmap.triangulate_points, *inputs, options=options)
+        reference.write_binary(output)
+    return reference
 
 
 def incremental_mapping(
