@@ -48,7 +48,7 @@ from hloc_reduce.utils.feature_files import (
     get_image_size,
 )
 from hloc_reduce.utils.files import replacing, write_csv
-from hloc_reduce.utils.h5 import open_h5
+from hloc_reduce.utils.h5 import open_file, open_h5
 from hloc_reduce.utils.images import read_image
 
 MAP_FEATURES = {"colmap_sift": "colmap_sift_sv64"}  # of a base; default: the base itself
@@ -151,7 +151,7 @@ def _of_scans(place: InLoc, output: Path, base: str) -> Place:
     queries = [(name, camera, truth[name]) for name, camera in place.queries(features)]
     points = localize_inloc.lift_keypoints(place.root, features, names, output / "points3D.h5")
     poses = {name: scans.read_pose(place.root, name) for name in names}
-    reference = ScanMap(h5py.File(points), h5py.File(features), poses)
+    reference = ScanMap(open_file(points), open_file(features), poses)
     extent = float(np.linalg.norm(np.std([pose[:3, 3] for pose in poses.values()], axis=0)))
     with open_h5(features) as file:
         cameras = intrinsics.MapCameras({}, {get_image_size(file, name) for name in names})

@@ -6,7 +6,6 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pycolmap
 
@@ -24,7 +23,7 @@ from .runtime.group_writer import Group, GroupWriter, failures, fill
 from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.feature_files import get_image_size, get_keypoints
-from .utils.h5 import open_h5
+from .utils.h5 import open_file, open_h5
 from .utils.parsers import parse_retrieval
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
@@ -113,7 +112,7 @@ def main(
 
 
 def _load(points: Path, features: Path, poses: Mapping[str, np.ndarray]) -> ScanMap:
-    return ScanMap(h5py.File(points), h5py.File(features), poses)
+    return ScanMap(open_file(points), open_file(features), poses)
 
 
 def _config(ransac_thresh: float, _: str, camera: pycolmap.Camera) -> dict:

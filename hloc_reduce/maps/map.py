@@ -22,7 +22,7 @@ from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import CODED, QUANTIZED, STORAGES
 from ..utils.feature_files import Levels, first_descriptors
 from ..utils.files import replacing
-from ..utils.h5 import file_provenance, get_dataset, list_h5_names, open_h5
+from ..utils.h5 import Unavailable, file_provenance, get_dataset, list_h5_names, open_h5
 from ..utils.paths import strings_as_paths
 from . import contradictions, cropping, mirrored_photos, misfits, precision
 
@@ -150,6 +150,8 @@ class Map:
             read_vocabulary(self.vocabulary)
             if projection:
                 projections.load(projection)
+        except Unavailable:
+            raise
         except InputError as error:
             raise InputError(
                 f"The map {self.folder} is broken: {str(error).rstrip('.')}. Copy it again, or "

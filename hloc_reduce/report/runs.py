@@ -7,7 +7,6 @@ from collections import Counter
 from functools import cached_property
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pycolmap
 
@@ -23,7 +22,7 @@ from ..utils import cli, colmap
 from ..utils.cli import InputError, no_folder
 from ..utils.codes import FLOATS
 from ..utils.files import MEGABYTE
-from ..utils.h5 import open_h5
+from ..utils.h5 import open_file
 from ..utils.parsers import parse_poses, parse_retrieval
 
 COUNTS = ("num_matches", "num_correspondences", "num_inliers")
@@ -128,8 +127,7 @@ class Run:
         points, features = self.files["map"], self.files["map_features"]
         if points.is_dir():
             return SfmMap(colmap.read_model(points))
-        with open_h5(points), open_h5(features):  # which raise an InputError for a broken file
-            files = h5py.File(points), h5py.File(features)
+        files = open_file(points), open_file(features)
         names = sorted({name for names in self.retrieved.values() for name in names})
         poses = {name: scans.read_pose(self.files["map_images"], name) for name in names}
         return ScanMap(*files, poses)

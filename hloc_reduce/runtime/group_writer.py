@@ -16,7 +16,7 @@ import numpy as np
 
 from ..utils.cli import InputError, check_file, make_folder
 from ..utils.files import announce, replacing
-from ..utils.h5 import get_text, iterate_h5_names, open_h5, reading, set_text, write_h5
+from ..utils.h5 import Unavailable, get_text, iterate_h5_names, open_h5, reading, set_text, write_h5
 from . import trace
 from .executors import Executor, Item, Results
 
@@ -156,6 +156,8 @@ def resume_or_replace(path: Path, made_from: dict, overwrite: bool = False) -> G
     """Return a writer that resumes an intermediate file, or replaces it if it is stale."""
     try:
         return GroupWriter(path, made_from, overwrite)
+    except Unavailable:
+        raise
     except InputError:  # stale, or broken
         return GroupWriter(path, made_from, overwrite=True)
 

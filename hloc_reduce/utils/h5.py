@@ -13,22 +13,51 @@ import numpy as np
 
 from .cli import InputError
 from .interrupts import uninterrupted
+from .locks import has_locks
 
 MOST_COMPRESSED = 2000  # times its size: more than gzip can compress into a file
 
 
+class Unavailable(InputError):
+    """An h5 file cannot be opened now, but may be whole: nothing should replace it."""
+
+
 @contextmanager
 def open_h5(path: Path) -> Iterator[h5py.File]:
-    """Open an h5 file for reading; raise an InputError if it is missing or broken."""
+    """Open an h5 file for reading during a block, see `open_file`."""
+    with open_file(path) as file, reading(path):
+        yield file
+
+
+def open_file(path: Path) -> h5py.File:
+    """Open an h5 file for reading, without locks where the file system has none.
+
+    Raises:
+        Unavailable: when another program writes to the file, or it must not be read.
+        InputError: when it is missing or broken.
+    """
     try:
-        file = h5py.File(path, "r", libver="latest")
+        locking = None if has_locks(path) else False
+        return h5py.File(path, "r", libver="latest", locking=locking)
+    except FileNotFoundError as error:
+        raise InputError(f"Cannot open {path}: it does not exist.") from error
+    except BlockingIOError as error:
+        raise Unavailable(
+            f"{path} is open for writing in another program: wait until that has closed it."
+        ) from error
+    except OSError as error:
+        if error.errno is not None:
+            raise Unavailable(f"Cannot open {path}: {os.strerror(error.errno)}.") from error
+        if "already open for write" in str(error):  # by a mark in the file
+            raise Unavailable(
+                f"{path} is open for writing in another program, or that was killed: wait until it "
+                f"has closed the file. If it was killed, mend the file: h5clear -s {path}"
+            ) from error
+        raise InputError(f"Cannot open {path}: not a whole h5 file.") from error
     except Exception as error:
         if not _is_of_h5py(error):
             raise
-        reason = "not a whole h5 file" if path.exists() else "it does not exist"
-        raise InputError(f"Cannot open {path}: {reason}.") from error
-    with file, reading(path):
-        yield file
+        raise InputError(f"Cannot open {path}: not a whole h5 file.") from error
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """A map on disk: built once, kept, moved, stale, broken."""
 
+import fcntl
 import json
 import os
 import shutil
@@ -207,6 +208,21 @@ def test_a_map_with_a_broken_file_is_refused_before_any_work(place, tmp_path, ru
         assert not (tmp_path / "x").exists()
         file.write_bytes(content)
     run(*given)
+
+
+@pytest.mark.fault(4)
+def test_a_map_in_use_is_not_broken(place, run, refused):
+    """Whoever builds it again loses a good map."""
+    build, images, outputs = place
+    run(*build)
+    (path,) = outputs.glob("map/feats-*64.h5")
+    with path.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # as a program does that writes to it
+        opened = "--map", outputs / "map", "--query_images", images / "query/day"
+        for given in (build, (*opened, "--outputs", outputs / "new")):
+            message = refused(*given)
+            assert message.startswith(f"{path} is open for writing in another program: wait")
+            assert "overwrite" not in message and "broken" not in message
 
 
 def test_a_build_that_was_stopped_goes_on(place, run, refused):

@@ -1,6 +1,7 @@
 """COLMAP databases: images and their cameras, keypoints and matches."""
 
 import errno
+import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ import numpy as np
 import pycolmap
 
 from ..cli import InputError, Parser, choose, some
+from ..locks import has_locks
 
 Options = TypeVar("Options")
 
@@ -21,8 +23,25 @@ FULL = 2**16  # free bytes, below which COLMAP cannot even open a database
 @contextmanager
 def open_database(database: Path) -> Iterator[pycolmap.Database]:
     """Open a COLMAP database, without a transaction: on a full disk it would abort the process."""
-    with full_disk(database), pycolmap.Database.open(database) as opened:
+    with full_disk(database), _open(database) as opened:
         yield opened
+
+
+def _open(database: Path) -> pycolmap.Database:
+    """Open a COLMAP database.
+
+    Raises:
+        InputError: when its file system has no locks, without which SQLite does not write.
+    """
+    try:
+        return pycolmap.Database.open(database)
+    except RuntimeError:
+        if database.exists() and not has_locks(database, fcntl.lockf):
+            raise InputError(
+                f"The file system of {database} has no locks, which COLMAP's databases need: "
+                "choose a folder on a local disk."
+            ) from None
+        raise
 
 
 @contextmanager

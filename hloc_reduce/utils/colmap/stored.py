@@ -4,6 +4,7 @@ Of all versions of COLMAP from 3.0 on: only tables and columns are read that all
 the type of descriptors where there is one.
 """
 
+import fcntl
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..cli import InputError
+from ..locks import has_locks
 
 MAGIC = b"SQLite format 3\0"
 WAL = 2  # the value of the bytes 18 and 19 of a file that has a write-ahead log beside it
@@ -135,7 +137,10 @@ def open_stored(path: Path) -> Iterator[StoredDatabase]:
     # without a log nobody is writing, and an immutable file needs no locks, for which SQLite would
     # create files beside one that may have a log
     alone = WAL in header[18:20] and not log_of(path).exists()
-    uri = f"{path.resolve().as_uri()}?{'immutable=1' if alone else 'mode=ro'}"
+    mode = "immutable=1" if alone else "mode=ro"
+    if not has_locks(path, fcntl.lockf):
+        mode += "&nolock=1"
+    uri = f"{path.resolve().as_uri()}?{mode}"
     with _reading(path), closing(sqlite3.connect(uri, uri=True, timeout=PATIENCE)) as connection:
         yield StoredDatabase(path, connection)
 
