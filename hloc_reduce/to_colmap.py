@@ -1,11 +1,11 @@
 """Write features and matches into a new COLMAP database.
 
-For `colmap mapper`, GLOMAP and `colmap gui`. The database has keypoints, matches and verified
-matches, but no descriptors: nothing needs to be matched again.
+For `colmap mapper` of COLMAP 3.8 and later, GLOMAP and `colmap gui`. The database has keypoints,
+matches and verified matches, but no descriptors: nothing needs to be matched again.
 """
 
-import tempfile
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pycolmap
 
@@ -56,13 +56,19 @@ def main(
     pairs = list_pairs(matches, names)
     if not pairs:
         raise InputError(f"{matches} has no pair of images of {features}.")
-    with tempfile.TemporaryDirectory() as folder, replacing(database) as temporary:
-        listed = Path(folder) / "pairs.txt"
+    with (
+        replacing(database) as temporary,
+        TemporaryDirectory(".tmp", ".", database.parent) as folder,
+    ):
+        listed, of_pycolmap = Path(folder, "pairs.txt"), Path(folder, "colmap.db")
         write_pairs(pairs, listed)
         keypoints, _, found = read_matches(names, listed, features, matches, None)
         arguments = image_dir, keypoints, found, listed, camera_mode
-        databases.write(temporary, *arguments, verbose=verbose)
-        verified = colmap.count_verified(temporary)
+        databases.write(of_pycolmap, *arguments, verbose=verbose)
+        verified = colmap.count_verified(of_pycolmap)
+        colmap.write_for_all(of_pycolmap, temporary)
+        for left in ("-wal", "-shm", "-journal"):  # of the old database: they would change the new
+            database.with_name(f"{database.name}{left}").unlink(missing_ok=True)
     logger.info(
         "%d images, %d of %d pairs with verified matches: %s",
         *(len(names), len(verified), len(found), database),

@@ -23,6 +23,7 @@ from .estimators import (
     triangulate_points,
     verify_matches,
 )
+from .exchange import write_for_all
 from .models import (
     PARTS,
     add_image,

@@ -4,6 +4,7 @@ import errno
 import fcntl
 import os
 import shutil
+import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -46,7 +47,7 @@ def _open(database: Path) -> pycolmap.Database:
 
 @contextmanager
 def full_disk(path: Path) -> Iterator[None]:
-    """Raise an OSError if the disk gets full in a block that writes `path`; COLMAP does not."""
+    """Raise an OSError if the disk gets full in a block that writes `path`."""
 
     def check() -> None:
         if shutil.disk_usage(path.parent).free < FULL:
@@ -54,7 +55,7 @@ def full_disk(path: Path) -> Iterator[None]:
 
     try:
         yield
-    except RuntimeError:
+    except (RuntimeError, sqlite3.Error):
         check()
         raise
     check()
