@@ -21,7 +21,7 @@ from .utils import cli
 from .utils.cli import InputError
 from .utils.codes import FLOATS, STORAGES, store
 from .utils.files import file_sha256
-from .utils.images import UnreadableImage, list_images
+from .utils.images import UnreadableImage, check_readable, list_images, with_reasons
 from .utils.parsers import image_names
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
@@ -109,7 +109,7 @@ def extract_several(
             rounding them would save little.
 
     Raises:
-        UnreadableImage: if `strict`.
+        UnreadableImage: if `strict`; it names all images that cannot be read.
     """
     confs = {path: conf for path, (conf, _) in features.items()}
     writers = {path: writer for path, (_, writer) in features.items()}
@@ -118,9 +118,13 @@ def extract_several(
     if todo:
         extract = partial(_extract, confs, image_dir, strict, frozenset(queries))
         groups = sum(len(paths) for _, paths in todo)
-        with closing(fill(writers, extract, todo, executor, CHUNK, gpu=True)) as written:
-            for _ in progress(written, "Extracting features", "image", groups):
-                pass
+        try:
+            with closing(fill(writers, extract, todo, executor, CHUNK, gpu=True)) as written:
+                for _ in progress(written, "Extracting features", "image", groups):
+                    pass
+        except UnreadableImage:
+            check_readable(image_dir, [name for name, _ in todo])
+            raise
     for path in writers:
         logger.info("Features of %d images are in %s.", len(names), path)
 
@@ -321,13 +325,6 @@ def _without(left_out: list[str], names: list[str], accept_partial: bool, reason
     logger.warning("The map is without %d images: %s.", len(left_out), cli.some(left_out))
     dropped = set(left_out)
     return [name for name in names if name not in dropped]
-
-
-def with_reasons(failed: Mapping[str, str]) -> str:
-    """Name the first few images that could not be read, and why."""
-    return cli.some(
-        f"{name} ({reason.rpartition(': ')[2].rstrip('.')})" for name, reason in failed.items()
-    )
 
 
 def _main() -> None:

@@ -8,7 +8,7 @@ from typing import Self
 
 import pycolmap
 
-from hloc_reduce import extract_features, logger, match_features
+from hloc_reduce import logger, match_features
 from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.evaluation.summaries import (
     bytes_per_keypoint,
@@ -23,7 +23,7 @@ from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.runtime.versions import versions
 from hloc_reduce.utils.files import write_csv
-from hloc_reduce.utils.images import list_images
+from hloc_reduce.utils.images import list_images, with_reasons
 from hloc_reduce.utils.match_files import check_distinct
 from hloc_reduce.utils.parsers import parse_pairs
 
@@ -145,7 +145,7 @@ class Run:
             logger.warning(
                 "%d of %d queries are unreadable and not localized: %s. Run the same command again "
                 "to retry them.",
-                *(len(failed), len(rows), extract_features.with_reasons(failed)),
+                *(len(failed), len(rows), with_reasons(failed)),
             )
         write_csv(rows, outputs / "queries.csv")
         summary = {

@@ -16,6 +16,7 @@ import pycolmap
 
 from ..localization.intrinsics import to_list
 from ..utils.cli import InputError
+from ..utils.images import refusal
 from ..utils.parsers import parse_camera
 
 if TYPE_CHECKING:
@@ -148,7 +149,9 @@ def answer(
     except Image.DecompressionBombError:
         width = height = MAX_PIXELS
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
-        raise Refused(400, "the body is not a JPEG or PNG file") from None
+        reason = refusal(photo[:32])
+        said = f"cannot be read: {reason}" if reason else "is not a JPEG or PNG file"
+        raise Refused(400, f"the body {said}") from None
     if width * height > MAX_PIXELS:
         raise Refused(413, f"a photo has at most {MAX_PIXELS:,} pixels")
     # a file, as its EXIF data tell the intrinsics

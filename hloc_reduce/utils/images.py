@@ -1,6 +1,6 @@
 """Images: their names and their pixels."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -12,14 +12,26 @@ from .parsers import check_names, image_names
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 # photos and videos of other types, which are named and ignored
-_OTHERS = (
-    "arw avif bmp cr2 cr3 dng gif heic heif jp2 nef orf ppm raf rw2 tif tiff webp "
-    "3gp avi m4v mkv mov mp4 mpeg mpg mts webm wmv"
+_PHOTOS = "arw avif bmp cr2 cr3 dng gif heic heif jp2 jxl nef orf ppm raf rw2 tif tiff webp"
+_VIDEOS = "3gp avi m4v mkv mov mp4 mpeg mpg mts webm wmv"
+CONVERTIBLE = {f".{name}" for name in _PHOTOS.split()}
+OTHER_SUFFIXES = CONVERTIBLE | {f".{name}" for name in _VIDEOS.split()}
+CONVERT = "Convert photos and keep their EXIF data, for example with: magick mogrify -format jpg"
+# Formats by bytes of a file and where they are. No file of these is read, whatever its name is:
+# COLMAP and OpenCV read some of them, in some versions. ImageMagick converts all but videos.
+_VIDEO = "a video"
+_FORMATS = (
+    (0, b"GIF8", "GIF"),
+    (8, b"WEBP", "WebP"),
+    (4, b"ftypavi", "AVIF"),
+    *((4, b"ftyp" + brand, "HEIC") for brand in (b"he", b"mif", b"msf")),
+    (4, b"ftypcrx ", "CR3"),
+    (4, b"ftyp", _VIDEO),
+    *((at, found, "JPEG 2000") for at, found in ((4, b"jP  \r\n"), (0, b"\xff\x4f\xff\x51"))),
+    *((at, found, "JPEG XL") for at, found in ((4, b"JXL \r\n"), (0, b"\xff\x0a"))),
 )
-OTHER_SUFFIXES = {f".{name}" for name in _OTHERS.split()}
-CONVERT = (
-    "Convert HEIC photos and keep their EXIF data, for example with: magick mogrify -format jpg"
-)
+NO_IMAGE = "it is not an image, or it is truncated"
+_PNG, _TIFF = b"\x89PNG\r\n\x1a\n", (b"II*\0", b"MM\0*")
 
 
 def list_images(
@@ -44,8 +56,8 @@ def list_images(
         others = [str(file) for file in files if file.suffix.lower() in OTHER_SUFFIXES]
         read = ", ".join(sorted(IMAGE_SUFFIXES))
         suffixes = sorted({Path(other).suffix for other in others})
-        of_phones = [f"*{one}" for one in suffixes if one.lower() in (".heic", ".heif")]
-        hint = f" {CONVERT} {' '.join(of_phones)}" if of_phones else ""
+        photos = [f"*{one}" for one in suffixes if one.lower() in CONVERTIBLE]
+        hint = f" {CONVERT} {' '.join(photos)}" if photos else ""
         if not names:
             there_are = f" It has {some(others)}, but only {read} are read." if others else ""
             raise InputError(f"There is no image in {within}.{there_are}{hint}")
@@ -140,21 +152,121 @@ class UnreadableImage(InputError):
     """An image file is missing or cannot be read."""
 
 
+def refusal(head: bytes, suffix: str = ".jpg") -> str | None:
+    """Return why an image file is not read, if its first bytes tell.
+
+    Args:
+        head: the first 32 bytes of the file, or more.
+        suffix: of its name, which stays when the file is converted.
+    """
+    if not head:
+        return "it is empty"
+    for start, found, name in _FORMATS:
+        if head.startswith(found, start):
+            if name == _VIDEO:
+                return "it is a video, not JPEG or PNG"
+            kept = suffix.lower() if suffix.lower() in IMAGE_SUFFIXES else ".jpg"
+            how = f"`magick mogrify -format {kept[1:]}` converts it"
+            return f"it is {name}, not JPEG or PNG; {how}"
+    return None
+
+
+def unreadable(path: Path, reason: str) -> UnreadableImage:
+    """Return the error for an image file that cannot be read."""
+    return UnreadableImage(f"Cannot read image {path}: {reason}.")
+
+
+def with_reasons(failed: Mapping[str, str]) -> str:
+    """Name the first few images that could not be read, and why.
+
+    Args:
+        failed: messages of UnreadableImage by image name.
+    """
+    by_reason: dict[str, list[str]] = {}
+    for name, message in failed.items():
+        by_reason.setdefault(message.rpartition(": ")[2].rstrip("."), []).append(name)
+    return "; ".join(f"{some(names)} ({reason})" for reason, names in by_reason.items())
+
+
+def check_format(path: Path) -> None:
+    """Raise an UnreadableImage if a file is missing, or of a format that is not read."""
+    try:
+        with path.open("rb") as file:
+            reason = refusal(file.read(32), path.suffix)
+    except OSError as error:
+        reason = str(error.strerror)
+    if reason:
+        raise unreadable(path, reason)
+
+
 def read_image(path: Path, grayscale: bool = False) -> np.ndarray:
     """Read an image as uint8, (H, W) or (H, W, 3) RGB, without applying EXIF's rotation.
 
+    Values of 10, 12 or 14 bits that are stored in 16 are scaled by their own range.
+
     Raises:
-        UnreadableImage: when OpenCV cannot read the file.
+        UnreadableImage: when OpenCV cannot read the file, or it is of a format that others that
+            read photos do not know.
     """
     mode = cv2.IMREAD_GRAYSCALE if grayscale else cv2.IMREAD_COLOR
+    mode |= cv2.IMREAD_IGNORE_ORIENTATION
+    image = None
     try:
         data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
-        reason = "it is not an image, or it is truncated" if data.size else "it is empty"
+        if (reason := refusal(data[:32].tobytes(), Path(path).suffix)) is None:
+            reason, image = NO_IMAGE, _decode(data, mode)
     except OSError as error:
-        image, reason = None, str(error.strerror)
+        reason = str(error.strerror)
     except cv2.error as error:
-        image, reason = None, f"OpenCV requires {error.err}"
+        reason = f"OpenCV requires {error.err}"
     if image is None:
-        raise UnreadableImage(f"Cannot read image {path}: {reason}.")
+        raise unreadable(path, reason)
     return image if grayscale else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _decode(data: np.ndarray, mode: int) -> np.ndarray | None:
+    """Return the pixels of a file's content (N,) uint8 as uint8, or None."""
+    head = data[:32].tobytes()
+    if head.startswith(_TIFF) or head.startswith(_PNG) and head[24:25] == b"\x10":
+        deep = cv2.imdecode(data, mode | cv2.IMREAD_ANYDEPTH)
+        if deep is not None and deep.dtype == np.uint16 and (bits := _bits(data, deep)) < 16:
+            return cv2.convertScaleAbs(deep, alpha=255 / (2**bits - 1))
+    return cv2.imdecode(data, mode)
+
+
+def _bits(data: np.ndarray, pixels: np.ndarray) -> int:
+    """Return of how many bits the values of 16-bit pixels are.
+
+    The chunk sBIT of a PNG may say it. Its values should fill all 16 bits even so, but those of
+    many cameras do not.
+    """
+    largest = int(pixels.max())
+    header = data[: 2**16].tobytes().partition(b"IDAT")[0]
+    _, found, rest = header.partition(b"sBIT")
+    declared = rest[0] if found and rest else 0
+    usual = (declared, 8, 10, 12, 14)
+    return next((bits for bits in usual if bits >= 8 and largest < 2**bits), 16)
+
+
+def check_readable(
+    image_dir: Path, names: Iterable[str], read: Callable[[Path], object] = read_image
+) -> None:
+    """Raise an UnreadableImage that names all images of a folder that cannot be read, and why.
+
+    Args:
+        image_dir: the folder.
+        names: of the images.
+        read: what reads an image.
+    """
+    failed = {}
+    for name in names:
+        try:
+            read(image_dir / name)
+        except UnreadableImage as error:
+            failed[name] = str(error)
+    if len(failed) == 1:
+        raise UnreadableImage(*failed.values())
+    if failed:
+        raise UnreadableImage(
+            f"Cannot read {len(failed)} images in {image_dir}: {with_reasons(failed)}."
+        )

@@ -123,11 +123,12 @@ def test_garbage_is_refused(start):
     url = start(localizer, max_mb=0.1)
     photo = png((8, 8))
     noise = np.random.default_rng(0).bytes(1000)
-    for body in (b"", noise, photo[:20], b"GIF89a" + noise):
+    for body in (noise, photo[:20]):
         assert ask(url + "/localize", body) == (
             400,
             {"error": "the body is not a JPEG or PNG file"},
         )
+    assert ask(url + "/localize", b"")[1] == {"error": "the body cannot be read: it is empty"}
     assert ask(url + "/localize", photo) == (400, {"error": "Cannot read image: it is truncated."})
     assert ask(url + "/localize", bytes(100_001))[0] == 413
     for size in ((12_000, 9_000), (30_000, 20_000)):
@@ -148,6 +149,18 @@ def test_garbage_is_refused(start):
         assert status == 400 and "MODEL WIDTH HEIGHT PARAMS" in found["error"], camera
     assert ask(url + "/localize")[0] == 405 and ask(url + "/map")[0] == 404
     assert ask(url + "/health")[1]["waiting"] == 0
+
+
+@pytest.mark.fault(10)
+@pytest.mark.parametrize("kind", ["GIF", "WEBP"])
+def test_photos_of_other_formats_are_refused(kind, start):
+    """By what pipelines say of them."""
+    buffer = BytesIO()
+    Image.new("L", (8, 8)).save(buffer, kind)
+    name = {"WEBP": "WebP"}.get(kind, kind)
+    how = "`magick mogrify -format jpg` converts it"
+    said = f"the body cannot be read: it is {name}, not JPEG or PNG; {how}"
+    assert ask(start(Blocked()) + "/localize", buffer.getvalue()) == (400, {"error": said})
 
 
 def test_a_full_queue_is_refused(start):

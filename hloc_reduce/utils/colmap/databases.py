@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 
 from ..cli import InputError, Parser, choose, some
+from ..images import check_format, check_readable
 from ..locks import has_locks
 
 Options = TypeVar("Options")
@@ -126,6 +127,7 @@ def import_images(
     Raises:
         InputError: for an unknown option, or an image that COLMAP skips.
     """
+    check_readable(image_dir, names, check_format)  # which some versions would read
     with open_database(database):
         pass
     reader = parse_options(pycolmap.ImageReaderOptions, options, "image")
@@ -133,6 +135,7 @@ def import_images(
     with open_database(database) as opened:
         imported = {image.name for image in opened.read_all_images()}
     if skipped := [name for name in names if name not in imported]:
+        check_readable(image_dir, skipped)
         reason = "they cannot be read"
         if camera_mode in (pycolmap.CameraMode.SINGLE, pycolmap.CameraMode.PER_FOLDER):
             reason += " or differ in size from the images that share their camera"

@@ -14,7 +14,7 @@ import pycolmap
 
 from ..cli import InputError
 from ..files import replacing
-from ..images import UnreadableImage
+from ..images import NO_IMAGE, check_format, unreadable
 from ..parsers import CAMERA_MODELS, check_names
 
 if TYPE_CHECKING:
@@ -215,10 +215,9 @@ def infer_camera(image: Path) -> tuple[pycolmap.Camera, bool]:
     Raises:
         UnreadableImage: when the image cannot be read.
     """
+    check_format(image)  # which some versions of COLMAP would read
     try:
         camera = pycolmap.infer_camera_from_image(image)
     except Exception:  # RuntimeError or ValueError, depending on the version
-        broken, absent = "it is not an image, or it is truncated", "No such file or directory"
-        reason = broken if Path(image).exists() else absent
-        raise UnreadableImage(f"Cannot read image {image}: {reason}.") from None
+        raise unreadable(image, NO_IMAGE) from None
     return camera, camera.has_prior_focal_length
