@@ -35,6 +35,7 @@ from . import retrieval
 
 FEATURE, STORAGE, NUM_LOC = "colmap_sift_sv32", "uint4", 50
 TABLE = "shrink.csv"
+MODELS = "*/points3D.???"  # files of COLMAP models in a folder
 HLOC, REDUCED, COMPACT = "hloc's features and model", "reduced features", "compact map"
 COLUMNS = "map", "MB", "localized", "inliers", "recall [%]", "median error [cm]", "s a query"
 
@@ -78,8 +79,11 @@ def main(
     _check(hloc_outputs, outputs, max_mb)
     if ground_truth is not None and queries is None:
         raise InputError("--ground_truth is of queries: give --queries, too.")
-    features = features or _only(_feature_files(hloc_outputs), hloc_outputs, "features")
-    sfm = sfm or _only(_models(hloc_outputs, features), hloc_outputs, "sfm")
+    if features is None:
+        features = _only(_feature_files(hloc_outputs), hloc_outputs, "features", "feature file")
+    if sfm is None:
+        model = f"model of the keypoints in {features.name}"
+        sfm = _only(_models(hloc_outputs, features), hloc_outputs, "sfm", model)
     map_names = sorted(image.name for image in colmap.read_model(sfm).images.values())
     listed = [] if queries is None else read_queries(queries)
     truth = true_poses([name for name, _ in listed], ground_truth, True) if ground_truth else {}
@@ -137,12 +141,33 @@ def _check(hloc_outputs: Path, outputs: Path, max_mb: float | None) -> None:
         raise InputError(f"--outputs {outputs} is hloc's folder: choose another one.")
 
 
-def _only(found: Sequence[Path], folder: Path, option: str) -> Path:
-    """Return the only file of its kind, or raise an InputError."""
+def _only(found: Sequence[Path], folder: Path, option: str, what: str) -> Path:
+    """Return the only file of its kind, or raise an InputError.
+
+    Args:
+        found: the files.
+        folder: hloc's.
+        option: names another file.
+        what: kind of the file.
+    """
     if len(found) == 1:
         return found[0]
-    which = f"several: {cli.some([path.name for path in found])}" if found else "none"
-    raise InputError(f"{folder} has no single --{option} to take, but {which}. Give --{option}.")
+    if found:
+        which = cli.some(path.name for path in found)
+        raise InputError(f"{folder} has several: {which}. Give --{option}.")
+    names = cli.some(sorted(path.name for path in folder.iterdir()))
+    near = next((path for path in (*folder.iterdir(), folder.parent) if _may_be_finished(path)), "")
+    raise InputError(
+        f"{folder} is not a finished outputs folder of hloc, which has a feature file and a COLMAP "
+        f"model of its keypoints: it has no {what}, "
+        f"{f'only {names}' if names else 'as it is empty'}. "
+        + (f"Did you mean {near}?" if near else f"Give the right one, or --{option}.")
+    )
+
+
+def _may_be_finished(folder: Path) -> bool:
+    """Tell whether a folder has files like those of hloc's outputs."""
+    return all(any(folder.glob(found)) for found in ("*.h5", MODELS))
 
 
 def _feature_files(folder: Path) -> list[Path]:
@@ -160,7 +185,7 @@ def _models(folder: Path, features: Path) -> list[Path]:
     """Return the COLMAP models in a folder that have the keypoints of a feature file."""
     found = []
     with open_h5(features) as file:
-        for path in sorted({path.parent for path in folder.glob("*/points3D.???")}):
+        for path in sorted({path.parent for path in folder.glob(MODELS)}):
             images = colmap.read_model(path).images.values()
             image = next(iter(images), None)
             if image is not None and image.name in file:

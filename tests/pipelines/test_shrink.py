@@ -82,10 +82,49 @@ def test_wrong_input(finished, tmp_path, refused):
     assert "several: feats-2.h5, feats-sift.h5" in message and "Give --features" in message
     for path in finished.folder.glob("feats-*.h5"):
         path.unlink()
-    assert "none. Give --features" in refused(*given)
+    assert "it has no feature file, only pairs-db.txt, sfm_sift" in refused(*given)
     chosen = ("--features", finished.features)
     shutil.copytree(finished.folder / "sfm_sift", finished.folder / "sfm_2")
     assert "several: sfm_2, sfm_sift. Give --sfm" in refused(*given, *chosen)
     message = refused(*given, *chosen, "--sfm", finished.sfm, "--feature", "xfeat_sv32")
     assert "128-D" in message
     assert not (tmp_path / "small/shrink.csv").exists()
+
+
+@pytest.mark.fault(10)
+@pytest.mark.parametrize(
+    "inside, message",
+    [
+        ((), "it has no feature file, as it is empty. Give the right one, or --features."),
+        (("a.jpg", "b.jpg"), "it has no feature file, only a.jpg, b.jpg. Give the right one, or"),
+        (("sfm/points3D.bin",), "it has no feature file, only sfm. Give the right one, or --f"),
+        (
+            ("hloc/feats.h5", "hloc/sfm/points3D.bin", "a.txt"),
+            "it has no feature file, only a.txt, hloc. Did you mean {folder}/hloc?",
+        ),
+        (
+            ("../feats.h5", "points3D.bin"),
+            "it has no feature file, only points3D.bin. Did you mean {folder.parent}?",
+        ),
+    ],
+)
+def test_a_folder_that_is_not_of_hloc(inside, message, tmp_path, refused):
+    folder = tmp_path / "outputs/folder"
+    folder.mkdir(parents=True)
+    for name in inside:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"")
+    said = refused("--hloc_outputs", folder, "--outputs", tmp_path / "small")
+    begin = f"{folder} is not a finished outputs folder of hloc, which has a feature file and a "
+    assert said.startswith(f"{begin}COLMAP model of its keypoints: {message.format(folder=folder)}")
+    assert not (tmp_path / "small").exists()
+
+
+@pytest.mark.fault(10)
+def test_a_folder_of_features_only(finished, tmp_path, refused):
+    shutil.rmtree(finished.folder / "sfm_sift")
+    folder = shutil.copytree(finished.folder, tmp_path / "elsewhere/hloc")
+    said = refused("--hloc_outputs", folder, "--outputs", tmp_path / "small")
+    there_are = "feats-sift.h5, feats-sift_matches.h5, pairs-db.txt"
+    assert f"it has no model of the keypoints in feats-sift.h5, only {there_are}." in said
+    assert said.endswith("Give the right one, or --sfm.")
