@@ -50,7 +50,13 @@ def check(
             "--add_model and --refine_map are for photos that are added: --add_images."
         )
     folder, others = given["map"], (given["map_images"], given["database"])
-    if folder is None or any(others) or maps.is_compact(folder):
+    if folder is not None and maps.is_compact(folder):
+        raise InputError(
+            f"--map {folder} is a compact map, which cannot be changed: add photos to the map "
+            "that it was made from, or remove them there, and pack that again: --map FOLDER "
+            f"--compact {folder}"
+        )
+    if folder is None or any(others):
         raise InputError(
             "--add_images and --remove_images change a map that was built before: give its folder, "
             "--map, without --map_images and --database."

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pycolmap
 
 from ..localization.intrinsics import to_list
-from ..utils.cli import InputError
+from ..utils.cli import InputError, some
 from ..utils.images import refusal
 from ..utils.parsers import parse_camera
 
@@ -33,6 +33,7 @@ SHOWN = 5  # retrieved images in an answer
 BUSY, BUSY_SECONDS = 503, 2  # status of a full queue, after which a client may try again
 UPLOAD_SECONDS = 60.0
 FORMATS = ("JPEG", "PNG")
+PARAMETERS = ("camera", "inliers")  # of a request, as docs/serve.md has them
 
 
 class Refused(Exception):
@@ -66,24 +67,21 @@ def make_app(localizer: "Localizer", max_mb: float = MAX_MB, queue: int = QUEUE)
 
     async def localize(request: "Request") -> "Response":
         try:
-            camera = _camera(request.query_params.get("camera"))
+            camera, inliers = _parameters(request.query_params.multi_items())
             photo = await _body(request, int(max_mb * 1e6))
-            return JSONResponse(await answered(request, photo, camera))
+            return JSONResponse(await answered(photo, camera, inliers))
         except Refused as error:
             headers = {"Retry-After": str(BUSY_SECONDS)} if error.status == BUSY else None
             return JSONResponse({"error": error.reason}, error.status, headers)
         except ClientDisconnect:
             return JSONResponse({"error": "the client is gone"}, 400)
 
-    async def answered(request: "Request", photo: bytes, camera: pycolmap.Camera | None) -> dict:
-        whole = request.query_params.get("inliers", "0")
-        if whole not in ("0", "1"):
-            raise Refused(400, f"inliers is {whole[:20]!r}: it is 0 or 1")
+    async def answered(photo: bytes, camera: pycolmap.Camera | None, inliers: bool) -> dict:
         if state["waiting"] >= queue:
             raise Refused(BUSY, f"{queue} requests are waiting")
         state["waiting"] += 1
         try:
-            work = partial(answer, localizer, photo, camera, whole == "1")
+            work = partial(answer, localizer, photo, camera, inliers)
             found = await asyncio.get_running_loop().run_in_executor(worker, work)
             state["served"] += 1
             return found
@@ -114,6 +112,21 @@ async def _body(request: "Request", most: int) -> bytes:
     except TimeoutError:
         raise Refused(408, f"the upload took more than {UPLOAD_SECONDS:g} seconds") from None
     return b"".join(parts)
+
+
+def _parameters(given: list[tuple[str, str]]) -> tuple[pycolmap.Camera | None, bool]:
+    """Parse the parameters of a request: the camera, and whether to answer with the inliers."""
+    names = [name for name, _ in given]
+    if unknown := sorted(set(names) - set(PARAMETERS)):
+        named, known = some(name[:20] for name in unknown), " and ".join(PARAMETERS)
+        raise Refused(400, f"unknown parameters: {named}; there are {known}")
+    if twice := [name for name in PARAMETERS if names.count(name) > 1]:
+        raise Refused(400, f"{' and '.join(twice)}: give it once")
+    values = dict(given)
+    inliers = values.get("inliers", "0")
+    if inliers not in ("0", "1"):
+        raise Refused(400, f"inliers is {inliers[:20]!r}: it is 0 or 1")
+    return _camera(values.get("camera")), inliers == "1"
 
 
 def _camera(text: str | None) -> pycolmap.Camera | None:

@@ -1,5 +1,7 @@
 """Command line of `hloc_reduce.serve`."""
 
+import asyncio
+import os
 from pathlib import Path
 
 from .. import logger
@@ -34,12 +36,31 @@ def _main() -> None:
     from ..maps.localizer import Localizer
 
     localizer = Localizer(args.map, args.num_loc, onnx=args.onnx)
+    check_address(args.host, args.port)
     logger.info("Serving %s at http://%s:%d.", args.map, args.host, args.port)
     app = make_app(localizer, args.max_mb, args.queue)
     # photos that are being uploaded are in memory, too
     most = args.queue + UPLOADS
     address = {"host": args.host, "port": args.port}
     uvicorn.run(app, **address, log_level="warning", limit_concurrency=most, timeout_keep_alive=30)
+
+
+def check_address(host: str, port: int) -> None:
+    """Raise an InputError if nothing can listen at an address, where uvicorn would only exit."""
+
+    async def listen() -> None:
+        server = await asyncio.get_running_loop().create_server(asyncio.Protocol, host, port)
+        server.close()
+
+    try:
+        asyncio.run(listen())
+    except OSError as error:
+        # asyncio's own text repeats the address; an unknown host has a negative number
+        number = error.errno or 0
+        reason = os.strerror(number) if number > 0 else error.strerror
+        raise InputError(
+            f"Cannot listen on {host}:{port}: {reason}. Choose another --port or --host."
+        ) from None
 
 
 if __name__ == "__main__":

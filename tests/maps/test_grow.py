@@ -278,6 +278,15 @@ def test_a_killed_removal_goes_on(grown):
     assert len(list(folder.glob("sfm*"))) == 1
 
 
+@pytest.mark.fault(13)
+@pytest.mark.parametrize("option", ["--add_images", "--remove_images"])
+def test_a_compact_map_cannot_be_changed(option, tmp_path, refused):
+    path = tmp_path / "place.hlm"
+    message = refused("--map", path, option, tmp_path)
+    assert message.startswith(f"--map {path} is a compact map, which cannot be changed: add photos")
+    assert message.endswith(f"and pack that again: --map FOLDER --compact {path}")
+
+
 def test_wrong_options(grown, tmp_path, refused):
     folder, new, model = grown
     assert "is a COLMAP model" in refused("--map", model, "--add_images", new)

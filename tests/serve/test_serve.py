@@ -163,6 +163,40 @@ def test_photos_of_other_formats_are_refused(kind, start):
     assert ask(start(Blocked()) + "/localize", buffer.getvalue()) == (400, {"error": said})
 
 
+@pytest.mark.fault(13)
+@pytest.mark.parametrize(
+    "given, error",
+    [
+        ("?foo", "unknown parameters: foo; there are camera and inliers"),
+        ("?Camera=PINHOLE&inliers=1", "unknown parameters: Camera; there are camera and inliers"),
+        ("?b=1&a=2&inliers=0", "unknown parameters: a, b; there are camera and inliers"),
+        ("?" + "x" * 99, f"unknown parameters: {'x' * 20}; there are camera and inliers"),
+        ("?inliers=0&inliers=1", "inliers: give it once"),
+    ],
+)
+def test_parameters_that_would_be_ignored_are_refused(given, error, start):
+    localizer = Blocked()
+    localizer.released.set()
+    assert ask(f"{start(localizer)}/localize{given}", png((8, 8))) == (400, {"error": error})
+
+
+@pytest.mark.fault(13)
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "203.0.113.7"])
+def test_an_address_that_cannot_be_had(host, monkeypatch, caplog):
+    """Where another program listens, or of another machine; before anything is served."""
+    monkeypatch.setattr("hloc_reduce.maps.localizer.Localizer", lambda *_, **__: Blocked())
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        given = ["serve", "--map", "place.hlm", "--host", host, "--port", str(port)]
+        monkeypatch.setattr(sys, "argv", given)
+        with pytest.raises(SystemExit) as exit:
+            cli.run(_main)
+    (line,) = [record.getMessage() for record in caplog.records if record.name == "hloc_reduce"]
+    assert exit.value.code == 2 and line.startswith(f"Cannot listen on {host}:{port}: ")
+    assert line.endswith(". Choose another --port or --host.") and "(" not in line
+    assert ("in use" in line) == (host in ("127.0.0.1", "localhost"))
+
+
 def test_a_full_queue_is_refused(start):
     localizer = Blocked()
     url = start(localizer, queue=2)
