@@ -6,6 +6,7 @@ import shutil
 import command
 import pytest
 from command import outcome
+from PIL import Image
 
 from hloc_reduce import maps
 from hloc_reduce.localization.records import log_file, read_records
@@ -183,6 +184,20 @@ def test_a_map_photo_that_cannot_be_read(kind, aachen_layout, tmp_path, monkeypa
     photo.write_bytes(content)
     command.run(monkeypatch, aachen, *arguments)
     assert outcome(outputs)[1] == outcome(tmp_path / "whole")[1]
+
+
+@pytest.mark.fault(10)
+@pytest.mark.parametrize("place", ["aachen", "localize"], indirect=True)
+def test_all_photos_of_the_map_that_cannot_be_read_are_named(place, monkeypatch, caplog):
+    """One of them is a photo of another format, which OpenCV would read."""
+    pipeline, arguments, _, query, _ = place
+    images = query.parents[2]
+    Image.open(images / "db/1.png").save(images / "db/1.png", "WEBP")
+    harm(images / "db/2.png", b"")
+    message = command.refused(monkeypatch, caplog, pipeline, *arguments)
+    how = "`magick mogrify -format png` converts it"
+    assert f"db/1.png (it is WebP, not JPEG or PNG; {how})" in message
+    assert "db/2.png (it is empty)" in message
 
 
 def test_a_cutout_that_cannot_be_read(inloc_layout, tmp_path, monkeypatch, caplog):
