@@ -165,7 +165,7 @@ def refusal(head: bytes, suffix: str = ".jpg") -> str | None:
         if head.startswith(found, start):
             if name == _VIDEO:
                 return "it is a video, not JPEG or PNG"
-            kept = suffix.lower() if suffix.lower() in IMAGE_SUFFIXES else ".jpg"
+            kept = suffix if suffix.lower() in IMAGE_SUFFIXES else ".jpg"
             how = f"`magick mogrify -format {kept[1:]}` converts it"
             return f"it is {name}, not JPEG or PNG; {how}"
     return None
@@ -208,13 +208,11 @@ def read_image(path: Path, grayscale: bool = False) -> np.ndarray:
         UnreadableImage: when OpenCV cannot read the file, or it is of a format that others that
             read photos do not know.
     """
-    mode = cv2.IMREAD_GRAYSCALE if grayscale else cv2.IMREAD_COLOR
-    mode |= cv2.IMREAD_IGNORE_ORIENTATION
     image = None
     try:
         data = np.fromfile(path, np.uint8)
         if (reason := refusal(data[:32].tobytes(), Path(path).suffix)) is None:
-            reason, image = NO_IMAGE, _decode(data, mode)
+            reason, image = NO_IMAGE, _decode(data, grayscale)
     except OSError as error:
         reason = str(error.strerror)
     except cv2.error as error:
@@ -224,14 +222,17 @@ def read_image(path: Path, grayscale: bool = False) -> np.ndarray:
     return image if grayscale else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def _decode(data: np.ndarray, mode: int) -> np.ndarray | None:
-    """Return the pixels of a file's content (N,) uint8 as uint8, or None."""
-    head = data[:32].tobytes()
+def _decode(data: np.ndarray, grayscale: bool) -> np.ndarray | None:
+    """Return the pixels of a file's content (N,) uint8, (H, W) or (H, W, 3) BGR uint8, or None."""
+    as_stored, head = cv2.IMREAD_IGNORE_ORIENTATION, data[:32].tobytes()
     if head.startswith(_TIFF) or head.startswith(_PNG) and head[24:25] == b"\x10":
-        deep = cv2.imdecode(data, mode | cv2.IMREAD_ANYDEPTH)
+        # in colour, as grey values are smaller than the largest of a channel
+        deep = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | as_stored)
         if deep is not None and deep.dtype == np.uint16 and (bits := _bits(data, deep)) < 16:
-            return cv2.convertScaleAbs(deep, alpha=255 / (2**bits - 1))
-    return cv2.imdecode(data, mode)
+            scaled = cv2.convertScaleAbs(deep, alpha=255 / (2**bits - 1))
+            return cv2.cvtColor(scaled, cv2.COLOR_BGR2GRAY) if grayscale else scaled
+    mode = cv2.IMREAD_GRAYSCALE if grayscale else cv2.IMREAD_COLOR
+    return cv2.imdecode(data, mode | as_stored)
 
 
 def _bits(data: np.ndarray, pixels: np.ndarray) -> int:

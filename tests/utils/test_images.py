@@ -132,6 +132,15 @@ def test_values_of_fewer_bits_than_are_stored_fill_the_range(bits, is_grey, pict
 
 
 @pytest.mark.fault(10)
+def test_the_range_is_that_of_all_channels(picture, tmp_path):
+    """A blue photo, whose grey values are small."""
+    blue, path = picture * np.array([0, 0, 1], np.uint8), tmp_path / "blue.png"
+    with_bits(blue[..., ::-1], path, 12)
+    expected = cv2.cvtColor(blue, cv2.COLOR_RGB2GRAY).astype(int)
+    assert np.abs(read_image(path, grayscale=True) - expected).max() <= 1
+
+
+@pytest.mark.fault(10)
 def test_significant_bits_are_those_that_a_file_declares(picture, tmp_path):
     """So that a photo taken in the dark stays dark; values that exceed them fill all 16 bits."""
     dark, path = picture[..., 0] // 8, tmp_path / "dark.png"
@@ -176,7 +185,7 @@ def test_other_formats_are_named_whatever_the_file_is_called(kind, suffix, pictu
     """The same by all that read photos; COLMAP and OpenCV read some of them."""
     path = tmp_path / f"a{suffix}"
     path.write_bytes(OTHERS[kind](picture))
-    kept = "jpg" if suffix == ".webp" else suffix[1:].lower()
+    kept = "jpg" if suffix == ".webp" else suffix[1:]
     how = "" if kind == "a video" else f"; `magick mogrify -format {kept}` converts it"
     message = f"Cannot read image {path}: it is {kind}, not JPEG or PNG{how}."
 
