@@ -43,8 +43,8 @@ def check_names(names: list[str], place: Path | str) -> list[str]:
     if wrong:
         raise InputError(
             f"{place}: {some(map(repr, wrong), 3)} cannot be names of images: a name is a relative "
-            "path that does not begin with # or a space, does not end with a space, and has no "
-            "tabs and no part . or .. in it. Rename them."
+            "path in UTF-8 that does not begin with # or a space, does not end with a space, and "
+            "has no tabs and no part . or .. in it. Rename them."
         )
     return names
 
@@ -64,12 +64,12 @@ def _lines(path: Path, form: str) -> Iterator[tuple[str, list[str]]]:
                     check_names(words[:names], place)
                     yield place, words
     except UnicodeDecodeError:
-        raise _not_text(path, f"A list has lines `{form}`.") from None
+        raise not_text(path, f"A list has lines `{form}`; save it as UTF-8.") from None
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror}.") from None
 
 
-def _not_text(path: Path, expected: str) -> InputError:
+def not_text(path: Path, expected: str) -> InputError:
     """Return the error for a file that is not UTF-8; `expected` says what it should contain."""
     data, line = path.read_bytes(), 1
     try:
@@ -79,7 +79,7 @@ def _not_text(path: Path, expected: str) -> InputError:
     return InputError(f"{path}:{line}: not text in UTF-8. {expected}")
 
 
-def _wrong(place: str, what: str, form: str, reason: str = "", hint: str = "") -> InputError:
+def wrong_line(place: str, what: str, form: str, reason: str = "", hint: str = "") -> InputError:
     """Return the error for a line that is not of the form."""
     said = f" ({reason})" if reason else ""
     return InputError(f"{place}: not {what}{said}. A line must look like `{form}`{hint}.")
@@ -119,7 +119,7 @@ def read_yaml(path: Path) -> object:
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except UnicodeDecodeError:
-        raise _not_text(path, "A YAML file is expected.") from None
+        raise not_text(path, "A YAML file is expected.") from None
     except Exception as error:  # yaml raises many types for broken values
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise InputError(f"{path} cannot be read ({reason}).") from None
@@ -160,7 +160,7 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
             # a name with spaces, or commas between the words, leave no model behind the name
             spaced = not any(word in CAMERA_MODELS for word in words[:1])
             hint = "; put spaces between the words, and put a tab after a name that has spaces"
-            raise _wrong(place, "a query", QUERY, str(error), hint * spaced) from None
+            raise wrong_line(place, "a query", QUERY, str(error), hint * spaced) from None
         if name in queries:
             raise InputError(f"{place}: query {name} is listed twice.")
         queries[name] = camera
@@ -180,6 +180,17 @@ def parse_camera(words: list[str]) -> pycolmap.Camera:
     Raises:
         ValueError: with what is wrong.
     """
+    camera = camera_of(words)
+    check_camera(camera)
+    return camera
+
+
+def camera_of(words: list[str]) -> pycolmap.Camera:
+    """Return the camera of the words `MODEL width height params...`, whatever their values.
+
+    Raises:
+        ValueError: when they are not of this form.
+    """
     if len(words) < 3:
         raise ValueError("it has no camera model, width and height")
     model, *sizes = words[:3]
@@ -198,11 +209,20 @@ def parse_camera(words: list[str]) -> pycolmap.Camera:
         raise ValueError("its parameters are not all numbers") from None
     if not camera.verify_params():
         raise ValueError(f"the parameters of {model} are {camera.params_info}")
+    return camera
+
+
+def check_camera(camera: pycolmap.Camera) -> None:
+    """Check that sizes and focal lengths are positive, and all parameters finite.
+
+    Raises:
+        ValueError: otherwise.
+    """
     # COLMAP crashes when a panorama, which has none, is asked for a focal length
     focal_lengths = camera.params[camera.focal_length_idxs()]
-    if not (np.isfinite(camera.params).all() and min(*map(int, sizes), *focal_lengths) > 0):
+    smallest = min(camera.width, camera.height, *focal_lengths)
+    if not (np.isfinite(camera.params).all() and smallest > 0):
         raise ValueError("sizes and focal lengths are positive and finite")
-    return camera
 
 
 def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]]]:
@@ -232,7 +252,7 @@ def parse_pairs(path: Path) -> Iterator[tuple[str, str]]:
     for place, words in _lines(path, PAIR):
         if len(words) != 2:
             hint = "; put a tab between names that have spaces"
-            raise _wrong(place, "a pair", PAIR, hint=hint)
+            raise wrong_line(place, "a pair", PAIR, hint=hint)
         yield words[0], words[1]
 
 
@@ -276,7 +296,7 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
             rotation = pycolmap.Rotation3d(quaternion / norm)
             poses[name] = pycolmap.Rigid3d(rotation, np.array(translation).reshape(3))
         except ValueError:
-            raise _wrong(place, "a pose", POSE) from None
+            raise wrong_line(place, "a pose", POSE) from None
     return poses
 
 

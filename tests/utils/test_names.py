@@ -78,7 +78,7 @@ def test_a_model_with_a_name_that_is_no_text_is_refused(tmp_path):
     model = model_of(["a\u00e9.jpg"], tmp_path / "model")
     path = model / "images.bin"
     path.write_bytes(path.read_bytes().replace("a\u00e9".encode(), b"a\xe9\xe9"))
-    with pytest.raises(InputError, match="model is not a COLMAP model"):
+    with pytest.raises(InputError, match="images.bin, image 1: the name a.* is not in UTF-8"):
         colmap.read_model(model)
 
 
@@ -94,3 +94,15 @@ def test_models_that_are_cut_off_are_refused(name, aachen_layout):
         path.write_bytes(content[:length])
         with pytest.raises(InputError, match=f"not a COLMAP model .{name}.bin is truncated"):
             colmap.read_model(model)
+
+
+@pytest.mark.fault(7)
+def test_names_and_lists_in_latin_1_are_refused(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / os.fsdecode(b"caf\xe9.jpg")).touch()
+    with pytest.raises(InputError, match=r"photos: .* a name is a relative path in UTF-8 that"):
+        list_images(tmp_path / "photos")
+    path = tmp_path / "list.txt"
+    path.write_bytes(f"a.jpg {QUERY}\ncaf\u00e9.jpg {QUERY}\n".encode("latin-1"))
+    with pytest.raises(InputError, match=r"list.txt:2: not text in UTF-8.*; save it as UTF-8\."):
+        parsers.parse_query_list(path)

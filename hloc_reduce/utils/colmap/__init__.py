@@ -25,9 +25,9 @@ from .estimators import (
 )
 from .exchange import write_for_all
 from .models import (
-    PARTS,
     add_image,
     cam_from_img,
+    find_model,
     infer_camera,
     model_files,
     observed,
@@ -37,6 +37,7 @@ from .models import (
     write_part,
 )
 from .origin import near_from_world, near_origin, transformed
+from .records import PARTS
 from .sift import check_dog_options, detect_dog
 from .stored import SIFT, StoredDatabase, open_stored, shapes
 

@@ -3,109 +3,199 @@
 import shutil
 from collections.abc import Collection, Iterable
 from functools import lru_cache
-from mmap import ACCESS_READ, mmap
+from itertools import islice
 from pathlib import Path
-from struct import error as struct_error
-from struct import unpack_from
+from tempfile import TemporaryDirectory
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
 
+from ... import logger
 from ..cli import InputError
 from ..files import replacing
 from ..images import NO_IMAGE, check_format, unreadable
-from ..parsers import CAMERA_MODELS, check_names
+from . import binary_files, text_files
+from .records import PARTS
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-PARTS = ("cameras", "frames", "images", "points3D", "rigs")  # files of a model
+NEEDED = ("cameras", "images", "points3D")  # files; models of COLMAP 3.11 and older have no others
+COMPARED = 300  # points of a model whose tracks are compared with the images
+# which pycolmap raises for broken files
+COLMAP_ERRORS = (RuntimeError, ValueError, IndexError, KeyError, OverflowError)
+# as COLMAP, binary files are read rather than text
+FORMATS = {".bin": binary_files, ".txt": text_files}
+
+
+def find_model(path: Path) -> Path:
+    """Return the folder of a COLMAP model: `path`, or the only model in it, such as `sparse/0`.
+
+    Raises:
+        InputError: when there is none, or several.
+    """
+    return _find(path)[0]
+
+
+def _find(path: Path) -> tuple[Path, ModuleType]:
+    """Return the folder of a model, and the module for its files."""
+    if not path.is_dir():
+        raise InputError(f"There is no COLMAP model folder {path}.")
+    if (files := _format(path)) is not None:
+        return path, files
+    if lacking := _lacking(path):
+        raise InputError(f"{path} is not a COLMAP model (it has no {lacking}).")
+    folders = sorted(path.iterdir(), key=lambda folder: (len(folder.name), folder.name))
+    found = [(folder, files) for folder in folders if (files := _format(folder)) is not None]
+    if not found:
+        raise InputError(f"{path} is not a COLMAP model (it has no cameras.bin or cameras.txt).")
+    if len(found) > 1:
+        counts = (
+            f"{folder.name} of {files.count_images(folder)} photos" for folder, files in found
+        )
+        raise InputError(
+            f"{path} has {len(found)} COLMAP models: {', '.join(counts)}. Give the folder of one."
+        )
+    return found[0]
+
+
+def _format(folder: Path) -> ModuleType | None:
+    """Return the module for the files that COLMAP reads in a folder; points may be missing."""
+    for parts in (NEEDED, NEEDED[:2]):
+        for suffix, files in FORMATS.items():
+            if all((folder / f"{part}{suffix}").is_file() for part in parts):
+                return files
+    return None
+
+
+def _lacking(folder: Path) -> str:
+    """Return the name of the file without which those in a folder are no model, "" if none."""
+    for suffix in FORMATS:
+        is_there = {part: (folder / f"{part}{suffix}").is_file() for part in PARTS}
+        if any(is_there.values()):
+            return next(f"{part}{suffix}" for part in NEEDED if not is_there[part])
+    return ""
 
 
 def model_files(path: Path) -> list[Path]:
-    """Return the files of a COLMAP model, binary or text, sorted."""
-    return sorted(file for file in path.iterdir() if file.stem in PARTS and file.is_file())
+    """Return the files of a COLMAP model, binary or text, sorted.
+
+    Raises:
+        InputError: as `find_model`.
+    """
+    files = find_model(path).iterdir()
+    return sorted(file for file in files if file.stem in PARTS and file.is_file())
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
-    """Read a COLMAP model, binary or text, with or without rigs and frames.
+    """Read a COLMAP model, binary or text, with or without rigs, frames and points.
+
+    Rotations are normalized. Where images and points disagree on which keypoints show which points,
+    the images are right.
+
+    Args:
+        path: folder of the model, or one with no other model in it.
 
     Raises:
         InputError: when it is missing or broken, or has an invalid image name.
     """
-    if not path.is_dir():
-        raise InputError(f"There is no COLMAP model folder {path}.")
-    check_whole(path)
+    folder, files = _find(path)
+    records = files.read(folder)
+    are_unit = records.check(folder)
     try:
-        model = pycolmap.Reconstruction(path)
-        names = [image.name for image in model.images.values()]
-    except Exception as error:  # pycolmap raises RuntimeError, ValueError, IndexError, ...
-        reason = str(error).strip().splitlines()[0]
-        raise InputError(f"{path} is not a COLMAP model ({reason}).") from None
-    check_names(names, path)
+        as_colmap = records.as_colmap
+        model = pycolmap.Reconstruction(folder) if as_colmap else _read_copy(folder, files)
+        agree = _agree(model, records.num_elements)
+    except COLMAP_ERRORS:
+        files.explain(folder)
+        agree = False
+    if not agree:
+        try:
+            model = _read_copy(folder, files, with_tracks=False)
+        except COLMAP_ERRORS as error:
+            reason = str(error).strip().splitlines()[0]
+            raise InputError(f"{folder} is not a COLMAP model ({reason}).") from None
+        _warn(folder, _make_tracks(model))
+    for record in records.images:
+        image = model.images[record.id]
+        image.name = record.name
+        if image.num_points2D() != record.num_points2D:
+            raise text_files.wrong_keypoints(record.place)
+    if not are_unit:
+        _normalize(model)
     return model
 
 
-def check_whole(path: Path) -> None:
-    """Check that no file of a binary COLMAP model is truncated: COLMAP may never finish reading it.
+def _read_copy(
+    folder: Path, files: ModuleType, with_tracks: bool = True
+) -> pycolmap.Reconstruction:
+    """Read a model from files that are written anew."""
+    with TemporaryDirectory(prefix="hloc_reduce-") as temporary:
+        files.rewrite(folder, Path(temporary), with_tracks)
+        return pycolmap.Reconstruction(temporary)
 
-    Raises:
-        InputError: naming a truncated file.
+
+def _normalize(model: pycolmap.Reconstruction) -> None:
+    """Make rotations of quaternions without unit length rotations."""
+    for frame in model.frames.values():
+        frame.rig_from_world = _rigid(frame.rig_from_world)
+    for rig in model.rigs.values():
+        for sensor, pose in rig.non_ref_sensors.items():
+            if pose is not None:
+                rig.set_sensor_from_rig(sensor, _rigid(pose))
+
+
+def _rigid(pose: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
+    quaternion = pose.rotation.quat
+    rotation = pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion))
+    return pycolmap.Rigid3d(rotation, pose.translation)
+
+
+def _agree(model: pycolmap.Reconstruction, num_elements: int) -> bool:
+    """Return whether images and points agree on which keypoints show which points.
+
+    Numbers are compared, and some points: to compare all takes as long as to read a model.
     """
-    for name, skip in RECORDS.items():
-        file = path / f"{name}.bin"
-        if not file.is_file():
-            continue
-        try:
-            with file.open("rb") as opened, mmap(opened.fileno(), 0, access=ACCESS_READ) as data:
-                (number,), end = unpack_from("<Q", data, 0), 8
-                for _ in range(number):
-                    end = skip(data, end)
-                if end > len(data):
-                    raise ValueError
-        except (ValueError, struct_error, OverflowError):  # of an empty file, or at its end
-            raise InputError(f"{path} is not a COLMAP model ({file.name} is truncated).") from None
+    if model.compute_num_observations() != num_elements:
+        return False
+    for point_id, point in islice(model.points3D.items(), COMPARED):
+        for element in point.track.elements:
+            if not model.exists_image(element.image_id):
+                return False
+            image, index = model.images[element.image_id], element.point2D_idx
+            if index >= image.num_points2D() or image.point2D(index).point3D_id != point_id:
+                return False
+    return True
 
 
-def _skip_camera(data: mmap, start: int) -> int:
-    (model,) = unpack_from("<i", data, start + 4)
-    if model not in _num_params():
-        raise ValueError
-    return start + 24 + 8 * _num_params()[model]
+def _make_tracks(model: pycolmap.Reconstruction) -> int:
+    """Make the tracks of points without any from the images.
+
+    Returns:
+        The number of keypoints whose points are not there: they are made ones without points.
+    """
+    absent = 0
+    for image_id, image in model.images.items():
+        for index in image.get_observation_point2D_idxs():
+            point_id = image.point2D(index).point3D_id
+            if model.exists_point3D(point_id):
+                model.points3D[point_id].track.add_element(image_id, index)
+            else:
+                image.reset_point3D_for_point2D(index)
+                absent += 1
+    return absent
 
 
-def _skip_image(data: mmap, start: int) -> int:
-    end_of_name = data.find(b"\0", start + 64)
-    if end_of_name < 0:
-        raise ValueError
-    return end_of_name + 9 + 24 * unpack_from("<Q", data, end_of_name + 1)[0]
-
-
-def _skip_point(data: mmap, start: int) -> int:
-    return start + 51 + 8 * unpack_from("<Q", data, start + 43)[0]
-
-
-def _skip_frame(data: mmap, start: int) -> int:
-    return start + 68 + 16 * unpack_from("<I", data, start + 64)[0]
-
-
-@lru_cache
-def _num_params() -> dict[int, int]:
-    """Return the number of parameters of each camera model, by its id."""
-    models = [pycolmap.CameraModelId.__members__[name] for name in CAMERA_MODELS]
-    new = hasattr(pycolmap.Camera, "create_from_model_id")  # pycolmap 4
-    make = pycolmap.Camera.create_from_model_id if new else pycolmap.Camera.create
-    return {int(model): len(make(1, model, 1.0, 1, 1).params) for model in models}
-
-
-# files of a binary COLMAP model -> functions that return the end of the record at an offset
-RECORDS = {
-    "cameras": _skip_camera,
-    "images": _skip_image,
-    "points3D": _skip_point,
-    "frames": _skip_frame,
-}
+@lru_cache  # a model is read more than once
+def _warn(folder: Path, absent: int) -> None:
+    """Say that a model has other tracks now."""
+    logger.warning(
+        "%s: images and points disagree on which keypoints show which points. The images are taken "
+        "as right; %d keypoints whose points are not there are taken as ones without points.",
+        *(folder, absent),
+    )
 
 
 def write_part(path: Path, names: Collection[str], output: Path) -> Path:
