@@ -15,7 +15,6 @@ from .localization.references import SfmMap
 from .runtime import provenance
 from .runtime.executors import SERIAL, Executor
 from .utils import cli, colmap
-from .utils.cli import InputError
 from .utils.parsers import parse_retrieval
 from .utils.paths import strings_as_paths
 
@@ -90,8 +89,6 @@ def main(
         load = partial(SfmMap, reference_sfm, covisibility_clustering)
         overwrite, executor = True, SERIAL
     else:
-        if not reference_sfm.is_dir():
-            raise InputError(f"There is no COLMAP model folder {reference_sfm}.")
         inputs += colmap.model_files(reference_sfm)
         written = reference_sfm.stat().st_mtime_ns
         load = partial(_load, reference_sfm, covisibility_clustering, written)

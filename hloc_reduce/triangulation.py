@@ -74,6 +74,7 @@ def main(
     """
     options = {"random_seed": 0, "num_threads": 1, **(mapper_options or {})}
     colmap.mapper_options(options)  # raises for a wrong one
+    reference_model = colmap.find_model(reference_model)
     reference = colmap.read_model(reference_model)
     pixel_scale = median_photo_scale(image.camera for image in reference.images.values())
     mapper = colmap.mapper_options(options, pixel_scale)

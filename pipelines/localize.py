@@ -119,7 +119,7 @@ def open_map(
 
 def _open(model_or_map: Path, folder: Path, overwrite: bool) -> Map:
     """Open a map that was built before; unpack a compact one into a folder."""
-    if any(model_or_map.glob("cameras.*")):
+    if any(any(model_or_map.glob(cameras)) for cameras in ("cameras.*", "[0-9]*/cameras.*")):
         raise InputError(
             f"{model_or_map} is a COLMAP model: give its photos, --map_images, or its --database."
         )
@@ -230,8 +230,8 @@ def _parser() -> cli.Parser:
         "--map",
         type=Path,
         metavar="MODEL|MAP",
-        help="COLMAP model of --map_images or --database; or a map of an earlier run: its folder "
-        "or .hlm file",
+        help="COLMAP model of --map_images or --database, or a folder with one model in it; or a "
+        "map of an earlier run: its folder or .hlm file",
     )
     parser.add_argument(
         "--map_images", type=Path, help="photos of the map; without --map they are reconstructed"

@@ -84,6 +84,7 @@ def main(
     if sfm is None:
         model = f"model of the keypoints in {features.name}"
         sfm = _only(_models(hloc_outputs, features), hloc_outputs, "sfm", model)
+    sfm = colmap.find_model(sfm)
     map_names = sorted(image.name for image in colmap.read_model(sfm).images.values())
     listed = [] if queries is None else read_queries(queries)
     truth = true_poses([name for name, _ in listed], ground_truth, True) if ground_truth else {}

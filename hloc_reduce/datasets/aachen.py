@@ -11,6 +11,7 @@ from ..utils.cli import InputError
 from ..utils.parsers import parse_query_lists
 from . import SOURCE, refuse
 
+MODEL = "3D-models/aachen_v_1_1"
 AACHEN_SOURCE = f"{SOURCE} (Aachen Day-Night v1.1); --demo makes a small town in its layout."
 
 
@@ -29,12 +30,15 @@ class Aachen:
     whole_map: ClassVar[bool] = True  # all map images are needed, not only the retrieved ones
 
     def __post_init__(self) -> None:
-        folders = (self.images, self.reference_model, self.queries.parent)
+        model = self.root / MODEL
+        folders = (self.images, model, self.queries.parent)
         missing = [path for path in folders if not path.is_dir()]
-        parts = [self.reference_model / f"{part}.*" for part in ("cameras", "images", "points3D")]
-        for path in (*parts, self.queries):
-            if path.parent.is_dir() and not any(path.parent.glob(path.name)):
-                missing.append(path)
+        for part in ("cameras", "images", "points3D"):
+            inside = (any(model.glob(f"{folder}{part}.*")) for folder in ("", "*/"))
+            if model.is_dir() and not any(inside):
+                missing.append(model / f"{part}.*")
+        if self.queries.parent.is_dir() and not any(self.queries.parent.glob(self.queries.name)):
+            missing.append(self.queries)
         refuse(self.root, missing, AACHEN_SOURCE)
 
     def check(self, map_names: list[str]) -> None:
@@ -54,8 +58,8 @@ class Aachen:
 
     @property
     def reference_model(self) -> Path:
-        """The COLMAP model with the poses of the map images."""
-        return self.root / "3D-models/aachen_v_1_1"
+        """The COLMAP model with the poses of the map images, in its folder or one in that."""
+        return colmap.find_model(self.root / MODEL)
 
     @property
     def queries(self) -> Path:

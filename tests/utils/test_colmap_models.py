@@ -1,12 +1,16 @@
 """COLMAP models of other programs and of careless hands are read as they are meant, or refused."""
 
+import shutil
 import struct
+from types import SimpleNamespace
 
 import hostile
 import numpy as np
 import pycolmap
 import pytest
 
+from hloc_reduce import pairs_from_covisibility
+from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize
@@ -357,6 +361,54 @@ def test_a_broken_model_ends_a_run_before_photos_are_read(tmp_path, refused):
     message = refused("--map", folder, "--map_images", tmp_path, "--outputs", tmp_path / "outputs")
     assert "cameras.txt:1: not a camera (sizes and focal lengths are positive" in message
     assert not (tmp_path / "outputs").exists()
+
+
+@pytest.fixture
+def sparse(tmp_path):
+    """A folder with several models, as COLMAP writes it."""
+    whole = write(tmp_path / "sparse/0")
+    single = write(tmp_path / "sparse/1", images=images()[:2], points3D=[])
+    ten = tmp_path / "sparse/10"
+    ten.mkdir()
+    colmap.read_model(whole).write_binary(ten)
+    (tmp_path / "sparse/project.ini").write_text("")
+    return SimpleNamespace(folder=tmp_path / "sparse", whole=whole, single=single, ten=ten)
+
+
+@pytest.mark.fault(8)
+@pytest.mark.parametrize("suffix", [".txt", ".bin"])
+def test_the_only_model_in_a_folder_is_taken(suffix, sparse):
+    taken, other = (sparse.whole, sparse.ten)[:: 1 if suffix == ".txt" else -1]
+    shutil.rmtree(other)
+    shutil.rmtree(sparse.single)
+    check(colmap.read_model(sparse.folder))
+    assert colmap.find_model(sparse.folder) == colmap.find_model(taken) == taken
+    assert colmap.model_files(sparse.folder) == colmap.model_files(taken)
+    assert {path.suffix for path in colmap.model_files(taken)} == {suffix}
+
+
+@pytest.mark.fault(8)
+def test_several_models_in_a_folder_are_named(sparse, tmp_path, refused):
+    said = f"{sparse.folder} has 3 COLMAP models: 0 of 3 photos, 1 of 1 photos, 10 of 3 photos"
+    for read in (colmap.find_model, colmap.read_model, colmap.model_files):
+        with pytest.raises(InputError, match=said):
+            read(sparse.folder)
+    new = ("--outputs", tmp_path / "outputs")
+    assert said in refused("--map", sparse.folder, "--map_images", tmp_path, *new)
+    assert "is a COLMAP model: give its photos" in refused("--map", sparse.folder, *new)
+
+
+@pytest.mark.fault(8)
+def test_stages_and_data_sets_take_the_only_model_in_a_folder(aachen_layout, tmp_path):
+    model = aachen_layout / "3D-models/aachen_v_1_1"
+    whole = pairs_from_covisibility.main(model, tmp_path / "whole.txt", 2).read_text()
+    names = Aachen(aachen_layout).map_names()
+    model.rename(tmp_path / "0")
+    model.mkdir()
+    (tmp_path / "0").rename(model / "0")
+    assert pairs_from_covisibility.main(model, tmp_path / "in.txt", 2).read_text() == whole
+    assert Aachen(aachen_layout).map_names() == names
+    assert Aachen(aachen_layout).reference_model == model / "0"
 
 
 @pytest.mark.fault(7)
