@@ -1,11 +1,12 @@
 """Binary files of COLMAP models."""
 
+from array import array
 from collections.abc import Callable
 from functools import lru_cache
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from struct import Struct, pack, unpack_from
 from struct import error as struct_error
+from struct import pack, unpack_from
 from typing import TypeVar
 
 import numpy as np
@@ -175,12 +176,11 @@ def _points(data: mmap, number: int, path: Path) -> tuple[np.ndarray, int]:
 
 def _starts(data: mmap, number: int) -> tuple[np.ndarray, int]:
     """Return the offsets of points (P,) int64, and that after the last one."""
-    starts: list[int] = []
-    end = 8
-    add, length = starts.append, Struct("<Q").unpack_from
+    starts, end = array("q"), 8
+    add, length = starts.append, _anywhere(data, np.dtype("<u8")).item
     for _ in range(number):  # millions
         add(end)
-        end += 51 + 8 * length(data, end + 43)[0]
+        end += 51 + 8 * length(end + 43)
     if end > len(data):
         raise ValueError
     return np.array(starts, np.int64), end
