@@ -1,7 +1,7 @@
 """Bundle adjustment of a whole model with other cameras than those that it was built with."""
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -16,26 +16,6 @@ Model = pycolmap.CameraModelId
 ESTIMATED = {Model.SIMPLE_PINHOLE, Model.PINHOLE, Model.SIMPLE_RADIAL, Model.RADIAL}
 
 
-def with_cameras(
-    sfm: pycolmap.Reconstruction, camera_of: Callable[[int], pycolmap.Camera]
-) -> pycolmap.Reconstruction:
-    """Copy the images, points and tracks of a model, with other cameras.
-
-    Args:
-        sfm: the model.
-        camera_of: returns the camera of an image, by the id of the image.
-    """
-    made = pycolmap.Reconstruction()
-    for image_id in sfm.reg_image_ids():
-        image, camera = sfm.images[image_id], camera_of(image_id)
-        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-        new = pycolmap.Image(image.name, keypoints, camera_id=camera.camera_id, image_id=image_id)
-        colmap.add_image(made, camera, new, image.cam_from_world())
-    for point in sfm.points3D.values():
-        made.add_point3D(point.xyz, point.track)
-    return made
-
-
 def with_own_cameras(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Copy a model, with a camera for each image."""
 
@@ -44,7 +24,7 @@ def with_own_cameras(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         camera.camera_id = image_id
         return camera
 
-    return with_cameras(sfm, own)
+    return colmap.with_cameras(sfm, own)
 
 
 def with_one_camera(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -52,7 +32,7 @@ def with_one_camera(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     cameras = [sfm.cameras[sfm.images[i].camera_id] for i in sfm.reg_image_ids()]
     shared = copy.deepcopy(cameras[0])
     shared.params = np.median([camera.params for camera in cameras], axis=0).tolist()
-    return with_cameras(sfm, lambda _: shared)
+    return colmap.with_cameras(sfm, lambda _: shared)
 
 
 def adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool = False) -> float:

@@ -102,13 +102,6 @@ def _extend(
     model.update_point_3d_errors()
 
 
-def remove(model: pycolmap.Reconstruction, names: Collection[str]) -> None:
-    """Take images away from a model, in place, with the points that fewer than two others see."""
-    for image in list(model.images.values()):
-        if image.name in names and image.has_pose:
-            model.deregister_frame(image.frame_id)
-
-
 def _add_images(
     model: pycolmap.Reconstruction,
     placed: Mapping[str, Placed],

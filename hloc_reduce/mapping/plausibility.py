@@ -9,7 +9,7 @@ import pycolmap
 from .. import logger
 from ..localization.confidence import focal_lengths
 from ..utils import colmap
-from . import copies, extension
+from . import copies
 from .epipolar import Pair, misplaced
 
 # ratios of focal lengths of images that one camera may have taken: one camera for all is tried
@@ -130,7 +130,7 @@ def count_viewpoints(model: pycolmap.Reconstruction) -> int:
 def _drop(model: pycolmap.Reconstruction, dropped: dict[str, str]) -> dict[str, str]:
     """Drop photos, and those that only these connect; return the photos."""
     if dropped:
-        extension.remove(model, dropped)
+        colmap.remove_images(model, dropped)  # in place: the mapper's images have their own frames
         _keep_connected(model)
     return dropped
 

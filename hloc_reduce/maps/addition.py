@@ -25,7 +25,7 @@ from ..runtime import provenance
 from ..runtime.group_writer import failures, merge
 from ..runtime.outputs import CONF
 from ..triangulation import read_matches
-from ..utils import cli
+from ..utils import cli, colmap
 from ..utils.cli import InputError
 from ..utils.feature_files import get_image_size
 from ..utils.files import announce, delete, is_readable
@@ -241,7 +241,7 @@ class Addition:
 
     def _drop(self, reason: str, names: list[str]) -> None:
         """Take photos out of the model again."""
-        extension.remove(self.sfm, names)
+        self.sfm = colmap.remove_images(self.sfm, names)
         self._leave_out(reason, names)
 
     def report(self) -> None:

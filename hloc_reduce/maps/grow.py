@@ -14,7 +14,7 @@ import pycolmap
 
 from .. import logger
 from ..localization import intrinsics
-from ..mapping import copies, extension, registration
+from ..mapping import copies, registration
 from ..mapping.plausibility import focal_length_spread
 from ..runtime import provenance
 from ..runtime.group_writer import merge
@@ -107,9 +107,8 @@ def remove(built: Map, names: Iterable[str]) -> Map:
         # also of a removal that was interrupted after map.json was written
         if unknown := removed - inside - {*list_h5_names(built.features)}:
             raise InputError(f"The map {built.folder} has no photo {cli.some(sorted(unknown))}.")
-        _check_rigs(sfm, removed)
         if removed & inside:
-            extension.remove(sfm, removed)
+            sfm = colmap.remove_images(sfm, removed)
             if not sfm.num_points3D():
                 raise InputError(f"No point of the map {built.folder} would be left.")
         if removed & {*inside, *built.mirrored, *built.unlike_others}:
@@ -129,18 +128,6 @@ def _check_whole(built: Map) -> None:
         raise InputError(
             f"The map {built.folder} is an unpacked compact one, to which no photo can be added: "
             "change the map that it was made from, and compact that again."
-        )
-
-
-def _check_rigs(sfm: pycolmap.Reconstruction, names: Collection[str]) -> None:
-    """Refuse to remove photos without those that a rig took together with them."""
-    images = sfm.images.values()
-    frames = {image.frame_id for image in images if image.name in names}
-    others = {image.name for image in images if image.frame_id in frames} - {*names}
-    if others:
-        raise InputError(
-            f"A rig of cameras took {cli.some(sorted(others))} together with photos to remove: "
-            "remove them, too."
         )
 
 

@@ -17,9 +17,8 @@ from ..localization.mirrored import mirror
 from ..localization.query import merged, ransac_options
 from ..localization.references import SfmMap
 from ..localize_sfm import RANSAC_THRESH
-from ..mapping import extension
 from ..runtime.executors import SERIAL
-from ..utils import cli
+from ..utils import cli, colmap
 from ..utils.colmap import point3D_ids, visibility
 from ..utils.parsers import parse_retrieval, write_pairs
 from . import mirroring
@@ -116,8 +115,8 @@ class _Judge:
             return set()
         known = intrinsics.of_map(self.sfm, self.image_dir, by)
         inferred = intrinsics.infer_all(self.image_dir, sorted(names), known)
-        others = copy.deepcopy(self.sfm)
-        extension.remove(others, {image.name for image in others.images.values()} - by)
+        unused = {image.name for image in self.sfm.images.values()} - by
+        others = colmap.remove_images(copy.deepcopy(self.sfm), unused)
         if not inferred or not others.num_points3D():
             return set()
         reference = SfmMap(others)

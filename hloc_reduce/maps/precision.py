@@ -9,8 +9,7 @@ import pycolmap
 from .. import logger
 from ..localization.confidence import MAX_POSITION, uncertainty
 from ..localization.projection import FOCAL, POSE
-from ..mapping import extension
-from ..mapping.adjustment import focal_length_deviations, with_cameras
+from ..mapping.adjustment import focal_length_deviations
 from ..mapping.plausibility import MANY
 from ..utils import cli, colmap
 
@@ -70,10 +69,9 @@ def _without(sfm: pycolmap.Reconstruction, names: list[str]) -> pycolmap.Reconst
     """Return a model without some of its photos, whose parameters would make others uncertain."""
     if not names:
         return sfm
-    rest = copy.deepcopy(sfm)
-    extension.remove(rest, names)
+    rest = colmap.remove_images(copy.deepcopy(sfm), names)
     # COLMAP computes no covariance of a model with frames that have no pose
-    return with_cameras(
+    return colmap.with_cameras(
         rest, lambda image_id: copy.deepcopy(sfm.cameras[sfm.images[image_id].camera_id])
     )
 

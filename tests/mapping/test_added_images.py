@@ -150,10 +150,10 @@ def test_the_map_is_refined_on_demand(scene, model):
 
 def test_removed_images_leave_the_points_of_the_others(scene, model):
     extend(scene, model, NEW)
-    extension.remove(model, [*NEW, OLD[0]])
+    colmap.remove_images(model, [*NEW, OLD[0]])
     assert {image.name for image in model.images.values() if image.has_pose} == {*OLD[1:]}
     assert {point.track.length() for point in model.points3D.values()} == {3}
-    extension.remove(model, OLD[1:3])
+    colmap.remove_images(model, OLD[1:3])
     assert model.num_points3D() == 0
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hloc_reduce.mapping import extension
 from hloc_reduce.maps import cropping
 from hloc_reduce.utils import colmap
 
@@ -126,7 +125,7 @@ def test_photos_that_were_removed_do_not_count():
     for point in worst.points2D:
         point.xy += 3.0
     model.update_point_3d_errors()
-    extension.remove(model, [worst.name])
+    colmap.remove_images(model, [worst.name])
     assert abs(cropping.find(model).gain) < 0.02
 
 

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
+import rigs
 from command import contents, write
 
 from hloc_reduce import Localizer, maps
@@ -53,6 +54,10 @@ def names(folder):
 def poses(folder):
     images = colmap.read_model(maps.Map(folder).sfm).images.values()
     return {image.name: image.cam_from_world().matrix().tolist() for image in images}
+
+
+def truth_of(model, name):
+    return colmap.read_model(model).find_image_with_name(name).cam_from_world()
 
 
 def test_doubts_end_with_the_photos_that_raised_them(grown, tmp_path, run, caplog):
@@ -112,6 +117,25 @@ def test_a_photo_that_is_only_left_out_is_removed(grown, tmp_path, refused, run)
     run(*arguments)
     assert provenance.read(folder / "map.json")["images_unlike_others"] == []
     assert "has no photo" in refused(*arguments)
+
+
+@pytest.mark.fault(3)
+@pytest.mark.parametrize("lost", ["db/0.png", "db/1.png"])  # of the reference sensor, and not
+@pytest.mark.parametrize("is_missing", [True, False])
+def test_a_photo_of_a_rig_is_missing_or_removed(is_missing, lost, place, tmp_path, run):
+    (_, model, _, images, _, outputs), _, _ = place
+    (tmp_path / "rig").mkdir()
+    rigs.taken_by_a_rig(colmap.read_model(model)).write(tmp_path / "rig")
+    if is_missing:
+        shutil.move(images / lost, tmp_path)
+    options = "--map_images", images, "--outputs", outputs, "--accept_partial"
+    run("--map", tmp_path / "rig", *options)
+    if not is_missing:
+        run("--map", outputs / "map", "--remove_images", write(tmp_path / "list.txt", lost))
+    found = poses(outputs / "map")
+    assert {*found} == {*BASE, NEW} - {lost}
+    for name, pose in found.items():
+        np.testing.assert_allclose(pose, truth_of(model, name).matrix(), atol=1e-9)
 
 
 def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):

@@ -33,7 +33,9 @@ from .models import (
     observed,
     point3D_ids,
     read_model,
+    remove_images,
     visibility,
+    with_cameras,
     write_part,
 )
 from .origin import near_from_world, near_origin, transformed

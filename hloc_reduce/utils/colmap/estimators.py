@@ -101,6 +101,7 @@ def triangulate_points(
     with open_database(database) as opened:
         if opened.num_inlier_matches() == 0:
             return pycolmap.Reconstruction()
+    options.ba_refine_sensor_from_rig = False  # else only the poses of reference sensors stay
     with _log(verbose), full_disk(output):
         with near_origin(reference):
             inputs = reference, database, image_dir, output

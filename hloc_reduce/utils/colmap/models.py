@@ -1,7 +1,7 @@
 """COLMAP models: read, check, select images; and the cameras of photos."""
 
 import shutil
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -204,15 +204,14 @@ def write_part(path: Path, names: Collection[str], output: Path) -> Path:
     Args:
         path: folder of the model.
         names: the images.
-        output: folder of the new model; unchanged files keep their times.
+        output: folder of the new model, whose rigs are those of `remove_images`; unchanged files
+            keep their times.
 
     Returns:
         `output`.
     """
     model = read_model(path)
-    for image in model.images.values():
-        if image.name not in names:
-            model.deregister_frame(image.frame_id)
+    model = remove_images(model, {image.name for image in model.images.values()} - {*names})
     written = output.with_name(f".{output.name}.tmp")
     shutil.rmtree(written, ignore_errors=True)
     written.mkdir(parents=True)
@@ -224,6 +223,52 @@ def write_part(path: Path, names: Collection[str], output: Path) -> Path:
     finally:
         shutil.rmtree(written)
     return output
+
+
+def remove_images(
+    model: pycolmap.Reconstruction, names: Collection[str]
+) -> pycolmap.Reconstruction:
+    """Remove images from a model, with the points that fewer than two others see.
+
+    COLMAP removes all images of a frame at once. So if a rig took some of `names` together with
+    other images, each image of the model that is returned has a rig and a frame of its own.
+
+    Args:
+        model: changed, unless a rig took some of `names` together with others.
+        names: the images.
+
+    Returns:
+        `model`, or a changed copy of it.
+    """
+    posed = [image for image in model.images.values() if image.has_pose]
+    removed = {image.frame_id for image in posed if image.name in names}
+    if any(image.frame_id in removed and image.name not in names for image in posed):
+        model = with_cameras(model, lambda i: model.cameras[model.images[i].camera_id])
+    for image in list(model.images.values()):
+        if image.name in names and image.has_pose:
+            model.deregister_frame(image.frame_id)
+    return model
+
+
+def with_cameras(
+    model: pycolmap.Reconstruction, camera_of: Callable[[int], pycolmap.Camera]
+) -> pycolmap.Reconstruction:
+    """Copy the images, points and tracks of a model, with other cameras.
+
+    Args:
+        model: the model; each image of the copy has a rig and a frame of its own.
+        camera_of: returns the camera of an image, by the id of the image.
+    """
+    made = pycolmap.Reconstruction()
+    for image_id in model.reg_image_ids():
+        image, camera = model.images[image_id], camera_of(image_id)
+        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        new = pycolmap.Image(image.name, keypoints, camera_id=camera.camera_id, image_id=image_id)
+        add_image(made, camera, new, image.cam_from_world())
+    for point in model.points3D.values():
+        point_id = made.add_point3D(point.xyz, point.track, point.color)
+        made.points3D[point_id].error = point.error
+    return made
 
 
 def observed(
