@@ -5,6 +5,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 
 from . import logger
 from .utils import cli, colmap
@@ -34,22 +35,36 @@ def main(model: Path, output: Path, num_matched: int) -> Path:
     reconstruction = colmap.read_model(model)
     if not reconstruction.images:
         raise cli.InputError(f"The model {model} has no images.")
-    images = [reconstruction.images[i] for i in sorted(reconstruction.images)]
-    ranking = most_covisible((colmap.point3D_ids(image) for image in images), num_matched)
 
     def pairs() -> Iterator[tuple[str, str]]:
         alone = 0
-        for image, others in zip(images, ranking, strict=True):
-            if not len(others):
-                logger.warning("Image %s has no covisible image.", image.name)
+        for name, others in covisible(reconstruction, num_matched):
+            if not others:
+                logger.warning("Image %s has no covisible image.", name)
                 alone += 1
-            yield from ((image.name, images[j].name) for j in others)
-        if alone == len(images):
-            raise cli.InputError(f"The model {model} has no covisible images: has it 3D points?")
+            yield from ((name, other) for other in others)
+        if alone == len(reconstruction.images):
+            raise cli.InputError(
+                f"The model {model} has no covisible images: it has no 3D point that two of them "
+                "see. Use pairs_from_exhaustive or pairs_from_retrieval."
+            )
 
     number = write_pairs(pairs(), output)
     logger.info("Found %d covisible pairs.", number)
     return output
+
+
+def covisible(model: pycolmap.Reconstruction, number: int) -> Iterator[tuple[str, list[str]]]:
+    """Yield each image of a model, by id, with those that share most points with it, best first.
+
+    Args:
+        model: with one or more images.
+        number: maximum number of the others.
+    """
+    images = [model.images[i] for i in sorted(model.images)]
+    ranking = most_covisible((colmap.point3D_ids(image) for image in images), number)
+    for image, others in zip(images, ranking, strict=True):
+        yield image.name, [images[j].name for j in others]
 
 
 def most_covisible(point3D_ids: Iterable[np.ndarray], number: int) -> Iterator[np.ndarray]:

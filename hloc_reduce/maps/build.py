@@ -51,9 +51,9 @@ def main(
         projection: projection file to use with the base descriptor of `feature`.
         matcher: a key of `confs.matchers`; default: the feature's.
         num_covis: each image is paired with this number of the most covisible ones in the model.
-            Without points in the model, or without a model, up to `MAX_EXHAUSTIVE` images are all
-            paired with each other, and of more each with the most similar ones; without a model,
-            pairs are added where these leave images unconnected.
+            Images that share no point of the model with others, and all without a model, are
+            paired with all others, or of more than `MAX_EXHAUSTIVE` with the most similar ones;
+            without a model, pairs are added where these leave images unconnected.
         overwrite: rebuild the map.
         storage: how descriptors are stored, one of `utils.codes.STORAGES`.
         keypoints: settings of the DoG detector, one of `detectors.dog.KEYPOINTS`.
@@ -77,8 +77,9 @@ def main(
         raise InputError(f"The model {model} has no images.")
     names = _list(image_dir, reference, accept_partial)
     check_distinct(names)
-    has_points = reference is not None and reference.num_points3D() > 0
-    exhaustive = not has_points and len(names) <= MAX_EXHAUSTIVE
+    # points without tracks, such as those of scanners, tell nothing of the photos
+    has_points = reference is not None and any(i.num_points3D for i in reference.images.values())
+    exhaustive = len(names) <= MAX_EXHAUSTIVE
     if overwrite or not (map_dir / CONF).exists():
         extract_features.check_model(conf)
     images = {name: image_dir / name for name in names}
@@ -90,7 +91,7 @@ def main(
         "num_covis": num_covis,
         **found,
     }
-    if exhaustive:
+    if exhaustive and not has_points:
         made_from |= {"num_covis": None, "pairs": "exhaustive"}
     elif model is None:
         made_from |= {"pairs": f"retrieval, {ROUNDS} rounds of verification"}

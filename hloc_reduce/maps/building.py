@@ -27,7 +27,7 @@ from ..mapping import mapper, plausibility, registration
 from ..runtime import provenance
 from ..runtime.outputs import RunFolder
 from ..utils import cli, colmap
-from ..utils.parsers import parse_pairs, write_pairs
+from ..utils.parsers import parse_pairs, parse_retrieval, write_pairs
 from . import contradictions, cropping, mirrored_photos, misfits, precision
 from .map import FINISHED, RETRIEVAL, SFM, Map, keep_projection, models, write
 
@@ -45,6 +45,7 @@ ROUNDS = 3  # of additional pairs, in which larger sets of photos get connected
 class Building:
     """A map that is being built; `names` loses images that cannot be read.
 
+    If `exhaustive`, images without covisible ones are paired with all others.
     `matches` are its match files by the names of their feature files. `mirrored` and
     `unlike_others` are images that are left out; `names` has not those of another size.
     """
@@ -145,12 +146,8 @@ class Building:
         features, descriptors = self._describe(conf)
         if len(self.names) < len(reference.images):
             model = colmap.write_part(model, set(self.names), self.folder.path / "sfm_reference")
-        if reference.num_points3D():
-            pairs = self.folder.path / f"pairs-db-{self.num_covis}.txt"
-            with self.folder.stage("pairs"):
-                pairs_from_covisibility.main(model, pairs, self.num_covis)
-        else:
-            pairs = self._pairs(descriptors)
+            reference = colmap.read_model(model)
+        pairs = self._pairs_of_model(reference, descriptors)
         matches = self._match(pairs, features)
         with self.folder.stage("triangulation"):
             sfm = triangulation.main(
@@ -158,6 +155,33 @@ class Building:
             )
         shutil.rmtree(self.folder.path / "sfm_reference", ignore_errors=True)
         return sfm
+
+    def _pairs_of_model(self, reference: pycolmap.Reconstruction, descriptors: Path) -> Path:
+        """Pair covisible images, and those without any as if the model had no points."""
+        others = dict(pairs_from_covisibility.covisible(reference, self.num_covis))
+        alone = [name for name, seen in others.items() if not seen]
+        if len(alone) == len(others):
+            return self._pairs(descriptors)
+        pairs = self.folder.path / f"pairs-db-{self.num_covis}.txt"
+        with self.folder.stage("pairs"):
+            if alone:
+                logger.info(
+                    "%d of %d photos share no point of the model with others, so they are paired "
+                    "with %s: %s.",
+                    *(len(alone), len(others)),
+                    "all others" if self.exhaustive else "the most similar ones",
+                    cli.some(alone),
+                )
+            if self.exhaustive:
+                others |= {name: [other for other in others if other != name] for name in alone}
+            elif alone:
+                pairs_from_retrieval.main(
+                    *(descriptors, pairs, self.num_covis), query_list=alone, db_list=[*others]
+                )
+                others |= parse_retrieval(pairs)
+            number = write_pairs(((a, b) for a in others for b in others[a]), pairs)
+        logger.info("Found %d pairs of %d images.", number, len(others))
+        return pairs
 
     @property
     def _left_out(self) -> set[str]:

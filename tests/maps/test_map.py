@@ -14,7 +14,7 @@ from command import outcome, state
 from hloc_reduce import Localizer, maps, projections
 from hloc_reduce.training import tracks
 from hloc_reduce.training.tracks import parse_maps
-from hloc_reduce.utils import parsers
+from hloc_reduce.utils import colmap, parsers
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize
 
@@ -283,6 +283,36 @@ def test_a_model_of_poses_only(place, aachen_layout, monkeypatch, exhaustive, ru
     assert len(pairs) == (6 if exhaustive == 4 else 8)
     pose, _ = Localizer(outputs / "map").localize(images / "query/day/a.png")
     assert pose is not None
+
+
+@pytest.mark.fault(5)
+@pytest.mark.parametrize("exhaustive", [4, 3])
+@pytest.mark.parametrize(
+    ("blind", "numbers"),  # of pairs: of all photos, or each with the two most similar ones
+    [([0, 1, 2, 3], (6, 8)), ([0], (9, 8)), ([2, 3], (8, 6))],
+)
+def test_photos_that_see_no_point_of_the_model(
+    blind, numbers, exhaustive, place, aachen_layout, monkeypatch, run
+):
+    """They are paired as without points; those that see some, by these: of a scanner, none do."""
+    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", exhaustive)
+    build, images, outputs = place
+    model = aachen_layout / "3D-models/aachen_v_1_1"
+    reference = pycolmap.Reconstruction(model)
+    points = [point.xyz for point in reference.points3D.values()]
+    for image in (reference.find_image_with_name(f"db/{i}.png") for i in blind):
+        while rows := image.get_observation_point2D_idxs():
+            reference.delete_observation(image.image_id, rows[0])
+    for xyz in points:
+        reference.add_point3D(xyz, pycolmap.Track())
+    reference.write(model)
+    run(*build, "--num_covis", 2)
+    (listed,) = (outputs / "map").glob("pairs-db-*.txt")
+    pairs = list(parsers.parse_pairs(listed))
+    assert len(pairs) == numbers[exhaustive == 3]
+    assert {name for pair in pairs for name in pair} == {f"db/{i}.png" for i in range(4)}
+    sfm = colmap.read_model(outputs / "map/sfm")
+    assert min(image.num_points3D for image in sfm.images.values()) > 100
 
 
 def test_a_map_to_train_on(place, run):
