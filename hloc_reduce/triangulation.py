@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,9 @@ import pycolmap
 from . import logger
 from .localization.projection import median_photo_scale
 from .mapping.epipolar import agreeing
+from .mapping.sizes import Size, scale_cameras
 from .runtime import provenance
+from .runtime.group_writer import failures
 from .utils import cli, colmap
 from .utils.cli import InputError
 from .utils.feature_files import get_colmap_keypoints, get_image_size
@@ -51,7 +53,8 @@ def main(
 
     Args:
         sfm_dir: folder of the new COLMAP model; a model made from the same inputs is read instead.
-        reference_model: COLMAP model with the cameras and poses of all images of the pairs.
+        reference_model: COLMAP model with the cameras and poses of all images of the pairs. A
+            camera whose photos were all resized in the same way is scaled to them.
         image_dir: folder of the images, which give the points their colours.
         pairs: text file of pairs.
         features: feature file.
@@ -70,17 +73,19 @@ def main(
         The map. It has the keypoints of the feature file, in the same order.
 
     Raises:
-        InputError: when an input is missing or no point can be triangulated.
+        InputError: when an input is missing, photos do not have the size of their cameras, see
+            `mapping.sizes`, or no point can be triangulated.
     """
     options = {"random_seed": 0, "num_threads": 1, **(mapper_options or {})}
     colmap.mapper_options(options)  # raises for a wrong one
     reference_model = colmap.find_model(reference_model)
     reference = colmap.read_model(reference_model)
-    pixel_scale = median_photo_scale(image.camera for image in reference.images.values())
-    mapper = colmap.mapper_options(options, pixel_scale)
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
+    scale_cameras(reference, _photo_sizes(reference, features))
+    pixel_scale = median_photo_scale(image.camera for image in reference.images.values())
+    mapper = colmap.mapper_options(options, pixel_scale)
     verification = {
         "skip_geometric_verification": skip_geometric_verification,
         "estimate_two_view_geometries": estimate_two_view_geometries,
@@ -98,7 +103,6 @@ def main(
     with replacing_map(sfm_dir, made_from, reference_model) as building:
         database = building / "database.db"
         colmap.write_reference(database, reference)
-        _check_sizes(reference, features)
         names = [image.name for image in reference.images.values()]
         keypoints, uncertainty, found = read_matches(
             names, pairs, features, matches, min_match_score
@@ -210,25 +214,15 @@ def read_matches(
     return keypoints, uncertainty, found
 
 
-def _check_sizes(reference: pycolmap.Reconstruction, features: Path) -> None:
-    """Warn of photos whose sizes differ from those of their cameras: their geometry is wrong."""
-    wrong = []
+def _photo_sizes(reference: pycolmap.Reconstruction, features: Path) -> dict[str, Size]:
+    """Return the sizes of the photos of a model, as far as a feature file has them."""
+    sizes, unreadable = {}, failures(features)
     with open_h5(features) as file:
         for image in reference.images.values():
-            camera = reference.cameras[image.camera_id]
-            try:
-                width, height = get_image_size(file, image.name)
-            except InputError:  # features of other programs may have none
-                continue
-            if (width, height) != (camera.width, camera.height):
-                size = f"{camera.width}x{camera.height}"
-                wrong.append(f"{image.name} ({width}x{height}, its camera {size})")
-    if wrong:
-        logger.warning(
-            "%d of %d photos differ in size from their cameras in the model: %s. Use the photos "
-            "that the model was made from, or resize its cameras.",
-            *(len(wrong), len(reference.images), cli.some(wrong, 3)),
-        )
+            if image.name not in unreadable:
+                with suppress(InputError):  # features of other programs may have none
+                    sizes[image.name] = get_image_size(file, image.name)
+    return sizes
 
 
 def _verify(

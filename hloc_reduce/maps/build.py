@@ -10,13 +10,14 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
 from ..extract_features import keep_present
+from ..mapping import sizes
 from ..runtime import provenance
 from ..runtime.outputs import CONF, RunFolder
 from ..utils import colmap
 from ..utils.cli import InputError
 from ..utils.codes import STORAGES
 from ..utils.files import replacing
-from ..utils.images import list_images
+from ..utils.images import image_sizes, list_images
 from ..utils.match_files import check_distinct
 from ..utils.paths import strings_as_paths
 from .building import ROUNDS, Building, drop_others
@@ -67,7 +68,8 @@ def main(
 
     Raises:
         InputError: if the folder has a map that was made from something else, something is missing
-            or wrong, or the reconstruction is refused, see `registration.check`; what is finished
+            or wrong, photos do not have the size of their cameras in the model (`mapping.sizes`),
+            or the reconstruction is refused, see `registration.check`; what is finished
             is kept, for a run with `accept_partial`.
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
@@ -82,6 +84,8 @@ def main(
     exhaustive = len(names) <= MAX_EXHAUSTIVE
     if overwrite or not (map_dir / CONF).exists():
         extract_features.check_model(conf)
+    if reference is not None and (overwrite or not (map_dir / FINISHED).exists()):
+        sizes.resized(reference, image_sizes(image_dir, names))
     images = {name: image_dir / name for name in names}
     parts = {path.name: path for path in (colmap.model_files(model) if model else [])}
     fingerprints, found = digests(map_dir, {"images": images, "model": parts})

@@ -1,10 +1,12 @@
 """Images: their names and their pixels."""
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from .. import logger
 from .cli import InputError, no_folder, some
@@ -74,6 +76,15 @@ def list_images(
             f"{len(missing)} of {len(names)} images are not in {image_dir}: {some(missing)}"
         )
     return names
+
+
+def image_sizes(image_dir: Path, names: Iterable[str]) -> dict[str, tuple[int, int]]:
+    """Return the (width, height) of images as they are stored, but not of unreadable ones."""
+    sizes = {}
+    for name in names:
+        with suppress(Exception), Image.open(image_dir / name) as opened:  # Pillow raises many
+            sizes[name] = opened.size
+    return sizes
 
 
 def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:

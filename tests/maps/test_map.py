@@ -315,6 +315,28 @@ def test_photos_that_see_no_point_of_the_model(
     assert min(image.num_points3D for image in sfm.images.values()) > 100
 
 
+@pytest.mark.fault(11)
+def test_photos_that_were_made_smaller(place, aachen_layout, run, refused):
+    """Their cameras are scaled if all were; else nothing is extracted."""
+    build, images, outputs = place
+    for number in range(4):
+        photo = images / f"db/{number}.png"
+        pixels = cv2.imread(str(photo))
+        cv2.imwrite(str(photo), cv2.resize(pixels, (288, 216), interpolation=cv2.INTER_AREA))
+        if number < 3:
+            said = refused(*build)
+            assert "db/0.png (288x216, its camera 360x270: resized" in said
+            assert not list(outputs.rglob("*.h5"))
+    run(*build)
+    (camera,) = colmap.read_model(outputs / "map/sfm").cameras.values()
+    assert [camera.width, camera.height, *camera.params] == [288, 216, 300, 144, 108]
+    camera.rescale(360, 270)
+    pose, _ = Localizer(outputs / "map").localize(images / "query/day/a.png", camera)
+    truth = parsers.parse_poses(aachen_layout / "queries/ground_truth_poses.txt")
+    error = pose.inverse().translation - truth["query/day/a.png"].inverse().translation
+    assert abs(error).max() < 0.01
+
+
 def test_a_map_to_train_on(place, run):
     build, images, outputs = place
     run(*build)

@@ -159,9 +159,36 @@ def test_overflowed_matches_are_refused(built):
         built.triangulate(built.root / "new")
 
 
-def test_photos_of_another_size_than_the_model_are_named(built, caplog, monkeypatch):
-    monkeypatch.setattr(cli.logger, "propagate", True)
-    with h5py.File(built.features, "r+") as file:
-        file["db/0.jpg/image_size"] = np.array([320, 240])
-    built.triangulate()
-    assert "1 of" in caplog.text and "db/0.jpg (320x240, its camera 640x480)" in caplog.text
+def resize(features, ratio, names):
+    """Move the keypoints of photos as if these were of another size."""
+    with h5py.File(features, "a") as file:
+        for name in names:
+            keypoints = file[f"{name}/keypoints"]
+            keypoints[:] = (keypoints[:] + 0.5) * ratio - 0.5
+            file[f"{name}/image_size"] = np.round([640 * ratio, 480 * ratio]).astype(int)
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize("ratio", [0.5, 0.33, 2, 1])
+def test_cameras_are_scaled_to_their_photos(ratio, built):
+    """Points are where they were, and seen in the pixels of the photos."""
+    resize(built.features, ratio, list_h5_names(built.features))
+    found = built.triangulate(built.root / "resized")
+    assert found.num_points3D() == 300
+    for point in found.points3D.values():
+        element = point.track.elements[0]
+        name = found.images[element.image_id].name
+        true = built.points[built.seen[name][element.point2D_idx]]
+        np.testing.assert_allclose(point.xyz, true, atol=1e-2)
+    (camera,) = found.cameras.values()
+    assert [camera.width, camera.height] == [round(640 * ratio), round(480 * ratio)]
+    assert camera.params[0] == pytest.approx(500 * ratio, rel=2e-3)
+
+
+@pytest.mark.fault(11)
+def test_a_camera_does_not_fit_photos_of_two_sizes(built):
+    resize(built.features, 0.5, ["db/0.jpg"])
+    resize(built.features, 1, ["db/1.jpg"])
+    said = "1 of 2 .*db/0.jpg .320x240, its camera 640x480: resized, unlike others"
+    with pytest.raises(InputError, match=said):
+        built.triangulate()
