@@ -58,6 +58,11 @@ def detector(conf: dict) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]
     return partial(detect, options=options, adaptive=adaptive)
 
 
+def is_rotation_invariant(conf: dict) -> bool:
+    """Tell whether keypoints of a configuration like `CONF` have the orientations of the photo."""
+    return not conf["options"].get("upright", False)
+
+
 def strongest(
     keypoints: np.ndarray, descriptors: np.ndarray, number: int
 ) -> tuple[np.ndarray, np.ndarray]:

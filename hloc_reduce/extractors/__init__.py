@@ -36,6 +36,7 @@ class Extractor(BaseModel):
         detect: detects the keypoints, if that can be done in another process (pickled), separately
             from describing them; `_forward` gets the result as `detected`.
         dim: dimension of the descriptors, as far as it is known.
+        rotation_invariant: photos match however they are turned.
         gpu_images: how many threads may give images to one extractor on a GPU.
         stride: what the sides of an image are multiples of in `fixed`.
     """
@@ -44,6 +45,7 @@ class Extractor(BaseModel):
     detection_noise = 1.0
     detect: Detect | None = None
     dim = DIM
+    rotation_invariant = False
     gpu_images = 1
     stride = 1
 

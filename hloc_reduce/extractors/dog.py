@@ -91,6 +91,7 @@ class DoG(Extractor):
         descriptor = choose("descriptor", conf["descriptor"], BASES)
         self.describe = None if descriptor == COLMAP else Descriptor(descriptor)
         self.detect = dog.detector(conf)
+        self.rotation_invariant = dog.is_rotation_invariant(conf)
 
     @property
     def descriptor(self) -> str:

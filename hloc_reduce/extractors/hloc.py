@@ -11,6 +11,7 @@ from . import Extractor
 
 # keys of hloc's configurations that determine the descriptors
 DETERMINING = ("descriptor", "model_name", "weights")
+ROTATION_INVARIANT = {"dog"}
 
 
 def _reason(error: Exception) -> str:
@@ -43,6 +44,7 @@ class HlocExtractor(Extractor):
                 f"hloc's extractor {name} cannot be made ({_reason(error)})."
             ) from None
         self.detection_noise = getattr(self.model, "detection_noise", 1.0)
+        self.rotation_invariant = self.name in ROTATION_INVARIANT
 
     @property
     def descriptor(self) -> str:

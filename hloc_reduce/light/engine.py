@@ -37,6 +37,7 @@ class LightEngine:
 
     def __init__(self, extract: Extract, matcher: dict, vocabulary: np.ndarray):
         self._extract, self._vocabulary = extract, vocabulary
+        self.rotation_invariant = extract.rotation_invariant
         self._ratio_threshold = matcher.get("ratio_threshold")
         self._distance_threshold = matcher.get("distance_threshold")
 

@@ -1,7 +1,8 @@
 """Features of photos: COLMAP's SIFT, or a network in an ONNX file."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -11,10 +12,20 @@ from ..utils.cli import InputError
 from . import projection
 from .noise import reduce_noise
 
-# from an image, (H, W) or (H, W, 3) RGB float32 in [0, 1], to `keypoints` (N, 2) x, y in its
-# pixels, centres at integers; `descriptors` (D, N) of unit norm; and perhaps `blur`, the standard
-# deviation in pixels of the blur by which the noise was reduced
-Extract = Callable[[np.ndarray], dict]
+
+class Extract(Protocol):
+    """Extracts the features of an image."""
+
+    rotation_invariant: bool  # see `extractors.Extractor`
+
+    def __call__(self, image: np.ndarray) -> dict:
+        """Return the features of an image (H, W) or (H, W, 3) RGB float32 in [0, 1].
+
+        Returns:
+            `keypoints` (N, 2) x, y in its pixels, centres at integers; `descriptors` (D, N) of unit
+            norm; and perhaps `blur`, the standard deviation in pixels of the blur by which the
+            noise was reduced.
+        """
 
 
 class ColmapSift:
@@ -33,6 +44,7 @@ class ColmapSift:
             raise InputError(f"DoG has no option {', '.join(sorted(unknown))}.")
         self._conf, self._layers = {**dog.CONF, **conf}, layers
         self._detect = dog.detector(self._conf)
+        self.rotation_invariant = dog.is_rotation_invariant(self._conf)
 
     def __call__(self, image: np.ndarray) -> dict:
         """Return the features of an image (H, W)."""
@@ -56,6 +68,8 @@ class OnnxNetwork:
     Raises:
         InputError: when ONNX Runtime is not installed, or the file is broken or of another feature.
     """
+
+    rotation_invariant = False
 
     def __init__(self, path: Path, feature: str, denoise: bool):
         try:

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import pycolmap
 from PIL import Image
 
-MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769  # EXIF tags
+MAKE, MODEL, ORIENTATION, EXIF = 0x010F, 0x0110, 0x0112, 0x8769  # EXIF tags
 ZOOM, FOCAL_35MM, FOCAL_LENGTH = 0xA404, 0xA405, 0x920A
 WIDTH, HEIGHT = 0xA002, 0xA003  # as the camera wrote it
 FOCAL_PLANE, UNIT = 0xA20E, 0xA210  # pixels of the sensor in a unit of length
 UNITS = {2: 25.4, 3: 10.0}  # millimetres
+UPRIGHT, ORIENTATIONS = 1, range(1, 9)
 MAX_ZOOM = 1.01
 RESHAPED = 1.02  # ratio of aspect ratios: a copy of another size differs by rounding only
 MAX_RATIO = 10.0  # of width and height in EXIF data: others are nonsense
@@ -68,6 +69,19 @@ def exif_camera(image: Path) -> ExifCamera | None:
     name, lens = f"{make} {model}", f"{make} {model} {focal_length:g} mm"
     full_size = (taken[1], _in_pixels(more)) if taken else (0.0, 0.0)
     return ExifCamera(name, lens, size, zoom > MAX_ZOOM, _is_cropped(size, taken), full_size)
+
+
+def stored(image: Path) -> tuple[tuple[int, int], int] | None:
+    """Return how a photo is stored: (width, height) and EXIF orientation, 1 if that is not known.
+
+    None for a file that cannot be read.
+    """
+    try:
+        with Image.open(image) as opened:
+            size, found = opened.size, opened.getexif().get(ORIENTATION, UPRIGHT)
+    except Exception:  # Pillow raises many types for broken data
+        return None
+    return size, int(found) if found in ORIENTATIONS else UPRIGHT
 
 
 def _in_pixels(more: Mapping[int, Any]) -> float:

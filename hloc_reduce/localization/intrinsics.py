@@ -13,7 +13,7 @@ from ..utils.files import replacing
 from ..utils.images import UnreadableImage
 from ..utils.parsers import parse_camera, to_line
 from .confidence import FOCAL_LENGTHS
-from .exif import WELL_KNOWN, correct, exif_camera
+from .exif import WELL_KNOWN, correct, exif_camera, stored
 
 # A lens is typical of photos whose cameras have one of these models, if the logarithms of their
 # focal lengths, their distortions and principal points differ by at most this.
@@ -48,7 +48,7 @@ class Lens(NamedTuple):
 
 
 class MapCameras(NamedTuple):
-    """What a map tells about the intrinsics of other photos.
+    """What the photos of a map tell about the intrinsics of others, and how these are stored.
 
     Args:
         known: cameras that took several of its photos, by their `exif.ExifCamera.name`.
@@ -58,6 +58,7 @@ class MapCameras(NamedTuple):
             does not know.
         typical: of each size of which it has several photos, (width, height), their lens, if that
             is much the same in all of them.
+        orientations: EXIF orientations of its photos, empty if the map does not know.
     """
 
     known: dict[str, pycolmap.Camera]
@@ -65,6 +66,7 @@ class MapCameras(NamedTuple):
     models: Collection[str] = ()
     focal_lengths: tuple[float, float] | None = None
     typical: Mapping[tuple[int, int], Lens] = MappingProxyType({})
+    orientations: Collection[int] = ()
 
 
 def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera, str]:
@@ -215,7 +217,9 @@ def of_map(
         if len(ids) >= WELL_KNOWN and len(set(ids)) == 1
     }
     cameras = [reconstruction.cameras[image.camera_id] for image in photos]
-    return of_cameras(cameras)._replace(known=known, models=models)
+    found_stored = (stored(image_dir / image.name) for image in photos)
+    orientations = {one[1] for one in found_stored if one is not None}
+    return of_cameras(cameras)._replace(known=known, models=models, orientations=orientations)
 
 
 def merged(first: MapCameras, second: MapCameras) -> MapCameras:
@@ -226,7 +230,10 @@ def merged(first: MapCameras, second: MapCameras) -> MapCameras:
     models = {*first.models, *second.models}
     ranges = [cameras.focal_lengths for cameras in (first, second) if cameras.focal_lengths]
     lengths = (min(low for low, _ in ranges), max(high for _, high in ranges)) if ranges else None
-    return MapCameras(second.known | first.known, first.sizes | second.sizes, models, lengths)
+    return MapCameras(
+        *(second.known | first.known, first.sizes | second.sizes, models, lengths),
+        orientations={*first.orientations, *second.orientations},
+    )
 
 
 def to_dict(cameras: MapCameras) -> dict:
@@ -237,6 +244,7 @@ def to_dict(cameras: MapCameras) -> dict:
         "camera_models": sorted(cameras.models),
         "focal_lengths": cameras.focal_lengths,
         "typical": to_rows(cameras.typical),
+        "orientations": sorted(cameras.orientations),
     }
 
 

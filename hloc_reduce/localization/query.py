@@ -30,7 +30,8 @@ def localize(
         camera: intrinsics.
         matches: from map images, best first, to (M, 2) indices of the keypoints of the query and
             of the image, the most similar first.
-        config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
+        config: hloc's dict of options of pycolmap, under "estimation" and "refinement"; under
+            "photo", what `absolute_pose.estimate` reads, and how it is "turned", see `turned`.
         gate: what a pose must have to be trusted.
         thorough: where few matches agree with a pose, try those of single images, too.
         workers: threads that estimate poses.
@@ -67,6 +68,8 @@ def localize(
                     f"ambiguous: a pose by other images has {other.num_inliers} inliers, this one "
                     f"{best.num_inliers}"
                 )
+    if info["reason"] and len(keypoints) and (turned := config.get("photo", {}).get("turned")):
+        info["reason"] += f"; {turned}"
     return best.cam_from_world, info
 
 

@@ -146,9 +146,10 @@ class CompactMap:
         known = metadata["known"].items()
         models, focal = {str(m) for m in metadata["models"]}, metadata.get("focal_lengths")
         typical = intrinsics.from_rows(metadata.get("typical", []))
+        orientations = {int(one) for one in metadata.get("orientations", [])}
         self.cameras = intrinsics.MapCameras(
             {str(name): intrinsics.from_list(values) for name, values in known},
-            *(sizes, models, intrinsics.to_range(focal), typical),
+            *(sizes, models, intrinsics.to_range(focal), typical, orientations),
         )
 
     def _read_projection(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:

@@ -30,6 +30,7 @@ class Engine(Protocol):
     """Computes for a map, see `light.engine.LightEngine` and `maps.engine.TorchEngine`."""
 
     takes_codes: bool  # of its matcher, see `matchers.Matcher`
+    rotation_invariant: bool  # of its extractor, see `extractors.Extractor`
 
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
         """Extract the features of a photo, see `extractors.extract`."""

@@ -32,6 +32,7 @@ class TorchEngine:
     ):
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._extractor = extractor.eval().to(self._device)
+        self.rotation_invariant = extractor.rotation_invariant
         self._matcher = matchers.load(matcher).eval()
         self._vlad = aggregators.load(RETRIEVAL["model"])
         self._vlad.vocabulary = vocabulary

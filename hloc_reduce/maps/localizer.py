@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from ..localization import intrinsics, mirrored, query, stage
+from ..localization import intrinsics, mirrored, query, stage, turned
 from ..localization.confidence import DEFAULT_GATE, Gate
 from ..localization.query import merged, ransac_options
 from ..localize_sfm import RANSAC_THRESH
@@ -98,6 +98,8 @@ class Localizer:
         if camera is None:
             camera, source = intrinsics.infer(image, self.cameras)
             refinement = intrinsics.refinement(camera, source, self.cameras)
+        if not self.engine.rotation_invariant:
+            refinement = merged(refinement, turned.options(image, self.cameras))
         features = self._extract(image)
         width, height = map(int, features["image_size"])
         if (camera.width, camera.height) != (width, height):

@@ -113,6 +113,7 @@ class Map:
             {str(model) for model in content.get("camera_models", [])},
             intrinsics.to_range(content.get("focal_lengths")),
             intrinsics.from_rows(content.get("typical", [])),
+            {int(orientation) for orientation in content.get("orientations", [])},
         )
         conf = dict(content["conf"])
         conf |= {key: dict(conf[key]) for key in ("model", "preprocessing")}

@@ -73,6 +73,7 @@ def encode(
         "models": sorted(source.cameras.models),
         "focal_lengths": source.cameras.focal_lengths,
         "typical": intrinsics.to_rows(source.cameras.typical),
+        "orientations": sorted(source.cameras.orientations),
         "doubts": source.doubts,
     }
     _add_images(tensors, metadata, points, source.model)

@@ -1,0 +1,106 @@
+"""Queries that are stored turned against the photos of a map."""
+
+import numpy as np
+import pytest
+from command import outcome, write
+from PIL import Image
+
+from hloc_reduce import Localizer, compact, extractors
+from hloc_reduce.confs import features
+from hloc_reduce.localization import turned
+from hloc_reduce.localization.exif import ORIENTATION
+from hloc_reduce.localization.intrinsics import MapCameras
+from pipelines import localize
+
+PIPELINE = localize
+LANDSCAPE, PORTRAIT = (40, 30), (30, 40)
+SAID = "it is stored turned against the map's photos"
+PERHAPS = "it may be stored turned against the map's photos"
+
+
+def save(path, pixels, orientation=None):
+    """Write a photo as it is, with an EXIF orientation."""
+    exif = Image.Exif()
+    if orientation is not None:
+        exif[ORIENTATION] = orientation
+    Image.fromarray(pixels).save(path, exif=exif)
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize(
+    ("size", "orientation", "sizes", "orientations", "said"),
+    [
+        (LANDSCAPE, None, {LANDSCAPE}, {1}, None),
+        (LANDSCAPE, 1, {LANDSCAPE}, {1}, None),
+        (LANDSCAPE, 99, {LANDSCAPE}, {1}, None),
+        (LANDSCAPE, 3, {LANDSCAPE}, {1}, f"{SAID} (EXIF orientation 3, theirs 1)"),
+        (LANDSCAPE, None, {PORTRAIT}, {8}, f"{SAID} (EXIF orientation 1, theirs 8)"),
+        (LANDSCAPE, 6, {LANDSCAPE}, {1, 8}, f"{SAID} (EXIF orientation 6, theirs 1, 8)"),
+        (PORTRAIT, 8, {LANDSCAPE, PORTRAIT}, {1, 8}, None),
+        (PORTRAIT, None, {LANDSCAPE}, {1}, f"{PERHAPS} (portrait, theirs landscape)"),
+        (LANDSCAPE, None, {PORTRAIT}, set(), f"{PERHAPS} (landscape, theirs portrait)"),
+        (PORTRAIT, 6, {LANDSCAPE}, set(), f"{PERHAPS} (portrait, theirs landscape)"),  # an old map
+        (LANDSCAPE, 6, {LANDSCAPE}, set(), None),
+        ((30, 30), None, {LANDSCAPE}, {1}, None),
+        (LANDSCAPE, None, {(30, 30)}, {1}, None),
+        (LANDSCAPE, None, set(), {1}, None),
+    ],
+)
+def test_which_photos_are_turned(size, orientation, sizes, orientations, said, tmp_path):
+    save(tmp_path / "a.jpg", np.zeros(size[::-1], np.uint8), orientation)
+    found = turned.reason(tmp_path / "a.jpg", MapCameras({}, sizes, orientations=orientations))
+    assert found is None if said is None else found.startswith(f"{said}, which this feature")
+
+
+def test_a_photo_that_cannot_be_read_is_not_turned(tmp_path):
+    of_map = MapCameras({}, {LANDSCAPE}, orientations={8})
+    assert turned.reason(write(tmp_path / "a.jpg", "broken"), of_map) is None
+    assert turned.reason(tmp_path / "absent.jpg", of_map) is None
+    assert turned.reason(np.zeros((30, 40, 3), np.uint8), of_map) is None  # no EXIF data
+    assert turned.reason(np.zeros((40, 30), np.uint8), of_map).startswith(PERHAPS)
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize(
+    ("model", "invariant"),
+    [
+        (features.confs["colmap_sift_sv64"]["model"], True),
+        (features.confs["hardnet"]["model"], True),
+        ({"name": "dog", "options": {"upright": True}, "descriptor": "colmap_sift"}, False),
+        (features.confs["mini32"]["model"], False),
+    ],
+)
+def test_features_are_invariant_if_their_keypoints_have_orientations(model, invariant, monkeypatch):
+    monkeypatch.setattr("hloc_reduce.extractors.dog.Descriptor", lambda name: None)
+    assert extractors.load(model).rotation_invariant == invariant
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize("invariant", [True, False])
+def test_the_reason_says_that_a_query_is_turned(invariant, place, tmp_path, monkeypatch, run):
+    monkeypatch.setattr("hloc_reduce.detectors.dog.is_rotation_invariant", lambda conf: invariant)
+    build, images, outputs = place
+    noise = np.random.default_rng(0).integers(0, 255, (270, 360), np.uint8)
+    queries = tmp_path / "turned"
+    queries.mkdir()
+    for name, pixels, orientation in (
+        ("upright.png", noise, 1),
+        ("left.png", np.rot90(noise), None),
+        ("upside_down.png", np.rot90(noise, 2), 3),
+        ("grey.png", np.full_like(noise, 128), 3),
+    ):
+        save(queries / name, pixels, orientation)
+    run(*build, "--query_images", queries)
+    _, rows = outcome(outputs / "queries-turned")
+    said = {name: row["reason"] for name, row in rows.items()}
+    assert said["grey.png"] == "no keypoints"
+    assert said["upright.png"] and "stored" not in said["upright.png"]
+    clauses = {"left.png": PERHAPS, "upside_down.png": SAID}
+    for name, clause in clauses.items():
+        assert said[name] and (clause in said[name]) != invariant
+    compact.main(tmp_path / "map.hlm", outputs / "map")
+    for path in (outputs / "map", tmp_path / "map.hlm"):
+        localizer = Localizer(path)
+        assert localizer.cameras.orientations == {1}
+        for name, clause in clauses.items():
+            assert (clause in localizer.localize(queries / name)[1]["reason"]) != invariant
