@@ -47,7 +47,8 @@ def main(
     their EXIF data, are dropped from the model.
     If images are missing (of more than 100 images, more than a fifth), further attempts follow, and
     the model with the most images is kept: an attempt with lower thresholds and, for up to 30
-    images, some with other initial pairs, as many at once as there are cores. With `camera_mode`
+    images, some with other initial pairs, as many at once as there are cores; none of these begins
+    after they have taken `mapper.PATIENCE` seconds, which is said. With `camera_mode`
     AUTO, if at most two thirds of the images are in the model, or focal lengths differ by more than
     a factor of 1.2, and one camera may have taken all of them, the mapper runs with one shared
     camera. Its model is kept if it has at least 1.5 times as many images, or 1.5 times as many
@@ -79,7 +80,7 @@ def main(
     Raises:
         InputError: when an input is missing, or the model is refused; it is kept for a run with
             `accept_partial`.
-        NoModelError: when nothing can be reconstructed.
+        NoModelError: when nothing can be reconstructed, as of fewer than three images.
     """
     options = {**MAPPER_OPTIONS, **(mapper_options or {})}
     colmap.mapper_options(options)  # raises for a wrong one
@@ -87,6 +88,7 @@ def main(
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
     names = list_images(image_dir, list_h5_names(features) if image_list is None else image_list)
+    registration.check_number(image_dir, len(names))
     attempts = [{}] if mapper_options else attempts_for(len(names))
     chosen = {
         "camera_mode": camera_mode.name,

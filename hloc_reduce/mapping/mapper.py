@@ -2,8 +2,9 @@
 
 import copy
 import shutil
+import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -46,6 +47,7 @@ RELAXED = {
 FALLBACK = "structure_less_registration_fallback"
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
 SEEDS = (1, 2, 3)
+PATIENCE = 300.0  # seconds of further attempts, after which none begins: most maps take far less
 MORE = 1.5  # times as many images show that one camera took all
 # Images that one camera took fit up to 10 % better with cameras of their own, in nine of twelve
 # models whose focal lengths differ by more than DOUBTFUL. Where one of them was enlarged by 8 %,
@@ -92,6 +94,8 @@ class Mapper:
     attempts: list[dict]  # of pycolmap's IncrementalPipelineOptions
     once: bool  # make the first attempt only, unless images fit with one camera
     verbose: bool
+    seconds: float = field(default=0.0, init=False)  # spent on further attempts
+    left_out: int = field(default=0, init=False)  # attempts that were not made for lack of time
 
     def reconstruct(self, camera_mode: pycolmap.CameraMode) -> None:
         """Write the best model, its database and its registration."""
@@ -102,7 +106,7 @@ class Mapper:
             (models, dropped), database = shared
             alike = False
         if not models:
-            raise NoModelError(nothing(self.image_dir, dropped))
+            raise NoModelError(nothing(self.image_dir, dropped, self.left_out))
         models[0].write(self.folder)
         parts = _parts(models)
         missing = sorted(set(self.names) - set(parts[0]))
@@ -114,6 +118,7 @@ class Mapper:
             "implausible": {name: what for name, what in dropped.items() if name in missing},
             "alike": alike,
             "spread": round(focal_length_spread(models), 2),
+            "attempts_left_out": self.left_out,
         }
         provenance.write(self.folder / REGISTRATION, state)
         database.rename(self.folder / "database.db")
@@ -150,6 +155,9 @@ class Mapper:
 
     def run(self, database: Path, once: bool) -> Models:
         """Return the plausible models of the best attempt; stop when enough images are in one."""
+        if _largest_group(database) < VIEWPOINTS:
+            logger.info("No %d images have verified matches that connect them.", VIEWPOINTS)
+            return [], {}
         evidence = colmap.read_cameras(database), self.keypoints, colmap.read_verified(database)
         number = len(self.names)
         enough = number if number <= FEW else ENOUGH * number
@@ -167,7 +175,7 @@ class Mapper:
 
         attempts = self.attempts[:1] if once else self.attempts
         tried: list[tuple[Models, dict]] = []
-        for found, changed in zip(_in_turn(attempted, attempts), attempts, strict=False):
+        for found, changed in zip(self._in_turn(attempted, attempts), attempts, strict=False):
             tried.append((found, changed))
             best, options = max(tried, key=lambda both: _size(both[0][0]))
             registered = _size(best[0])[0]
@@ -190,19 +198,48 @@ class Mapper:
                 return others, more | dropped
         return best
 
+    def _in_turn(self, attempted: Callable[..., Models], attempts: list[dict]) -> Iterator[Models]:
+        """Yield the models of attempts in turn, while there is time for further ones.
 
-def _in_turn(attempted: Callable[..., Models], attempts: list[dict]) -> Iterator[Models]:
-    """Yield the models of attempts in turn: after the first, as many at once as there are cores."""
-    cores = parallel.cores()
-    batches = (attempts[i : i + cores] for i in range(1, len(attempts), cores))
-    for batch in (attempts[:1], *batches):
-        attempt = partial(attempted, alone=len(batch) == 1)
-        yield from interruptible(list, parallel.ordered("attempt", attempt, batch))
+        After the first, as many are made at once as there are cores.
+        """
+        cores, number = parallel.cores(), len(attempts)
+        for first in (0, *range(1, number, cores)):
+            if first and self.seconds > PATIENCE:
+                self.left_out += number - first
+                logger.warning(
+                    "%d of %d attempts are left out, as further ones took %.0f s.",
+                    *(number - first, number, self.seconds),
+                )
+                return
+            batch = attempts[first : first + cores] if first else attempts[:1]
+            last = first + len(batch)
+            which = f"attempt {last}" if len(batch) == 1 else f"attempts {first + 1} to {last}"
+            logger.info("COLMAP's mapper makes %s of up to %d...", which, number)
+            start = time.monotonic()
+            attempt = partial(attempted, alone=len(batch) == 1)
+            yield from interruptible(list, parallel.ordered("attempt", attempt, batch))
+            self.seconds += time.monotonic() - start if first else 0
 
 
 def _matched(database: Path) -> set[str]:
     """Return the images of a database that have verified matches with another."""
     return {name for pair in colmap.count_verified(database) for name in pair}
+
+
+def _largest_group(database: Path) -> int:
+    """Return the size of the largest set of images that verified matches connect, 0 without any."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = np.array([*colmap.count_verified(database)]).reshape(-1, 2)
+    if not len(pairs):
+        return 0
+    names, ends = np.unique(pairs, return_inverse=True)
+    rows, columns = ends.reshape(-1, 2).T
+    graph = coo_array((np.ones(len(pairs)), (rows, columns)), (len(names),) * 2)
+    _, group = connected_components(graph, directed=False)
+    return int(np.bincount(group).max())
 
 
 def _are_alike(database: Path) -> bool:

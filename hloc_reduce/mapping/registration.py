@@ -58,15 +58,38 @@ class NoModelError(InputError):
     """No two images could be reconstructed."""
 
 
-def nothing(image_dir: Path, dropped: dict[str, str] | None = None) -> str:
+def check_number(image_dir: Path, number: int) -> None:
+    """Raise a NoModelError for fewer images than a model has viewpoints."""
+    if number < VIEWPOINTS:
+        raise NoModelError(
+            f"A map of photos alone needs {VIEWPOINTS} or more, from different places: {image_dir} "
+            f"has {number}. Fewer do not determine focal lengths. Take more photos, each "
+            "overlapping the one before by two thirds, or give a COLMAP model of their poses."
+        )
+
+
+def nothing(
+    image_dir: Path, dropped: dict[str, str] | None = None, attempts_left_out: int = 0
+) -> str:
     """Say that no image could be reconstructed, and what to try."""
     why = _left_out(dropped, []) if dropped else "Do enough of them overlap?"
-    edited = f"{TRIES[LENS]}; " if LENS in _kinds(dropped or {}) else ""
+    tries = [TRIES[LENS]] if LENS in _kinds(dropped or {}) else []
+    tries.append("take photos from several places, each overlapping the one before by two thirds")
+    tries += _more_time(attempts_left_out)
     return (
         f"COLMAP could not reconstruct the images of {image_dir} from {VIEWPOINTS} viewpoints or "
-        f"more. {why} What to try: {edited}take photos from several places, each overlapping the "
-        "one before by two thirds."
+        f"more. {why} What to try: {'; '.join(tries)}."
     )
+
+
+def _more_time(attempts_left_out: int) -> list[str]:
+    """Return what to try if attempts were left out."""
+    if not attempts_left_out:
+        return []
+    return [
+        "run again with --overwrite on a faster machine, or one that is idle, as attempts were "
+        f"left out for lack of time: {attempts_left_out}"
+    ]
 
 
 def _kinds(dropped: dict[str, str]) -> dict[str, list[str]]:
@@ -177,6 +200,7 @@ def shortfall(
     implausible: dict[str, str],
     alike: bool,
     left_out: int = 0,
+    attempts_left_out: int = 0,
 ) -> str:
     """Say which images are not in a model, why, and what to try.
 
@@ -189,6 +213,7 @@ def shortfall(
         implausible: from each dropped image to what is implausible about it.
         alike: each image has its own camera, but one camera may have taken all.
         left_out: number of further images that the model was not to have.
+        attempts_left_out: number of attempts that were not made for lack of time.
     """
     registered = images - len(missing)
     only = "Only " if registered < ENOUGH * images else ""
@@ -220,4 +245,5 @@ def shortfall(
     if alike:
         likely = LENS in _kinds(implausible)  # own focal lengths of photos of one camera
         tries.insert(0 if likely else len(tries), ONE_CAMERA)
+    tries += _more_time(attempts_left_out)
     return f"{' '.join(said)} What to try: {'; '.join(dict.fromkeys(tries))}."

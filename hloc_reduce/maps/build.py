@@ -10,7 +10,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
 from ..extract_features import keep_present
-from ..mapping import sizes
+from ..mapping import registration, sizes
 from ..runtime import provenance
 from ..runtime.outputs import CONF, RunFolder
 from ..utils import colmap
@@ -149,8 +149,7 @@ def _list(
     """List the images of a map: those of the model, or without it all images in a folder."""
     if reference is None:
         names = keep_present(image_dir, list_images(image_dir), accept_partial)
-        if len(names) == 1:
-            raise InputError(f"A map of photos alone needs two or more: {image_dir} has one.")
+        registration.check_number(image_dir, len(names))
         return names
     names = sorted(image.name for image in reference.images.values())
     return list_images(image_dir, keep_present(image_dir, names, accept_partial))

@@ -84,7 +84,8 @@ def test_a_folder_with_a_broken_photo_only(kind, place, tmp_path, run, refused, 
     printed = capsys.readouterr().out
     assert printed == f"No query is localized. {results / 'queries.csv'} gives the reasons.\n"
     assert f"Cannot read image {photo}" in outcome(results)[1]["a.png"]["reason"]
-    shutil.copy(images / "db/1.png", photo.parent)
+    for number in (1, 2):
+        shutil.copy(images / f"db/{number}.png", photo.parent)
     message = refused("--map_images", photo.parent, "--outputs", tmp_path / "o")
     assert "a.png" in message and str(photo.parent) in message
 
@@ -101,11 +102,13 @@ def test_wrong_input(place, tmp_path, run, refused):
     assert "no folder" in message and "nowhere" in message
     message = refused("--map_images", images / "db/1.png", *build[4:])
     assert message.endswith("1.png is a file, not a folder.")
-    one = tmp_path / "one"
+    one = tmp_path / "few"
     one.mkdir()
-    shutil.copy(images / "db/1.png", one)
-    message = refused("--map_images", one, *build[4:])
-    assert "needs two or more" in message and not (outputs / "map").exists()
+    for number in (1, 2):
+        shutil.copy(images / f"db/{number}.png", one)
+        message = refused("--map_images", one, *build[4:])
+        assert f"needs 3 or more, from different places: {one} has {number}" in message
+        assert not (outputs / "map").exists()
     assert "Unknown matcher" in refused(*build, "--matcher", "NN")
     photos = tmp_path / "photos"
     photos.mkdir()

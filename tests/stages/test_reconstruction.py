@@ -101,6 +101,66 @@ def test_further_attempts_where_images_are_missing(scene, matched, tmp_path, mon
     assert attempts == [(6, 30)]
 
 
+@pytest.mark.fault(12)
+def test_further_attempts_begin_while_there_is_time(scene, matched, tmp_path, monkeypatch, caplog):
+    """The first one with each choice of cameras is always made."""
+    monkeypatch.setattr(parallel, "cores", lambda: 1)
+    monkeypatch.setattr(mapper, "PATIENCE", 0.0)
+    names, pairs, matches = matched
+    attempts, mapping = [], colmap.incremental_mapping
+
+    def three_at_most(database, image_dir, output, options, verbose):
+        cameras = len(colmap.read_cameras(database))
+        attempts.append((cameras, options.mapper.abs_pose_min_num_inliers))
+        if len(attempts) == fails:
+            return []
+        models = mapping(database, image_dir, output, options, verbose)
+        for name in names[3:]:
+            models[0].deregister_frame(models[0].find_image_with_name(name).frame_id)
+        return models
+
+    monkeypatch.setattr(colmap, "incremental_mapping", three_at_most)
+    arguments = (scene.images, pairs, scene.features, matches)
+    for fails in (0, 1):
+        model = reconstruction.main(tmp_path / f"{fails}", *arguments, image_list=names)
+        assert model.num_reg_images() == 3
+        assert attempts == [(6, 30), (6, 15), (1, 30)]
+        running = [text for text in caplog.messages if text.startswith("COLMAP's mapper makes")]
+        assert [text.partition("makes ")[2] for text in running] == [
+            *("attempt 1 of up to 8...", "attempt 2 of up to 8...", "attempt 1 of up to 8...")
+        ]
+        assert "run again with --overwrite" in caplog.text
+        assert "attempts were left out for lack of time: 13" in caplog.text
+        attempts.clear()
+        caplog.clear()
+
+
+@pytest.mark.fault(12)
+@pytest.mark.parametrize(
+    "kept",  # pairs of images
+    [[], [(0, 1)], [(0, 1), (2, 3), (4, 5)]],
+)
+def test_without_three_connected_images_nothing_is_tried(
+    kept, scene, matched, tmp_path, monkeypatch
+):
+    names, pairs, matches = matched
+    parsers.write_pairs([(names[i], names[j]) for i, j in kept], pairs)
+    monkeypatch.setattr(colmap, "incremental_mapping", None)
+    arguments = (scene.images, pairs, scene.features, matches)
+    with pytest.raises(InputError, match="could not reconstruct"):
+        reconstruction.main(tmp_path / "sfm", *arguments, image_list=names)
+
+
+@pytest.mark.fault(12)
+def test_two_images_are_too_few(scene, matched, tmp_path, monkeypatch):
+    """Two viewpoints do not determine focal lengths."""
+    names, pairs, matches = matched
+    monkeypatch.setattr(colmap, "incremental_mapping", None)
+    arguments = (scene.images, pairs, scene.features, matches)
+    with pytest.raises(InputError, match="needs 3 or more, .* has 2"):
+        reconstruction.main(tmp_path / "sfm", *arguments, image_list=names[:2])
+
+
 def test_attempts_at_once_find_the_same(scene, matched, tmp_path, monkeypatch, caplog):
     """Whichever ends first, the first attempt that registers all images counts."""
     names, pairs, matches = matched
