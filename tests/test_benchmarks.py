@@ -126,7 +126,8 @@ def test_matching_at_once_gives_each_keypoint_one_point():
     points = np.eye(4, 8, dtype=np.float32)
     visible = {"a": np.array([0, 2]), "b": np.array([1, 2, 3]), "c": np.array([], int)}
     compact = SimpleNamespace(visible=visible.get, descriptors=lambda rows, unbiased: points[rows])
-    engine = LightEngine(lambda image: {}, {"name": "nearest_neighbor"}, points)
+    extract = SimpleNamespace(rotation_invariant=True)
+    engine = LightEngine(extract, {"name": "nearest_neighbor"}, points)
     query = points[[2, 3, 0]]
     found = at_once(SimpleNamespace(engine=engine, reference=compact))(query, ["a", "b", "c"])
     pairs = {name: sorted(map(tuple, part.tolist())) for name, part in found.items()}
