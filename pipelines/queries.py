@@ -25,6 +25,8 @@ from .run import check_queries
 
 SOURCES = {
     "map": "those of the map's camera, according to their EXIF data",
+    "lens": "those of the map's photos of their size",
+    "none": "not known, as photos of the map are by a fisheye or the like: give them by --queries",
     "EXIF": "from EXIF data and refined with the pose",
     "guess": "guessed and estimated with the pose, or those of the map's photos if they fit",
     "unknown": "guessed and estimated with the pose, of no map photo's size: perhaps cropped",

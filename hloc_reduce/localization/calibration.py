@@ -1,13 +1,16 @@
 """Whether other intrinsics than those of a pose fit the matches of a query better."""
 
+import copy
 from collections.abc import Iterable
 
 import numpy as np
 
+from ..utils import colmap
 from . import resection
 from .confidence import MAX_POSITION, MAX_ROTATION, confidence
+from .lenses import is_bent
 from .pose import Matches, Pose, differ, quality
-from .projection import ALL, FOCAL, RADIAL, SKEW
+from .projection import ALL, FOCAL, RADIAL, SKEW, reprojection_errors
 from .resection import Resection, View
 
 # ratios of the confidence with other intrinsics to the confidence with the assumed ones
@@ -18,6 +21,7 @@ RIGHT = 1.1  # above it, the other intrinsics are right
 # multiple of MAX_POSITION and MAX_ROTATION between poses with listed and other focal lengths: many
 # lists are 5 % off
 TOLERANT = 1.2
+SEED = 0
 
 STRETCHED = (
     "it may be cropped or stretched: another principal point and aspect ratio fit about as well, "
@@ -100,14 +104,34 @@ def _contradiction(
                 "its intrinsics contradict the map: a focal length of "
                 f"{other.camera.mean_focal_length():.0f} pixels fits better, and the pose differs"
             )
-    if anew is None or anew.confidence <= RIGHT * pose.confidence:
+    others = {
+        "another principal point and aspect ratio fit": anew,
+        f"other parameters of {pose.camera.model.name} fit": _refined(matches, pose),
+    }
+    for what, other in others.items():
+        fits = other is not None and other.confidence > RIGHT * pose.confidence
+        if other and fits and differ(pose, other, matches.points3D, *limits):
+            return f"its intrinsics contradict the map: {what} much better, and the pose differs"
+    return None
+
+
+def _refined(matches: Matches, pose: Pose) -> Pose | None:
+    """Estimate a pose anew from its inliers, and the focal length and distortion of a bent lens.
+
+    The others have so few parameters that `resection` estimates them.
+    """
+    if not is_bent(pose.camera):
         return None
-    if not differ(pose, anew, matches.points3D, *limits):
+    camera, inliers = copy.deepcopy(pose.camera), pose.inliers
+    free = {"refinement": {"refine_focal_length": True, "refine_extra_params": True}}
+    points = matches.points2D[inliers], matches.points3D[inliers]
+    found = colmap.estimate_pose(*points, camera, matches.config | free, {"random_seed": SEED})
+    if not found:
         return None
-    return (
-        "its intrinsics contradict the map: another principal point and aspect ratio fit much "
-        "better, and the pose differs"
-    )
+    view = found["cam_from_world"], camera
+    errors, _ = reprojection_errors(matches.points2D, matches.points3D, *view)
+    value = confidence(matches.points2D, matches.points3D, *view, matches.max_error, FOCAL)
+    return Pose(*view, errors <= matches.max_error, value, degrees_of_freedom=FOCAL)
 
 
 def choose(

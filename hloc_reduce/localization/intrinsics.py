@@ -1,4 +1,4 @@
-"""Intrinsics of queries without a list: those of the map's camera, from EXIF data, or guessed."""
+"""Intrinsics of queries without a list: those of the map's cameras, of EXIF data, or guessed."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -8,28 +8,36 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from ..utils import colmap
+from ..utils import cli, colmap
 from ..utils.files import replacing
 from ..utils.images import UnreadableImage
 from ..utils.parsers import parse_camera, to_line
 from .confidence import FOCAL_LENGTHS
-from .exif import WELL_KNOWN, correct, exif_camera, stored
+from .exif import WELL_KNOWN, ExifCamera, correct, exif_camera, stored
+from .lenses import PLAIN, Size, split
 
-# A lens is typical of photos whose cameras have one of these models, if the logarithms of their
-# focal lengths, their distortions and principal points differ by at most this.
-PLAIN = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL"
+# A lens is typical of photos whose cameras have a `PLAIN` model, if the logarithms of their focal
+# lengths, their distortions and principal points differ by at most this.
 ALIKE = 0.05, 0.1, 0.02, 0.02
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
+MOST_LENSES = 8  # that are tried
+UNKNOWN_LENS = (
+    "its lens is not known: photos of the map ({} pixels) are by a fisheye or another lens that "
+    "cannot be guessed; give its intrinsics by --queries"
+)
 _REFINED = {"refinement": {"refine_focal_length": True}}
 _GUESSED = {"estimation": {"estimate_focal_length": True}, **_REFINED}
 # source of intrinsics -> options of `localize_sfm.main` that make up for their errors
 REFINEMENTS = {
     "list": {},
-    "map": {},
+    "map": {"photo": {"of_map": True}},
+    "lens": {"photo": {"of_map": True}},
     "EXIF": _REFINED,
     "guess": _GUESSED,
     "unknown": {**_GUESSED, "photo": {"cropped": True}},
+    "none": {},
 }
+EXACT = "map", "lens"  # sources of intrinsics that are not estimated with the pose
 
 
 class Lens(NamedTuple):
@@ -52,21 +60,23 @@ class MapCameras(NamedTuple):
 
     Args:
         known: cameras that took several of its photos, by their `exif.ExifCamera.name`.
-        sizes: (width, height) of its photos.
+        sizes: (width, height) of its photos, except those by `lenses`.
         models: `exif.ExifCamera.model` of all cameras that took its photos.
         focal_lengths: the least and the largest of its cameras, in longer sides; None if the map
             does not know.
         typical: of each size of which it has several photos, (width, height), their lens, if that
             is much the same in all of them.
         orientations: EXIF orientations of its photos, empty if the map does not know.
+        lenses: of each size of photos by bent lenses, such as fisheyes, these; see `lenses`.
     """
 
     known: dict[str, pycolmap.Camera]
-    sizes: set[tuple[int, int]]
+    sizes: set[Size]
     models: Collection[str] = ()
     focal_lengths: tuple[float, float] | None = None
-    typical: Mapping[tuple[int, int], Lens] = MappingProxyType({})
+    typical: Mapping[Size, Lens] = MappingProxyType({})
     orientations: Collection[int] = ()
+    lenses: Mapping[Size, Sequence[pycolmap.Camera]] = MappingProxyType({})
 
 
 def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera, str]:
@@ -81,7 +91,9 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         else a SIMPLE_RADIAL camera without distortion, from "EXIF" data or guessed. It is a "guess"
         if map photos have the size of the photo, which then is hardly cropped, else "unknown". So
         are digital zooms, photos of another shape than their EXIF data say, and photos by a camera
-        of the map whose size no map photo has: their EXIF data do not say what was cut off.
+        of the map whose size no map photo has: their EXIF data do not say what was cut off. In a
+        map with bent lenses, photos that may be by one of them are no guess: those of the size of
+        its photos have one of these, "lens", and others have "none".
 
     Raises:
         UnreadableImage: if the image cannot be read.
@@ -96,16 +108,35 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         exif = exif_camera(image)
     size = camera.width, camera.height
     has_size = bool({size, size[::-1]} & of_map.sizes)
-    is_copy = exif is not None and exif.model in of_map.models and not has_size
+    bent = of_map.lenses.get(size, ())
+    is_copy = exif is not None and exif.model in of_map.models and not (has_size or bent)
     is_cut = is_copy or (exif is not None and not exif.is_original)
     if exif is not None and not is_cut and exif.name in of_map.known:
         return of_map.known[exif.name], "map"
+    if of_map.lenses and not (has_size or _is_by_another_camera(exif, of_map, bool(bent))):
+        camera.has_prior_focal_length = False
+        is_known = 0 < len(bent) <= MOST_LENSES and not is_cut
+        return (bent[0], "lens") if is_known else (camera, "none")
     if has_focal_length and not is_cut:
         if exif is not None:
             correct(camera, exif)
         return camera, "EXIF"
     camera.has_prior_focal_length = False
     return camera, "guess" if has_size and not is_cut else "unknown"
+
+
+def _is_by_another_camera(exif: ExifCamera | None, of_map: MapCameras, has_size: bool) -> bool:
+    """Tell whether EXIF data show that no camera of a map took a photo.
+
+    Args:
+        exif: of the photo.
+        of_map: what the map tells.
+        has_size: whether photos of the map have the size of the photo. If these have no EXIF data,
+            the same camera may have taken it all the same.
+    """
+    if exif is None or exif.model in of_map.models:
+        return False
+    return bool(of_map.models) or not has_size
 
 
 def infer_all(
@@ -137,14 +168,24 @@ def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict
     Returns:
         Those of `REFINEMENTS`; for a "guess" also the `focal_lengths` in pixels of the map's
         cameras, as a photo that has another one may have been cropped and enlarged; and the
-        `typical` lens of map photos of its size, upright or turned, if there is one.
+        `typical` lens of map photos of its size, upright or turned, if there is one. If map photos
+        of its size are by bent lenses, these are the `lenses` to try.
     """
     options = REFINEMENTS[source]
-    if source != "guess" or of_map.focal_lengths is None:
-        return options
-    side = max(camera.width, camera.height)
-    photo: dict = {"focal_lengths": [side * f for f in of_map.focal_lengths]}
     size = camera.width, camera.height
+    photo: dict = dict(options.get("photo", {}))
+    bent = [to_list(lens) for lens in of_map.lenses.get(size, ())]
+    if source == "none":
+        sizes = {f"{width}x{height}" for width, height in of_map.lenses}
+        photo["refusal"] = UNKNOWN_LENS.format(cli.some(sorted(sizes)))
+    elif source not in EXACT and bent:
+        photo["lenses"] = bent[:MOST_LENSES]
+    elif source == "lens" and bent[1:]:
+        photo["lenses"] = bent[1:]
+    if source != "guess" or of_map.focal_lengths is None:
+        return options | {"photo": photo} if photo else options
+    side = max(camera.width, camera.height)
+    photo["focal_lengths"] = [side * f for f in of_map.focal_lengths]
     if lens := of_map.typical.get(size):
         photo["typical"] = [*lens]
     elif lens := of_map.typical.get(size[::-1]):  # the principal point depends on which way
@@ -154,16 +195,24 @@ def refinement(camera: pycolmap.Camera, source: str, of_map: MapCameras) -> dict
 
 def of_cameras(cameras: Iterable[pycolmap.Camera]) -> MapCameras:
     """Return what photos of a map tell about the intrinsics of others, from the camera of each."""
-    cameras = list(cameras)
+    cameras, bent = split(cameras)
     sizes = {(camera.width, camera.height) for camera in cameras}
     found = [camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras]
     lengths = (min(found), max(found)) if found else None
-    alike: dict[tuple[int, int], list[pycolmap.Camera]] = {}
+    alike: dict[Size, list[pycolmap.Camera]] = {}
     for camera in cameras:
         alike.setdefault((camera.width, camera.height), []).append(camera)
     lenses = {size: _typical(same) for size, same in alike.items()}
     typical = {size: lens for size, lens in lenses.items() if lens is not None}
-    return MapCameras({}, sizes, focal_lengths=lengths, typical=typical)
+    return MapCameras({}, sizes, focal_lengths=lengths, typical=typical, lenses=bent)
+
+
+def with_lenses(told: MapCameras, cameras: Iterable[pycolmap.Camera]) -> MapCameras:
+    """Return what a map tells with its bent lenses, from the camera of each of its photos."""
+    found = of_cameras(cameras)
+    sizes = told.sizes - (found.lenses.keys() - found.sizes)
+    focal_lengths = found.focal_lengths if found.lenses else told.focal_lengths
+    return told._replace(sizes=sizes, focal_lengths=focal_lengths, lenses=found.lenses)
 
 
 def _typical(cameras: Sequence[pycolmap.Camera]) -> Lens | None:
@@ -225,7 +274,7 @@ def of_map(
 def merged(first: MapCameras, second: MapCameras) -> MapCameras:
     """Return what two groups of photos of a map tell, without typical lenses.
 
-    If both know a camera, the first one's counts.
+    If both know a camera, or bent lenses of a size, the first one's count.
     """
     models = {*first.models, *second.models}
     ranges = [cameras.focal_lengths for cameras in (first, second) if cameras.focal_lengths]
@@ -233,6 +282,7 @@ def merged(first: MapCameras, second: MapCameras) -> MapCameras:
     return MapCameras(
         *(second.known | first.known, first.sizes | second.sizes, models, lengths),
         orientations={*first.orientations, *second.orientations},
+        lenses={**second.lenses, **first.lenses},
     )
 
 
@@ -245,15 +295,25 @@ def to_dict(cameras: MapCameras) -> dict:
         "focal_lengths": cameras.focal_lengths,
         "typical": to_rows(cameras.typical),
         "orientations": sorted(cameras.orientations),
+        "lenses": [to_list(one) for lenses in cameras.lenses.values() for one in lenses],
     }
 
 
-def to_rows(typical: Mapping[tuple[int, int], Lens]) -> list[list]:
+def to_lenses(rows: Iterable[Sequence]) -> dict[Size, list[pycolmap.Camera]]:
+    """Return the bent lenses in rows from `to_dict`; raise a ValueError if they are wrong."""
+    lenses: dict[Size, list[pycolmap.Camera]] = {}
+    for row in rows:
+        camera = from_list(row)
+        lenses.setdefault((camera.width, camera.height), []).append(camera)
+    return lenses
+
+
+def to_rows(typical: Mapping[Size, Lens]) -> list[list]:
     """Return typical lenses as JSON values: width, height, and the values of a `Lens`."""
     return [[*size, *lens] for size, lens in sorted(typical.items())]
 
 
-def from_rows(rows: Iterable[Sequence]) -> dict[tuple[int, int], Lens]:
+def from_rows(rows: Iterable[Sequence]) -> dict[Size, Lens]:
     """Return the lenses in rows from `to_rows`; raise a ValueError or TypeError for wrong ones."""
     typical = {}
     for width, height, *values in rows:

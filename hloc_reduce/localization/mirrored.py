@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 
 from .confidence import Gate
+from .intrinsics import from_list, to_list
 
 # agreement and confidence below which poses are doubtful. Those of most mirrored photos have an
 # agreement of at most 0.85 or a confidence of at most 125; two of a castle 0.92 and 432.
@@ -38,6 +39,15 @@ def mirror(camera: pycolmap.Camera) -> pycolmap.Camera:
     sided = [name.strip() in SIDED for name in camera.params_info.split(",")]
     mirrored.params = (np.where(sided, -1, 1) * mirrored.params).tolist()
     return mirrored
+
+
+def mirror_options(options: dict) -> dict:
+    """Return the options of a photo, see `lens_choice.estimate`, with mirrored lenses to try."""
+    photo = options.get("photo", {})
+    if "lenses" not in photo:
+        return options
+    lenses = [to_list(mirror(from_list(lens))) for lens in photo["lenses"]]
+    return {**options, "photo": {**photo, "lenses": lenses}}
 
 
 def refusal(confidence: float, of_mirror_image: float, gate: Gate) -> str | None:

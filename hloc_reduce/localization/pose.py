@@ -85,11 +85,21 @@ class Matches:
         width, height = self.camera.width, self.camera.height
         focal_length, distortion, x, y = lens
         params = [focal_length * max(width, height), x * width, y * height, distortion]
-        camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
+        return self.with_lens(
+            pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
+        )
+
+    def with_lens(self, camera: pycolmap.Camera) -> "Matches":
+        """Return the same matches with the exact intrinsics of a lens of the map's photos."""
         estimation = {**self.config.get("estimation", {}), "estimate_focal_length": False}
         refinement = {**self.config.get("refinement", {}), "refine_focal_length": False}
-        config = {"estimation": estimation, "refinement": refinement}
+        config = {"estimation": estimation, "refinement": refinement, "photo": {"of_map": True}}
         return replace(self, camera=camera, config=config)
+
+    @property
+    def is_lens_of_map(self) -> bool:
+        """Whether the intrinsics are those of photos of the map that the same lens took."""
+        return bool(self.config.get("photo", {}).get("of_map"))
 
     @property
     def is_focal_length_guessed(self) -> bool:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import pycolmap
 
-from . import absolute_pose
+from . import lens_choice
 from .confidence import DEFAULT_GATE, RIVAL_BY_OTHERS, Gate
 from .pose import differ
 from .projection import photo_scale
@@ -48,7 +48,7 @@ def localize(
     for names in reference.clusters(list(matches)) if matches else [[]]:
         info, images = _correspondences(reference, names, matches)
         points = keypoints[info["keypoints"]], info["points3D"]
-        found = absolute_pose.estimate(*points, images, camera, config, gate, thorough, workers)
+        found = lens_choice.estimate(*points, images, camera, config, gate, thorough, workers)
         info |= {
             "reason": _reason(len(keypoints), names, info) or found.refusal,
             "confidence": round(max(0.0, found.confidence), 2),

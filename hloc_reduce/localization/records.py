@@ -13,7 +13,7 @@ from .confidence import Gate
 from .intrinsics import to_list
 from .references import Reference
 
-RECORDS = 21  # the version of the content of records, and of the gate
+RECORDS = 22  # the version of the content of records, and of the gate
 NUMBERS = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
 
 

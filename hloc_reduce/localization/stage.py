@@ -23,7 +23,7 @@ from ..utils.match_files import find_pair, get_matcher, get_matches, most_simila
 from ..utils.parsers import parse_query_lists, write_poses
 from ..utils.progress import progress
 from .confidence import DEFAULT_GATE, Gate, add_gate_options
-from .mirrored import MirrorImages, is_doubtful, mirror
+from .mirrored import MirrorImages, is_doubtful, mirror, mirror_options
 from .query import localize
 from .records import (
     RECORDS,
@@ -113,6 +113,8 @@ def main(
         if mirror_images and tasks:
             files, reference = mirror_images([name for name, _, _ in tasks]), load_reference()
             gate = _of_matches(gate, *files)
+            config = partial(_mirrored, config)
+            solve = partial(localize_all, load_reference, config, skip_matches, gate, executor)
             for name, record in solve(*files, tasks, False, "Trying mirror images"):
                 names = [other for other in retrieved.get(name, []) if other in reference]
                 before = log.records[name]
@@ -194,6 +196,13 @@ def _may_be_mirrored(record: dict) -> bool:
     return (
         record["localized"] and not tried and is_doubtful(record["agreement"], record["confidence"])
     )
+
+
+def _mirrored(
+    config: Callable[[str, pycolmap.Camera], dict], name: str, camera: pycolmap.Camera
+) -> dict:
+    """Return the options of the mirror image of a query, whose intrinsics are mirrored."""
+    return mirror_options(config(name, camera))
 
 
 def localize_all(

@@ -186,7 +186,7 @@ class Addition:
             placed = {}
             for name, record in records.items():
                 if record["localized"] and (pose := pose_of(record)) is not None:
-                    exact = inferred[name][1] == "map"
+                    exact = inferred[name][1] in intrinsics.EXACT
                     placed[name] = Placed(pose, camera_of(record), exact, fixed=False)
             left = [name for name in left if name not in placed]
             if not placed:

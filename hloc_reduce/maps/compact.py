@@ -147,10 +147,11 @@ class CompactMap:
         models, focal = {str(m) for m in metadata["models"]}, metadata.get("focal_lengths")
         typical = intrinsics.from_rows(metadata.get("typical", []))
         orientations = {int(one) for one in metadata.get("orientations", [])}
-        self.cameras = intrinsics.MapCameras(
+        told = intrinsics.MapCameras(
             {str(name): intrinsics.from_list(values) for name, values in known},
             *(sizes, models, intrinsics.to_range(focal), typical, orientations),
         )
+        self.cameras = intrinsics.with_lenses(told, self.camera_of.values())
 
     def _read_projection(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
         self.projection: bytes | None = None

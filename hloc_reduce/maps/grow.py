@@ -217,6 +217,7 @@ def _commit(
     else:
         images = (image for image in sfm.images.values() if image.name not in fit.altered)
         told = told._replace(typical=intrinsics.of_cameras(i.camera for i in images).typical)
+    told = intrinsics.with_lenses(told, (image.camera for image in sfm.images.values()))
     content |= intrinsics.to_dict(told)
     provenance.write(built.folder / FINISHED, content)
 

@@ -119,6 +119,7 @@ class Localizer:
             flipped = self._extract(image, flip=True)
             matches = self._match(flipped["descriptors"], retrieved)
             camera = mirrored.mirror(camera)
+            refinement = mirrored.mirror_options(refinement)
             _, other = self._estimate(flipped, matches, camera, refinement, thorough=False)
             confidences = info["confidence"], other["confidence"]
             info["reason"] = mirrored.refusal(*confidences, self.gate)

@@ -71,6 +71,10 @@ class Map:
         InputError: if the folder is missing, or is not a finished map.
     """
 
+    cameras: intrinsics.MapCameras
+    sfm: Path
+    _tells_lenses: bool
+
     @strings_as_paths
     def __init__(self, folder: Path):
         self.folder = folder
@@ -85,6 +89,10 @@ class Map:
                 f"{folder} is not a map, or not a finished one: it has no sound {FINISHED}.{hint}"
             ) from None
         self._check()
+        if not self._tells_lenses:  # of an earlier version
+            model = colmap.read_model(self.sfm)
+            cameras = [image.camera for image in model.images.values()]
+            self.cameras = intrinsics.with_lenses(self.cameras, cameras)
 
     def _read(self, content: dict) -> None:
         self.place = (self.folder / PLACE).read_text()
@@ -114,7 +122,9 @@ class Map:
             intrinsics.to_range(content.get("focal_lengths")),
             intrinsics.from_rows(content.get("typical", [])),
             {int(orientation) for orientation in content.get("orientations", [])},
+            intrinsics.to_lenses(content.get("lenses", [])),
         )
+        self._tells_lenses = "lenses" in content
         conf = dict(content["conf"])
         conf |= {key: dict(conf[key]) for key in ("model", "preprocessing")}
         self.storage = choose("storage", conf.get("storage", STORAGES[0]), STORAGES)

@@ -10,8 +10,10 @@ import h5py
 import pycolmap
 import pytest
 from command import outcome, state
+from conftest import SIZE
 
-from hloc_reduce import Localizer, maps, projections
+from hloc_reduce import Localizer, compact, maps, projections
+from hloc_reduce.localization.intrinsics import to_list
 from hloc_reduce.training import tracks
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import colmap, parsers
@@ -335,6 +337,31 @@ def test_photos_that_were_made_smaller(place, aachen_layout, run, refused):
     truth = parsers.parse_poses(aachen_layout / "queries/ground_truth_poses.txt")
     error = pose.inverse().translation - truth["query/day/a.png"].inverse().translation
     assert abs(error).max() < 0.01
+
+
+@pytest.mark.fault(2)
+def test_a_map_knows_its_fisheyes(place, run):
+    """In map.json; that of an earlier version does not have them, but the model does."""
+    build, _, outputs = place
+    run(*build)
+    folder = outputs / "map"
+    assert maps.Map(folder).cameras.sizes == {SIZE} and not maps.Map(folder).cameras.lenses
+    written = json.loads((folder / "map.json").read_text())
+    fisheye = ["SIMPLE_RADIAL_FISHEYE", *SIZE, 130.0, SIZE[0] / 2, SIZE[1] / 2, 0.0]
+    (folder / "map.json").write_text(json.dumps({**written, "lenses": [fisheye], "sizes": []}))
+    assert [to_list(one) for one in maps.Map(folder).cameras.lenses[SIZE]] == [fisheye]
+    model = pycolmap.Reconstruction(folder / "sfm")
+    for camera in model.cameras.values():
+        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL_FISHEYE
+        camera.params = fisheye[3:]
+    model.write(folder / "sfm")
+    del written["lenses"]
+    (folder / "map.json").write_text(json.dumps(written))
+    cameras = Localizer(folder).cameras
+    assert [to_list(one) for one in cameras.lenses[SIZE]] == [fisheye] and not cameras.sizes
+    compact.main(outputs / "place.hlm", folder)
+    cameras = Localizer(outputs / "place.hlm").cameras
+    assert [to_list(one) for one in cameras.lenses[SIZE]] == [fisheye] and not cameras.sizes
 
 
 def test_a_map_to_train_on(place, run):
