@@ -7,7 +7,7 @@ import numpy as np
 
 from ..utils import colmap
 from . import resection
-from .confidence import MAX_POSITION, MAX_ROTATION, confidence
+from .confidence import MAX_POSITION, MAX_ROTATION, confidence, uncertainty
 from .lenses import is_bent
 from .pose import Matches, Pose, differ, quality
 from .projection import ALL, FOCAL, RADIAL, SKEW, reprojection_errors
@@ -21,6 +21,9 @@ RIGHT = 1.1  # above it, the other intrinsics are right
 # multiple of MAX_POSITION and MAX_ROTATION between poses with listed and other focal lengths: many
 # lists are 5 % off
 TOLERANT = 1.2
+# standard deviations between poses with the intrinsics of a map's own lens and with another focal
+# length: photos of a flat scene hardly tell one, and errors of the map decide which fits better
+DEVIATIONS = 1.5
 SEED = 0
 
 STRETCHED = (
@@ -95,11 +98,17 @@ def _contradiction(
             length is estimated.
     """
     limits = TOLERANT * MAX_POSITION, TOLERANT * MAX_ROTATION
+    of_focal_length = limits
+    if matches.is_lens_of_map and pose.cam_from_world is not None:
+        inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
+        position, rotation, _ = uncertainty(*inliers, pose.cam_from_world, pose.camera, FOCAL)
+        uncertain = DEVIATIONS * position, DEVIATIONS * rotation
+        of_focal_length = max(limits[0], uncertain[0]), max(limits[1], uncertain[1])
     for points2D, start in guesses:
         other = _resect(matches, points2D, start, FOCAL)
         if other is None or other.confidence <= pose.confidence:
             continue
-        if differ(pose, other, matches.points3D, *limits):
+        if differ(pose, other, matches.points3D, *of_focal_length):
             return (
                 "its intrinsics contradict the map: a focal length of "
                 f"{other.camera.mean_focal_length():.0f} pixels fits better, and the pose differs"
