@@ -11,6 +11,7 @@ from .confidence import MAX_POSITION, MAX_ROTATION, confidence, uncertainty
 from .lenses import is_bent
 from .pose import Matches, Pose, differ, quality
 from .projection import ALL, FOCAL, RADIAL, SKEW, reprojection_errors
+from .refusals import CROPPED
 from .resection import Resection, View
 
 # ratios of the confidence with other intrinsics to the confidence with the assumed ones
@@ -66,8 +67,21 @@ def calibrate(matches: Matches, pose: Pose) -> tuple[Pose, str | None]:
         centred = resection.centred(pose.cam_from_world, pose.camera)
         guesses = (image, start), (matches.points2D, centred)
         return pose, _contradiction(matches, pose, other, guesses)
-    unclear = UNCLEAR_CROPPED if matches.may_be_cropped(assumed) else UNCLEAR
-    return choose(assumed, other, points3D, unclear) if other else (assumed, None)
+    if other is None:
+        return assumed, None
+    unclear = UNCLEAR_CROPPED
+    if not matches.may_be_cropped(assumed):
+        # a scene that tells no principal point lets any error of the map move it
+        unclear = UNCLEAR if _is_determined(matches, other) else RIGHT
+    return choose(assumed, other, points3D, unclear)
+
+
+def _is_determined(matches: Matches, pose: Pose) -> bool:
+    """Tell whether the inliers of a pose determine it although all intrinsics are free."""
+    assert pose.cam_from_world is not None
+    inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
+    position, rotation, _ = uncertainty(*inliers, pose.cam_from_world, pose.camera, ALL)
+    return position <= CROPPED[0] * MAX_POSITION and rotation <= CROPPED[1] * MAX_ROTATION
 
 
 def _resect(matches: Matches, points2D: np.ndarray, start: View, freedom: int) -> Pose | None:
