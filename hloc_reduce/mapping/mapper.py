@@ -21,6 +21,7 @@ from . import database as databases
 from .adjustment import adjusted_error, with_one_camera
 from .plausibility import (
     COPY,
+    DISTORTION,
     DOUBTFUL,
     FEW,
     FEW_POINTS,
@@ -54,6 +55,10 @@ MORE = 1.5  # times as many images show that one camera took all
 # they fit at least 11 % better, in most models over 30 %.
 MISFIT = 0.1
 ALMOST = 0.9  # times as many points with one camera as with several
+# Focal length in longer sides from which photos hardly tell a distortion: it may make up for wrong
+# poses by a coefficient that no lens has. Without one, true distortions move points little.
+NARROW = 2.5
+UNDISTORTED = {"ba_refine_extra_params": False}
 # what the provenance of a model says of how it was chosen
 RULES = {
     "inferred": databases.CAMERAS,
@@ -61,6 +66,7 @@ RULES = {
     "points": f"{MORE} times as many where focal lengths differ",
     "doubtful": f"from {DOUBTFUL}, misfit {MISFIT}, {ALMOST} times as many points",
     "lenses": "others without the implausible ones, by the best attempt",
+    "narrow": f"no distortion from {NARROW} longer sides if it is implausible",
     "spread": SPREAD,
     "viewpoints": VIEWPOINTS,
     "misplaced": f"{epipolar.AGREEING} of {epipolar.EVIDENCE} matches or more, {FEWEST} points",
@@ -171,7 +177,14 @@ class Mapper:
                 found = colmap.incremental_mapping(
                     own, self.image_dir, Path(folder) / "models", options, self.verbose
                 )
-            return keep_plausible(found, *evidence)
+            is_narrow = any(_is_narrow(model) for model in found)
+            models, dropped = keep_plausible(found, *evidence)
+            distorted = any(what.startswith(DISTORTION) for what in dropped.values())
+            if not (distorted and is_narrow) or UNDISTORTED.items() <= changed.items():
+                return models, dropped
+            logger.info("Trying again without distortion.")
+            others = attempted({**changed, **UNDISTORTED}, alone)
+            return max((models, dropped), others, key=lambda found: _size(found[0]))
 
         attempts = self.attempts[:1] if once else self.attempts
         tried: list[tuple[Models, dict]] = []
@@ -220,6 +233,12 @@ class Mapper:
             attempt = partial(attempted, alone=len(batch) == 1)
             yield from interruptible(list, parallel.ordered("attempt", attempt, batch))
             self.seconds += time.monotonic() - start if first else 0
+
+
+def _is_narrow(model: pycolmap.Reconstruction) -> bool:
+    """Tell whether any camera of the images of a model has a narrow view."""
+    cameras = [model.cameras[model.images[i].camera_id] for i in model.reg_image_ids()]
+    return any(c.mean_focal_length() > NARROW * max(c.width, c.height) for c in cameras)
 
 
 def _matched(database: Path) -> set[str]:

@@ -27,6 +27,7 @@ SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one vie
 VIEWPOINTS = 3  # at least, of a model: two do not determine the focal lengths
 
 # in place of an implausible lens; see `epipolar.misplaced` and `copies`
+DISTORTION = "distortion"  # begins what is implausible about a lens
 MISPLACED, COPY, FEW_POINTS = "misplaced", "another side or a copy", "few points"
 
 Models = tuple[list[pycolmap.Reconstruction], dict[str, str]]  # see `keep_plausible`
@@ -103,7 +104,7 @@ def _implausible(camera: pycolmap.Camera, initial: pycolmap.Camera, number: int)
     if not low <= focal_length <= high:
         return f"focal length {focal_length:.0f}" if focal_length > 0 else "no focal length fits"
     distortion = max(camera.params[list(camera.extra_params_idxs())], key=abs, default=0.0)
-    return f"distortion {distortion:.1f}" if abs(distortion) > MAX_DISTORTION else None
+    return f"{DISTORTION} {distortion:.1f}" if abs(distortion) > MAX_DISTORTION else None
 
 
 def count_viewpoints(model: pycolmap.Reconstruction) -> int:

@@ -66,6 +66,36 @@ def test_reconstruction_from_matches_alone(scene, matched, tmp_path):
         reconstruction.main(tmp_path / "no", *arguments, **shared)
 
 
+@pytest.mark.fault(6)
+@pytest.mark.parametrize(("narrow", "number"), [(True, 6), (False, 0)])
+def test_photos_of_a_narrow_view_are_tried_without_distortion(
+    narrow, number, scene, matched, tmp_path, monkeypatch
+):
+    """Their views do not tell it: COLMAP's coefficient may be absurd, as on a turntable."""
+    names, pairs, matches = matched
+    mapping, tried = colmap.incremental_mapping, []
+
+    def absurd(database, image_dir, output, options, verbose):
+        models = mapping(database, image_dir, output, options, verbose)
+        tried.append(options.ba_refine_extra_params)
+        for camera in models[0].cameras.values() if tried[-1] else ():
+            focal_length = 3 * 640 if narrow else 500
+            camera.params = [focal_length, *camera.params[1:3], -7.4]
+        return models
+
+    monkeypatch.setattr(colmap, "incremental_mapping", absurd)
+    arguments = (scene.images, pairs, scene.features, matches)
+    options = {"image_list": names, "camera_mode": pycolmap.CameraMode.SINGLE, "once": True}
+    if not number:
+        with pytest.raises(NoModelError, match="distortion -7.4"):
+            reconstruction.main(tmp_path / "sfm", *arguments, **options)
+        assert tried == [True]
+        return
+    model = reconstruction.main(tmp_path / "sfm", *arguments, **options)
+    assert model.num_reg_images() == number and tried == [True, False]
+    assert all(camera.params[3] == 0 for camera in model.cameras.values())
+
+
 def test_further_attempts_where_images_are_missing(scene, matched, tmp_path, monkeypatch):
     """With one camera for all, which the scene has, and with lower thresholds."""
     monkeypatch.setattr(parallel, "cores", lambda: 1)
