@@ -27,6 +27,10 @@ TOLERANT = 1.2
 DEVIATIONS = 1.5
 SEED = 0
 
+OTHER_LENS = (
+    "another lens than that of the map's photos of its size may have taken it: other parameters "
+    "fit about as well, and the pose differs; known intrinsics would help"
+)
 STRETCHED = (
     "it may be cropped or stretched: another principal point and aspect ratio fit about as well, "
     "and the pose differs; known intrinsics would help"
@@ -129,13 +133,16 @@ def _contradiction(
             )
     others = {
         "another principal point and aspect ratio fit": anew,
-        f"other parameters of {pose.camera.model.name} fit": _refined(matches, pose),
+        f"other parameters of {pose.camera.model.name} fit": (refined := _refined(matches, pose)),
     }
     for what, other in others.items():
         fits = other is not None and other.confidence > RIGHT * pose.confidence
         if other and fits and differ(pose, other, matches.points3D, *limits):
             return f"its intrinsics contradict the map: {what} much better, and the pose differs"
-    return None
+    if refined is None or not matches.is_lens_by_size:
+        return None
+    fits = refined.confidence > UNCLEAR_CROPPED * pose.confidence
+    return OTHER_LENS if fits and differ(pose, refined, matches.points3D, *limits) else None
 
 
 def _refined(matches: Matches, pose: Pose) -> Pose | None:

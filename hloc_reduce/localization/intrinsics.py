@@ -15,6 +15,7 @@ from ..utils.parsers import parse_camera, to_line
 from .confidence import FOCAL_LENGTHS
 from .exif import WELL_KNOWN, ExifCamera, correct, exif_camera, stored
 from .lenses import PLAIN, Size, split
+from .pose import OF_SIZE
 
 # A lens is typical of photos whose cameras have a `PLAIN` model, if the logarithms of their focal
 # lengths, their distortions and principal points differ by at most this.
@@ -31,7 +32,7 @@ _GUESSED = {"estimation": {"estimate_focal_length": True}, **_REFINED}
 REFINEMENTS = {
     "list": {},
     "map": {"photo": {"of_map": True}},
-    "lens": {"photo": {"of_map": True}},
+    "lens": {"photo": OF_SIZE},
     "EXIF": _REFINED,
     "guess": _GUESSED,
     "unknown": {**_GUESSED, "photo": {"cropped": True}},

@@ -12,6 +12,7 @@ MAX_ERROR = 12.0  # pixels, pycolmap's default
 # poses that differ by more are rivals
 SAME_ROTATION = 10.0  # degrees
 SAME_POSITION = 0.25  # of the median depth of the inliers
+OF_SIZE = {"of_map": True, "by_size": True}  # options of a photo by a lens of the map's photos
 ZOOMED = 1.05  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
 
 
@@ -93,13 +94,18 @@ class Matches:
         """Return the same matches with the exact intrinsics of a lens of the map's photos."""
         estimation = {**self.config.get("estimation", {}), "estimate_focal_length": False}
         refinement = {**self.config.get("refinement", {}), "refine_focal_length": False}
-        config = {"estimation": estimation, "refinement": refinement, "photo": {"of_map": True}}
+        config = {"estimation": estimation, "refinement": refinement, "photo": OF_SIZE}
         return replace(self, camera=camera, config=config)
 
     @property
     def is_lens_of_map(self) -> bool:
         """Whether the intrinsics are those of photos of the map that the same lens took."""
         return bool(self.config.get("photo", {}).get("of_map"))
+
+    @property
+    def is_lens_by_size(self) -> bool:
+        """Whether nothing but the size of the photo tells that."""
+        return bool(self.config.get("photo", {}).get("by_size"))
 
     @property
     def is_focal_length_guessed(self) -> bool:
