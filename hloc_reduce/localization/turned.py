@@ -38,7 +38,8 @@ def reason(image: Path | np.ndarray, of_map: MapCameras) -> str | None:
         )
     width, height = size
     shape, theirs = ("landscape", "portrait") if width > height else ("portrait", "landscape")
-    if width != height and of_map.sizes and all(_is(theirs, *other) for other in of_map.sizes):
+    sizes = {*of_map.sizes, *of_map.lenses}
+    if width != height and sizes and all(_is(theirs, *other) for other in sizes):
         return (
             f"it may be stored turned against the map's photos ({shape}, theirs {theirs}), {REMEDY}"
         )
