@@ -213,13 +213,16 @@ def camera_of(words: list[str]) -> pycolmap.Camera:
 
 
 def check_camera(camera: pycolmap.Camera) -> None:
-    """Check that sizes and focal lengths are positive, and all parameters finite.
+    """Check that a camera has focal lengths, these and sizes are positive, all parameters finite.
 
     Raises:
         ValueError: otherwise.
     """
-    # COLMAP crashes when a panorama, which has none, is asked for a focal length
     focal_lengths = camera.params[camera.focal_length_idxs()]
+    if not len(focal_lengths):  # COLMAP crashes when it is asked for one
+        raise ValueError(
+            f"{camera.model.name} has no focal length: render perspective views of panoramas"
+        )
     smallest = min(camera.width, camera.height, *focal_lengths)
     if not (np.isfinite(camera.params).all() and smallest > 0):
         raise ValueError("sizes and focal lengths are positive and finite")
