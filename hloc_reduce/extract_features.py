@@ -123,7 +123,8 @@ def extract_several(
                 for _ in progress(written, "Extracting features", "image", groups):
                     pass
         except UnreadableImage:
-            check_readable(image_dir, [name for name, _ in todo])
+            todo_names = [name for name, _ in todo]
+            check_readable(image_dir, progress(todo_names, "Checking photos", "image"))
             raise
     for path in writers:
         logger.info("Features of %d images are in %s.", len(names), path)

@@ -141,8 +141,8 @@ def lift_keypoints(
         features: feature file.
         cutouts: names of images.
         output: h5 file, `points3D` (N, 3) float32 in the `point_group` of each cutout: metres in
-            the frame of its scan, NaN where that has no depth, from the attribute `origin` (3,) if
-            there is one. Cutouts in it are skipped.
+            the frame of its scan, NaN where that has no depth. If the data set has an attribute
+            `origin` (3,), points are relative to that. Cutouts in it are skipped.
         overwrite: compute all points again.
         executor: does the work.
 

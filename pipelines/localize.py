@@ -119,7 +119,8 @@ def open_map(
 
 def _open(model_or_map: Path, folder: Path, overwrite: bool) -> Map:
     """Open a map that was built before; unpack a compact one into a folder."""
-    if any(any(model_or_map.glob(cameras)) for cameras in ("cameras.*", "[0-9]*/cameras.*")):
+    models = [*model_or_map.glob("cameras.*"), *model_or_map.glob("*/cameras.*")]
+    if models and not maps.is_map(model_or_map):
         raise InputError(
             f"{model_or_map} is a COLMAP model: give its photos, --map_images, or its --database."
         )

@@ -35,8 +35,8 @@ def _main() -> None:
         raise InputError("The service needs: pip install 'hloc-reduce[serve]'.") from None
     from ..maps.localizer import Localizer
 
+    check_address(args.host, args.port)  # before the map is loaded
     localizer = Localizer(args.map, args.num_loc, onnx=args.onnx)
-    check_address(args.host, args.port)
     logger.info("Serving %s at http://%s:%d.", args.map, args.host, args.port)
     app = make_app(localizer, args.max_mb, args.queue)
     # photos that are being uploaded are in memory, too
@@ -54,10 +54,10 @@ def check_address(host: str, port: int) -> None:
 
     try:
         asyncio.run(listen())
-    except OSError as error:
+    except (OSError, UnicodeError) as error:  # the latter for a host like a..b
         # asyncio's own text repeats the address; an unknown host has a negative number
-        number = error.errno or 0
-        reason = os.strerror(number) if number > 0 else error.strerror
+        number = getattr(error, "errno", None) or 0
+        reason = os.strerror(number) if number > 0 else getattr(error, "strerror", "no host name")
         raise InputError(
             f"Cannot listen on {host}:{port}: {reason}. Choose another --port or --host."
         ) from None

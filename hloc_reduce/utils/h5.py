@@ -51,7 +51,8 @@ def open_file(path: Path) -> h5py.File:
         if "already open for write" in str(error):  # by a mark in the file
             raise Unavailable(
                 f"{path} is open for writing in another program, or that was killed: wait until it "
-                f"has closed the file. If it was killed, mend the file: h5clear -s {path}"
+                f"has closed the file. If it was killed, mend the file (h5clear -s {path}), or "
+                "delete it and run again."
             ) from error
         raise InputError(f"Cannot open {path}: not a whole h5 file.") from error
     except Exception as error:

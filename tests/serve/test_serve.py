@@ -181,10 +181,14 @@ def test_parameters_that_would_be_ignored_are_refused(given, error, start):
 
 
 @pytest.mark.fault(13)
-@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "203.0.113.7"])
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "203.0.113.7", "a..b"])
 def test_an_address_that_cannot_be_had(host, monkeypatch, caplog):
     """Where another program listens, or of another machine; before anything is served."""
-    monkeypatch.setattr("hloc_reduce.maps.localizer.Localizer", lambda *_, **__: Blocked())
+
+    def loaded(*_, **__):
+        pytest.fail("the map is loaded although nothing can listen there")
+
+    monkeypatch.setattr("hloc_reduce.maps.localizer.Localizer", loaded)
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         given = ["serve", "--map", "place.hlm", "--host", host, "--port", str(port)]

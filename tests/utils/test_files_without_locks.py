@@ -126,7 +126,7 @@ def test_a_file_whose_writer_was_killed(tmp_path):
         file["numbers"] = 1
         file.flush()
         shutil.copy(path, copy)
-    with pytest.raises(InputError, match=f"killed, mend the file: h5clear -s {copy}"):
+    with pytest.raises(InputError, match=rf"killed, mend the file \(h5clear -s {copy}\)"):
         list_h5_names(copy)
 
 

@@ -172,6 +172,7 @@ OTHERS = {
     "JPEG 2000": encoded("JPEG2000"),
     "HEIC": box(b"heic"),
     "AVIF": box(b"avif"),
+    "HEIC or AVIF": box(b"mif1"),
     "CR3": box(b"crx "),
     "a video": box(b"isom"),
     "JPEG XL": lambda _: b"\xff\x0a" + bytes(100),
