@@ -1,5 +1,6 @@
 """COLMAP models of other programs and of careless hands are read as they are meant, or refused."""
 
+import re
 import shutil
 import struct
 from types import SimpleNamespace
@@ -48,6 +49,18 @@ def write(folder, **parts):
             content = lines if isinstance(lines, bytes) else ("\n".join(lines) + "\n").encode()
             (folder / f"{part}.txt").write_bytes(content)
     return folder
+
+
+def changed(lines, line, word, value):
+    """Replace a word of a line."""
+    words = lines[line].split(" ")
+    words[word] = value
+    return [*lines[:line], " ".join(words), *lines[line + 1 :]]
+
+
+def as_float(word):
+    """Write a whole number as numpy does by default."""
+    return f"{int(word):.18e}" if word.lstrip("-").isdigit() else word
 
 
 def as_bytes(lines, end="\n", encoding="utf-8"):
@@ -123,7 +136,29 @@ READ = {  # parts of a text model, and what is read
         },
         {"keypoints": many},
     ),
-    "an unused broken camera": ({"cameras": [*CAMERAS, "9 PINHOLE 1 1 0 0 0 0"]}, {}),
+    "an unused broken camera": ({"cameras": [*CAMERAS, "9 PINHOLE 0 0 0 0 0 0"]}, {}),
+    "whole numbers written as others": (
+        {"cameras": ["1.0 SIMPLE_PINHOLE 640.0 4.80e+02 500.5 320 240", CAMERAS[1]]}
+        | {"images": [" ".join(map(as_float, line.split(" "))) for line in images()]}
+        | {"points3D": ["7.0 0.5 1e-05 2.5 1.0 2.00e+00 3 0.25 1.0 0 2 1.0"]},
+        {},
+    ),
+    "points of exponents": ({"points3D": [changed(POINTS, 0, 4, "1e0")[0] + " "]}, {}),
+    "comments at the ends of lines": (
+        {"cameras": [f"{CAMERAS[0]} # a, 1 2", f"{CAMERAS[1]}\t#b"]}
+        | {"images": changed(images(), 1, 5, "-1 # c d e")}
+        | {"points3D": [f"{POINTS[0]} # f 1"]},
+        {},
+    ),
+    "no numbers for keypoints without points": (
+        {"images": changed(changed(images(), 1, 3, "NaN"), 1, 4, "-inf")},
+        {"keypoints": [KEYPOINTS[0].replace("30.25 1e-05", "0 0"), *KEYPOINTS[1:]]},
+    ),
+    **{
+        f"error {error}": ({"points3D": changed(POINTS, 0, 7, error)}, {})
+        for error in ("nan", "inf", "-nan", "?", "-1")
+    },
+    "no error": ({"points3D": [POINTS[0].replace(" 0.25", "")]}, {}),
 }
 
 
@@ -136,24 +171,22 @@ def test_text_models_are_read_whole(kind, tmp_path, caplog):
     if "points3D" not in parts or parts["points3D"]:
         assert track(model) == [(1, 0), (2, 1)]
         assert model.points3D[7].xyz.tolist() == [0.5, 1e-05, 2.5]
+        assert model.points3D[7].color.tolist() == [1, 2, 3]
     assert not caplog.records
-
-
-def changed(lines, line, word, value):
-    """Replace a word of a line."""
-    words = lines[line].split(" ")
-    words[word] = value
-    return [*lines[:line], " ".join(words), *lines[line + 1 :]]
 
 
 REFUSED = [  # part, lines, what the message says
     *(("cameras", changed(CAMERAS, 0, 4, f), r"txt:1: not a camera") for f in ("0", "-5", "nan")),
     ("cameras", changed(CAMERAS, 1, 1, "PINHOL"), r"txt:2: .*Unknown camera model 'PINHOL'"),
     ("cameras", CAMERAS[:1], r"images.txt:1: it has camera 2, which is not among the cameras"),
-    ("cameras", [*CAMERAS, CAMERAS[0]], r"txt:3: the id 1 is at .*txt:1, too"),
+    ("cameras", [*CAMERAS, CAMERAS[0]], r"txt:3: the id 1 is used twice, first at .*txt:1\."),
     ("cameras", [one.replace(".", ",") for one in CAMERAS], r"txt:1: .*points into decimal"),
     ("images", changed(images(), 2, 9, "a.jpg"), r"txt:3: a.jpg is in the model twice, .*txt:1"),
-    ("images", changed(images(), 2, 0, "1"), r"txt:3: the id 1 is at .*images.txt:1, too"),
+    (
+        "images",
+        changed(images(), 2, 0, "1"),
+        r"txt:3: the id 1 is used twice, first at .*images.txt:1\.",
+    ),
     ("images", changed(images(), 2, 0, "4294967277"), r"txt:3: the id 4294967277 is not from"),
     ("images", changed(images(), 2, 0, "-1"), r"txt:3: the id -1 is not from 0"),
     *(("images", changed(images(), 2, 5, t), rf"txt:3: .*{t} is not") for t in ("nan", "1e999")),
@@ -166,8 +199,19 @@ REFUSED = [  # part, lines, what the message says
     ("images", as_bytes(images(["\u00e9.jpg", "b", "c"]), encoding="latin-1"), "txt:1: .*UTF-8"),
     ("images", as_bytes(images(), encoding="utf-16"), "txt:1: not text in UTF-8"),
     *(("points3D", changed(POINTS, 0, 1, x), rf"txt:1: .*{x} is") for x in ("nan", "1e999", "1,5")),
-    ("points3D", [*POINTS, POINTS[0]], r"txt:2: the id 7 is at .*txt:1, too"),
-    ("points3D", ["7 0 0 1 9 9 9"], r"txt:1: not a point .it has too few words"),
+    *(("images", changed(images(), 1, i, "nan"), r"txt:2: .*nan is not a") for i in (0, 1, 2, 5)),
+    ("images", changed(images(), 1, 3, "x"), r"txt:2: .*x is not a finite number"),
+    ("images", changed(images(), 1, 0, "3.5 4"), r"txt:2: .*keypoints .the number of its words"),
+    ("images", changed(images(), 3, 5, "7.5"), r"txt:4: .*keypoints .7.5 is not a whole number"),
+    ("images", changed(images(), 3, 3, "x"), r"txt:4: .*keypoints .x is not a finite number"),
+    ("images", images(keypoints=["10 20", "", ""]), r"txt:2: .*words. nor its keypoints .the num"),
+    ("cameras", changed(CAMERAS, 1, 2, "800.5"), r"txt:2: .*800.5 600 are not a width"),
+    ("cameras", changed(CAMERAS, 1, 2, "0"), r"txt:2: not a camera"),
+    *(("points3D", changed(POINTS, 0, 4, c), rf"txt:1: .*{c} is not") for c in ("128.5", "1e-1")),
+    ("points3D", changed(POINTS, 0, 9, "0.5"), r"txt:1: .*0.5 is not a whole number"),
+    ("points3D", changed(POINTS, 0, 0, "9" * 400), r"txt:1: not a point"),
+    ("points3D", [*POINTS, POINTS[0]], r"txt:2: the id 7 is used twice, first at .*txt:1\."),
+    ("points3D", ["7 0 0 1 9 9"], r"txt:1: not a point .it has too few words"),
     ("rigs", ["1 1 CAMERA 1"], "images.txt:1: image 1 is in no frame"),
 ]
 
@@ -389,9 +433,9 @@ def test_the_only_model_in_a_folder_is_taken(suffix, sparse):
 
 @pytest.mark.fault(8)
 def test_several_models_in_a_folder_are_named(sparse, tmp_path, refused):
-    said = f"{sparse.folder} has 3 COLMAP models: 0 of 3 photos, 1 of 1 photos, 10 of 3 photos"
+    said = f"{sparse.folder} has 3 COLMAP models: 0 (3 photos), 1 (1 photos), 10 (3 photos)"
     for read in (colmap.find_model, colmap.read_model, colmap.model_files):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=re.escape(said)):
             read(sparse.folder)
     new = ("--outputs", tmp_path / "outputs")
     assert said in refused("--map", sparse.folder, "--map_images", tmp_path, *new)

@@ -56,7 +56,7 @@ def explain(folder: Path) -> None:
     if path.is_file():
         ids, numbers = np.unique(_parse(path, _points)["id"], return_counts=True)
         if (numbers > 1).any():
-            raise InputError(f"{path}: the id {ids[np.argmax(numbers)]} is there twice.")
+            raise InputError(f"{path}: the id {ids[np.argmax(numbers)]} is used twice.")
 
 
 def count_images(folder: Path) -> int:

@@ -53,7 +53,7 @@ def _find(path: Path) -> tuple[Path, ModuleType]:
         raise InputError(f"{path} is not a COLMAP model (it has no cameras.bin or cameras.txt).")
     if len(found) > 1:
         counts = (
-            f"{folder.name} of {files.count_images(folder)} photos" for folder, files in found
+            f"{folder.name} ({files.count_images(folder)} photos)" for folder, files in found
         )
         raise InputError(
             f"{path} has {len(found)} COLMAP models: {', '.join(counts)}. Give the folder of one."

@@ -135,17 +135,19 @@ class Records:
                 if data_id not in images:
                     raise _absent(frame.place, "image", data_id, "images")
                 if (other := frame_of.setdefault(data_id, frame)) is not frame:
-                    raise InputError(f"{frame.place}: image {data_id} is at {other.place}, too.")
+                    raise InputError(
+                        f"{frame.place}: image {data_id} is in two frames, first at {other.place}."
+                    )
                 image, rig = images[data_id], rigs[frame.rig_id]
                 if image.camera_id != sensor_id:
                     raise InputError(
-                        f"{frame.place}: image {data_id} is of camera {sensor_id}, but of camera "
-                        f"{image.camera_id} at {image.place}."
+                        f"{frame.place}: image {data_id} belongs to camera {sensor_id} here, but "
+                        f"to camera {image.camera_id} at {image.place}."
                     )
                 if (kind, sensor_id) not in {*rig.sensors[:1], *rig.poses}:
                     raise InputError(
                         f"{rig.place}: the rig has no camera {sensor_id}, or no pose of it, but "
-                        f"image {data_id} is of that camera."
+                        f"image {data_id} belongs to that camera."
                     )
         for image in self.images:
             if image.id not in frame_of:
@@ -172,7 +174,9 @@ def _by_id(records: Iterable[Record], largest: int = MAX_ID) -> dict[int, Record
                 f"{record.place}: the id {record.id} is not from 0 to {largest}. Renumber all."
             )
         if (first := found.setdefault(record.id, record)) is not record:
-            raise InputError(f"{record.place}: the id {record.id} is at {first.place}, too.")
+            raise InputError(
+                f"{record.place}: the id {record.id} is used twice, first at {first.place}."
+            )
     return found
 
 
@@ -190,5 +194,7 @@ def _are_unit(poses: Iterable[tuple[str, Pose]]) -> bool:
     wrong = ~np.isfinite(numbers).all(axis=1) | ~((lengths > UNIT) & (lengths < 1 / UNIT))
     if wrong.any():
         place = places[int(np.argmax(wrong))]
-        raise InputError(f"{place}: not a pose: its numbers must be finite, and QW QX QY QZ not 0.")
+        raise InputError(
+            f"{place}: not a pose: all numbers must be finite, and QW QX QY QZ must not all be 0."
+        )
     return bool((np.abs(lengths - 1) < UNIT).all())

@@ -1,6 +1,7 @@
 """Text files of COLMAP models."""
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -20,8 +21,13 @@ POINT = "POINT3D_ID X Y Z R G B ERROR (IMAGE_ID POINT2D_IDX)..."
 
 _MARK, _UTF16 = b"\xef\xbb\xbf", (b"\xff\xfe", b"\xfe\xff")  # byte order marks
 TOO_SHORT = "it has too few words"
-_SUSPICIOUS = b",;nNE\t"  # in lists of other things, and in numbers that may not be finite
+_SUSPICIOUS = b",;#nNeE\t"  # in lists of other things, and in numbers that may not be finite
+_NOT_FINITE = {b"nan", b"-nan", b"inf", b"-inf"}
 _POINT_TYPES = [int, *[float] * 3, *[int] * 3, float]  # of the first words of POINT
+_REAL = rb" -?\d+(?:\.\d+)?(?:e-\d+)?"  # with another exponent it may be infinite
+_REGULAR = re.compile(rb"\d+(?:%b){3}(?: \d+){3}%b(?: \d[ \d]*)?\r?\n?" % (_REAL, _REAL))
+# how many of the first words have all whole numbers among them, None for all
+_WHOLE = {"cameras": 4, "rigs": None, "frames": None}
 _CHUNK = 2**22  # bytes
 _LONG = 500  # bytes of a line that is no image but keypoints
 
@@ -40,7 +46,8 @@ def read(folder: Path) -> Records:
     """Read the records of a text model, and check the form of the lines of keypoints and points.
 
     Unlike COLMAP, this takes the rest of a line for the name of an image, ignores byte order marks,
-    and needs neither lines of keypoints nor points3D.txt.
+    comments at the ends of lines and errors of points that are not numbers, takes whole numbers
+    that are written as others (1.0), and needs neither lines of keypoints nor points3D.txt.
 
     Raises:
         InputError: naming the file and the line that is wrong.
@@ -50,10 +57,11 @@ def read(folder: Path) -> Records:
     for lines in _image_lines(folder / "images.txt"):
         images.append(_image(lines))
         as_colmap &= lines.as_colmap
-    few: dict[str, list[tuple[str, bytes]]] = {
-        part: list(_lines(folder / f"{part}.txt")) for part in ("cameras", "rigs", "frames")
-    }
-    as_colmap &= all(_is_plain(line) for lines in few.values() for _, line in lines)
+    few: dict[str, list[tuple[str, list[bytes]]]] = {part: [] for part in _WHOLE}
+    for part, found in few.items():
+        for place, line in _lines(folder / f"{part}.txt"):
+            found.append((place, _few(part, line)))
+            as_colmap &= line == b" ".join(found[-1][1])
     cameras = [_camera(*line) for line in few["cameras"]]
     rigs = [_rig(*line) for line in few["rigs"]]
     frames = [_frame(*line) for line in few["frames"]]
@@ -63,17 +71,19 @@ def read(folder: Path) -> Records:
 
 def rewrite(folder: Path, output: Path, with_tracks: bool) -> None:
     """Write a text model in a way that COLMAP reads, with the ids of images for their names."""
-    for part in ("cameras", "rigs", "frames", "points3D"):
-        if part != "points3D" and not (folder / f"{part}.txt").is_file():
-            continue
-        kept = len(_POINT_TYPES) if part == "points3D" and not with_tracks else None
-        with (output / f"{part}.txt").open("wb") as file:
-            for _, line in _lines(folder / f"{part}.txt"):
-                file.write(b" ".join(line.split()[:kept]) + b"\n")
+    for part in _WHOLE:
+        if (folder / f"{part}.txt").is_file():
+            with (output / f"{part}.txt").open("wb") as file:
+                for _, line in _lines(folder / f"{part}.txt"):
+                    file.write(b" ".join(_few(part, line)) + b"\n")
+    kept = None if with_tracks else len(_POINT_TYPES)
+    with (output / "points3D.txt").open("wb") as file:
+        for place, line in _lines(folder / "points3D.txt"):
+            file.write(b" ".join(_point(place, line)[:kept]) + b"\n")
     with (output / "images.txt").open("wb") as file:
         for _, words, keypoints, *_ in _image_lines(folder / "images.txt"):
             file.write(b" ".join([*words[:9], words[0]]) + b"\n")
-            file.write(b" ".join(keypoints.split()) + b"\n")
+            file.write(keypoints + b"\n")
 
 
 def count_images(folder: Path) -> int:
@@ -85,10 +95,9 @@ def explain(folder: Path) -> None:
     """Raise an InputError that names the line of points3D.txt that COLMAP cannot read, if any."""
     places: dict[int, str] = {}
     for place, line in _lines(folder / "points3D.txt"):
-        _check_point(place, line)
-        point_id = int(line.split(None, 1)[0])
+        point_id = int(_point(place, line)[0])
         if (first := places.setdefault(point_id, place)) != place:
-            raise InputError(f"{place}: the id {point_id} is at {first}, too.")
+            raise InputError(f"{place}: the id {point_id} is used twice, first at {first}.")
 
 
 def wrong_keypoints(place: str) -> InputError:
@@ -128,9 +137,26 @@ def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
     return ((place, line) for place, line in _numbered(path) if line and line[:1] != b"#")
 
 
-def _is_plain(line: bytes) -> bool:
-    """Return whether words are separated by single spaces: COLMAP 3.13 splits at these alone."""
-    return not (b"  " in line or b"\t" in line)
+def _words(line: bytes) -> list[bytes]:
+    """Return the words of a line before a comment."""
+    return re.split(rb"\s#", line, maxsplit=1)[0].split()
+
+
+def _whole(word: bytes) -> bytes:
+    """Return a whole number that is written as another, such as 1.0, as one; or another word."""
+    try:
+        number = float(word)
+    except ValueError:
+        return word
+    is_whole = number.is_integer() and not word.lstrip(b"+-").isdigit() and b"_" not in word
+    return b"%d" % number if is_whole else word
+
+
+def _few(part: str, line: bytes) -> list[bytes]:
+    """Return the words of a line that is neither of images nor of points, as COLMAP reads them."""
+    words = _words(line)
+    words[: _WHOLE[part]] = map(_whole, words[: _WHOLE[part]])
+    return words
 
 
 def _image_lines(path: Path) -> Iterator[ImageLines]:
@@ -147,9 +173,9 @@ def _image_lines(path: Path) -> Iterator[ImageLines]:
         no_keypoints = None
         if image is not None:
             try:
-                number, plain = _num_keypoints(line)
-                as_colmap = image.as_colmap and plain and not after
-                yield image._replace(keypoints=line, num_points2D=number, as_colmap=as_colmap)
+                number, keypoints = _keypoints(line)
+                as_colmap = image.as_colmap and keypoints == line and not after
+                yield image._replace(keypoints=keypoints, num_points2D=number, as_colmap=as_colmap)
                 image = None
                 continue
             except ValueError as error:
@@ -162,25 +188,32 @@ def _image_lines(path: Path) -> Iterator[ImageLines]:
         yield image._replace(as_colmap=image.as_colmap and after[:1] == [b""])
 
 
-def _num_keypoints(line: bytes) -> tuple[int, bool]:
-    """Count the keypoints in a line.
+def _keypoints(line: bytes) -> tuple[int, bytes]:
+    """Check the keypoints in a line.
+
+    Those that are not finite and show no point become 0 0: COLMAP 4 stops at them.
 
     Returns:
-        Their number, and whether words are separated as COLMAP does it.
+        Their number, and the line as COLMAP reads it.
 
     Raises:
         ValueError: with why the line is none of keypoints.
     """
     number, rest = divmod(line.count(b" ") + 1, 3)
-    suspicious = rest or any(mark in line for mark in _SUSPICIOUS + b"e") or b"  " in line[:_LONG]
+    suspicious = rest or any(mark in line for mark in _SUSPICIOUS) or b"  " in line[:_LONG]
     if len(line) > _LONG and not suspicious:
-        return number, True
-    words = line.split()
+        return number, line
+    words = _words(line)
     number, rest = divmod(len(words), 3)
-    _take(iter(words), *[float, float, int] * number)
     if rest:
         raise ValueError("the number of its words is no multiple of 3")
-    return number, _is_plain(line)
+    words[2::3] = map(_whole, words[2::3])
+    if b"n" in line.lower():
+        for i in range(0, 3 * number, 3):
+            if words[i + 2] == b"-1" and _NOT_FINITE & {word.lower() for word in words[i : i + 2]}:
+                words[i : i + 2] = b"0", b"0"
+    _take(iter(words), *[float, float, int] * number)
+    return number, b" ".join(words)
 
 
 def _image_line(place: str, line: bytes, no_keypoints: ValueError | None) -> ImageLines:
@@ -193,16 +226,21 @@ def _image_line(place: str, line: bytes, no_keypoints: ValueError | None) -> Ima
     """
     words = line.split(None, 9)
     try:
+        words[:9:8] = map(_whole, words[:9:8])
         for kind, word in zip([int, *[float] * 7, int], [*words, *[b""] * 9], strict=False):
             _number(word, kind)
         if len(words) < 10:
             raise ValueError(TOO_SHORT)
     except ValueError as error:
-        form, reason = IMAGE, error
-        if no_keypoints is not None and not words[0].isdigit():
-            form, reason = f"{IMAGE}` or, after that, `{KEYPOINTS}", no_keypoints
-        raise _wrong(place, "an image", form, words, reason) from None
-    as_colmap = _is_plain(line) and words[9].split() == [words[9]]
+        what, form, reason = "an image", IMAGE, error
+        if no_keypoints is not None:
+            what, form = (
+                f"an image ({error}) nor its keypoints",
+                f"{IMAGE}` or, after that, `{KEYPOINTS}",
+            )
+            reason = no_keypoints
+        raise _wrong(place, what, form, words, reason) from None
+    as_colmap = line == b" ".join(words) and words[9].split() == [words[9]]
     return ImageLines(place, words, b"", 0, as_colmap)
 
 
@@ -220,9 +258,8 @@ def _image(lines: ImageLines) -> Image:
     return Image(lines.place, int(image_id), numbers, int(camera_id), name, lines.num_points2D)
 
 
-def _camera(place: str, line: bytes) -> Camera:
+def _camera(place: str, words: list[bytes]) -> Camera:
     """Return the record of a camera."""
-    words = line.split()
     try:
         camera_id = int(_number(words[0], int))
         for word in words[4:]:
@@ -233,9 +270,8 @@ def _camera(place: str, line: bytes) -> Camera:
     return Camera(place, camera_id, camera)
 
 
-def _rig(place: str, line: bytes) -> Rig:
+def _rig(place: str, words: list[bytes]) -> Rig:
     """Return the record of a rig."""
-    words = line.split()
     rest = iter(words)
     sensors: list[Sensor] = []
     poses: dict[Sensor, Pose] = {}
@@ -250,9 +286,8 @@ def _rig(place: str, line: bytes) -> Rig:
     return Rig(place, rig_id, sensors, poses)
 
 
-def _frame(place: str, line: bytes) -> Frame:
+def _frame(place: str, words: list[bytes]) -> Frame:
     """Return the record of a frame."""
-    words = line.split()
     rest = iter(words)
     try:
         frame_id, rig_id, *pose, number = _take(rest, int, int, *[float] * 7, int)
@@ -289,7 +324,8 @@ def _check_points(path: Path) -> tuple[int, bool]:
             number = None if found is None else number + found
     if number is not None:
         return number, True
-    return sum(_check_point(place, line) for place, line in _lines(path)), False
+    first = len(_POINT_TYPES)
+    return sum(len(_point(*line)) - first for line in _lines(path)) // 2, False
 
 
 def _num_elements(lines: list[bytes]) -> int | None:
@@ -299,28 +335,39 @@ def _num_elements(lines: list[bytes]) -> int | None:
     """
     lines = [line for line in lines if line[:1] != b"#"]
     spaces = [line.count(b" ") for line in lines]
-    joined = b"".join(lines)
     regular = (
-        all(number >= 7 and number % 2 for number in {*spaces})
-        and not any(mark in joined for mark in _SUSPICIOUS)
-        and b"  " not in joined
-        and joined.count(b"e") == joined.count(b"e-")  # others may be infinite
+        all(number % 2 for number in {*spaces})
+        and all(map(_REGULAR.fullmatch, lines))
+        and b"  " not in b"".join(lines)
     )
     return (sum(spaces) - 7 * len(lines)) // 2 if regular else None
 
 
-def _check_point(place: str, line: bytes) -> int:
-    """Return the length of the track in a line, or raise an InputError if it is not of a point."""
-    words = line.split()
+def _point(place: str, line: bytes) -> list[bytes]:
+    """Return the words of a point as COLMAP reads them, or raise an InputError if they are none.
+
+    ERROR counts for nothing, and may be missing.
+    """
+    words = _words(line)
+    given, first = words[:], len(_POINT_TYPES)
+    words[:1], words[4:] = map(_whole, words[:1]), map(_whole, words[4:])
     try:
-        rest = iter(words)
-        _take(rest, *_POINT_TYPES)
-        _take(rest, *[int] * max(0, len(words) - len(_POINT_TYPES)))
         if len(words) % 2:
-            raise ValueError("it has an odd number of words")
+            words.insert(first - 1, b"-1")
+        words[first - 1 : first] = map(_error, words[first - 1 : first])
+        _take(iter(words), *_POINT_TYPES, *[int] * max(0, len(words) - first))
     except ValueError as error:
-        raise _wrong(place, "a point", POINT, words, error) from None
-    return (len(words) - len(_POINT_TYPES)) // 2
+        raise _wrong(place, "a point", POINT, given, error) from None
+    return words
+
+
+def _error(word: bytes) -> bytes:
+    """Return ERROR, or -1, which is COLMAP's for an unknown one."""
+    try:
+        _number(word, float)
+    except ValueError:
+        return b"-1"
+    return word
 
 
 def _number(word: bytes, kind: Callable[[bytes], float]) -> float:
@@ -333,7 +380,7 @@ def _number(word: bytes, kind: Callable[[bytes], float]) -> float:
         number = kind(word)
         if math.isfinite(number) and b"_" not in word:
             return number
-    except ValueError:
+    except (ValueError, OverflowError):
         pass
     if not word:
         raise ValueError(TOO_SHORT)
