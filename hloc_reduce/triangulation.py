@@ -79,7 +79,7 @@ def main(
     options = {"random_seed": 0, "num_threads": 1, **(mapper_options or {})}
     colmap.mapper_options(options)  # raises for a wrong one
     reference_model = colmap.find_model(reference_model)
-    reference = colmap.read_model(reference_model)
+    reference, normalized = colmap.read_normalized(reference_model)
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
@@ -92,6 +92,7 @@ def main(
         "min_match_score": min_match_score,
     }
     chosen = {key: value for key, value in verification.items() if value}
+    chosen |= {"normalized": True} if normalized else {}
     if pixel_scale > 1:
         chosen["pixel_scale"] = pixel_scale
     inputs = [*colmap.model_files(reference_model), pairs, features, matches]

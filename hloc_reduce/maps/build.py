@@ -74,7 +74,7 @@ def main(
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher = matcher or features_confs.matcher_of(conf)
-    reference = None if model is None else colmap.read_model(model)
+    reference, normalized = (None, False) if model is None else colmap.read_normalized(model)
     if reference is not None and not reference.images:
         raise InputError(f"The model {model} has no images.")
     names = _list(image_dir, reference, accept_partial)
@@ -99,6 +99,7 @@ def main(
         made_from |= {"num_covis": None, "pairs": "exhaustive"}
     elif model is None:
         made_from |= {"pairs": f"retrieval, {ROUNDS} rounds of verification"}
+    made_from |= {"normalized": True} if normalized else {}
     with claim(map_dir, made_from, overwrite, image_dir, model, projection) as folder:
         if not (map_dir / FINISHED).exists():
             begin(map_dir, fingerprints)

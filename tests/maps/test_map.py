@@ -120,6 +120,31 @@ def test_what_has_changed_is_noticed(place, aachen_layout, run, refused):
     assert outcome(outputs / "queries-day")[0]["map_images"] == 3
 
 
+@pytest.mark.fault(7)
+def test_a_map_of_rotations_that_were_not_normalized_is_stale(
+    place, aachen_layout, monkeypatch, refused
+):
+    build, _, outputs = place
+    model, folder = aachen_layout / "3D-models/aachen_v_1_1", outputs / "map"
+    reference = pycolmap.Reconstruction(model)
+    for frame in reference.frames.values():
+        pose = frame.rig_from_world
+        rotation = pycolmap.Rotation3d(1.002 * pose.rotation.quat)
+        frame.rig_from_world = pycolmap.Rigid3d(rotation, pose.translation)
+    reference.write(model)
+
+    def stop(*_):
+        raise InputError("stopped")
+
+    monkeypatch.setattr(maps.build, "begin", stop)
+    assert "stopped" in refused(*build)
+    conf = json.loads((folder / "conf.json").read_text())
+    del conf["normalized"]  # which an earlier version did not say
+    (folder / "conf.json").write_text(json.dumps(conf))
+    (folder / maps.map.FINISHED).touch()
+    assert "differs: normalized" in refused(*build)
+
+
 def test_inputs_are_not_deleted(place, tmp_path, run, refused):
     build, images, outputs = place
     run(*build)

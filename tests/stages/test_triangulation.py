@@ -1,5 +1,7 @@
 """The map of a scene whose points are known."""
 
+import json
+
 import h5py
 import numpy as np
 import pycolmap
@@ -45,6 +47,26 @@ def test_map_is_built_once_and_again_when_its_inputs_change(built, caplog, monke
     all_pairs(built.pairs, skip=[5])
     assert built.triangulate().find_image_with_name("db/5.jpg").num_points3D == 0
     assert "1 of 6 photos have no point in the map" in caplog.text and "db/5.jpg." in caplog.text
+
+
+@pytest.mark.fault(7)
+@pytest.mark.parametrize(("length", "stale"), [(1.002, True), (1 + 1e-6, False)])
+def test_a_map_of_rotations_that_were_not_normalized_is_stale(length, stale, built):
+    reference = pycolmap.Reconstruction(built.model)
+    for frame in reference.frames.values():
+        pose = frame.rig_from_world
+        rotation = pycolmap.Rotation3d(length * pose.rotation.quat)
+        frame.rig_from_world = pycolmap.Rigid3d(rotation, pose.translation)
+    reference.write_binary(built.model)
+    assert built.triangulate().num_points3D() == 300
+    written = [(built.sfm / "points3D.bin").stat().st_mtime_ns]
+    made_from = json.loads((built.sfm / "made_from.json").read_text())
+    made_from["options"].pop("normalized", None)  # which an earlier version did not say
+    (built.sfm / "made_from.json").write_text(json.dumps(made_from))
+    for _ in range(2):
+        built.triangulate()
+        written.append((built.sfm / "points3D.bin").stat().st_mtime_ns)
+    assert (written[0] != written[1]) == stale and written[1] == written[2]
 
 
 def test_an_empty_map_is_loud_and_keeps_the_old_one(built):

@@ -33,6 +33,7 @@ from .models import (
     observed,
     point3D_ids,
     read_model,
+    read_normalized,
     remove_images,
     visibility,
     with_cameras,

@@ -17,12 +17,13 @@ from ..cli import InputError
 from ..files import replacing
 from ..images import NO_IMAGE, check_format, unreadable
 from . import binary_files, text_files
-from .records import PARTS
+from .records import PARTS, UNIT
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 NEEDED = ("cameras", "images", "points3D")  # files; models of COLMAP 3.11 and older have no others
+ROUNDED = 1e-5  # quaternions of lengths that far from 1 are as good as unit quaternions
 COMPARED = 300  # points of a model whose tracks are compared with the images
 # which pycolmap raises for broken files
 COLMAP_ERRORS = (RuntimeError, ValueError, IndexError, KeyError, OverflowError)
@@ -52,9 +53,7 @@ def _find(path: Path) -> tuple[Path, ModuleType]:
     if not found:
         raise InputError(f"{path} is not a COLMAP model (it has no cameras.bin or cameras.txt).")
     if len(found) > 1:
-        counts = (
-            f"{folder.name} ({files.count_images(folder)} photos)" for folder, files in found
-        )
+        counts = (f"{folder.name} ({files.count_images(folder)} photos)" for folder, files in found)
         raise InputError(
             f"{path} has {len(found)} COLMAP models: {', '.join(counts)}. Give the folder of one."
         )
@@ -101,9 +100,17 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     Raises:
         InputError: when it is missing or broken, or has an invalid image name.
     """
+    return read_normalized(path)[0]
+
+
+def read_normalized(path: Path) -> tuple[pycolmap.Reconstruction, bool]:
+    """Read a COLMAP model as `read_model`, and tell whether this changed its rotations.
+
+    What an earlier version made from such a model is stale.
+    """
     folder, files = _find(path)
     records = files.read(folder)
-    are_unit = records.check(folder)
+    distance = records.check(folder)
     try:
         as_colmap = records.as_colmap
         model = pycolmap.Reconstruction(folder) if as_colmap else _read_copy(folder, files)
@@ -123,9 +130,9 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         image.name = record.name
         if image.num_points2D() != record.num_points2D:
             raise text_files.wrong_keypoints(record.place)
-    if not are_unit:
+    if distance >= UNIT:
         _normalize(model)
-    return model
+    return model, distance > ROUNDED
 
 
 def _read_copy(

@@ -85,14 +85,14 @@ class Records:
     num_elements: int
     as_colmap: bool
 
-    def check(self, folder: Path) -> bool:
+    def check(self, folder: Path) -> float:
         """Check that the records fit together.
 
         Args:
             folder: of the model, for messages.
 
         Returns:
-            Whether all quaternions have unit length.
+            How far lengths of quaternions are from 1, at most.
 
         Raises:
             InputError: naming the record that is wrong.
@@ -116,7 +116,7 @@ class Records:
                 raise InputError(f"{place}: not a camera ({error}).") from None
         if self.rigs or self.frames:
             self._check_frames(cameras, images)
-        return _are_unit(self._poses())
+        return _distance_from_unit(self._poses())
 
     def _check_frames(self, cameras: dict[int, Camera], images: dict[int, Image]) -> None:
         """Check that rigs, frames, cameras and images fit together."""
@@ -185,8 +185,8 @@ def _absent(place: str, what: str, its_id: int, part: str) -> InputError:
     return InputError(f"{place}: it has {what} {its_id}, which is not among the {part}.")
 
 
-def _are_unit(poses: Iterable[tuple[str, Pose]]) -> bool:
-    """Return whether quaternions have unit length; raise an InputError if poses are none."""
+def _distance_from_unit(poses: Iterable[tuple[str, Pose]]) -> float:
+    """Return how far lengths of quaternions are from 1; raise an InputError if poses are none."""
     places, values = zip(*poses, strict=True) if (poses := list(poses)) else ((), ())
     numbers = np.array(values).reshape(-1, 7)
     with np.errstate(over="ignore"):
@@ -197,4 +197,4 @@ def _are_unit(poses: Iterable[tuple[str, Pose]]) -> bool:
         raise InputError(
             f"{place}: not a pose: all numbers must be finite, and QW QX QY QZ must not all be 0."
         )
-    return bool((np.abs(lengths - 1) < UNIT).all())
+    return float(np.abs(lengths - 1).max(initial=0))
