@@ -136,6 +136,10 @@ READ = {  # parts of a text model, and what is read
         },
         {"keypoints": many},
     ),
+    "long lines of -1.0": (
+        {"images": images(keypoints=[one.replace("-1 ", "-1.0 ") for one in many])},
+        {"keypoints": many},
+    ),
     "an unused broken camera": ({"cameras": [*CAMERAS, "9 PINHOLE 0 0 0 0 0 0"]}, {}),
     "whole numbers written as others": (
         {"cameras": ["1.0 SIMPLE_PINHOLE 640.0 4.80e+02 500.5 320 240", CAMERAS[1]]}

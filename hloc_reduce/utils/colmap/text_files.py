@@ -201,7 +201,7 @@ def _keypoints(line: bytes) -> tuple[int, bytes]:
     """
     number, rest = divmod(line.count(b" ") + 1, 3)
     suspicious = rest or any(mark in line for mark in _SUSPICIOUS) or b"  " in line[:_LONG]
-    if len(line) > _LONG and not suspicious:
+    if len(line) > _LONG and not suspicious and b"." not in b"".join(line.split(b" ")[2::3]):
         return number, line
     words = _words(line)
     number, rest = divmod(len(words), 3)
