@@ -62,9 +62,10 @@ def check_number(image_dir: Path, number: int) -> None:
     """Raise a NoModelError for fewer images than a model has viewpoints."""
     if number < VIEWPOINTS:
         raise NoModelError(
-            f"A map of photos alone needs {VIEWPOINTS} or more, from different places: {image_dir} "
-            f"has {number}. Fewer do not determine focal lengths. Take more photos, each "
-            "overlapping the one before by two thirds, or give a COLMAP model of their poses."
+            f"A map of photos alone needs {VIEWPOINTS} or more, from different places: {number} "
+            f"{'image is' if number == 1 else 'images are'} given of {image_dir}. Fewer do not "
+            "determine focal lengths. Take more photos, each overlapping the one before by two "
+            "thirds, or give a COLMAP model of their poses."
         )
 
 

@@ -107,7 +107,8 @@ def test_wrong_input(place, tmp_path, run, refused):
     for number in (1, 2):
         shutil.copy(images / f"db/{number}.png", one)
         message = refused("--map_images", one, *build[4:])
-        assert f"needs 3 or more, from different places: {one} has {number}" in message
+        given = "1 image is given" if number == 1 else f"{number} images are given"
+        assert f"needs 3 or more, from different places: {given} of {one}." in message
         assert not (outputs / "map").exists()
     assert "Unknown matcher" in refused(*build, "--matcher", "NN")
     photos = tmp_path / "photos"

@@ -187,7 +187,7 @@ def test_two_images_are_too_few(scene, matched, tmp_path, monkeypatch):
     names, pairs, matches = matched
     monkeypatch.setattr(colmap, "incremental_mapping", None)
     arguments = (scene.images, pairs, scene.features, matches)
-    with pytest.raises(InputError, match="needs 3 or more, .* has 2"):
+    with pytest.raises(InputError, match="needs 3 or more, .*: 2 images are given of "):
         reconstruction.main(tmp_path / "sfm", *arguments, image_list=names[:2])
 
 
