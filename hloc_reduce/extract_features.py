@@ -294,7 +294,7 @@ def keep_present(image_dir: Path, names: list[str], accept_partial: bool) -> lis
         InputError: when an image is missing and `accept_partial` is not set, or all are missing.
     """
     absent = [name for name in names if not (image_dir / name).is_file()]
-    return _without(absent, names, accept_partial, f"are not in {image_dir}: {cli.some(absent)}")
+    return without(absent, names, accept_partial, f"are not in {image_dir}: {cli.some(absent)}")
 
 
 def keep_readable(features: Path, names: list[str], accept_partial: bool) -> list[str]:
@@ -311,11 +311,21 @@ def keep_readable(features: Path, names: list[str], accept_partial: bool) -> lis
     """
     failed = failures(features)
     broken = {name: failed[name] for name in names if name in failed}
-    return _without(list(broken), names, accept_partial, f"cannot be read: {with_reasons(broken)}")
+    return without(list(broken), names, accept_partial, f"cannot be read: {with_reasons(broken)}")
 
 
-def _without(left_out: list[str], names: list[str], accept_partial: bool, reason: str) -> list[str]:
-    """Return the other images of a map, if it may do without some."""
+def without(left_out: list[str], names: list[str], accept_partial: bool, reason: str) -> list[str]:
+    """Return the other images of a map, if it may do without some.
+
+    Args:
+        left_out: the images that cannot be used.
+        names: the images of the map.
+        accept_partial: leave out some.
+        reason: what is wrong with them, a predicate.
+
+    Raises:
+        InputError: when some are left out and `accept_partial` is not set, or all are.
+    """
     if not left_out:
         return names
     if not accept_partial or len(left_out) == len(names):
@@ -323,7 +333,7 @@ def _without(left_out: list[str], names: list[str], accept_partial: bool, reason
             f"{len(left_out)} of {len(names)} images of the map {reason}."
             + (" Give --accept_partial to do without them." if len(left_out) < len(names) else "")
         )
-    logger.warning("The map is without %d images: %s.", len(left_out), cli.some(left_out))
+    logger.warning("The map is without %d images, which %s.", len(left_out), reason)
     dropped = set(left_out)
     return [name for name in names if name not in dropped]
 

@@ -10,8 +10,8 @@ import pycolmap
 
 from . import logger
 from .localization.projection import median_photo_scale
+from .mapping import sizes
 from .mapping.epipolar import agreeing
-from .mapping.sizes import Size, scale_cameras
 from .runtime import provenance
 from .runtime.group_writer import failures
 from .utils import cli, colmap
@@ -83,7 +83,9 @@ def main(
     for path in (pairs, features, matches):
         if not path.is_file():
             raise InputError(f"There is no file {path}.")
-    scale_cameras(reference, _photo_sizes(reference, features))
+    photos = _photo_sizes(reference, features)
+    resized, unfit = sizes.compare(reference, photos)
+    scaled = sizes.scale_cameras(reference, resized)
     pixel_scale = median_photo_scale(image.camera for image in reference.images.values())
     mapper = colmap.mapper_options(options, pixel_scale)
     verification = {
@@ -91,15 +93,21 @@ def main(
         "estimate_two_view_geometries": estimate_two_view_geometries,
         "min_match_score": min_match_score,
     }
-    chosen = {key: value for key, value in verification.items() if value}
+    chosen: dict = {key: value for key, value in verification.items() if value}
     chosen |= {"normalized": True} if normalized else {}
     if pixel_scale > 1:
         chosen["pixel_scale"] = pixel_scale
+    if resized:
+        chosen["camera_sizes"] = {str(one): list(size) for one, size in resized.items()}
     inputs = [*colmap.model_files(reference_model), pairs, features, matches]
     made_from = provenance.of_inputs({**options, **chosen}, inputs)
     if not overwrite and provenance.is_current(sfm_dir / MADE_FROM, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
         return colmap.read_model(sfm_dir)
+    if unfit:
+        raise InputError(f"{len(unfit)} of {len(photos)} photos {sizes.complaint(unfit)}.")
+    if scaled:
+        logger.info("Cameras of the model are scaled to their photos: %s.", cli.some(scaled))
 
     with replacing_map(sfm_dir, made_from, reference_model) as building:
         database = building / "database.db"
@@ -205,8 +213,8 @@ def read_matches(
                         raise InputError(f"{pairs}: image {name} is not in the reference model.")
                 if name0 == name1 or (name0, name1) in found or (name1, name0) in found:
                     continue
-                sizes = len(keypoints[name0]), len(keypoints[name1])
-                indices, scores = get_matches(file, name0, name1, sizes)
+                numbers = len(keypoints[name0]), len(keypoints[name1])
+                indices, scores = get_matches(file, name0, name1, numbers)
                 if min_match_score:
                     if scores is None:
                         raise InputError(f"{matches}: the pair {name0}, {name1} has no scores.")
@@ -215,15 +223,15 @@ def read_matches(
     return keypoints, uncertainty, found
 
 
-def _photo_sizes(reference: pycolmap.Reconstruction, features: Path) -> dict[str, Size]:
+def _photo_sizes(reference: pycolmap.Reconstruction, features: Path) -> dict[str, sizes.Size]:
     """Return the sizes of the photos of a model, as far as a feature file has them."""
-    sizes, unreadable = {}, failures(features)
+    found, unreadable = {}, failures(features)
     with open_h5(features) as file:
         for image in reference.images.values():
             if image.name not in unreadable:
                 with suppress(InputError):  # features of other programs may have none
-                    sizes[image.name] = get_image_size(file, image.name)
-    return sizes
+                    found[image.name] = get_image_size(file, image.name)
+    return found
 
 
 def _verify(

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 
 import pycolmap
 
-from .. import logger
 from ..utils import cli
 
 Size = tuple[int, int]  # width, height
@@ -30,67 +29,82 @@ def size_of(camera: pycolmap.Camera) -> Size:
     return camera.width, camera.height
 
 
-def resized(model: pycolmap.Reconstruction, sizes: Mapping[str, Size]) -> dict[int, Size]:
-    """Find the cameras of a model whose photos were all resized in the same way.
+def compare(
+    model: pycolmap.Reconstruction, sizes: Mapping[str, Size]
+) -> tuple[dict[int, Size], dict[str, str]]:
+    """Compare the sizes of photos with those of their cameras.
+
+    The photos of a camera have its size, or all were resized in the same way. Most tell which; if
+    that is undecided, they have its size.
 
     Args:
         model: the model.
         sizes: (width, height) of its photos by name; others are left out.
 
     Returns:
-        From the ids of these cameras to the size of their photos.
-
-    Raises:
-        InputError: if photos have another size than their cameras, and not all photos of a camera
-            were resized in the same way.
+        From the ids of cameras whose photos were resized to the size of these; and from the names
+        of the photos that do not fit to their sizes and what happened to them, in words.
     """
     photos: dict[int, dict[str, Size]] = {}
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.name in sizes:
             photos.setdefault(image.camera_id, {})[image.name] = sizes[image.name]
-    found, wrong = {}, []
+    found, unfit = {}, {}
     for camera_id, its_sizes in photos.items():
         before = size_of(model.cameras[camera_id])
-        ((after, _),) = Counter(its_sizes.values()).most_common(1)
-        alike = all(
-            abs(side - other) <= ROUNDING
-            for size in its_sizes.values()
-            for side, other in zip(size, after, strict=True)
-        )
-        if not (alike and is_resized(before, after)):
-            wrong += [
-                f"{name} ({_written(size)}, its camera {_written(before)}: {_reason(before, size)})"
-                for name, size in its_sizes.items()
-                if size != before
-            ]
-        elif after != before:
+        after = _most(before, Counter(its_sizes.values()))
+        if after != before:
             found[camera_id] = after
-    if wrong:
-        raise cli.InputError(
-            f"{len(wrong)} of {len(sizes)} photos do not have the size of their cameras in the "
-            f"model: {cli.some(wrong, 3)}. Use the photos that the model was made from, as they "
-            "were, or all of them resized in the same way."
-            + (f" {TURN}" if any(TURNED in one for one in wrong) else "")
-        )
-    return found
+        for name, size in its_sizes.items():
+            if not _is_near(size, after):
+                reason = _reason(before, after, size)
+                unfit[name] = f"{_written(size)}, its camera {_written(before)}: {reason}"
+    return found, unfit
 
 
-def scale_cameras(model: pycolmap.Reconstruction, sizes: Mapping[str, Size]) -> None:
-    """Scale the cameras of a model, in place, whose photos were resized; see `resized`."""
+def complaint(unfit: Mapping[str, str]) -> str:
+    """Say that photos do not fit, see `compare`, and what to do; the sentence has no subject."""
+    named = cli.some([f"{name} ({what})" for name, what in unfit.items()], 3)
+    turn = f" {TURN}" if any(TURNED in what for what in unfit.values()) else ""
+    return (
+        f"do not have the size of their cameras in the model: {named}.{turn} Use the photos that "
+        "the model was made from, as they were, or all of them resized in the same way"
+    )
+
+
+def scale_cameras(model: pycolmap.Reconstruction, found: Mapping[int, Size]) -> list[str]:
+    """Scale cameras of a model, in place, to the sizes in `found`; return them in words."""
     scaled = []
-    for camera_id, size in resized(model, sizes).items():
+    for camera_id, size in found.items():
         camera = model.cameras[camera_id]
         scaled.append(f"{camera_id} ({_written(size_of(camera))} to {_written(size)})")
         camera.rescale(*size)
-    if scaled:
-        logger.info("Cameras of the model are scaled to their photos: %s.", cli.some(scaled))
+    return scaled
 
 
-def _reason(before: Size, size: Size) -> str:
-    """Say how the size of a photo came about."""
+def _most(before: Size, sizes: Counter[Size]) -> Size:
+    """Return the size that most photos of a camera have, of those to which it can be scaled."""
+
+    def votes(size: Size) -> tuple[int, int, bool]:
+        near = sum(number for other, number in sizes.items() if _is_near(size, other))
+        return near, sizes[size], size == before
+
+    return max((size for size in {before: 0, **sizes} if is_resized(before, size)), key=votes)
+
+
+def _is_near(size: Size, other: Size) -> bool:
+    """Tell whether sizes are the same up to rounding."""
+    return all(abs(a - b) <= ROUNDING for a, b in zip(size, other, strict=True))
+
+
+def _reason(before: Size, after: Size, size: Size) -> str:
+    """Say how the size of a photo came about that does not fit a camera scaled to another size."""
+    if _is_near(size, before):
+        return f"not resized, unlike others of the same camera, which have {_written(after)}"
     if is_resized(before, size):
-        return "resized, unlike others of the same camera"
-    return TURNED if is_resized(before, size[::-1]) else "cropped, or by another camera"
+        return "resized or cropped, unlike others of the same camera"
+    turned = is_resized(before, size[::-1])
+    return TURNED if turned else "cropped, stretched, or by another camera"
 
 
 def _written(size: Size) -> str:

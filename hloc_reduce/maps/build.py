@@ -9,7 +9,7 @@ from .. import extract_features, logger
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
-from ..extract_features import keep_present
+from ..extract_features import keep_present, without
 from ..mapping import registration, sizes
 from ..runtime import provenance
 from ..runtime.outputs import CONF, RunFolder
@@ -17,7 +17,7 @@ from ..utils import colmap
 from ..utils.cli import InputError
 from ..utils.codes import STORAGES
 from ..utils.files import replacing
-from ..utils.images import image_sizes, list_images
+from ..utils.images import list_images, stored_size
 from ..utils.match_files import check_distinct
 from ..utils.paths import strings_as_paths
 from .building import ROUNDS, Building, drop_others
@@ -58,9 +58,9 @@ def main(
         overwrite: rebuild the map.
         storage: how descriptors are stored, one of `utils.codes.STORAGES`.
         keypoints: settings of the DoG detector, one of `detectors.dog.KEYPOINTS`.
-        accept_partial: do without images that are missing or unreadable; without a model, build a
-            map even if fewer than half of the images are in it, or its focal lengths,
-            positions or matches show that it may be wrong.
+        accept_partial: do without images that are missing, unreadable or of another size than their
+            cameras in the model; without a model, build a map even if fewer than half of the images
+            are in it, or its focal lengths, positions or matches show that it may be wrong.
         camera_mode: which images share a camera, without a model.
 
     Returns:
@@ -84,8 +84,9 @@ def main(
     exhaustive = len(names) <= MAX_EXHAUSTIVE
     if overwrite or not (map_dir / CONF).exists():
         extract_features.check_model(conf)
+    usable = names
     if reference is not None and (overwrite or not (map_dir / FINISHED).exists()):
-        sizes.resized(reference, image_sizes(image_dir, names))
+        usable = _of_fitting_size(image_dir, names, reference, accept_partial)
     images = {name: image_dir / name for name in names}
     parts = {path.name: path for path in (colmap.model_files(model) if model else [])}
     fingerprints, found = digests(map_dir, {"images": images, "model": parts})
@@ -104,7 +105,7 @@ def main(
         if not (map_dir / FINISHED).exists():
             begin(map_dir, fingerprints)
             building = Building(
-                *(folder, image_dir, names, matcher, num_covis, exhaustive),
+                *(folder, image_dir, usable, matcher, num_covis, exhaustive),
                 *(accept_partial, camera_mode),
             )
             return building.build(feature, conf, keypoints, model, reference)
@@ -154,6 +155,15 @@ def _list(
         return names
     names = sorted(image.name for image in reference.images.values())
     return list_images(image_dir, keep_present(image_dir, names, accept_partial))
+
+
+def _of_fitting_size(
+    image_dir: Path, names: list[str], reference: pycolmap.Reconstruction, accept_partial: bool
+) -> list[str]:
+    """Return the images of a map whose sizes fit their cameras; unreadable ones are kept."""
+    found = {name: stored_size(image_dir / name) for name in names}
+    _, unfit = sizes.compare(reference, {name: one for name, one in found.items() if one})
+    return without([*unfit], names, accept_partial, sizes.complaint(unfit))
 
 
 def digests(

@@ -79,13 +79,11 @@ def list_images(
     return names
 
 
-def image_sizes(image_dir: Path, names: Iterable[str]) -> dict[str, tuple[int, int]]:
-    """Return the (width, height) of images as they are stored, but not of unreadable ones."""
-    sizes = {}
-    for name in names:
-        with suppress(Exception), Image.open(image_dir / name) as opened:  # Pillow raises many
-            sizes[name] = opened.size
-    return sizes
+def stored_size(image: Path) -> tuple[int, int] | None:
+    """Return the (width, height) of an image as it is stored, None if it cannot be read."""
+    with suppress(Exception), Image.open(image) as opened:  # Pillow raises many
+        return opened.size
+    return None
 
 
 def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:

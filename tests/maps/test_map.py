@@ -16,7 +16,7 @@ from hloc_reduce import Localizer, compact, maps, projections
 from hloc_reduce.localization.intrinsics import to_list
 from hloc_reduce.training import tracks
 from hloc_reduce.training.tracks import parse_maps
-from hloc_reduce.utils import colmap, parsers
+from hloc_reduce.utils import cli, colmap, parsers
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize
 
@@ -344,7 +344,7 @@ def test_photos_that_see_no_point_of_the_model(
 
 @pytest.mark.fault(11)
 def test_photos_that_were_made_smaller(place, aachen_layout, run, refused):
-    """Their cameras are scaled if all were; else nothing is extracted."""
+    """Their cameras are scaled if all were; else nothing is extracted, and the odd ones named."""
     build, images, outputs = place
     for number in range(4):
         photo = images / f"db/{number}.png"
@@ -352,7 +352,11 @@ def test_photos_that_were_made_smaller(place, aachen_layout, run, refused):
         cv2.imwrite(str(photo), cv2.resize(pixels, (288, 216), interpolation=cv2.INTER_AREA))
         if number < 3:
             said = refused(*build)
-            assert "db/0.png (288x216, its camera 360x270: resized" in said
+            odd = "0.png (288x216" if number < 2 else "3.png (360x270"
+            assert f"map do not have the size of their cameras in the model: db/{odd}, its" in said
+            assert said.endswith(
+                "resized in the same way. Give --accept_partial to do without them."
+            )
             assert not list(outputs.rglob("*.h5"))
     run(*build)
     (camera,) = colmap.read_model(outputs / "map/sfm").cameras.values()
@@ -362,6 +366,37 @@ def test_photos_that_were_made_smaller(place, aachen_layout, run, refused):
     truth = parsers.parse_poses(aachen_layout / "queries/ground_truth_poses.txt")
     error = pose.inverse().translation - truth["query/day/a.png"].inverse().translation
     assert abs(error).max() < 0.01
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize(
+    ("ratio", "crop", "usual"), [(1, (2, 2), (360, 270)), (0.8, (0, 0), (288, 216))]
+)
+def test_a_photo_of_an_odd_size_may_be_left_out(
+    ratio, crop, usual, place, run, refused, caplog, monkeypatch
+):
+    """Photos of one camera, one of which was cropped, or all but one of which were made smaller."""
+    monkeypatch.setattr(cli.logger, "propagate", True)
+    build, images, outputs = place
+    odd = images / "db/1.png"
+    for photo in images.glob("db/*.png"):
+        if photo != odd:
+            pixels = cv2.imread(str(photo))
+            resized = cv2.resize(pixels, usual, interpolation=cv2.INTER_AREA)
+            cv2.imwrite(str(photo), resized)
+    right, lower = crop
+    pixels = cv2.imread(str(odd))
+    cv2.imwrite(str(odd), pixels[: 270 - lower, : 360 - right])
+    assert "1 of 4 images of the map do not have the size" in refused(*build)
+    for _ in range(2):  # a finished map is used again
+        run(*build, "--accept_partial")
+        sfm = colmap.read_model(outputs / "map/sfm")
+        names = [image.name for image in sfm.images.values()]
+        assert sorted(names) == ["db/0.png", "db/2.png", "db/3.png"]
+    (camera,) = sfm.cameras.values()
+    assert [camera.width, camera.height, camera.params[0]] == [*usual, 375 * ratio]
+    said = "The map is without 1 images, which do not have the size of their cameras in the model: "
+    assert caplog.text.count(said + "db/1.png (") == 1
 
 
 @pytest.mark.fault(2)

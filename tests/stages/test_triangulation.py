@@ -9,6 +9,7 @@ import pytest
 import small_map
 from small_map import all_pairs
 
+from hloc_reduce import triangulation
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.h5 import list_h5_names
@@ -208,9 +209,34 @@ def test_cameras_are_scaled_to_their_photos(ratio, built):
 
 
 @pytest.mark.fault(11)
+def test_a_map_of_resized_photos_is_read_again(built, caplog, monkeypatch):
+    monkeypatch.setattr(cli.logger, "propagate", True)
+    resize(built.features, 0.5, list_h5_names(built.features))
+    for _ in range(2):
+        assert built.triangulate(built.root / "resized").num_points3D() == 300
+    assert caplog.text.count("Cameras of the model are scaled") == 1
+    assert caplog.text.count("is up to date") == 1
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize("odd", [False, True])
+def test_maps_of_versions_that_did_not_compare_sizes(odd, built, monkeypatch):
+    """One with unscaled cameras is made again; photos that do not fit cannot be."""
+    with monkeypatch.context() as earlier:
+        earlier.setattr(triangulation.sizes, "compare", lambda model, sizes: ({}, {}))
+        names = list_h5_names(built.features)
+        resize(built.features, 0.5, names[:1] if odd else names)
+        resize(built.features, 1, names[1:] if odd else [])
+        before = built.triangulate()
+    after = built.triangulate()
+    widths = [{camera.width for camera in sfm.cameras.values()} for sfm in (before, after)]
+    assert widths == [{640}, {640} if odd else {320}]
+
+
+@pytest.mark.fault(11)
 def test_a_camera_does_not_fit_photos_of_two_sizes(built):
     resize(built.features, 0.5, ["db/0.jpg"])
     resize(built.features, 1, ["db/1.jpg"])
-    said = "1 of 2 .*db/0.jpg .320x240, its camera 640x480: resized, unlike others"
+    said = "1 of 2 .*db/0.jpg .320x240, its camera 640x480: resized or cropped, unlike others"
     with pytest.raises(InputError, match=said):
         built.triangulate()
