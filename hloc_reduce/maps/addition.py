@@ -19,7 +19,7 @@ from ..confs import matchers as matchers_confs
 from ..localization import intrinsics
 from ..localization.confidence import DEFAULT_GATE
 from ..localization.records import camera_of, pose_of
-from ..mapping import extension
+from ..mapping import extension, sizes
 from ..mapping.extension import Placed
 from ..runtime import provenance
 from ..runtime.group_writer import failures, merge
@@ -147,19 +147,18 @@ class Addition:
         return readable
 
     def place(self, reference: pycolmap.Reconstruction, names: list[str]) -> None:
-        """Add photos with the poses of a model."""
-        images = {image.name: image for image in reference.images.values()}
-        placed, resized = {}, []
+        """Add photos with the poses of a model, whose cameras are scaled to resized photos."""
         with open_h5(self.features) as file:
-            for name in names:
-                camera = reference.cameras[images[name].camera_id]
-                width, height = get_image_size(file, name)
-                if (width, height) != (camera.width, camera.height):
-                    resized.append(name)
-                    continue
-                pose = images[name].cam_from_world()
-                placed[name] = Placed(pose, camera, known=True, fixed=True)
-        self._leave_out("of another size than their cameras in the model", resized)
+            resized, unfit = sizes.compare(
+                reference, {name: get_image_size(file, name) for name in names}
+            )
+        sizes.scale_cameras(reference, resized)
+        self._leave_out("of another size than their cameras in the model", [*unfit])
+        images = {image.name: image for image in reference.images.values()}
+        placed = {}
+        for image in (images[name] for name in names if name not in unfit):
+            pose = image.cam_from_world()
+            placed[image.name] = Placed(pose, image.camera, known=True, fixed=True)
         if placed:
             self._extend(placed, [self._pairs([*placed], [*self.inside, *placed], "posed")])
 

@@ -234,10 +234,28 @@ def test_a_pose_in_another_frame_is_refused(grown, tmp_path, refused):
     assert names(folder) == BASE
 
 
-def test_a_photo_of_another_size_than_its_camera_is_refused(grown, refused):
+@pytest.mark.fault(11)
+def test_the_camera_of_a_photo_that_was_made_smaller_is_scaled(grown, run):
+    """Its focal length and principal point are those of its pixels, and its pose is the given."""
     folder, new, model = grown
     photo = cv2.imread(str(new / NEW))
-    cv2.imwrite(str(new / NEW), cv2.resize(photo, (180, 135)))
+    cv2.imwrite(str(new / NEW), cv2.resize(photo, (288, 216), interpolation=cv2.INTER_AREA))
+    run("--map", folder, "--add_images", new, "--add_model", model)
+    sfm = colmap.read_model(maps.Map(folder).sfm)
+    image = sfm.find_image_with_name(NEW)
+    camera, before = image.camera, sfm.find_image_with_name(BASE[0]).camera
+    assert [camera.width, camera.height, *camera.params] == [288, 216, 300, 144, 108]
+    assert [before.width, before.height, before.params[0]] == [360, 270, 375]
+    assert np.array_equal(image.cam_from_world().matrix(), truth_of(model, NEW).matrix())
+    assert image.num_points3D > 100
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize(("height", "width"), [(268, 360), (270, 300), (200, 360)])
+def test_a_photo_that_was_cropped_is_refused(height, width, grown, refused):
+    folder, new, model = grown
+    photo = cv2.imread(str(new / NEW))
+    cv2.imwrite(str(new / NEW), photo[:height, :width])
     message = refused("--map", folder, "--add_images", new, "--add_model", model)
     assert f"of another size than their cameras in the model: {NEW}." in message
     assert names(folder) == BASE
