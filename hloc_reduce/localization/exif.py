@@ -12,7 +12,7 @@ ZOOM, FOCAL_35MM, FOCAL_LENGTH = 0xA404, 0xA405, 0x920A
 WIDTH, HEIGHT = 0xA002, 0xA003  # as the camera wrote it
 FOCAL_PLANE, UNIT = 0xA20E, 0xA210  # pixels of the sensor in a unit of length
 UNITS = {2: 25.4, 3: 10.0}  # millimetres
-UPRIGHT, ORIENTATIONS = 1, range(1, 9)
+ORIENTATIONS = range(1, 9)
 MAX_ZOOM = 1.01
 RESHAPED = 1.02  # ratio of aspect ratios: a copy of another size differs by rounding only
 MAX_RATIO = 10.0  # of width and height in EXIF data: others are nonsense
@@ -71,17 +71,14 @@ def exif_camera(image: Path) -> ExifCamera | None:
     return ExifCamera(name, lens, size, zoom > MAX_ZOOM, _is_cropped(size, taken), full_size)
 
 
-def stored(image: Path) -> tuple[tuple[int, int], int] | None:
-    """Return how a photo is stored: (width, height) and EXIF orientation, 1 if that is not known.
-
-    None for a file that cannot be read.
-    """
+def orientation(image: Path) -> int | None:
+    """Return the EXIF orientation of a photo, None if EXIF data do not tell."""
     try:
         with Image.open(image) as opened:
-            size, found = opened.size, opened.getexif().get(ORIENTATION, UPRIGHT)
+            found = opened.getexif().get(ORIENTATION)
     except Exception:  # Pillow raises many types for broken data
         return None
-    return size, int(found) if found in ORIENTATIONS else UPRIGHT
+    return int(found) if found is not None and found in ORIENTATIONS else None
 
 
 def _in_pixels(more: Mapping[int, Any]) -> float:

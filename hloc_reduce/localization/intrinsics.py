@@ -13,7 +13,7 @@ from ..utils.files import replacing
 from ..utils.images import UnreadableImage
 from ..utils.parsers import parse_camera, to_line
 from .confidence import FOCAL_LENGTHS
-from .exif import WELL_KNOWN, ExifCamera, correct, exif_camera, stored
+from .exif import WELL_KNOWN, ExifCamera, correct, exif_camera, orientation
 from .lenses import PLAIN, Size, split
 from .pose import OF_SIZE
 
@@ -67,7 +67,7 @@ class MapCameras(NamedTuple):
             does not know.
         typical: of each size of which it has several photos, (width, height), their lens, if that
             is much the same in all of them.
-        orientations: EXIF orientations of its photos, empty if the map does not know.
+        orientations: EXIF orientations of its photos, empty if EXIF data of any do not tell.
         lenses: of each size of photos by bent lenses, such as fisheyes, these; see `lenses`.
     """
 
@@ -267,22 +267,24 @@ def of_map(
         if len(ids) >= WELL_KNOWN and len(set(ids)) == 1
     }
     cameras = [reconstruction.cameras[image.camera_id] for image in photos]
-    found_stored = (stored(image_dir / image.name) for image in photos)
-    orientations = {one[1] for one in found_stored if one is not None}
-    return of_cameras(cameras)._replace(known=known, models=models, orientations=orientations)
+    told = of_cameras(cameras)._replace(known=known, models=models)
+    turns = {orientation(image_dir / image.name) for image in photos}
+    return told._replace(orientations={one for one in turns if one and None not in turns})
 
 
 def merged(first: MapCameras, second: MapCameras) -> MapCameras:
     """Return what two groups of photos of a map tell, without typical lenses.
 
-    If both know a camera, or bent lenses of a size, the first one's count.
+    If both know a camera, or bent lenses of a size, the first one's count. Orientations are known
+    if those of both groups are, or one has no photos.
     """
+    turns = [one.orientations for one in (first, second) if one.sizes or one.lenses]
     models = {*first.models, *second.models}
     ranges = [cameras.focal_lengths for cameras in (first, second) if cameras.focal_lengths]
     lengths = (min(low for low, _ in ranges), max(high for _, high in ranges)) if ranges else None
     return MapCameras(
         *(second.known | first.known, first.sizes | second.sizes, models, lengths),
-        orientations={*first.orientations, *second.orientations},
+        orientations=set().union(*turns) if all(turns) else set(),
         lenses={**second.lenses, **first.lenses},
     )
 

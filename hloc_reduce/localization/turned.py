@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ..confs.features import RECOMMENDED
-from .exif import stored
+from ..utils.images import stored_size
+from .exif import orientation
 from .intrinsics import MapCameras
 
 REMEDY = (
@@ -21,21 +22,25 @@ REMEDY = (
 def reason(image: Path | np.ndarray, of_map: MapCameras) -> str | None:
     """Say how a photo is stored turned against those of a map, and what to do; None if it is not.
 
+    EXIF orientations tell; where these are not known, the shapes of the photos.
+
     Args:
         image: its file, or its pixels (H, W) or (H, W, 3), whose EXIF data are not known.
         of_map: what the map tells about its photos.
     """
-    if isinstance(image, np.ndarray):
-        size, orientation = image.shape[1::-1], None
-    else:
-        size, orientation = stored(image) or ((1, 1), None)
     others = of_map.orientations
-    if orientation is not None and others and orientation not in others:
+    own = None if isinstance(image, np.ndarray) or not others else orientation(image)
+    if own is not None:
+        if own in others:
+            return None
         theirs = ", ".join(map(str, sorted(others)))
         return (
-            f"it is stored turned against the map's photos (EXIF orientation {orientation}, "
+            f"it is stored turned against the map's photos (EXIF orientation {own}, "
             f"theirs {theirs}), {REMEDY}"
         )
+    size = image.shape[1::-1] if isinstance(image, np.ndarray) else stored_size(image)
+    if size is None:
+        return None
     width, height = size
     shape, theirs = ("landscape", "portrait") if width > height else ("portrait", "landscape")
     sizes = {*of_map.sizes, *of_map.lenses}

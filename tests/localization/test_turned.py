@@ -1,6 +1,7 @@
 """Queries that are stored turned against the photos of a map."""
 
 import numpy as np
+import pycolmap
 import pytest
 from command import outcome, write
 from PIL import Image
@@ -9,7 +10,8 @@ from hloc_reduce import Localizer, compact, extractors
 from hloc_reduce.confs import features
 from hloc_reduce.localization import turned
 from hloc_reduce.localization.exif import ORIENTATION
-from hloc_reduce.localization.intrinsics import MapCameras
+from hloc_reduce.localization.intrinsics import MapCameras, merged, of_map
+from hloc_reduce.utils import colmap
 from pipelines import localize
 
 PIPELINE = localize
@@ -34,7 +36,11 @@ def save(path, pixels, orientation=None):
         (LANDSCAPE, 1, {LANDSCAPE}, {1}, None),
         (LANDSCAPE, 99, {LANDSCAPE}, {1}, None),
         (LANDSCAPE, 3, {LANDSCAPE}, {1}, f"{SAID} (EXIF orientation 3, theirs 1)"),
-        (LANDSCAPE, None, {PORTRAIT}, {8}, f"{SAID} (EXIF orientation 1, theirs 8)"),
+        (LANDSCAPE, None, {PORTRAIT}, {8}, f"{PERHAPS} (landscape, theirs portrait)"),
+        (LANDSCAPE, None, {LANDSCAPE}, {6}, None),  # perhaps as theirs
+        (PORTRAIT, 1, {LANDSCAPE}, {1}, None),  # the camera was upright
+        (LANDSCAPE, 8, {PORTRAIT}, {6, 8}, None),
+        (PORTRAIT, 99, {LANDSCAPE}, {1}, f"{PERHAPS} (portrait, theirs landscape)"),
         (LANDSCAPE, 6, {LANDSCAPE}, {1, 8}, f"{SAID} (EXIF orientation 6, theirs 1, 8)"),
         (PORTRAIT, 8, {LANDSCAPE, PORTRAIT}, {1, 8}, None),
         (PORTRAIT, None, {LANDSCAPE}, {1}, f"{PERHAPS} (portrait, theirs landscape)"),
@@ -50,6 +56,24 @@ def test_which_photos_are_turned(size, orientation, sizes, orientations, said, t
     save(tmp_path / "a.jpg", np.zeros(size[::-1], np.uint8), orientation)
     found = turned.reason(tmp_path / "a.jpg", MapCameras({}, sizes, orientations=orientations))
     assert found is None if said is None else found.startswith(f"{said}, which this feature")
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize(
+    ("found", "known"),
+    [([1, 1], {1}), ([1, 6], {1, 6}), ([1, None], set()), ([None, None], set()), ([6, 99], set())],
+)
+def test_orientations_of_a_map_are_known_if_all_photos_have_them(found, known, tmp_path):
+    model, pixels = pycolmap.Reconstruction(), np.zeros((30, 40), np.uint8)
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 50.0, *LANDSCAPE)
+    for number, orientation in enumerate(found, start=1):
+        save(tmp_path / f"{number}.jpg", pixels, orientation)
+        image = pycolmap.Image(name=f"{number}.jpg", camera_id=1, image_id=number)
+        colmap.add_image(model, camera, image, pycolmap.Rigid3d())
+    assert of_map(model, tmp_path).orientations == known
+    parts = [of_map(model, tmp_path, [f"{number}.jpg"]) for number in (1, 2)]
+    assert merged(*parts).orientations == known  # a map to which a photo was added
+    assert merged(parts[0], of_map(model, tmp_path, [])).orientations == parts[0].orientations
 
 
 def test_a_photo_that_cannot_be_read_is_not_turned(tmp_path):
@@ -80,6 +104,8 @@ def test_features_are_invariant_if_their_keypoints_have_orientations(model, inva
 def test_the_reason_says_that_a_query_is_turned(invariant, place, tmp_path, monkeypatch, run):
     monkeypatch.setattr("hloc_reduce.detectors.dog.is_rotation_invariant", lambda conf: invariant)
     build, images, outputs = place
+    for photo in sorted(images.glob("db/*.png")):
+        save(photo, np.array(Image.open(photo)), 1)
     noise = np.random.default_rng(0).integers(0, 255, (270, 360), np.uint8)
     queries = tmp_path / "turned"
     queries.mkdir()
