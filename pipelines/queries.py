@@ -109,11 +109,10 @@ def _turned(query_images: Path, names: Iterable[str], built: Map) -> dict[str, d
     """Return the options of queries that are stored turned, if that matters for the feature."""
     from hloc_reduce import extractors
 
-    found = {name: turned.options(query_images / name, built.cameras) for name in names}
-    found = {name: options for name, options in found.items() if options}
-    if not found or extractors.load(built.conf["model"]).rotation_invariant:
+    if extractors.is_rotation_invariant(built.conf["model"]):
         return {}
-    return found
+    found = {name: turned.options(query_images / name, built.cameras) for name in names}
+    return {name: options for name, options in found.items() if options}
 
 
 class Photos:

@@ -64,6 +64,11 @@ class Extractor(BaseModel):
         """What determines the keypoints, equal for extractors that share them."""
         return {**self.conf, "name": type(self).__module__}
 
+    @classmethod
+    def is_rotation_invariant(cls, conf: dict) -> bool:
+        """Tell whether an extractor of this class with a configuration is `rotation_invariant`."""
+        return cls.rotation_invariant
+
     def reduce(self, features: dict) -> dict:
         """Return the features of this extractor, computed from those of `base`."""
         return features
@@ -145,14 +150,29 @@ def load(conf: dict) -> Extractor:
         InputError: when there is no such extractor, or its configuration is wrong.
     """
     name = str(conf.get("name"))
-    ours = [module.name for module in pkgutil.iter_modules(__path__)]
-    if name not in ours and (is_installed() or name.startswith("hloc.")):
+    if not _is_ours(name) and (is_installed() or name.startswith("hloc.")):
         return load({"name": "hloc", "conf": conf})
     try:
         extractor = dynamic_load(sys.modules[__name__], name, Extractor)
     except InputError as error:
         raise InputError(f"{error} hloc's own extractors need hloc to be installed.") from None
     return extractor(conf)
+
+
+def is_rotation_invariant(conf: dict) -> bool:
+    """Tell whether the extractor of a model configuration is `rotation_invariant`.
+
+    It is not made, so that neither its weights nor an installed hloc are needed.
+    """
+    name = str(conf.get("name"))
+    if not _is_ours(name):
+        name, conf = "hloc", {"conf": conf}
+    return dynamic_load(sys.modules[__name__], name, Extractor).is_rotation_invariant(conf)
+
+
+def _is_ours(name: str) -> bool:
+    """Tell whether an extractor is a module of this package."""
+    return name in [module.name for module in pkgutil.iter_modules(__path__)]
 
 
 def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:

@@ -91,7 +91,12 @@ class DoG(Extractor):
         descriptor = choose("descriptor", conf["descriptor"], BASES)
         self.describe = None if descriptor == COLMAP else Descriptor(descriptor)
         self.detect = dog.detector(conf)
-        self.rotation_invariant = dog.is_rotation_invariant(conf)
+        self.rotation_invariant = self.is_rotation_invariant(conf)
+
+    @classmethod
+    def is_rotation_invariant(cls, conf: dict) -> bool:
+        """Tell whether keypoints have orientations of their own."""
+        return dog.is_rotation_invariant({**cls.default_conf, **conf})
 
     @property
     def descriptor(self) -> str:

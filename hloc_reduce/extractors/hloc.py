@@ -44,7 +44,12 @@ class HlocExtractor(Extractor):
                 f"hloc's extractor {name} cannot be made ({_reason(error)})."
             ) from None
         self.detection_noise = getattr(self.model, "detection_noise", 1.0)
-        self.rotation_invariant = self.name in ROTATION_INVARIANT
+        self.rotation_invariant = self.is_rotation_invariant({"conf": conf})
+
+    @classmethod
+    def is_rotation_invariant(cls, conf: dict) -> bool:
+        """Tell whether an extractor of hloc is one of `ROTATION_INVARIANT`."""
+        return str(conf["conf"].get("name")).removeprefix("hloc.") in ROTATION_INVARIANT
 
     @property
     def descriptor(self) -> str:

@@ -2,7 +2,7 @@
 
 from .. import projections
 from ..utils.cli import InputError
-from . import Extractor, load
+from . import Extractor, is_rotation_invariant, load
 
 
 class Reduced(Extractor):
@@ -30,6 +30,11 @@ class Reduced(Extractor):
                 f"{self.base.descriptor}."
             )
         self.dim = self.project.dim
+
+    @classmethod
+    def is_rotation_invariant(cls, conf: dict) -> bool:
+        """Tell whether `base` is."""
+        return is_rotation_invariant({**cls.default_conf, **conf}["base"])
 
     @property
     def base(self) -> Extractor:

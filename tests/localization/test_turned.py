@@ -12,6 +12,7 @@ from hloc_reduce.localization import turned
 from hloc_reduce.localization.exif import ORIENTATION
 from hloc_reduce.localization.intrinsics import MapCameras, merged, of_map
 from hloc_reduce.utils import colmap
+from hloc_reduce.utils.cli import InputError
 from pipelines import localize
 
 PIPELINE = localize
@@ -97,6 +98,21 @@ def test_a_photo_that_cannot_be_read_is_not_turned(tmp_path):
 def test_features_are_invariant_if_their_keypoints_have_orientations(model, invariant, monkeypatch):
     monkeypatch.setattr("hloc_reduce.extractors.dog.Descriptor", lambda name: None)
     assert extractors.load(model).rotation_invariant == invariant
+    assert extractors.is_rotation_invariant(model) == invariant
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize("known", [lambda conf: conf, lambda conf: {"name": "hloc", "conf": conf}])
+@pytest.mark.parametrize(("name", "invariant"), [("dog", True), ("disk", False)])
+def test_a_feature_of_hloc_is_known_where_hloc_is_not_installed(
+    known, name, invariant, monkeypatch
+):
+    """Queries that were localized need not be described again."""
+    monkeypatch.setattr("hloc_reduce.utils.hloc.find_spec", lambda name: None)
+    model = {"name": "reduced", "base": known({"name": f"hloc.{name}"})}
+    with pytest.raises(InputError, match="hloc is not installed"):
+        extractors.load(model)
+    assert extractors.is_rotation_invariant(model) == invariant
 
 
 @pytest.mark.fault(11)
