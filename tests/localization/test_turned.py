@@ -66,7 +66,9 @@ def test_which_photos_are_turned(size, orientation, sizes, orientations, said, t
 )
 def test_orientations_of_a_map_are_known_if_all_photos_have_them(found, known, tmp_path):
     model, pixels = pycolmap.Reconstruction(), np.zeros((30, 40), np.uint8)
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 50.0, *LANDSCAPE)
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=40, height=30, params=[50, 20, 15], camera_id=1
+    )
     for number, orientation in enumerate(found, start=1):
         save(tmp_path / f"{number}.jpg", pixels, orientation)
         image = pycolmap.Image(name=f"{number}.jpg", camera_id=1, image_id=number)
