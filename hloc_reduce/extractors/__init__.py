@@ -36,7 +36,8 @@ class Extractor(BaseModel):
         detect: detects the keypoints, if that can be done in another process (pickled), separately
             from describing them; `_forward` gets the result as `detected`.
         dim: dimension of the descriptors, as far as it is known.
-        rotation_invariant: photos match however they are turned.
+        rotation_invariant: photos match however they are turned. If that depends on the
+            configuration, the subclass writes `is_rotation_invariant`, too.
         gpu_images: how many threads may give images to one extractor on a GPU.
         stride: what the sides of an image are multiples of in `fixed`.
     """
