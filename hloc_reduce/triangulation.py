@@ -129,6 +129,8 @@ def main(
                 f"The map is empty: COLMAP triangulated no point from the matches {matches}. "
                 "Do the poses belong to these images, of this size, and do the pairs overlap?"
             )
+        if resized:
+            sizes.check_scaled(reconstruction)
     logger.info("The map %s:\n%s", sfm_dir, reconstruction.summary())
     _warn_of_images_without_points(reconstruction)
     return reconstruction

@@ -106,7 +106,11 @@ def infer(image: Path | np.ndarray, of_map: MapCameras) -> tuple[pycolmap.Camera
         camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
     else:
         camera, has_focal_length = colmap.infer_camera(image)
-        exif = exif_camera(image)
+        exif, side = exif_camera(image), max(camera.width, camera.height)
+        low, high = FOCAL_LENGTHS
+        if has_focal_length and not low <= camera.mean_focal_length() / side <= high:
+            has_focal_length = False  # no lens has it: some programs write 65535 for an unknown one
+            camera.params = [GUESSED_FOCAL * side, *camera.params[1:]]
     size = camera.width, camera.height
     has_size = bool({size, size[::-1]} & of_map.sizes)
     bent = of_map.lenses.get(size, ())

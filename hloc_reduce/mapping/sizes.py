@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import pycolmap
 
 from ..utils import cli
+from .adjustment import GAIN, LARGEST, gain_of_free_intrinsics
 
 Size = tuple[int, int]  # width, height
 
@@ -80,6 +81,28 @@ def scale_cameras(model: pycolmap.Reconstruction, found: Mapping[int, Size]) -> 
         scaled.append(f"{camera_id} ({_written(size_of(camera))} to {_written(size)})")
         camera.rescale(*size)
     return scaled
+
+
+def check_scaled(model: pycolmap.Reconstruction) -> None:
+    """Check that photos fit the cameras that were scaled to them: cropped ones do not.
+
+    Of a model of more than `LARGEST` images this is not tried.
+
+    Args:
+        model: with the points that were triangulated with these cameras.
+
+    Raises:
+        InputError: if they fit much better with other intrinsics.
+    """
+    if model.num_reg_images() > LARGEST:
+        return
+    gain = gain_of_free_intrinsics(model)
+    if gain > GAIN:
+        raise cli.InputError(
+            "The photos have another size than their cameras in the model, and do not fit the "
+            f"cameras scaled to it: with other intrinsics they fit {100 * gain:.0f} % better. They "
+            "were cropped rather than resized: use the photos that the model was made from."
+        )
 
 
 def _most(before: Size, sizes: Counter[Size]) -> Size:

@@ -8,13 +8,9 @@ import numpy as np
 import pycolmap
 
 from .. import logger
-from ..mapping.adjustment import adjusted_error, with_own_cameras
+from ..mapping.adjustment import GAIN, LARGEST, adjusted_error, with_own_cameras
 from ..utils import cli
 
-LARGEST = 200  # images: adjusting more takes minutes, and more photos bend a map less
-# cropped photos, and others with wrong focal lengths, gain 18 % and more, those of sound maps at
-# most 10 % (docs/maps.md)
-GAIN = 0.12
 # photos that share a camera gain by cameras of their own, too: if none is unlike the others, up to
 # 21 % in sound maps, and 31 % and more if many were cropped
 GAIN_OF_OWN = 0.25

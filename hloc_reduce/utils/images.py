@@ -54,7 +54,7 @@ def list_images(
     if not within.is_dir():
         raise no_folder(within)
     if image_list is None:
-        files = sorted(p.relative_to(image_dir) for p in within.rglob("*") if not p.is_dir())
+        files = sorted(p.relative_to(image_dir) for p in within.rglob("*") if _may_be_read(p))
         names = [file.as_posix() for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
         others = [str(file) for file in files if file.suffix.lower() in OTHER_SUFFIXES]
         read = ", ".join(sorted(IMAGE_SUFFIXES))
@@ -77,6 +77,11 @@ def list_images(
             f"{len(missing)} of {len(names)} images are not in {image_dir}: {some(missing)}"
         )
     return names
+
+
+def _may_be_read(path: Path) -> bool:
+    """Tell files, and links to nothing, from folders and from pipes, which nobody writes to."""
+    return path.is_file() or (path.is_symlink() and not path.exists())
 
 
 def stored_size(image: Path) -> tuple[int, int] | None:

@@ -69,6 +69,16 @@ def test_the_camera_of_a_map_is_known_again(tmp_path):
         assert intrinsics.infer(tmp_path / "new.jpg", known)[1] == "EXIF"
 
 
+@pytest.mark.fault(6)
+@pytest.mark.parametrize(("focal_35mm", "source"), [(35, "EXIF"), (65535, "guess"), (1, "guess")])
+def test_a_focal_length_that_no_lens_has_tells_nothing(focal_35mm, source, tmp_path):
+    """Some programs write the largest number for one that they do not know."""
+    write_photo(tmp_path / "0.jpg", focal_35mm=focal_35mm)
+    camera, found = intrinsics.infer(tmp_path / "0.jpg", MapCameras({}, {(480, 360)}))
+    assert found == source and 400 < camera.mean_focal_length() < 600
+    assert camera.has_prior_focal_length == (source == "EXIF")
+
+
 @pytest.mark.parametrize(
     ("size", "taken", "focal_length"),
     [

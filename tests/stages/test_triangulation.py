@@ -209,6 +209,19 @@ def test_cameras_are_scaled_to_their_photos(ratio, built):
 
 
 @pytest.mark.fault(11)
+@pytest.mark.parametrize("corner", [(64, 48), (0, 0), (128, 40)])
+def test_cropped_photos_of_the_same_shape_are_refused(corner, built):
+    """Of 640x480 pixels, 512x384 are left: by their size, they could have been resized."""
+    with h5py.File(built.features, "a") as file:
+        for name in list_h5_names(built.features):
+            file[f"{name}/keypoints"][:] -= np.array(corner, np.float32)
+            file[f"{name}/image_size"] = np.array([512, 384])
+    with pytest.raises(InputError, match="They were cropped rather than resized"):
+        built.triangulate(built.root / "cropped")
+    assert not (built.root / "cropped").exists()
+
+
+@pytest.mark.fault(11)
 def test_a_map_of_resized_photos_is_read_again(built, caplog, monkeypatch):
     monkeypatch.setattr(cli.logger, "propagate", True)
     resize(built.features, 0.5, list_h5_names(built.features))

@@ -1,5 +1,6 @@
 """Images of all kinds, and files that are no image."""
 
+import os
 import struct
 import zlib
 from io import BytesIO
@@ -235,3 +236,13 @@ def test_photos_and_videos_of_other_types_are_named(name, tmp_path, picture, cap
     cv2.imwrite(str(tmp_path / "b.png"), picture)
     assert list_images(tmp_path) == ["b.png"]
     assert "1 photos and videos in" in caplog.text and name in caplog.text
+
+
+@pytest.mark.fault(10)
+def test_pipes_are_no_photos(picture, tmp_path):
+    """Whoever reads them waits forever; a link to nothing is a photo that cannot be read."""
+    Image.fromarray(picture).save(tmp_path / "a.jpg")
+    os.mkfifo(tmp_path / "pipe.jpg")
+    (tmp_path / "linked.jpg").symlink_to(tmp_path / "pipe.jpg")
+    (tmp_path / "lost.jpg").symlink_to(tmp_path / "nothing.jpg")
+    assert list_images(tmp_path) == ["a.jpg", "lost.jpg"]
