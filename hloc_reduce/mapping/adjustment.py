@@ -114,12 +114,9 @@ def _adjuster(
     known: Iterable[int] = (),
 ) -> Any:
     """Prepare the adjustment of a whole model, but for the intrinsics of known cameras."""
-    options = OPTIONS.get_global_bundle_adjustment()
+    options = colmap.exact(OPTIONS.get_global_bundle_adjustment())
     options.refine_principal_point = refine_principal_point
     options.print_summary = False
-    solver = colmap.solver_options(options)
-    # by COLMAP's limit of the gradient, 1, the adjustment of few points ends before it begins
-    solver.gradient_tolerance, solver.function_tolerance = 1e-4, 1e-6
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sfm.reg_image_ids():
         config.add_image(image_id)

@@ -1,6 +1,8 @@
 """Add images with poses to a COLMAP model: extend its points and triangulate new ones."""
 
-from collections.abc import Collection, Mapping
+import copy
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -186,7 +188,8 @@ def _adjust(
         new: ids of the new images.
         free: of those whose poses are estimated.
         unknown: ids of the cameras whose intrinsics are estimated.
-        refine_map: adjust the other images and points, too.
+        refine_map: adjust the other images and points, too; what the given poses leave open of the
+            frame stays that of the other images.
     """
     config = pycolmap.BundleAdjustmentConfig()
     images = set(model.reg_image_ids()) if refine_map else set(new)
@@ -202,8 +205,55 @@ def _adjust(
     else:
         for point_id in _points_of(model, new):
             config.add_variable_point(point_id)  # also seen by images that stay
-    options = OPTIONS.get_local_bundle_adjustment()
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    options = colmap.exact(OPTIONS.get_local_bundle_adjustment())
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
+    if refine_map:
+        with _same_frame(model, images - set(new), stays):
+            adjuster.solve()
+    else:
+        adjuster.solve()
+
+
+@contextmanager
+def _same_frame(
+    model: pycolmap.Reconstruction, old: Collection[int], fixed: Collection[int]
+) -> Iterator[None]:
+    """Move a model that is adjusted in a block back to where its images were.
+
+    COLMAP's gauge fixes one pose and a coordinate of another, so that the adjusted model depends on
+    the directions of its axes.
+
+    Args:
+        model: the model.
+        old: ids of the images that are aligned with where they were.
+        fixed: of those whose poses are given and stay. Two fix the frame, one all but its scale.
+    """
+    before = _corners(model, old)
+    yield
+    after = _corners(model, old)
+    if not fixed:
+        moved = pycolmap.estimate_sim3d(after, before)
+        if moved is not None:  # images at one place determine none
+            model.transform(moved)
+    elif len(fixed) == 1:
+        (image,) = (model.images[image_id] for image_id in fixed)
+        pose, centre = copy.deepcopy(image.cam_from_world()), image.projection_center()
+        scale = np.linalg.norm(before - centre) / np.linalg.norm(after - centre)
+        model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), (1 - scale) * centre))
+        model.frames[image.frame_id].rig_from_world = pose  # to the bit
+
+
+def _corners(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> np.ndarray:
+    """Return points (6 I, 3) that determine a frame, on the axes of cameras around their centres.
+
+    Centres alone leave open how a row of cameras is turned about itself. The distance of the points
+    is the spread of the centres, so that it has the scale of the model.
+    """
+    images = [model.images[i] for i in image_ids]
+    centres = np.array([image.projection_center() for image in images])
+    axes = np.concatenate([image.cam_from_world().rotation.matrix() for image in images])
+    spread, centres = np.sqrt(centres.var(axis=0).sum()), centres.repeat(3, axis=0)
+    return np.concatenate([centres + spread * axes, centres - spread * axes])
 
 
 def count_shared(model: pycolmap.Reconstruction, names: Collection[str]) -> dict[str, int]:

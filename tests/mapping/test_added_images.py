@@ -148,6 +148,58 @@ def test_the_map_is_refined_on_demand(scene, model):
         assert poses(model)[name] == pytest.approx(scene.poses[name].matrix(), abs=1e-3)
 
 
+FRAMES = {
+    "ECEF": pycolmap.Sim3d(
+        1.0,
+        pycolmap.Rotation3d(np.array([0.5, 0.1, 0.7, 0.5])),
+        np.array([4.000006e6, 6.00005e5, 4.899995e6]),
+    ),
+    "UTM in millimetres": pycolmap.Sim3d(
+        1000.0, pycolmap.Rotation3d(), np.array([4.48251e8, 5.411932e9, 3.12e5])
+    ),
+}
+
+
+@pytest.fixture
+def noisy(scene, model):
+    """The scene with keypoints that are off by a pixel, which no map fits exactly."""
+    generator = np.random.default_rng(0)
+    for name, keypoints in scene.keypoints.items():
+        scene.keypoints[name] = keypoints + generator.normal(0, 1, keypoints.shape)
+    return scene
+
+
+@pytest.mark.fault(1)
+@pytest.mark.parametrize("frame", FRAMES.values(), ids=FRAMES.keys())
+@pytest.mark.parametrize(("names", "fixed"), [(NEW, False), (NEW[:1], True)])
+def test_a_map_is_refined_alike_in_any_frame(noisy, frame, names, fixed):
+    """The solver ends at no size of the gradient, and the map keeps its frame."""
+    near, far = build(noisy), build(noisy)
+    extend(noisy, near, names, fixed=fixed, refine_map=True)
+    far.transform(frame)
+    noisy.poses = {n: frame.transform_camera_world(pose) for n, pose in noisy.poses.items()}
+    extend(noisy, far, names, fixed=fixed, refine_map=True)
+    far.transform(frame.inverse())
+    for image in near.images.values():
+        other = far.find_image_with_name(image.name)
+        assert np.linalg.norm(image.projection_center() - other.projection_center()) < 1e-4
+        turn = image.cam_from_world().rotation * other.cam_from_world().rotation.inverse()
+        assert np.rad2deg(turn.angle()) < 0.001
+
+
+@pytest.mark.fault(1)
+def test_a_refined_map_keeps_its_frame(noisy):
+    """The errors of one camera, or of a coordinate, are not those of the whole map."""
+    refined = build(noisy)
+    extend(noisy, refined, NEW, refine_map=True)
+    errors = [
+        refined.find_image_with_name(name).projection_center() - pose.inverse().translation
+        for name, pose in noisy.poses.items()
+        if name in OLD
+    ]
+    assert np.linalg.norm(np.mean(errors, axis=0)) < 0.1 * np.linalg.norm(errors, axis=1).mean()
+
+
 def test_removed_images_leave_the_points_of_the_others(scene, model):
     extend(scene, model, NEW)
     colmap.remove_images(model, [*NEW, OLD[0]])

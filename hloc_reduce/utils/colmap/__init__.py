@@ -17,9 +17,9 @@ from .estimators import (
     bundle_adjuster,
     covariance,
     estimate_pose,
+    exact,
     incremental_mapping,
     mapper_options,
-    solver_options,
     triangulate_points,
     verify_matches,
 )

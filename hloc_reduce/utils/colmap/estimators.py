@@ -42,10 +42,15 @@ def mapper_options(options: dict, pixel_scale: float = 1.0) -> pycolmap.Incremen
     return parsed
 
 
-def solver_options(options: pycolmap.BundleAdjustmentOptions) -> Any:
-    """Return Ceres's options in those of a bundle adjustment; versions keep them elsewhere."""
-    holder: Any = getattr(options, "ceres", options)
-    return holder.solver_options
+def exact(options: pycolmap.BundleAdjustmentOptions) -> pycolmap.BundleAdjustmentOptions:
+    """Let a bundle adjustment run until it converges, and return its changed options.
+
+    By COLMAP's limits of the gradient, 1 and more, that of few points ends before it begins.
+    """
+    holder: Any = getattr(options, "ceres", options)  # versions keep Ceres's options elsewhere
+    solver = holder.solver_options
+    solver.gradient_tolerance, solver.function_tolerance = 1e-4, 1e-6
+    return options
 
 
 def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
