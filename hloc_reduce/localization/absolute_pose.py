@@ -104,7 +104,7 @@ def _with_typical_lens(
         return None
     if matches.may_be_cropped(pose):
         return None
-    inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
+    inliers = matches.inliers(pose)
     view = pose.cam_from_world, pose.camera
     typical = _estimate(known, np.flatnonzero(pose.inliers))
     if pose.degrees_of_freedom == ALL:
@@ -146,7 +146,7 @@ def _estimate(matches: Matches, chosen: np.ndarray, least_ratio: float = LEAST_R
         least_ratio: share of inliers below which RANSAC need not find a pose among these.
     """
     points2D, points3D, number = matches.points2D, matches.points3D, len(matches)
-    ransac = {"random_seed": SEED, "min_inlier_ratio": least_ratio}
+    ransac = {"min_inlier_ratio": least_ratio}
     pose = Pose(None, matches.camera, np.zeros(number, bool))
     for _ in range(1 if len(chosen) == number else ROUNDS):
         camera = copy.deepcopy(pose.camera)

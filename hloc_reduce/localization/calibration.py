@@ -24,8 +24,7 @@ RIGHT = 1.1  # above it, the other intrinsics are right
 TOLERANT = 1.2
 # standard deviations between poses with the intrinsics of a map's own lens and with another focal
 # length: photos of a flat scene hardly tell one, and errors of the map decide which fits better
-DEVIATIONS = 1.5
-SEED = 0
+POSE_DEVIATIONS = 1.5
 
 OTHER_LENS = (
     "another lens than that of the map's photos of its size may have taken it: other parameters "
@@ -83,7 +82,7 @@ def calibrate(matches: Matches, pose: Pose) -> tuple[Pose, str | None]:
 def _is_determined(matches: Matches, pose: Pose) -> bool:
     """Tell whether the inliers of a pose determine it although all intrinsics are free."""
     assert pose.cam_from_world is not None
-    inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
+    inliers = matches.inliers(pose)
     position, rotation, _ = uncertainty(*inliers, pose.cam_from_world, pose.camera, ALL)
     return position <= CROPPED[0] * MAX_POSITION and rotation <= CROPPED[1] * MAX_ROTATION
 
@@ -118,9 +117,9 @@ def _contradiction(
     limits = TOLERANT * MAX_POSITION, TOLERANT * MAX_ROTATION
     of_focal_length = limits
     if matches.is_lens_of_map and pose.cam_from_world is not None:
-        inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
+        inliers = matches.inliers(pose)
         position, rotation, _ = uncertainty(*inliers, pose.cam_from_world, pose.camera, FOCAL)
-        uncertain = DEVIATIONS * position, DEVIATIONS * rotation
+        uncertain = POSE_DEVIATIONS * position, POSE_DEVIATIONS * rotation
         of_focal_length = max(limits[0], uncertain[0]), max(limits[1], uncertain[1])
     for points2D, start in guesses:
         other = _resect(matches, points2D, start, FOCAL)
@@ -152,10 +151,10 @@ def _refined(matches: Matches, pose: Pose) -> Pose | None:
     """
     if not is_bent(pose.camera):
         return None
-    camera, inliers = copy.deepcopy(pose.camera), pose.inliers
+    camera = copy.deepcopy(pose.camera)
     free = {"refinement": {"refine_focal_length": True, "refine_extra_params": True}}
-    points = matches.points2D[inliers], matches.points3D[inliers]
-    found = colmap.estimate_pose(*points, camera, matches.config | free, {"random_seed": SEED})
+    points = matches.inliers(pose)
+    found = colmap.estimate_pose(*points, camera, matches.config | free, {})
     if not found:
         return None
     view = found["cam_from_world"], camera

@@ -137,7 +137,7 @@ def _is_by_another_camera(exif: ExifCamera | None, of_map: MapCameras, has_size:
         exif: of the photo.
         of_map: what the map tells.
         has_size: whether photos of the map have the size of the photo. If these have no EXIF data,
-            the same camera may have taken it all the same.
+            the same camera may still have taken it.
     """
     if exif is None or exif.model in of_map.models:
         return False

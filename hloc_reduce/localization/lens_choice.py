@@ -1,13 +1,14 @@
 """The pose of a query whose lens may be one of several, or is not known at all."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pycolmap
 
 from . import absolute_pose
 from .calibration import UNCLEAR_CROPPED
-from .confidence import MAX_POSITION, MAX_ROTATION, Gate
+from .confidence import MAX_POSITION, MAX_ROTATION
 from .intrinsics import from_list
 from .pose import Matches, Pose, differ, quality
 
@@ -23,9 +24,7 @@ def estimate(
     images: list[np.ndarray],
     camera: pycolmap.Camera,
     config: dict,
-    gate: Gate,
-    thorough: bool = True,
-    workers: int = 1,
+    *options: Any,
 ) -> Pose:
     """Estimate a pose with a camera and with each other lens that may have taken the photo.
 
@@ -39,9 +38,7 @@ def estimate(
         camera: intrinsics.
         config: as in `absolute_pose.estimate`; under "photo" also the other "lenses", or a
             "refusal" if no lens is known, see `intrinsics.refinement`.
-        gate: what a pose must have to be trusted.
-        thorough: try the matches of single images, too.
-        workers: threads that estimate poses.
+        options: the other arguments of `absolute_pose.estimate`.
     """
     photo = config.get("photo", {})
     if reason := photo.get("refusal"):
@@ -49,10 +46,7 @@ def estimate(
     tried = [Matches(points2D, points3D, camera, config)]
     tried += [tried[0].with_lens(from_list(lens)) for lens in photo.get("lenses", ())]
     poses = [
-        absolute_pose.estimate(
-            *(points2D, points3D, images, matches.camera, matches.config),
-            *(gate, thorough, workers),
-        )
+        absolute_pose.estimate(points2D, points3D, images, matches.camera, matches.config, *options)
         for matches in tried
     ]
     best = max(poses, key=quality)

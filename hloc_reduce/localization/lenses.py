@@ -13,12 +13,14 @@ import pycolmap
 
 from ..utils.colmap import cam_from_img
 from .exif import WELL_KNOWN
+from .pose import MAX_ERROR
+from .projection import DETECTED
 
 # camera models with one coefficient of radial distortion or none, which queries are estimated with
 PLAIN = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL"
 # The largest error that the best such camera may have, in longer sides: half of RANSAC's threshold.
 # Lenses with 0.5 to 1 % move synthetic queries by up to 2 %, those with 2 % by 6 % and more.
-BENT = 0.00375
+BENT = MAX_ERROR / DETECTED / 2
 ALIKE = 0.002  # two lenses that project no ray farther apart, in longer sides, count as one
 SHARE = 0.1  # of the photos of a map, or WELL_KNOWN ones: a lens of fewer may be a failed estimate
 GRID = 12  # points of an image across and down at which a lens is judged

@@ -63,6 +63,10 @@ class Matches:
     def __len__(self) -> int:
         return len(self.points2D)
 
+    def inliers(self, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+        """Return the image points (N, 2) and world points (N, 3) of the inliers of a pose."""
+        return self.points2D[pose.inliers], self.points3D[pose.inliers]
+
     @property
     def max_error(self) -> float:
         """The inlier threshold in pixels."""

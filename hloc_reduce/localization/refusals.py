@@ -54,7 +54,7 @@ def refusal(
 
 def imprecision(matches: Matches, pose: Pose, cam_from_world: pycolmap.Rigid3d) -> str | None:
     """Return how the inliers fail to determine a pose, None if they determine it."""
-    inliers = matches.points2D[pose.inliers], matches.points3D[pose.inliers]
+    inliers = matches.inliers(pose)
     precise = ESTIMATED if pose.degrees_of_freedom == ALL else PRECISE
     limits = [(pose.degrees_of_freedom, precise, "the inliers do not fix the pose: its")]
     if matches.may_be_cropped(pose):

@@ -65,43 +65,31 @@ def extend(
             )
             for name, image in placed.items()
         }
-        _extend(model, near, keypoints, uncertainty, matches, refine_map)
-
-
-def _extend(
-    model: pycolmap.Reconstruction,
-    placed: Mapping[str, Placed],
-    keypoints: Mapping[str, np.ndarray],
-    uncertainty: Mapping[str, float],
-    matches: Mapping[Pair, np.ndarray],
-    refine_map: bool,
-) -> None:
-    """Add images to a model near the origin, see `extend`."""
-    # the larger one: points must not lose their observations in the larger photos
-    pixel_scale = max(
-        median_photo_scale(image.camera for image in model.images.values()),
-        median_photo_scale(image.camera for image in placed.values()),
-    )
-    ids = _add_images(model, placed, keypoints)
-    graph = _graph(model, keypoints, uncertainty, matches)
-    observations = pycolmap.ObservationManager(model, graph)
-    triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
-    options = colmap.mapper_options(SETTINGS, pixel_scale)
-    tracks, limits = options.get_triangulation(), options.get_mapper()
-    # the graph has no matches of two images of the model, so that tracks of more look like these
-    tracks.ignore_two_view_tracks = False
-    for image_id in ids.values():
-        triangulator.triangulate_image(tracks, image_id)
-    free = {ids[name] for name, image in placed.items() if not image.fixed}
-    unknown = {model.images[ids[n]].camera_id for n, image in placed.items() if not image.known}
-    for _ in range(ROUNDS):
-        triangulator.complete_tracks(tracks, _points_of(model, ids.values()))
-        triangulator.merge_tracks(tracks, _points_of(model, ids.values()))
-        _adjust(model, ids.values(), free, unknown, refine_map)
-        observations.filter_points3D_in_images(
-            limits.filter_max_reproj_error, limits.filter_min_tri_angle, set(ids.values())
+        # the larger one: points must not lose their observations in the larger photos
+        pixel_scale = max(
+            median_photo_scale(image.camera for image in model.images.values()),
+            median_photo_scale(image.camera for image in near.values()),
         )
-    model.update_point_3d_errors()
+        ids = _add_images(model, near, keypoints)
+        graph = _graph(model, keypoints, uncertainty, matches)
+        observations = pycolmap.ObservationManager(model, graph)
+        triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
+        options = colmap.mapper_options(SETTINGS, pixel_scale)
+        tracks, limits = options.get_triangulation(), options.get_mapper()
+        # the graph has no matches of two images of the model, so longer tracks look like these
+        tracks.ignore_two_view_tracks = False
+        for image_id in ids.values():
+            triangulator.triangulate_image(tracks, image_id)
+        free = {ids[name] for name, image in near.items() if not image.fixed}
+        unknown = {model.images[ids[n]].camera_id for n, image in near.items() if not image.known}
+        for _ in range(ROUNDS):
+            triangulator.complete_tracks(tracks, _points_of(model, ids.values()))
+            triangulator.merge_tracks(tracks, _points_of(model, ids.values()))
+            _adjust(model, ids.values(), free, unknown, refine_map)
+            observations.filter_points3D_in_images(
+                limits.filter_max_reproj_error, limits.filter_min_tri_angle, set(ids.values())
+            )
+        model.update_point_3d_errors()
 
 
 def _add_images(

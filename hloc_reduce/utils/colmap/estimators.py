@@ -179,13 +179,14 @@ def estimate_pose(
         points3D: (M, 3) world points.
         camera: the intrinsics.
         config: hloc's dict, with options under "estimation" and "refinement".
-        ransac: options of RANSAC, such as its `random_seed`; those in `config` take precedence.
+        ransac: options of RANSAC, whose `random_seed` is 0 otherwise; those in `config` take
+            precedence.
 
     Returns:
         cam_from_world, num_inliers and inlier_mask (M,), or None.
     """
     estimation = {**config.get("estimation", {})}
-    estimation["ransac"] = {**ransac, **estimation.get("ransac", {})}
+    estimation["ransac"] = {"random_seed": 0, **ransac, **estimation.get("ransac", {})}
     if len(points2D) == 0:
         return None
     estimate: Callable[..., dict | None] = pycolmap.estimate_and_refine_absolute_pose
