@@ -15,7 +15,7 @@ from hloc_reduce import Localizer, compact, maps
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.maps import points
+from hloc_reduce.hlm import points
 from hloc_reduce.utils import cli
 
 LIMITS = 0.25, 2.0  # metres and degrees of a right pose

@@ -15,9 +15,21 @@ ROOT = Path(__file__).resolve().parents[1]
 STAGES = "stages"  # the modules at the top level of hloc_reduce
 # the lowest first
 ROOMS = (
-    *("utils", "runtime", "detectors", "descriptors", "light", "networks", "projections"),
-    *("extractors", "aggregators", "matchers", "confs", "datasets", "localization", "mapping"),
-    *(STAGES, "maps", "compact", "serve", "evaluation", "report", "demo", "training", "hloc"),
+    *("utils", "runtime", "detectors", "descriptors", "networks", "projections"),
+    *("extractors", "retrieval", "aggregators", "matchers", "confs", "datasets", "localization"),
+    *(
+        "mapping",
+        STAGES,
+        "hlm",
+        "maps",
+        "compact",
+        "serve",
+        "evaluation",
+        "report",
+        "demo",
+        "training",
+        "hloc",
+    ),
     *("hloc_reduce", "pipelines", "confs (shown)"),
 )
 

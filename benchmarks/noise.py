@@ -12,8 +12,8 @@ import numpy as np
 
 from hloc_reduce import Localizer, maps
 from hloc_reduce.datasets.aachen import Aachen
-from hloc_reduce.light import noise
 from hloc_reduce.localization.confidence import AGREEMENT_NOISY, Gate
+from hloc_reduce.networks import noise
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.images import read_image

@@ -2,14 +2,14 @@
 
 The true neighbours of an image are the five, or ten, others that show most points together with it.
 Prints their share among as many retrieved images: by VLAD as floats, and as compact maps keep it,
-in some bytes an image (`hloc_reduce.maps.signs`).
+in some bytes an image (`hloc_reduce.hlm.signs`).
 """
 
 from pathlib import Path
 
 import numpy as np
 
-from hloc_reduce.maps import signs
+from hloc_reduce.hlm import signs
 from hloc_reduce.maps.map import Map
 from hloc_reduce.pairs_from_retrieval import read_global
 from hloc_reduce.utils import cli, colmap

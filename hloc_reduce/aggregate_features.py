@@ -56,7 +56,7 @@ def main(
     from safetensors.numpy import save
 
     from . import aggregators
-    from .light.vlad import read_vocabulary
+    from .retrieval.vlad import read_vocabulary
 
     output = (export_dir or features.parent) / f"{conf['output']}_{features.stem}.h5"
     model = aggregators.load(conf["model"]).eval()

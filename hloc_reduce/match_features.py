@@ -28,7 +28,7 @@ from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
 if TYPE_CHECKING:
-    from .matchers import Matcher
+    from .matchers.base import Matcher
 
 confs = matchers_confs.confs
 CACHE_BYTES = 2**30  # descriptors in memory: 500 images of 8,000 x 64
@@ -162,11 +162,12 @@ def _match(
     import torch
 
     from . import matchers
+    from .matchers.base import GPU_BYTES
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
     size, workers = (1, parallel.cores()) if device == "cpu" else (PAIRS_ON_GPU, 1)
     matcher = matchers.load(conf["model"]).eval().to(device)
-    match = partial(_match_batch, matcher, device, gpu_bytes or matchers.GPU_BYTES)
+    match = partial(_match_batch, matcher, device, gpu_bytes or GPU_BYTES)
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
         described = map(partial(_describe, DescriptorCache(CACHE_BYTES), file0, file1), pairs)
         batches = iter(lambda: list(islice(described, size)), [])

@@ -14,8 +14,8 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.paths import strings_as_paths
 
-from . import compact_map, options
-from .dataset import DatasetRun, Settings
+from .common import compact_map, options
+from .common.dataset import DatasetRun, Settings
 
 NUMBERS = {"num_covis": 20, "num_loc": 50}
 Place = Aachen

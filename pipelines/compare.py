@@ -25,9 +25,10 @@ from hloc_reduce.utils.files import MEGABYTE, write_csv
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned, joined
 
-from . import aachen, compact_map
+from . import aachen
+from .common import compact_map
+from .common.options import add_retrieval_option
 from .layouts import pipeline_of
-from .options import add_retrieval_option
 
 
 @strings_as_paths

@@ -14,8 +14,8 @@ from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.paths import strings_as_paths
 
-from . import options
-from .dataset import SHARED_POINTS, DatasetRun, Settings
+from .common import options
+from .common.dataset import SHARED_POINTS, DatasetRun, Settings
 
 NUMBERS = {"num_loc": 40}
 Place = InLoc

@@ -24,10 +24,10 @@ from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.paths import strings_as_paths
 
-from . import changes, options
-from .queries import LISTED, Photos, Queries, identity, results_folder
-from .retrieval import retrieve_in_map
-from .run import Run, readable
+from .common import changes, options
+from .common.queries import LISTED, Photos, Queries, identity, results_folder
+from .common.retrieval import retrieve_in_map
+from .common.run import Run, readable
 
 MADE_FROM = "made_from.json"  # the map and the photos of the queries
 OF_MAP = "feature", "projection", "matcher", "storage", "keypoints", "camera_mode"  # options

@@ -17,9 +17,9 @@ from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.evaluation.poses import FAILED, pose_error, recall
 from hloc_reduce.evaluation.summaries import map_bytes
+from hloc_reduce.hlm.reader import SUFFIX
 from hloc_reduce.localization.records import pose_of
 from hloc_reduce.localization.stage import read_queries
-from hloc_reduce.maps.compact import SUFFIX
 from hloc_reduce.maps.map import RETRIEVAL
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, RunFolder
@@ -31,7 +31,7 @@ from hloc_reduce.utils.h5 import iterate_h5_names, list_h5_names, open_h5
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned
 
-from . import retrieval
+from .common import retrieval
 
 FEATURE, STORAGE, NUM_LOC = "colmap_sift_sv32", "uint4", 50
 TABLE = "shrink.csv"

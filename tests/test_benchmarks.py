@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from hloc_reduce.light.engine import LightEngine
+from hloc_reduce.maps.numpy_engine import NumpyEngine
 from hloc_reduce.training import levels
 from hloc_reduce.utils.cli import InputError
 
@@ -127,7 +127,7 @@ def test_matching_at_once_gives_each_keypoint_one_point():
     visible = {"a": np.array([0, 2]), "b": np.array([1, 2, 3]), "c": np.array([], int)}
     compact = SimpleNamespace(visible=visible.get, descriptors=lambda rows, unbiased: points[rows])
     extract = SimpleNamespace(rotation_invariant=True)
-    engine = LightEngine(extract, {"name": "nearest_neighbor"}, points)
+    engine = NumpyEngine(extract, {"name": "nearest_neighbor"}, points)
     query = points[[2, 3, 0]]
     found = at_once(SimpleNamespace(engine=engine, reference=compact))(query, ["a", "b", "c"])
     pairs = {name: sorted(map(tuple, part.tolist())) for name, part in found.items()}

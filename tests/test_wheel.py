@@ -41,6 +41,6 @@ def test_wheel_is_complete(tmp_path):
         assert sizes[f"hloc_reduce/networks/weights/{network}.safetensors"] < 1e6
     if has_compiler() and platform.system() == "Linux":
         assert any(name.startswith("hloc_reduce/utils/_best_two.") for name in names)
-    assert "hloc_reduce/light/vlad_sift_sv64.safetensors" in names
+    assert "hloc_reduce/retrieval/vlad_sift_sv64.safetensors" in names
     assert {f"hloc_reduce/report/page.{kind}" for kind in ("html", "css", "js")} <= names
     assert "hloc_reduce/evaluation/published/localization_recall.csv" in names

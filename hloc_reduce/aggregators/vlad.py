@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from ..light.vlad import aggregate
+from ..retrieval.vlad import aggregate
 from ..runtime import parallel
 from . import Aggregator
 

@@ -15,11 +15,11 @@ from .. import logger
 from ..aggregate_features import vocabulary_of
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..hlm import points, writer
+from ..hlm.reader import SUFFIX
+from ..hlm.writer import Source
 from ..localization import intrinsics
-from ..maps import packing, points
-from ..maps.compact import SUFFIX
 from ..maps.map import RETRIEVAL, Map
-from ..maps.packing import Source
 from ..pairs_from_retrieval import read_global
 from ..utils import cli, colmap
 from ..utils.cli import InputError
@@ -196,7 +196,7 @@ def _encode(
 ) -> tuple[bytes, dict[str, int]]:
     """Encode the points that images need most."""
     chosen = everything.only(points.select(everything, number))
-    return packing.encode(chosen, source, rows)
+    return writer.encode(chosen, source, rows)
 
 
 def _fit(

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ..maps.compact import SUFFIX
+from ..hlm.reader import SUFFIX
 from ..utils import cli
 from ..utils.codes import STORAGES
 from . import FEW, __doc__, main

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ..descriptors import DIM
-from ..light.noise import reduce_noise
+from ..networks.noise import reduce_noise
 from ..utils.base_model import BaseModel, dynamic_load
 from ..utils.cli import InputError
 from ..utils.hloc import is_installed

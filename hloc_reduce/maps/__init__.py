@@ -1,8 +1,8 @@
 """Maps to localize in: built from photos, changed, opened, and kept in memory."""
 
+from ..hlm.reader import is_compact
 from . import from_database
 from .build import main
-from .compact import is_compact
 from .grow import add, remove
 from .map import Map, is_map
 from .unpack import main as unpack

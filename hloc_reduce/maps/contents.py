@@ -10,24 +10,24 @@ import numpy as np
 
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
-from ..light.engine import LightEngine, is_colmap_sift, takes
-from ..light.extractors import ColmapSift, Extract, OnnxNetwork
-from ..light.vlad import read_vocabulary
+from ..hlm.reader import CompactMap, is_compact
 from ..localization import intrinsics
 from ..localization.references import Reference, SfmMap
 from ..pairs_from_retrieval import read_global, similarity
+from ..retrieval.vlad import read_vocabulary
 from ..runtime import parallel
 from ..utils import colmap
 from ..utils.arrays import distinct
 from ..utils.cli import InputError, naming
 from ..utils.feature_files import dimension, read_descriptors
 from ..utils.h5 import open_h5
-from .compact import CompactMap, is_compact
 from .map import Map
+from .numpy_engine import NumpyEngine, is_colmap_sift, takes
+from .numpy_features import ColmapSift, Extract, OnnxNetwork
 
 
 class Engine(Protocol):
-    """Computes for a map, see `light.engine.LightEngine` and `maps.engine.TorchEngine`."""
+    """Computes for a map, see `numpy_engine.NumpyEngine` and `torch_engine.TorchEngine`."""
 
     takes_codes: bool  # of its matcher, see `matchers.Matcher`
     rotation_invariant: bool  # of its extractor, see `extractors.Extractor`
@@ -111,7 +111,7 @@ def _check_torch(path: Path, kind: str) -> None:
 
 def _of_folder(path: Path) -> Contents:
     from .. import extractors
-    from .engine import TorchEngine
+    from .torch_engine import TorchEngine
 
     built = Map(path)
     matcher = matchers_confs.confs[built.matcher]["model"]
@@ -156,7 +156,7 @@ def _of_folder(path: Path) -> Contents:
 def _of_file(path: Path, onnx: Path | None) -> Contents:
     compact = CompactMap(path)
     matcher = matchers_confs.confs[compact.matcher]["model"]
-    engine = _light_engine(compact, matcher, onnx) or _torch_engine(compact, matcher)
+    engine = _numpy_engine(compact, matcher, onnx) or _torch_engine(compact, matcher)
 
     def match(descriptors: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
         visible = [compact.visible(name) for name in names]
@@ -181,7 +181,7 @@ def _of_file(path: Path, onnx: Path | None) -> Contents:
     )
 
 
-def _light_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engine | None:
+def _numpy_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engine | None:
     """Return an engine without torch, None if the map's feature or matcher needs torch."""
     base = features_confs.base_of(compact.conf["model"])
     extract: Extract
@@ -196,13 +196,13 @@ def _light_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engi
             extract = ColmapSift(base, compact.layers())
     else:
         return None
-    return LightEngine(extract, matcher, compact.vocabulary)
+    return NumpyEngine(extract, matcher, compact.vocabulary)
 
 
 def _torch_engine(compact: CompactMap, matcher: dict) -> Engine:
     _check_torch(compact.path, f"a map with the feature {compact.feature}")
     from .. import extractors
-    from .engine import TorchEngine
+    from .torch_engine import TorchEngine
 
     with TemporaryDirectory() as folder:
         model = compact.write_projection(Path(folder))["model"]

@@ -141,7 +141,7 @@ class Map:
 
     def _check(self) -> None:
         """Refuse a map that lacks a file, or has a broken one, before any work is done in it."""
-        from ..light.vlad import read_vocabulary
+        from ..retrieval.vlad import read_vocabulary
 
         projection = self.conf["model"].get("projection")
         needed = [self.features, self.descriptors, self.vocabulary]

@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 
 from ..confs import features as features_confs
+from ..hlm.reader import CompactMap
 from ..localization.projection import reprojection_errors
 from ..runtime import provenance
 from ..runtime.group_writer import GroupWriter
@@ -15,7 +16,6 @@ from ..utils.cli import InputError
 from ..utils.files import announce, file_sha256, replacing
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
-from .compact import CompactMap
 from .map import FINISHED, PLACE, RETRIEVAL, SFM, Map, write
 
 COMPACT = "compact"  # in the configuration of a folder: the sha256 of the file

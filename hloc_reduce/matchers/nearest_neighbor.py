@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch.nn.utils.rnn import pad_sequence
 
-from ..light import matching
-from . import GPU_BYTES, Matcher, Tensors
+from . import integers
+from .base import GPU_BYTES, Matcher, Tensors
 
 PART_BYTES = 2**19  # of descriptors1 at once: they stay in the cache of a core
 TILE = 2**20  # similarities at once
@@ -132,7 +132,7 @@ def mutual_nearest(
     """
     if descriptors0.dtype == torch.int16:
         numbers = None if rows is None else rows.numpy()
-        arrays = matching.mutual_nearest(
+        arrays = integers.mutual_nearest(
             *(descriptors0.numpy(), descriptors1.numpy(), ratio_threshold, numbers),
             *(distance_threshold, mutual),
         )
@@ -267,7 +267,7 @@ class NearestNeighbor(Matcher):
         )
         matched = matches1 >= 0
         found = (matches1[matched], rows1[matched], cosine[matched])
-        ordered = matching.most_similar_first(*(part.cpu().numpy() for part in found))
+        ordered = integers.most_similar_first(*(part.cpu().numpy() for part in found))
         return torch.from_numpy(ordered).to(matches1.device)
 
     def _forward(self, data: dict) -> dict:

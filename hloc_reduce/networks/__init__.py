@@ -28,7 +28,7 @@ class Network:
     version: int = 0
 
 
-NOISE_REDUCTION = 4  # the version of `light.noise.reduce_noise`, part of the provenance of features
+NOISE_REDUCTION = 4  # the version of `noise.reduce_noise`, part of the provenance of features
 
 EDGEPOINT2 = {
     "T32": "c88b76d2b05cb19de7314a108042d05688424d9a9a3abed97c778078e676cfdc",

@@ -10,7 +10,7 @@ from safetensors.torch import save as serialize
 from torch import nn
 
 from ..descriptors import DESCRIPTORS
-from ..light.projection import fold
+from ..projections.layers import fold
 from ..utils.cli import InputError
 from ..utils.files import replacing
 from . import released
@@ -82,7 +82,7 @@ class Projection(nn.Module):
     def forward(self, descriptors: torch.Tensor) -> torch.Tensor:
         """Map descriptors (N, D) of unit norm to (N, dim) float32 of unit norm.
 
-        On a CPU it is computed in float64, as by `light.projection`, with which it agrees when both
+        On a CPU it is computed in float64, as by `layers.project`, with which it agrees when both
         are rounded to float16, unless `exact` is False.
         """
         values = descriptors.double() if self.exact and descriptors.is_cpu else descriptors

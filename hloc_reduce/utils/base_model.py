@@ -60,10 +60,14 @@ class BaseModel(nn.Module):
 def dynamic_load(root: ModuleType, name: str, base: type[Model]) -> type[Model]:
     """Return the one subclass of `base` that the module `name` of the package `root` defines.
 
+    Modules whose names are in `root.HELPERS` define none.
+
     Raises:
         InputError: when there is no such module.
     """
-    names = [module.name for module in pkgutil.iter_modules(root.__path__)]
+    helpers = getattr(root, "HELPERS", ())
+    found = [module.name for module in pkgutil.iter_modules(root.__path__)]
+    names = [name for name in found if name not in helpers]
     kind = root.__name__.rpartition(".")[2].removesuffix("s")
     module = importlib.import_module(f"{root.__name__}.{choose(kind, name, names)}")
     (model,) = (

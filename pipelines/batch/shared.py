@@ -19,10 +19,10 @@ from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.files import announce
 
-from ..dataset import SHARED_POINTS
+from ..common.dataset import SHARED_POINTS
+from ..common.retrieval import check_retrieval, retrieve
+from ..common.run import readable
 from ..layouts import pipeline_of
-from ..retrieval import check_retrieval, retrieve
-from ..run import readable
 from .jobs import Job
 
 RECORD = "shared.json"  # the feature file that VLAD uses, in later runs too

@@ -16,7 +16,7 @@ from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import query
 from hloc_reduce.localization.records import read_records
 from hloc_reduce.maps import contents
-from hloc_reduce.maps.engine import TorchEngine
+from hloc_reduce.maps.torch_engine import TorchEngine
 from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
 from hloc_reduce.utils import cli, parsers
 from hloc_reduce.utils.cli import InputError

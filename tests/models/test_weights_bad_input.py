@@ -14,8 +14,8 @@ from safetensors.torch import load, save_file
 from hloc_reduce import projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.extract_features import provenance
-from hloc_reduce.light.vlad import read_vocabulary
 from hloc_reduce.projections import network
+from hloc_reduce.retrieval.vlad import read_vocabulary
 from hloc_reduce.utils.cli import InputError
 
 

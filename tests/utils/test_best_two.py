@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hloc_reduce.light import matching
+from hloc_reduce.matchers import integers
 from hloc_reduce.utils import best_two
 from hloc_reduce.utils.codes import UNIT, to_integers
 
@@ -55,11 +55,11 @@ def test_each_instruction_set_agrees_with_the_definition(kind, instruction_set):
 @pytest.mark.parametrize("kind", KINDS)
 def test_numpy_agrees_with_the_definition(kind, monkeypatch):
     """Whatever the machine; in blocks of a few rows."""
-    monkeypatch.setattr(matching, "TILE", 100)
+    monkeypatch.setattr(integers, "TILE", 100)
     for number0, number1 in SIZES[1:]:
         for dim in DIMS:
             rows0, rows1 = draw(number0, dim, kind, 0), draw(number1, dim, kind, 1)
-            index, best, second = matching.best_two_of_blocks(rows0, rows1)
+            index, best, second = integers.best_two_of_blocks(rows0, rows1)
             right = by_definition(rows0, rows1)
             assert index.tolist() == right[0].tolist()
             assert best.tolist() == right[1].tolist()

@@ -4,7 +4,7 @@ from hloc.utils.base_model import BaseModel
 
 from hloc_reduce.aggregators.vlad import VLAD as Aggregation
 from hloc_reduce.extractors import load
-from hloc_reduce.light.vlad import read_vocabulary
+from hloc_reduce.retrieval.vlad import read_vocabulary
 
 
 class VLAD(BaseModel):

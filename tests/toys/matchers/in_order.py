@@ -2,7 +2,7 @@
 
 import torch
 
-from hloc_reduce.matchers import Matcher
+from hloc_reduce.matchers.base import Matcher
 
 
 class InOrder(Matcher):

@@ -12,10 +12,10 @@ from safetensors.numpy import load_file, save_file
 from hloc_reduce import Localizer, aggregate_features, compact, maps, projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.light.vlad import VOCABULARY, read_vocabulary
-from hloc_reduce.maps.compact import CompactMap
+from hloc_reduce.hlm.reader import CompactMap
 from hloc_reduce.maps.unpack import COMPACT
 from hloc_reduce.pairs_from_retrieval import read_global
+from hloc_reduce.retrieval.vlad import VOCABULARY, read_vocabulary
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, DELETING
 from hloc_reduce.utils import parsers

@@ -6,14 +6,15 @@ import numpy as np
 
 from ..descriptors import COLMAP
 from ..detectors import dog
+from ..matchers import integers
+from ..retrieval import vlad
 from ..utils.codes import to_integers
 from ..utils.images import in_original, resized
-from . import matching, vlad
-from .extractors import Extract
+from .numpy_features import Extract
 
 
 def takes(matcher: dict) -> bool:
-    """Tell whether `LightEngine` has a matcher: mutual nearest neighbours."""
+    """Tell whether `NumpyEngine` has a matcher: mutual nearest neighbours."""
     return matcher["name"] == "nearest_neighbor" and matcher.get("do_mutual_check", True)
 
 
@@ -22,8 +23,8 @@ def is_colmap_sift(base: dict) -> bool:
     return base["name"] == "dog" and base.get("descriptor") == COLMAP
 
 
-class LightEngine:
-    """Computes with NumPy what `maps.engine.TorchEngine` does with torch.
+class NumpyEngine:
+    """Computes with NumPy what `torch_engine.TorchEngine` does with torch.
 
     Descriptors are matched as integers.
 
@@ -62,7 +63,7 @@ class LightEngine:
     def match_points(
         self, query: np.ndarray, described: np.ndarray, images: list[np.ndarray]
     ) -> list[np.ndarray]:
-        """Match the descriptors of a photo with images, see `matching.match_images_of_points`.
+        """Match the descriptors of a photo with images, see `integers.match_images_of_points`.
 
         Args:
             query: (N, D) from `prepare`.
@@ -70,4 +71,4 @@ class LightEngine:
             images: of each image the rows of its points (K,) int64, ascending.
         """
         limits = self._ratio_threshold, self._distance_threshold
-        return matching.match_images_of_points(described, query, images, *limits)
+        return integers.match_images_of_points(described, query, images, *limits)

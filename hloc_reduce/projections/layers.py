@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from .vlad import unit
+from ..utils.arrays import unit
 
 EPSILON = 1e-5  # of the batch normalizations
 Layer = tuple[np.ndarray, np.ndarray]  # weight (out, in) and bias (out,)

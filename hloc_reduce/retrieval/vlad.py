@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..utils.arrays import unit
 from ..utils.cli import InputError
 
 # 64 words of sift_sv64, learned by aggregate_features from south-building
 VOCABULARY = Path(__file__).parent / "vlad_sift_sv64.safetensors"
-LEAST_NORM = 1e-12  # shorter vectors stay as they are
 
 
 def read_vocabulary(path: Path | str | None = None) -> np.ndarray:
@@ -57,9 +57,3 @@ def aggregate(descriptors: np.ndarray, vocabulary: np.ndarray) -> np.ndarray:
     assigned = (nearest == np.arange(len(words))[:, None]).astype(np.float64)
     sums = assigned @ descriptors - assigned.sum(1)[:, None] * words
     return unit(unit(sums).ravel()).astype(np.float32)
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Divide vectors (..., D) by their norms; those of length 0 stay as they are."""
-    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.maximum(norm, LEAST_NORM)

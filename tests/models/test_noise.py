@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hloc_reduce.light.noise import NOISY, reduce_noise, relative_noise
+from hloc_reduce.networks.noise import NOISY, reduce_noise, relative_noise
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.02, 0.1])
@@ -57,7 +57,7 @@ def test_little_noise_is_blurred_little(monkeypatch):
     """A blur costs accuracy, which only much noise is worth."""
     image, blurs = np.full((1, 64, 64), 0.5, np.float32), []
     for value in (0.07, 0.1, 0.2, 0.5, 0.9):
-        monkeypatch.setattr("hloc_reduce.light.noise.relative_noise", lambda _, v=value: v)
+        monkeypatch.setattr("hloc_reduce.networks.noise.relative_noise", lambda _, v=value: v)
         blurs.append(reduce_noise(image)[1])
     assert blurs == sorted(blurs) and blurs[0] == 0
     assert 0 < blurs[1] < 0.6 and 1.9 < blurs[3] < 2.1

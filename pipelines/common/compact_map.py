@@ -6,10 +6,10 @@ from pathlib import Path
 from hloc_reduce import compact, localize_sfm, logger, maps
 from hloc_reduce.aggregate_features import vocabulary_of
 from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.hlm.reader import SUFFIX
+from hloc_reduce.hlm.writer import Source
 from hloc_reduce.localization import intrinsics
-from hloc_reduce.maps.compact import SUFFIX
 from hloc_reduce.maps.map import Map
-from hloc_reduce.maps.packing import Source
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.utils import colmap

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 
 from .. import aggregators, extractors, matchers
-from ..light.engine import takes
-from ..light.matching import match_images_of_points
+from ..matchers.integers import match_images_of_points
 from ..runtime import parallel
 from ..utils.codes import FLOATS, to_integers
 from .map import RETRIEVAL
+from .numpy_engine import takes
 
 
 class TorchEngine:
@@ -69,7 +69,7 @@ class TorchEngine:
     def match_points(
         self, query: torch.Tensor, described: torch.Tensor, images: list[np.ndarray]
     ) -> list[np.ndarray]:
-        """Match the descriptors of a photo with images, see `LightEngine.match_points`."""
+        """Match the descriptors of a photo with images, see `NumpyEngine.match_points`."""
         if self._as_integers and takes(self._matcher.conf):
             limits = self._matcher.conf["ratio_threshold"], self._matcher.conf["distance_threshold"]
             return match_images_of_points(described.numpy(), query.numpy(), images, *limits)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from hloc_reduce import compact
-from hloc_reduce.maps import contents, points
-from hloc_reduce.maps.compact import CompactMap
+from hloc_reduce.hlm import points
+from hloc_reduce.hlm.reader import CompactMap
+from hloc_reduce.maps import contents
 from pipelines import localize
 
 PIPELINE = localize

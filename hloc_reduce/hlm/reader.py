@@ -12,10 +12,10 @@ import pycolmap
 from .. import projections
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
-from ..light.projection import Layer
-from ..light.projection import read as read_layers
-from ..light.vlad import VOCABULARY, read_vocabulary
 from ..localization import intrinsics
+from ..projections.layers import Layer
+from ..projections.layers import read as read_layers
+from ..retrieval.vlad import VOCABULARY, read_vocabulary
 from ..utils.cli import InputError, choose, naming
 from ..utils.codes import CODED, FLOATS, QUANTIZED, STORAGES, check_levels, restore
 from ..utils.files import file_sha256, replacing

@@ -10,9 +10,9 @@ from hypothesis.extra import numpy as arrays
 from row_of_photos import row
 from small_map import build
 
-from hloc_reduce.maps import packing, points, signs
-from hloc_reduce.maps.compact import rotation_of
-from hloc_reduce.maps.signs import Signs, hadamard, pack
+from hloc_reduce.hlm import points, signs, writer
+from hloc_reduce.hlm.reader import rotation_of
+from hloc_reduce.hlm.signs import Signs, hadamard, pack
 
 
 @given(
@@ -132,7 +132,7 @@ def test_images_far_from_the_origin_stay_where_they_are():
     names = sorted(image.name for image in model.images.values())
     nothing = points.Points(np.zeros((0, 3)), np.zeros((0, 4)), names, [], [])
     tensors: dict[str, np.ndarray] = {}
-    packing._add_images(tensors, {}, nothing, model)
+    writer._add_images(tensors, {}, nothing, model)
     for i, name in enumerate(names):
         rotation = rotation_of(tensors["rotations"][i])
         pose = pycolmap.Rigid3d(rotation, tensors["translations"][i])

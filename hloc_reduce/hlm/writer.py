@@ -10,14 +10,14 @@ import pycolmap
 
 from .. import projections
 from ..confs import features as features_confs
-from ..light.vlad import VOCABULARY, read_vocabulary
 from ..localization import intrinsics
+from ..retrieval.vlad import VOCABULARY, read_vocabulary
 from ..utils.codes import QUANTIZED, STORAGES, store
 from ..utils.files import file_sha256
 from . import points as points_of_map
 from . import signs
-from .compact import VERSION, check_model, rotation_of
 from .points import Points
+from .reader import VERSION, check_model, rotation_of
 
 
 @dataclass(frozen=True)

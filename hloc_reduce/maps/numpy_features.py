@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from ..detectors import dog
+from ..networks.noise import reduce_noise
+from ..projections import layers as frozen
 from ..utils.cli import InputError
-from . import projection
-from .noise import reduce_noise
 
 
 class Extract(Protocol):
@@ -39,7 +39,7 @@ class ColmapSift:
         InputError: for unknown options.
     """
 
-    def __init__(self, conf: dict, layers: Sequence[projection.Layer] | None):
+    def __init__(self, conf: dict, layers: Sequence[frozen.Layer] | None):
         if unknown := set(conf) - set(dog.CONF) - {"name"}:
             raise InputError(f"DoG has no option {', '.join(sorted(unknown))}.")
         self._conf, self._layers = {**dog.CONF, **conf}, layers
@@ -53,7 +53,7 @@ class ColmapSift:
         number = self._conf["max_keypoints"]
         keypoints, descriptors = dog.strongest(*self._detect(image), number)
         if self._layers is not None:
-            descriptors = projection.project(descriptors, self._layers)
+            descriptors = frozen.project(descriptors, self._layers)
         return {"keypoints": keypoints[:, :2], "descriptors": descriptors.T}
 
 

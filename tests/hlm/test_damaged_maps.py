@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hloc_reduce import compact
-from hloc_reduce.maps import contents, packing, points
+from hloc_reduce.hlm import points, writer
+from hloc_reduce.maps import contents
 from pipelines import localize
 
 PIPELINE = localize
@@ -49,7 +50,7 @@ def file(request, place, run, tmp_path, monkeypatch):
     storage, kind = request.param.split()
     if kind == "deltas":  # which are shorter only in large maps
         pack = points.pack_visible
-        monkeypatch.setattr(packing.points_of_map, "pack_visible", lambda of, _: pack(of, 10**9))
+        monkeypatch.setattr(writer.points_of_map, "pack_visible", lambda of, _: pack(of, 10**9))
     path = tmp_path / "place.hlm"
     compact.main(path, outputs / "map", storage=storage, max_mb=0.02)
     content = path.read_bytes()

@@ -16,10 +16,11 @@ from safetensors.numpy import load, save
 
 from hloc_reduce import Localizer, compact, export, projections
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.light import matching, projection
+from hloc_reduce.hlm.reader import CompactMap
 from hloc_reduce.maps import contents
-from hloc_reduce.maps.compact import CompactMap
+from hloc_reduce.matchers import integers
 from hloc_reduce.networks import MINI
+from hloc_reduce.projections.layers import project, read
 from hloc_reduce.utils import match_files
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import to_integers
@@ -160,19 +161,19 @@ def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
 @pytest.mark.parametrize("number", [0, 1, 2, 300])
 def test_images_of_points_are_matched_one_by_one(ratio_threshold, number, monkeypatch):
     """What images share is searched once, in parts."""
-    monkeypatch.setattr(matching, "ROWS", 7)
+    monkeypatch.setattr(integers, "ROWS", 7)
     generator = np.random.default_rng(0)
     drawn = generator.standard_normal((100 + number, 16)).astype(np.float32)
     drawn[100 : 100 + number // 2] = drawn[: number // 2] + 0.02 * drawn[-(number // 2) or 100 :]
     drawn = to_integers(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
     points, query = drawn[:100], drawn[100:]
     images = [np.sort(generator.permutation(100)[:size]) for size in (0, 1, 2, 40, 100)]
-    found = matching.match_images_of_points(points, query, images, ratio_threshold, 0.7)
+    found = integers.match_images_of_points(points, query, images, ratio_threshold, 0.7)
     assert len(found) == len(images)
     for rows, pairs in zip(images, found, strict=True):
-        matches, cosine = matching.mutual_nearest(points[rows], query, ratio_threshold, None, 0.7)
+        matches, cosine = integers.mutual_nearest(points[rows], query, ratio_threshold, None, 0.7)
         own = np.flatnonzero(matches >= 0)
-        expected = matching.most_similar_first(matches[own], own, cosine[own])
+        expected = integers.most_similar_first(matches[own], own, cosine[own])
         np.testing.assert_array_equal(pairs, expected)
     assert len(found[-1]) >= number // 3
 
@@ -182,7 +183,7 @@ def test_matches_are_in_the_order_of_a_match_file():
     generator = np.random.default_rng(0)
     cosine = (0.9 + 1e-4 * generator.random(200)).astype(np.float32)  # many equal as float16
     rows0, rows1 = generator.permutation(500)[:200], generator.permutation(300)[:200]
-    found = matching.most_similar_first(rows0, rows1, cosine)
+    found = integers.most_similar_first(rows0, rows1, cosine)
     by_query = np.argsort(rows0)
     pairs = np.stack([rows0, rows1], axis=1)[by_query]
     scores = ((cosine[by_query] + 1) / 2).astype(np.float16)
@@ -213,7 +214,7 @@ def test_networks_run_by_onnx_runtime(feature, place, run, tmp_path):
     compact.main(path, outputs / "map")
     onnx = export.main(feature, tmp_path / "network.onnx")
     expected, found = Localizer(path), Localizer(path, onnx=onnx)
-    assert type(found.engine).__name__ == "LightEngine"
+    assert type(found.engine).__name__ == "NumpyEngine"
     pixels, camera = read_image(photo), next(iter(expected.reference.camera_of.values()))
     for image in (pixels, pixels[:-7, :-19]):
         camera.height, camera.width = image.shape[:2]
@@ -244,25 +245,25 @@ NAMES = ["sift_sv64", "mkd_us16", "colmap_sift_sv32", "xfeat_pca24", "sift_neste
 @pytest.mark.parametrize("name", NAMES)
 def test_projections_agree_with_torch(name):
     file, prefix = projections.find(name), projections.split_prefix(name)[1]
-    layers = projection.read(file.read_bytes(), prefix)
+    layers = read(file.read_bytes(), prefix)
     expected = projections.load(name)
     generator = np.random.default_rng(0)
     descriptors = generator.standard_normal((500, expected.sizes[0])).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    found = projection.project(descriptors, layers)
+    found = project(descriptors, layers)
     assert found.shape == (500, expected.dim) and found.dtype == np.float32
     of_torch = expected(torch.from_numpy(descriptors)).numpy()
     np.testing.assert_array_equal(found.astype(np.float16), of_torch.astype(np.float16))
-    assert projection.project(descriptors[:0], layers).shape == (0, expected.dim)
+    assert project(descriptors[:0], layers).shape == (0, expected.dim)
 
 
 @pytest.mark.parametrize("prefix", ["0", "65", "x", "-1"])
 def test_prefixes_that_a_projection_does_not_have(prefix):
     content = projections.find("sift_nested").read_bytes()
     with pytest.raises(ValueError, match="of no use"):
-        projection.read(content, prefix)
+        read(content, prefix)
     with pytest.raises(ValueError, match="of no use"):
-        projection.read(projections.find("sift_sv64").read_bytes(), "24")
+        read(projections.find("sift_sv64").read_bytes(), "24")
 
 
 def _without_a_layer(tensors):

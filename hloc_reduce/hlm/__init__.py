@@ -1,0 +1,1 @@
+"""Compact maps: one file with all that localization needs. docs/map-format.md describes it."""

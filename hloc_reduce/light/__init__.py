@@ -1,1 +1,0 @@
-"""Features, retrieval and matching in NumPy, for machines without torch."""

@@ -1,0 +1,1 @@
+"""Retrieval: global descriptors of images, and which images they find."""
