@@ -19,7 +19,7 @@ STAGES_OF_COLMAP := from_colmap localize_sfm more_pairs pairs_from_covisibility 
 # keep two cores busy, because some tests wait.
 WORKERS := -n 3 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test types suite test-long lint clean
+.PHONY: demo test types suite test-long docs lint clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed
@@ -47,6 +47,16 @@ suite: $(VENV)/installed $(OLD)/installed
 
 test-long: $(VENV)/installed
 	$(BIN)/python -m pytest -m long
+
+# the reference of the public API, from its docstrings; a warning is an error. Imports of h5py run
+# uname, which pdoc suppresses otherwise.
+API := hloc_reduce '!hloc_reduce\.' hloc_reduce.maps '!hloc_reduce\.maps\.' hloc_reduce.maps.localizer \
+	hloc_reduce.confs.features hloc_reduce.confs.matchers hloc_reduce.compact \
+	$(subst /,.,$(basename $(wildcard hloc_reduce/[!_]*.py)))
+
+docs: $(VENV)/installed
+	PDOC_ALLOW_EXEC=1 $(BIN)/python -W error::UserWarning -m pdoc --docformat google \
+		--output-directory build/api $(API)
 
 # torch by itself first: a pinned version is a CPU build where an index offers one
 $(VENV)/installed: pyproject.toml setup.py hloc_reduce/utils/best_two.cpp constraints.txt

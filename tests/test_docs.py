@@ -1,0 +1,51 @@
+"""The documentation: links lead somewhere, and commands and files that it names exist."""
+
+import re
+from collections import Counter
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("results/*.md")])
+OTHERS = "https://", "http://", "mailto:"
+
+every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+
+def without_code(text: str) -> str:
+    return re.sub(r"^```.*?^```|^    .*?$", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the headings of a page, as GitHub makes them."""
+    found, seen = set(), Counter()
+    for heading in re.findall(r"^#+ (.*)$", without_code(page.read_text()), re.MULTILINE):
+        title = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).lower()
+        slug = re.sub(r"[^\w\- ]", "", title).replace(" ", "-")
+        found.add(f"{slug}-{seen[slug]}" if seen[slug] else slug)
+        seen[slug] += 1
+    return found
+
+
+@every_page
+def test_links_lead_somewhere(page):
+    broken = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", without_code(page.read_text())):
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if link.startswith(OTHERS):
+            continue
+        if not target.exists() or anchor and anchor not in anchors(target):
+            broken.append(link)
+    assert not broken
+
+
+@every_page
+def test_commands_exist(page):
+    text = page.read_text()
+    modules = set(re.findall(r"python -m ((?:hloc_reduce|pipelines|benchmarks)[\w.]*\w)", text))
+    assert not [module for module in modules if find_spec(module) is None]
+    files = set(re.findall(r"\b((?:benchmarks|confs|tests)/[\w/]+\.\w+)", text))
+    assert not [file for file in files if not (ROOT / file).exists()]
