@@ -49,3 +49,10 @@ def test_commands_exist(page):
     assert not [module for module in modules if find_spec(module) is None]
     files = set(re.findall(r"\b((?:benchmarks|confs|tests)/[\w/]+\.\w+)", text))
     assert not [file for file in files if not (ROOT / file).exists()]
+
+
+@pytest.mark.parametrize("name", ["CONTRIBUTING.md", "docs/architecture.md", "docs/map-format.md"])
+def test_files_of_the_code_exist(name):
+    paths = set(re.findall(r"`([\w/]+/[\w.]*)`", (ROOT / name).read_text()))
+    places = ROOT / "hloc_reduce", ROOT
+    assert not [path for path in paths if not any((place / path).exists() for place in places)]
