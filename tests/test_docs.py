@@ -1,7 +1,11 @@
 """The documentation: links lead somewhere, and commands and files that it names exist."""
 
+import io
 import re
+import sys
 from collections import Counter
+from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -49,6 +53,35 @@ def test_commands_exist(page):
     assert not [module for module in modules if find_spec(module) is None]
     files = set(re.findall(r"\b((?:benchmarks|confs|tests)/[\w/]+\.\w+)", text))
     assert not [file for file in files if not (ROOT / file).exists()]
+
+
+@cache
+def options(module: str, *subcommand: str) -> set[str]:
+    """Return the options of a command."""
+    if hasattr(import_module(module), "__path__"):
+        module += ".__main__"
+    argv, stdout = sys.argv, sys.stdout
+    sys.argv, sys.stdout = [module, *subcommand, "--help"], io.StringIO()
+    try:
+        with pytest.raises(SystemExit):
+            import_module(module)._main()
+        return set(re.findall(r"--\w+", sys.stdout.getvalue()))
+    finally:
+        sys.argv, sys.stdout = argv, stdout
+
+
+@every_page
+def test_options_of_commands_exist(page):
+    text, unknown = page.read_text().replace("\\\n", " "), []
+    for module, arguments in re.findall(
+        r"python -m ((?:hloc_reduce|pipelines)[\w.]+)([^\n`|]*)", text
+    ):
+        if module != "hloc_reduce.hloc":  # those are of modules of hloc
+            subcommand = re.findall(r"^ ([a-z]+) --", arguments)
+            known = options(module, *subcommand)
+            given = re.findall(r" (--\w+)", arguments)
+            unknown += [(module, option) for option in given if option not in known]
+    assert not unknown
 
 
 @pytest.mark.parametrize("name", ["CONTRIBUTING.md", "docs/architecture.md", "docs/map-format.md"])
