@@ -19,7 +19,7 @@ STAGES_OF_COLMAP := from_colmap localize_sfm more_pairs pairs_from_covisibility 
 # keep two cores busy, because some tests wait.
 WORKERS := -n 3 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test types suite test-long docs lint clean
+.PHONY: demo test types suite test-long results results-quick docs lint clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed
@@ -57,6 +57,16 @@ API := hloc_reduce '!hloc_reduce\.' hloc_reduce.maps '!hloc_reduce\.maps\.' hloc
 docs: $(VENV)/installed
 	PDOC_ALLOW_EXEC=1 $(BIN)/python -W error::UserWarning -m pdoc --docformat google \
 		--output-directory build/api $(API)
+
+# all that the documentation shows, in hours; rows of results/ that exist are kept
+results: $(VENV)/installed
+	PYTHON=$(BIN)/python results/run.sh
+
+# a part again, in ten minutes
+results-quick: $(VENV)/installed
+	$(BIN)/python -m benchmarks.accuracy results/quick.yaml --again
+	$(BIN)/python -m benchmarks.render
+	git diff --stat results docs README.md
 
 # torch by itself first: a pinned version is a CPU build where an index offers one
 $(VENV)/installed: pyproject.toml setup.py hloc_reduce/utils/best_two.cpp constraints.txt

@@ -8,8 +8,8 @@ image retrieved for it. All other keypoints are clutter.
 For each fraction, a new process writes the features, counts covisible landmarks, makes the pairs
 (40 for each map image, half of which are reversed duplicates; 50 for each query, where other map
 images replace those that are left out), matches them and checks the matches. The cache of
-descriptors shrinks with the data, so that it misses as often as at full size. The result is a
-Markdown table, whose last row extrapolates linearly to the whole data set.
+descriptors shrinks with the data, so that it misses as often as at full size. Adds rows to
+results/scale.csv, the last of which extrapolates linearly to the whole data set.
 """
 
 import argparse
@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import rows
 from hloc_reduce import match_features, pairs_from_retrieval
 from hloc_reduce.pairs_from_covisibility import most_covisible
 from hloc_reduce.runtime.group_writer import GroupWriter
@@ -42,17 +43,18 @@ from hloc_reduce.utils.parsers import (
     write_pairs,
 )
 
+NAME = "scale"
 NUM_COVIS, NUM_LOC = 40, 50
 SEEN = 0.15  # share of the keypoints that show landmarks
 STEP = 0.04  # share of these that the next image in the row does not show
 NOISE = 0.2  # length of the noise vector that is added to the descriptor of a landmark
 CHECKED = 200  # pairs whose matches are checked
 MIN_KEYPOINTS = 10  # so that at least one shows a landmark
-WHOLE = {"images": 6697 + 1015, "pairs": 20 * 6697 + 50 * 1015}
+WHOLE = {"photos": 6697 + 1015, "pairs": 20 * 6697 + 50 * 1015}
 # columns that are proportional to the number of images, or of pairs
 GROWING = {
-    "images": ("features_s", "feature_MB"),
-    "pairs": ("matching_s", "match_MB"),
+    "photos": ("features_s", "feature_mb"),
+    "pairs": ("matching_s", "match_mb"),
 }
 
 
@@ -172,34 +174,26 @@ def run(data: Path, share: float, dim: int, number: int, storage: str) -> dict:
         checked = itertools.islice(parse_pairs(pairs_file), 0, None, -(-number // CHECKED))
         found, right = check(features, matches, checked)
         return {
-            "share": matched_pairs / WHOLE["pairs"],
-            "images": len(places),
+            "photos": len(places),
             "pairs": matched_pairs,
             "pairs_s": paired - start,
             "features_s": written - paired,
             "matching_s": matched - written,
-            "feature_MB": features.stat().st_size / 1e6,
-            "match_MB": matches.stat().st_size / 1e6,
-            "peak_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "feature_mb": features.stat().st_size / 1e6,
+            "match_mb": matches.stat().st_size / 1e6,
+            "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             "found": 100 * found,
             "right": 100 * right,
         }
 
 
-def line(rows: list[dict]) -> dict:
-    """Extrapolate linearly from the first and the last row to the whole data set."""
-    first, last = rows[0], rows[-1]
-    continued = {"share": 1, **WHOLE}
+def whole(smaller: dict, larger: dict) -> dict:
+    """Extrapolate linearly from two fractions to the whole data set."""
+    continued: dict[str, object] = dict(WHOLE)
     for number, columns in GROWING.items():
-        further = (WHOLE[number] - last[number]) / (last[number] - first[number])
-        continued |= {key: last[key] + further * (last[key] - first[key]) for key in columns}
+        further = (WHOLE[number] - larger[number]) / (larger[number] - smaller[number])
+        continued |= {key: larger[key] + further * (larger[key] - smaller[key]) for key in columns}
     return continued
-
-
-def print_row(row: dict, columns: list[str]) -> None:
-    """Print a row of a Markdown table."""
-    cells = [f"{row[key]:,.4g}" if key in row else "" for key in columns]
-    print(f"| {' | '.join(cells)} |", flush=True)
 
 
 def _main() -> None:
@@ -218,6 +212,7 @@ def _main() -> None:
     parser.add_argument("--keypoints", type=int, default=8000, help="of each image")
     parser.add_argument("--storage", default=STORAGES[0], help=f"one of {', '.join(STORAGES)}")
     parser.add_argument("--once", action="store_true", help=argparse.SUPPRESS)
+    rows.add_again_option(parser)
     args = parser.parse_args()
     cli.choose("storage", args.storage, STORAGES)
     if not all(0 < share <= 1 for share in args.share) or len(set(args.share)) < len(args.share):
@@ -229,23 +224,29 @@ def _main() -> None:
         measured = run(args.data, args.share[0], args.dim, args.keypoints, args.storage)
         print(json.dumps(measured))
         return
-    rows = []
+    cells = {"place": args.data.name, "feature": f"{args.dim} numbers", "storage": args.storage}
+    cells |= {"variant": f"{args.keypoints} keypoints"}
+    known = rows.select(rows.read(NAME), **cells)
+    if not args.again and rows.select(known, list="whole"):
+        return
+    fractions = []
     for share in sorted(args.share):
         options = {"data": args.data, "dim": args.dim, "keypoints": args.keypoints}
         options |= {"share": share, "storage": args.storage}
         given = [word for key, value in options.items() for word in (f"--{key}", str(value))]
         done = subprocess.run(
-            [sys.executable, __file__, "--once", *given], stdout=subprocess.PIPE, text=True
+            [sys.executable, "-m", "benchmarks.aachen_scale", "--once", *given],
+            stdout=subprocess.PIPE,
+            text=True,
         )
         if done.returncode:
             raise InputError(f"The share {share} failed.")
-        rows.append(json.loads(done.stdout))
-        columns = list(rows[0])
-        if len(rows) == 1:
-            print(f"| {' | '.join(columns)} |\n|{' ---: |' * len(columns)}")
-        print_row(rows[-1], columns)
-    if len(rows) > 1:
-        print_row(line(rows), columns)
+        fractions.append(json.loads(done.stdout))
+        part = {"list": f"share {share:g}"}
+        rows.add(NAME, [cells | part | fractions[-1] | rows.how(fractions[-1]["matching_s"])])
+    if len(fractions) > 1:
+        extrapolated = whole(fractions[0], fractions[-1])
+        rows.add(NAME, [cells | {"list": "whole"} | extrapolated | rows.how()])
 
 
 if __name__ == "__main__":

@@ -75,15 +75,16 @@ def _main() -> None:
     if not missing:
         logger.info("All jobs of %s have rows.", args.job_file)
         return
-    todo = args.outputs / "missing.yaml"
-    with replacing(todo) as temporary:
-        temporary.write_text(yaml.safe_dump({"jobs": [_options(job) for job in missing]}))
     with EXECUTORS["processes"](None) as executor:
-        batch.main(todo, args.outputs, overwrite=args.again, executor=executor)
-    for job in missing:
-        folder = args.outputs / job.dataset.name / job.name
-        if (folder / "summary.json").exists():
-            rows.add(NAME, (what(job) | cells for cells in measured(folder)))
+        for place in jobs.by_dataset(missing).values():
+            todo = args.outputs / "missing.yaml"
+            with replacing(todo) as temporary:
+                temporary.write_text(yaml.safe_dump({"jobs": [_options(job) for job in place]}))
+            batch.main(todo, args.outputs, overwrite=args.again, executor=executor)
+            for job in place:
+                folder = args.outputs / job.dataset.name / job.name
+                if (folder / "summary.json").exists():
+                    rows.add(NAME, (what(job) | cells for cells in measured(folder)))
 
 
 def _options(job: Job) -> dict[str, object]:

@@ -2,9 +2,8 @@
 
 hloc extracts `sift` and matches with NN-ratio; this project does the same with each --feature. Each
 run is a new process that starts with an empty folder and ends with poses. The runs take turns, and
-the fastest of several rounds counts. Needs hloc and a pycolmap that it works with. Prints two
-Markdown tables: seconds of each stage and in total, with the speedup over hloc; and points, file
-sizes and recall at the finest threshold.
+the fastest of several rounds counts. Needs hloc and a pycolmap that it works with. Adds rows to
+results/runs.csv: seconds of each stage, file sizes, and queries within the finest threshold.
 """
 
 import argparse
@@ -17,15 +16,17 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from benchmarks import rows
 from hloc_reduce.datasets import thresholds, true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import pose_error, recall
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.files import MEGABYTE
 from hloc_reduce.utils.hloc import extractors_package
 from hloc_reduce.utils.parsers import parse_poses, write_pairs
 
-STAGES = ("extraction", "matching", "triangulation", "localization")
+NAME = "runs"
 HLOC = "hloc"
 
 
@@ -83,28 +84,32 @@ def run(name: str, dataset: Path, outputs: Path) -> dict:
         used["localize"](sfm, given, loc_pairs, features, loc_matches, outputs / f"{key}.txt")
     lap("localization")
     truth = true_poses(queries, place.ground_truth, True)
-    finest = []
+    within = 0
     for key, part in lists.items():
         estimates = parse_poses(outputs / f"{key}.txt")
         errors = [pose_error(estimates.get(Path(query).name), truth[query]) for query in part]
-        finest.append(recall(errors, thresholds(key)[:1])[0])
+        within += round(recall(errors, thresholds(key)[:1])[0] * len(part) / 100)
     return {
-        "seconds": seconds,
+        "photos": len(database),
         "points": colmap.read_model(sfm).num_points3D(),
-        "feature_MB": features.stat().st_size / 1e6,
-        "match_MB": sum(path.stat().st_size for path in (matches, loc_matches)) / 1e6,
-        "recall": finest,
+        **{f"{stage}_s": value for stage, value in seconds.items()},
+        "feature_mb": features.stat().st_size / MEGABYTE,
+        "match_mb": sum(path.stat().st_size for path in (matches, loc_matches)) / MEGABYTE,
+        "queries": len(queries),
+        "within_finest": within,
+        "seconds": sum(seconds.values()),
     }
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--dataset herz-jesus")
+    parser = cli.Parser(__doc__, "--dataset datasets/herz-jesus")
     parser.add_argument("--dataset", type=Path, required=True, help="with true poses of queries")
     parser.add_argument(
         "--feature", nargs="+", default=["sift_sv64", "colmap_sift_sv64"], help="of this project"
     )
-    parser.add_argument("--rounds", type=int, default=2, help="rounds in which all take turns")
+    parser.add_argument("--rounds", type=int, default=3, help="rounds in which all take turns")
     parser.add_argument("--once", help=argparse.SUPPRESS)
+    rows.add_again_option(parser)
     args = parser.parse_args()
     if args.once:
         with tempfile.TemporaryDirectory() as temporary:
@@ -112,32 +117,20 @@ def _main() -> None:
         return
     cli.check_positive(args, "rounds")
     names = [HLOC, *args.feature]
+    cells = {name: {"place": args.dataset.name, "feature": name} for name in names}
+    known = rows.read(NAME)
+    if not args.again and all(rows.select(known, **cells[name]) for name in names):
+        return  # a run is only compared with those that it took turns with
     best: dict[str, dict] = {}
-    for _ in range(args.rounds):
-        for name in names:
-            command = [sys.executable, __file__, "--dataset", str(args.dataset), "--once", name]
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
-            if done.returncode:
-                raise InputError(f"{name} failed.")
-            result = json.loads(done.stdout.splitlines()[-1])
-            total = sum(result["seconds"].values())
-            if name not in best or total < sum(best[name]["seconds"].values()):
-                best[name] = result
-    print(f"| s | {' | '.join(STAGES)} | all | hloc / this |")
-    print("| --- |" + " ---: |" * (len(STAGES) + 2))
-    reference = sum(best[HLOC]["seconds"].values())
-    for name in names:
-        seconds = best[name]["seconds"]
-        total = sum(seconds.values())
-        cells = [f"{seconds[stage]:.2f}" for stage in STAGES]
-        print(f"| {name} | {' | '.join(cells)} | {total:.2f} | {reference / total:.2f} |")
-    print("\n| | points | MB features | MB matches | recall at the finest threshold, % |")
-    print("| --- | ---: | ---: | ---: | ---: |")
-    for name in names:
-        result = best[name]
-        reached = " / ".join(f"{value:.1f}" for value in result["recall"])
-        sizes = f"{result['feature_MB']:.1f} | {result['match_MB']:.2f}"
-        print(f"| {name} | {result['points']:,} | {sizes} | {reached} |")
+    for _, name in itertools.product(range(args.rounds), names):
+        command = [sys.executable, "-m", "benchmarks.against_hloc", "--once", name]
+        command += ["--dataset", str(args.dataset)]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+        if done.returncode:
+            raise InputError(f"{name} failed.")
+        result = json.loads(done.stdout.splitlines()[-1])
+        best[name] = min(result, best.get(name, result), key=lambda each: each["seconds"])
+    rows.add(NAME, [cells[name] | rows.how() | best[name] for name in names])
 
 
 if __name__ == "__main__":

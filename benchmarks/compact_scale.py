@@ -6,7 +6,8 @@ map has 2 million points, each seen in five images, and 10 million observations.
 between two images and shows the points of one, among clutter.
 
 For each fraction, a process writes the model and the features, another one builds the compact map,
-and a third one opens it and localizes queries, whose features it is given. Prints a Markdown table.
+and a third one opens it and localizes queries, whose features it is given. Adds rows to
+results/compact_scale.csv.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from benchmarks import rows
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.utils import cli
@@ -30,6 +32,7 @@ from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.parsers import image_names
 from hloc_reduce.utils.progress import progress
 
+NAME = "compact_scale"
 FEATURE, DIM = "colmap_sift_sv32", 32
 SEEN, STEP = 1493, 299  # points of an image; those that the next image does not show
 DEPTH, SPREAD = 10.0, 2.0  # metres from the images to the wall, and its relief
@@ -132,12 +135,12 @@ def build(folder: Path) -> dict:
     return {
         "points": parts["descriptors"] * 2 // DIM,
         "build_s": time.perf_counter() - start,
-        "build_MB": peak(),
-        "file_MB": (folder / "place.hlm").stat().st_size / 1e6,
+        "build_mb": peak(),
+        "mb": (folder / "place.hlm").stat().st_size / 1e6,
     }
 
 
-def localize(number: int, folder: Path, at_once: bool) -> dict:
+def localize(number: int, folder: Path) -> dict:
     """Open the compact map and localize queries, whose features are given."""
     start = time.perf_counter()
     from hloc_reduce import Localizer
@@ -146,10 +149,6 @@ def localize(number: int, folder: Path, at_once: bool) -> dict:
     localizer = Localizer(folder / "place.hlm")
     opened = time.perf_counter()
     resident = current()
-    if at_once:
-        import compact_matching
-
-        localizer._match = compact_matching.at_once(localizer)
     xyz, descriptors = wall(number)
     queries = [synthetic_query(place, xyz, descriptors) for place in places(number)]
     del xyz, descriptors
@@ -166,11 +165,12 @@ def localize(number: int, folder: Path, at_once: bool) -> dict:
     return {
         "import_s": imported - start,
         "open_s": opened - imported,
-        "resident_MB": resident,
-        "queries_MB": current() - before,
+        "resident_mb": resident,
+        "queries_mb": current() - before,
         **{f"{stage}_s": float(np.mean(seconds)) for stage, seconds in stages.items()},
         "correspondences": float(np.mean(correspondences)),
-        "right": f"{right} of {len(queries)}",
+        "queries": len(queries),
+        "localized": int(right),
     }
 
 
@@ -209,9 +209,7 @@ def _main() -> None:
         "--data", type=Path, required=True, help="folder of database_images.txt, a list of images"
     )
     parser.add_argument("--share", type=float, nargs="+", default=[0.01, 0.1], help="of its images")
-    parser.add_argument(
-        "--at_once", action="store_true", help="match with all points at once, not image by image"
-    )
+    rows.add_again_option(parser)
     for hidden in ("--folder", "--stage"):
         parser.add_argument(hidden, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -224,28 +222,27 @@ def _main() -> None:
         stages = {
             "synthesize": lambda: synthesize(some, folder),
             "build": lambda: build(folder),
-            "localize": lambda: localize(len(some), folder, args.at_once),
+            "localize": lambda: localize(len(some), folder),
         }
-        print(json.dumps({"images": len(some)} | (stages[args.stage]() or {})))
+        print(json.dumps({"photos": len(some)} | (stages[args.stage]() or {})))
         return
     for share in args.share:
-        row: dict = {}
+        cells: dict = {"place": args.data.name, "list": f"share {share:g}", "feature": FEATURE}
+        cells |= {"storage": "uint4"}
+        if not args.again and rows.select(rows.read(NAME), **cells):
+            continue
         with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as folder:
             for stage in ("synthesize", "build", "localize"):
                 given = ["--data", args.data, "--share", str(share), "--folder", folder]
-                given += ["--at_once"] * args.at_once
                 done = subprocess.run(
-                    [sys.executable, __file__, "--stage", stage, *given],
+                    [sys.executable, "-m", "benchmarks.compact_scale", "--stage", stage, *given],
                     stdout=subprocess.PIPE,
                     text=True,
                 )
                 if done.returncode:
                     raise InputError(f"The share {share} failed.")
-                row |= json.loads(done.stdout.splitlines()[-1])
-        if share == args.share[0]:
-            print(f"| {' | '.join(row)} |\n|{' ---: |' * len(row)}")
-        cells = [value if isinstance(value, str) else f"{value:,.4g}" for value in row.values()]
-        print(f"| {' | '.join(cells)} |", flush=True)
+                cells |= json.loads(done.stdout.splitlines()[-1])
+        rows.add(NAME, [cells | rows.how(cells["build_s"])])
 
 
 if __name__ == "__main__":

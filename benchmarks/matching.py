@@ -1,27 +1,26 @@
 """Time the matching of image pairs: mutual nearest neighbours with a ratio test.
 
 Compares the nearest_neighbor of the installed hloc (or else the same computation in torch); ours,
-for one pair at a time and for a run of pairs, one per core; runs of pairs stored as uint8 and as
-uint4, which are restored for every pair and matched as integers; exact search by faiss in both
-directions; and the bare matrix product, a lower bound for every search that computes it. Prints
-milliseconds per pair, the least of several rounds in which all take turns, the speedups over hloc,
-and the memory that floats and codes of an image take. A tenth of the descriptors of a pair match.
+for a run of pairs, one per core; and runs of pairs stored as uint8 and as uint4, which are restored
+for every pair and matched as integers. Adds rows to results/matching.csv: milliseconds per pair,
+the least of several rounds in which all take turns. A tenth of the descriptors of a pair match.
 """
 
 import sys
 import time
 from collections.abc import Callable
-from importlib.util import find_spec
 
 import numpy as np
 import torch
 
+from benchmarks import rows
 from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
 from hloc_reduce.runtime import parallel
 from hloc_reduce.utils import best_two, cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import CODED, restore, store, to_integers
 
+NAME = "matching"
 RATIO = 0.8
 MATCHING = 0.1  # share of the descriptors
 DIMS = (128, 64, 32, 24, 16)
@@ -83,25 +82,10 @@ def plain(pair: Pair) -> torch.Tensor:
     return torch.where((forward >= 0) & (backward[forward] == own), forward, -1)
 
 
-def faiss_both_ways(pair: Pair) -> torch.Tensor:
-    """Match by exact searches for the best two, in both directions."""
-    import faiss
-
-    nearest = []
-    for queries, others in (pair, pair[::-1]):
-        cosines, indices = faiss.knn(queries.numpy(), others.numpy(), 2, faiss.METRIC_INNER_PRODUCT)
-        accepted = 1 - cosines[:, 0] <= RATIO**2 * (1 - cosines[:, 1])
-        nearest.append(np.where(accepted, indices[:, 0], -1))
-    forward, backward = nearest
-    mutual = (forward >= 0) & (backward[forward] == np.arange(len(forward)))
-    return torch.from_numpy(np.where(mutual, forward, -1))
-
-
 def methods(data: list[Pair], device: str) -> dict[str, Callable[[list[Pair]], list]]:
     """Return the compared methods, functions of the list of pairs."""
     reference, match = hloc_matcher(device)
     ours = NearestNeighbor({"ratio_threshold": RATIO})
-    memory = torch.empty(len(data[0][0]), len(data[0][1]), device=device)
     batches = 1 if device == "cpu" else 64
 
     def run(pairs: list[Pair]) -> list:
@@ -120,17 +104,11 @@ def methods(data: list[Pair], device: str) -> dict[str, Callable[[list[Pair]], l
         stored = [[coded(part, storage) for part in pair] for pair in data]
         return lambda _: list(parallel.ordered("match", match_codes, stored))
 
-    compared = {
+    return {
         reference: lambda pairs: [match(pair) for pair in pairs],
-        "ours, one pair": lambda pairs: [ours.match([pair])[0][0] for pair in pairs],
         "ours, run": run,
         **{storage: run_codes(storage) for storage in ROUNDED if device == "cpu"},
-        "faiss": lambda pairs: [faiss_both_ways(pair) for pair in pairs],
-        "product": lambda pairs: [torch.mm(pair[0], pair[1].T, out=memory) for pair in pairs][:0],
     }
-    if device != "cpu" or find_spec("faiss") is None:
-        del compared["faiss"]
-    return compared
 
 
 @torch.no_grad()
@@ -159,37 +137,30 @@ def measure(number: int, dim: int, pairs: int, rounds: int, device: str) -> dict
 def _main() -> None:
     parser = cli.Parser(__doc__, "--keypoints 8000")
     parser.add_argument("--keypoints", type=int, default=8000, help="of each image")
-    parser.add_argument("--pairs", type=int, default=8, help="pairs in a run")
+    parser.add_argument("--pairs", type=int, default=6, help="pairs in a run")
     parser.add_argument("--rounds", type=int, default=5, help="rounds in which all take turns")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    rows.add_again_option(parser)
     args = parser.parse_args()
-    if min(args.keypoints, args.pairs, args.rounds) < 1:
-        raise InputError("--keypoints, --pairs and --rounds: at least 1.")
+    cli.check_positive(args, "keypoints", "pairs", "rounds")
     if args.device != "cpu" and not torch.cuda.is_available():
         raise InputError("There is no GPU.")
-    names = None
+    device = "" if args.device == "cpu" else torch.cuda.get_device_name()
+    code = next(iter(best_two.instructions()), "NumPy")
     for dim in DIMS:
+        cells = {"place": f"{args.keypoints} x {args.keypoints}", "feature": f"{dim} numbers"}
+        known = [row["variant"] for row in rows.select(rows.read(NAME), **cells)]
+        if not args.again and any(device in variant for variant in known):
+            continue
+        start = time.perf_counter()
         seconds = measure(args.keypoints, dim, args.pairs, args.rounds, args.device)
-        if names is None:
-            names = list(seconds)
-            code = next(iter(best_two.instructions()), "NumPy")
-            size, threads = f"{args.keypoints} x {args.keypoints}", torch.get_num_threads()
-            print(f"{size}, {threads} threads, codes with {code}, ms")
-            ratios = ["one pair", "run", "run / product"]
-            codes = [name for name in names if name in ROUNDED]
-            ratios += [f"{part} / {name}" for name in codes for part in (names[0], "run", "memory")]
-            print(f"| dimensions | {' | '.join(names + ratios)} |")
-            print("| ---: |" + " ---: |" * (len(names) + len(ratios)))
-        reference, one, run = (seconds[name] for name in names[:3])
-        cells = [f"{1e3 * value:.0f}" for value in seconds.values()]
-        cells += [f"{reference / one:.1f}x", f"{reference / run:.1f}x"]
-        cells += [f"{run / seconds['product']:.1f}"]
-        floats = make_pair(args.keypoints, dim, 0, "cpu")[0]
-        for name in codes:
-            (stored,) = coded(floats, name)[0].values()
-            cells += [f"{reference / seconds[name]:.1f}x", f"{run / seconds[name]:.1f}x"]
-            cells += [f"{floats.numpy().nbytes / stored.nbytes:.0f}x"]
-        print(f"| {dim} | {' | '.join(cells)} |", flush=True)
+        how = rows.how(time.perf_counter() - start, torch.get_num_threads())
+        for method, value in seconds.items():
+            stored = method if method in ROUNDED else "float32"
+            with_code = f"{method} by {code}" if method in ROUNDED else method
+            variant = " on ".join(filter(None, (with_code, device)))
+            found = {"storage": stored, "variant": variant, "ms": 1000 * value}
+            rows.add(NAME, [cells | found | how])
 
 
 if __name__ == "__main__":

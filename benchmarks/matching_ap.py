@@ -2,27 +2,26 @@
 
 Two observations of each point of a map are drawn, in different images. All first descriptors are
 ranked by the distance to their nearest second descriptor; a match is correct if it is of the same
-point. The columns of the maps and their mean use the tracks as triangulated from mutual nearest
-neighbours of `sift`, or of bases that have their own keypoints. "completed" adds the
-observations that matching missed and geometry found; "dark" also takes photometric variants
-(darkness, blur, noise) of the second photos. "photo pairs" matches one photo with another, as hloc
-does: the observations of the points that both see with all observations in the other photo.
+point. "matched" uses the tracks as triangulated from mutual nearest neighbours of `sift`, or of
+bases that have their own keypoints. "completed" adds the observations that matching missed and
+geometry found; "dark" also takes photometric variants (darkness, blur, noise) of the second photos.
+"photo pairs" matches one photo with another, as hloc does: the observations of the points that both
+see with all observations in the other photo. Second descriptors are stored as those of a map are.
 
-Prints Markdown tables of percentages, means over several draws: one for each base descriptor, with
-its own row and one for each shipped projection and each `--projection` whose name begins with the
-name of the descriptor; then one of the means by number of dimensions.
+Adds rows of AP in percent, means over several draws and all maps, to results/matching_ap.csv, for
+each base descriptor and each of its shipped projections and files whose name begins with its name.
 """
 
 import itertools
-import re
-from collections import defaultdict
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from hloc_reduce import projections
+from benchmarks import rows
+from hloc_reduce import logger, projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.evaluation.ranking import nearest_neighbor_ap
 from hloc_reduce.training import nested, tracks
@@ -30,10 +29,12 @@ from hloc_reduce.training.sampling import matchable
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.codes import CODED, STORAGES, descriptor_bytes, restore, store
 
+NAME = "matching_ap"
 KINDS = ("matched", "completed", "dark", "photo pairs")
-Describe = Callable[[torch.Tensor], torch.Tensor]  # base descriptors (N, B) to (N, D)
 MIN_SHARED = 30  # points that a pair of photos must share
+Describe = Callable[[torch.Tensor], torch.Tensor]  # base descriptors (N, B) to (N, D)
 
 
 def draw_pairs(data: tracks.Tracks, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -66,27 +67,6 @@ def photo_pairs(data: tracks.Tracks) -> list[tuple[torch.Tensor, torch.Tensor]]:
     return pairs
 
 
-def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.Module]:
-    """Load the projections of a descriptor by name, nested ones at each of their dimensions."""
-    names = [name for name in projections.names() if name.rpartition("_")[0] == descriptor]
-    nested_name = f"{descriptor}_nested"
-    if nested_name in names:
-        names.remove(nested_name)
-        names += [nested_name, *(f"{nested_name}@{dim}" for dim in nested.PREFIXES[1:])]
-    files = [file for file in files if file.name.lower().startswith(descriptor)]
-    loaded = {name: projections.load(name) for name in names}
-    loaded |= {file.name: projections.load(file) for file in files}
-    order = sorted(loaded, key=lambda name: (family(name), -loaded[name].dim))
-    base = torch.nn.Identity()
-    base.dim = features_confs.dimension(descriptor)
-    return {descriptor: base} | {name: loaded[name] for name in order}
-
-
-def family(name: str) -> str:
-    """Return the name of a projection without its dimension."""
-    return re.sub(r"(@|_dim)?\d*(?=(\.\w+)?$)", "", name)
-
-
 def draw_all(data: tracks.Tracks, draws: int) -> dict[str, list]:
     """Draw pairs of descriptors of a map, of each of `KINDS`."""
     matched = data.only(data.matched)
@@ -99,60 +79,83 @@ def draw_all(data: tracks.Tracks, draws: int) -> dict[str, list]:
     }
 
 
-def measure(project: Describe, draws: list, reference: Describe | None = None) -> float:
-    """Return the mean AP in percent of pairs, the second ones projected by `reference` if given."""
-    reference = reference or project
-    return np.mean([100 * nearest_neighbor_ap(project(a), reference(b)) for a, b in draws])
+def load_projections(descriptor: str, files: list[Path]) -> dict[str, torch.nn.Module]:
+    """Load the projections of a descriptor by name, nested ones at each of their dimensions."""
+    names = [name for name in projections.names() if name.rpartition("_")[0] == descriptor]
+    nested_name = f"{descriptor}_nested"
+    if nested_name in names:
+        names += [f"{nested_name}@{dim}" for dim in nested.PREFIXES[1:]]
+    files = [file for file in files if file.name.lower().startswith(descriptor)]
+    base = torch.nn.Identity()
+    base.dim = features_confs.dimension(descriptor)
+    loaded = {name: projections.load(name) for name in names}
+    return {descriptor: base} | loaded | {file.stem: projections.load(file) for file in files}
+
+
+def stored(project: Describe, name: str, storage: str) -> Describe:
+    """Return what projects descriptors and rounds them as in a file of this storage."""
+    table = projections.levels(name, storage) if storage in CODED else None
+
+    def describe(base: torch.Tensor) -> torch.Tensor:
+        written = store({"descriptors": project(base).numpy().T}, storage, table)
+        return torch.from_numpy(restore(*written))
+
+    return describe
+
+
+def measure(project: Describe, draws: list, reference: Describe) -> float:
+    """Return the mean AP in percent of pairs, the second ones projected by `reference`."""
+    return float(np.mean([100 * nearest_neighbor_ap(project(a), reference(b)) for a, b in draws]))
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--map sceaux/images:sceaux/sparse")
-    parser.add_argument("--map", action="append", required=True, metavar="IMAGES:MODEL")
-    parser.add_argument(
-        "--descriptor", nargs="+", default=["sift", "mkd", "tfeat"], help="base descriptors"
-    )
-    parser.add_argument(
-        "--projection", type=Path, nargs="*", default=[], help="projection files to compare with"
-    )
-    parser.add_argument(
-        "--cache", type=Path, default=Path("outputs/training/maps"), help="folder for the tracks"
-    )
-    parser.add_argument("--draws", type=int, default=5, help="draws of pairs of observations")
+    parser = cli.Parser(__doc__, "--map scenes/sceaux/images:scenes/sceaux/sparse")
+    add = parser.add_argument
+    add("--map", action="append", required=True, metavar="IMAGES:MODEL")
+    add("--descriptor", nargs="+", default=["sift", "mkd", "tfeat"], help="base descriptors")
+    add("--projection", type=Path, nargs="*", default=[], help="projection files, too")
+    add("--storage", nargs="+", default=["float16"], help=f"of {', '.join(STORAGES)}")
+    add("--cache", type=Path, default=Path("outputs/training/maps"), help="folder for the tracks")
+    add("--draws", type=int, default=5, help="draws of pairs of observations")
+    rows.add_again_option(parser)
     args = parser.parse_args()
-
+    cli.check_positive(args, "draws")
     for descriptor in args.descriptor:
         cli.choose("descriptor", descriptor, features_confs.BASES)
-    for file in args.projection:
-        if not file.name.lower().startswith(tuple(args.descriptor)):
-            raise InputError(f"{file}: its name must begin with one of --descriptor.")
-    if args.draws < 1:
-        raise InputError("--draws: at least 1.")
+    for storage in args.storage:
+        cli.choose("storage", storage, STORAGES)
+    known = [] if args.again else rows.read(NAME)
     maps = parse_maps(args.map)
-    means = defaultdict(dict)
+    places = ", ".join(maps)
     for descriptor in args.descriptor:
-        pairs = {
-            name: draw_all(
-                tracks.load(tracks.main(images, model, args.cache / name, descriptor)), args.draws
-            )
-            for name, (images, model) in maps.items()
-        }
-        points = [f"{name} ({len(kinds['matched'][0][0])})" for name, kinds in pairs.items()]
-        print(f"| feature | {' | '.join(points)} | mean | {' | '.join(KINDS[1:])} |")
-        print("| --- |" + " ---: |" * (len(points) + len(KINDS)))
-        for row, project in load_projections(descriptor, args.projection).items():
-            values = {
-                kind: [measure(project, kinds[kind]) for kinds in pairs.values()] for kind in KINDS
-            }
-            mean = {kind: np.mean(places) for kind, places in values.items()}
-            cells = " | ".join(f"{value:.2f}" for value in (*values["matched"], *mean.values()))
-            print(f"| {row} | {cells} |", flush=True)
-            means[family(row)][project.dim] = " / ".join(f"{mean[kind]:.1f}" for kind in KINDS)
-        print()
-    dims = sorted({dim for by_dim in means.values() for dim in by_dim}, reverse=True)
-    print(f"| {' / '.join(KINDS)} | {' | '.join(map(str, dims))} |")
-    print("| --- |" + " ---: |" * len(dims))
-    for name, by_dim in means.items():
-        print(f"| {name} | {' | '.join(by_dim.get(dim, '') for dim in dims)} |")
+        todo = [
+            (name, project, storage)
+            for name, project in load_projections(descriptor, args.projection).items()
+            for storage in args.storage
+            if not rows.select(known, place=places, feature=name, storage=storage)
+        ]
+        if not todo:
+            continue
+        files = [
+            tracks.main(images, model, args.cache / place, descriptor)
+            for place, (images, model) in maps.items()
+        ]
+        pairs = [draw_all(tracks.load(file), args.draws) for file in files]
+        for name, project, storage in todo:
+            start = time.perf_counter()
+            try:
+                reference = stored(project, name, storage)
+            except InputError:
+                logger.info("Left out: %s has no levels for %s.", name, storage)
+                continue
+            cells = {"place": places, "feature": name, "storage": storage}
+            cells |= {"bytes": descriptor_bytes(project.dim, storage)}
+            found = {}
+            for kind in KINDS:
+                of_maps = [measure(project, of_map[kind], reference) for of_map in pairs]
+                found[kind] = float(np.mean(of_maps))
+            cells |= rows.how(time.perf_counter() - start, torch.get_num_threads())
+            rows.add(NAME, [cells | {"list": kind, "ap": ap} for kind, ap in found.items()])
 
 
 if __name__ == "__main__":

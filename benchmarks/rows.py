@@ -45,11 +45,10 @@ def select(rows: Iterable[Row], **cells: object) -> list[Row]:
 def add(name: str, rows: Iterable[dict[str, object]]) -> None:
     """Add rows to `results/<name>.csv`, which is replaced at once and sorted by `WHAT`."""
     known = {tuple(row[key] for key in WHAT): row for row in read(name)}
-    for row in rows:
-        cells = {key: _text(value) for key, value in row.items()}
-        known[tuple(cells.setdefault(key, "") for key in WHAT)] = cells
-    ends = {*WHAT, *MAP, *HOW}
-    measures = dict.fromkeys(key for row in known.values() for key in row if key not in ends)
+    added = [{key: _text(value) for key, value in row.items()} for row in rows]
+    columns_of_rows = dict.fromkeys(key for row in [*known.values(), *added] for key in row)
+    measures = [key for key in columns_of_rows if key not in {*WHAT, *MAP, *HOW}]
+    known |= {tuple(row.setdefault(key, "") for key in WHAT): row for row in added}
     columns = (*WHAT, *MAP, *measures, *HOW)
     path = RESULTS / f"{name}.csv"
     with replacing(path) as temporary, temporary.open("w", newline="") as file:

@@ -79,7 +79,7 @@ def names(descriptor: str) -> list[str]:
 
 def matcher_of(conf: dict) -> str:
     """Return the matcher that suits a feature best, a key of `confs.matchers`."""
-    return "NN-mutual" if network_of(conf["model"]) else "NN-ratio"  # docs/results.md
+    return "NN-mutual" if network_of(conf["model"]) else "NN-ratio"  # docs/lab.md
 
 
 def base_of(model: dict) -> dict:

@@ -11,7 +11,7 @@ LAMPS, LAMPS_SHARE = 2.5, 0.02
 STEP = 4  # every fourth row and column tells as much of them, in a tenth of the time
 NOISY = 0.08  # standard deviation of the noise, in that of the image, from which it is blurred
 # the blur, a standard deviation in pixels: the smaller of BLUR * sqrt(noise) and
-# BLUR_LITTLE * noise, which are equal at 0.34 (docs/results.md)
+# BLUR_LITTLE * noise, which are equal at 0.34 (docs/lab.md)
 BLUR, BLUR_LITTLE = 2.8, 4.8
 
 

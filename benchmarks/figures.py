@@ -1,0 +1,122 @@
+"""Figures of the documentation, made from the rows of results/."""
+
+import re
+from collections.abc import Callable
+from functools import partial
+
+from benchmarks.rows import CENTIMETRES, Row, read, select
+from benchmarks.tables import (
+    FAMILIES,
+    FEATURES,
+    MAPS,
+    ONE_CORE,
+    SIZES,
+    STAGES,
+    chosen,
+    percent,
+    total,
+)
+from hloc_reduce.evaluation import plots
+
+
+def draw_features() -> list[Callable]:
+    """Draw the queries by position error, and the time of extraction."""
+    names = [f"{feature}, {storage}" for feature, storage in FEATURES][::-1]
+    seconds = {
+        row["feature"]: float(row["cpu_s"]) for row in select(read("extraction"), variant=ONE_CORE)
+    }
+
+    def errors(axis) -> None:
+        before = [0.0] * len(names)
+        for colour, limit in zip(plots.COLOURS, CENTIMETRES, strict=False):
+            within = [percent(chosen(*choice), f"within_{limit}cm") for choice in FEATURES][::-1]
+            widths = [value - left for value, left in zip(within, before, strict=True)]
+            axis.barh(names, widths, left=before, color=colour, label=f"within {limit} cm")
+            before = within
+        axis.set(xlabel="queries [%]")
+
+    def times(axis) -> None:
+        # projections take little time
+        bases = [re.sub(r"_sv\d+$", "", feature) for feature, _ in FEATURES][::-1]
+        axis.barh(names, [seconds[base] for base in bases], color=plots.COLOURS[-2])
+        axis.set(xlabel="extraction of a photo [CPU s]", yticklabels=[])
+
+    return [errors, times]
+
+
+def draw_bytes() -> list[Callable]:
+    """Draw recall and inliers against the bytes of a descriptor."""
+    found: dict[str, list[tuple[int, float, float]]] = {}
+    for family, choices in FAMILIES.items():
+        for choice in choices:
+            rows = chosen(*choice)
+            place = select(rows, place="herz-jesus", list="day")
+            values = percent(rows, "within_5cm"), total(place, "inliers")
+            found.setdefault(family, []).append((int(rows[0]["bytes"]), *values))
+
+    def panel(axis, column: int, label: str) -> None:
+        for colour, (family, points) in zip(plots.COLOURS, found.items(), strict=False):
+            sizes, values = [point[0] for point in points], [point[column] for point in points]
+            axis.plot(sizes, values, marker="o", color=colour, label=family)
+        axis.set(xscale="log", xlabel="bytes of a descriptor", ylabel=label)
+        axis.set_xticks(SIZES, [str(size) for size in SIZES])
+        axis.minorticks_off()
+
+    labels = ("queries within 5 cm [%]", "mean inliers, Herz-Jesus by day")
+    return [partial(panel, column=i, label=label) for i, label in enumerate(labels, 1)]
+
+
+def draw_maps() -> list[Callable]:
+    """Draw inliers on Herz-Jesus and recall in the town against the size of the map."""
+
+    def panel(axis, place: str, measure: Callable[[list[Row]], float], label: str) -> None:
+        for colour, (feature, storage) in zip(plots.COLOURS, MAPS, strict=False):
+            sizes: dict[float, list[Row]] = {}
+            for row in select(read("maps"), place=place, feature=feature):
+                if row["storage"] == storage or row["variant"] == "whole map":
+                    sizes.setdefault(float(row["mb"]), []).append(row)
+            values = [measure(sizes[size]) for size in sorted(sizes)]
+            if not sizes:
+                continue
+            *compact, whole = sorted(sizes)
+            name = f"{feature}, {storage}"
+            axis.plot(compact, values[:-1], marker="o", color=colour, label=name)
+            axis.plot(whole, values[-1], "o", color=colour, markerfacecolor="none")
+        axis.set(xscale="log", xlabel="map [MB], open: whole map", ylabel=label)
+
+    def mean_inliers(rows: list[Row]) -> float:
+        return total(rows, "inliers") / len(rows)
+
+    return [
+        partial(panel, place="herz-jesus", measure=mean_inliers, label="mean inliers, Herz-Jesus"),
+        partial(
+            panel,
+            place="demo_town-400",
+            measure=lambda rows: percent(rows, "within_finest"),
+            label="within the finest limits, town [%]",
+        ),
+    ]
+
+
+def draw_runs() -> list[Callable]:
+    """Draw the seconds of whole runs, stage by stage."""
+    runs = sorted(read("runs"), key=lambda row: float(row["seconds"]))
+
+    def panel(axis) -> None:
+        left = [0.0] * len(runs)
+        for colour, stage in zip(plots.COLOURS, STAGES, strict=False):
+            seconds = [float(row[f"{stage}_s"]) for row in runs]
+            names = [row["feature"] for row in runs]
+            axis.barh(names, seconds, left=left, color=colour, label=stage)
+            left = [sum(pair) for pair in zip(left, seconds, strict=True)]
+        axis.set(xlabel="seconds, 33 photos on two cores")
+
+    return [panel]
+
+
+FIGURES: dict[str, Callable[[], list[Callable]]] = {
+    "docs/features.svg": draw_features,
+    "docs/rate.svg": draw_bytes,
+    "docs/maps.svg": draw_maps,
+    "docs/runs.svg": draw_runs,
+}

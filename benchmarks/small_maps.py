@@ -1,0 +1,96 @@
+"""Localize the queries of a place in compact maps of several sizes and in the whole map.
+
+The place is in the layout of Aachen. Adds a row for each query list of each map to
+results/maps.csv, leaving out those that have rows unless --again is given. Maps are kept in the
+outputs folder. Seconds are those of matching and pose estimation of a query.
+"""
+
+import os
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks import rows
+from hloc_reduce import Localizer, compact, maps
+from hloc_reduce.datasets import true_poses
+from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.evaluation.poses import FAILED, pose_error
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.files import MEGABYTE
+
+NAME = "maps"
+WHOLE, ALL_POINTS = "whole map", "all points"
+
+
+def measured(localizer: Localizer, place: Aachen, size: int) -> Iterator[dict[str, object]]:
+    """Yield the cells of each query list, localized in a map of `size` bytes."""
+    lists = place.query_lists()
+    names = [name for part in lists.values() for name, _ in part]
+    truth = true_poses(names, place.ground_truth, True)
+    for name, queries in lists.items():
+        errors, inliers, seconds = [], [], []
+        for query, camera in queries:
+            pose, info = localizer.localize(place.images / query, camera)
+            inliers.append(info["num_inliers"])
+            seconds.append(info["seconds"]["matching"] + info["seconds"]["pose"])
+            errors.append(FAILED if pose is None else pose_error(pose, truth[query]))
+        yield {
+            "list": name.split("_")[0],
+            "photos": len(place.map_names()),
+            "points": len(localizer.reference.points),
+            "mb": size / MEGABYTE,
+            **rows.localization(errors, inliers, sum(error != FAILED for error in errors)),
+            **rows.how(float(np.mean(seconds)), cores=1),
+        }
+
+
+def _main() -> None:
+    parser = cli.Parser(__doc__, "--dataset datasets/herz-jesus --feature colmap_sift_sv32")
+    add = parser.add_argument
+    add("--dataset", type=Path, required=True, help="in Aachen's layout")
+    add("--feature", nargs="+", default=["colmap_sift_sv32"], help="features")
+    add("--storage", nargs="+", default=["uint4"], help="of the points' descriptors")
+    add("--matcher", default="", help="of queries and points; default: the feature's")
+    add("--max_mb", type=float, nargs="*", default=[0.03, 0.06], help="sizes besides all points")
+    add("--outputs", type=Path, default=Path("outputs/small_maps"))
+    rows.add_again_option(parser)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    place = Aachen(args.dataset)
+    known = [] if args.again else rows.read(NAME)
+
+    for feature in args.feature:
+        base = {"place": place.root.name, "feature": feature, "matcher": args.matcher}
+        todo = [base | {"storage": "float16", "variant": WHOLE}] if not args.matcher else []
+        limits: dict[str, float | None] = {ALL_POINTS: None}
+        limits |= {f"at most {limit:g} MB": limit for limit in args.max_mb}
+        todo += [
+            base | {"storage": storage, "variant": variant}
+            for storage, variant in product(args.storage, limits)
+        ]
+        todo = [cells for cells in todo if not rows.select(known, **cells)]
+        if not todo:
+            continue
+        folder = args.outputs / place.root.name / feature
+        built = maps.main(folder / "map", place.images, place.reference_model, feature)
+        for cells in todo:
+            if cells["variant"] == WHOLE:
+                path = built.folder
+                files = [built.features, built.descriptors, *built.sfm.glob("*.bin")]
+                size = sum(file.stat().st_size for file in files)
+            else:
+                path = folder / "compact.hlm"
+                limit, matcher = limits[cells["variant"]], args.matcher or None
+                options = {"storage": cells["storage"], "max_mb": limit, "matcher": matcher}
+                compact.main(path, built.folder, **options)
+                size = path.stat().st_size
+            found = measured(Localizer(path), place, size)
+            rows.add(NAME, [cells | each for each in found])
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    cli.run(_main)

@@ -1,0 +1,301 @@
+"""Tables of the documentation, made from the rows of results/."""
+
+from collections.abc import Callable
+
+from benchmarks.rows import Row, read, select
+from hloc_reduce.utils.cli import InputError
+
+Table = list[list[str]]  # the header and the rows
+Choice = tuple[str, str]  # feature, storage
+
+FEATURES: list[Choice] = [
+    ("colmap_sift", "float16"),
+    ("aliked", "float16"),
+    ("colmap_sift_sv64", "float16"),
+    ("xfeat", "float16"),
+    ("edgepoint2_m64", "float16"),
+    ("mini64", "float16"),
+    ("aliked_sv64", "uint4"),
+    ("colmap_sift_sv32", "uint4"),
+    ("xfeat_sv32", "uint4"),
+    ("mini64", "uint2"),
+    ("xfeat_sv32", "uint2"),
+    ("mini32", "uint2"),
+]
+README: list[Choice] = [
+    ("colmap_sift", "float16"),
+    ("colmap_sift_sv64", "float16"),
+    ("xfeat", "uint4"),
+    ("colmap_sift_sv32", "uint4"),
+    ("xfeat_sv32", "uint4"),
+    ("mini64", "uint2"),
+    ("colmap_sift_sv32", "uint2"),
+    ("xfeat_sv32", "uint2"),
+    ("mini32", "uint2"),
+]
+# the features of a family, with 256 bytes of a descriptor to 8
+FAMILIES: dict[str, list[Choice]] = {
+    **{
+        base: [
+            (base, "float16"),
+            *((f"{base}_sv64", storage) for storage in ("float16", "uint8", "uint4")),
+            *((f"{base}_sv32", storage) for storage in ("uint4", "uint2")),
+        ]
+        for base in ("colmap_sift", "sift", "mkd", "aliked")
+    },
+    "xfeat": [
+        *(("xfeat", storage) for storage in ("float16", "uint8", "uint4")),
+        *(("xfeat_sv32", storage) for storage in ("uint4", "uint2")),
+    ],
+    **{
+        base: [
+            *((f"{base}64", storage) for storage in ("float16", "uint8", "uint4", "uint2")),
+            (f"{base}32", "uint2"),
+        ]
+        for base in ("edgepoint2_m", "mini")
+    },
+}
+ALL = "all places"
+SIZES = (256, 128, 64, 32, 16, 8)
+MAPS: list[Choice] = [
+    ("colmap_sift_sv32", "uint4"),
+    ("xfeat_sv32", "uint2"),
+    ("mini32", "uint2"),
+]
+MAP_SIZES = (0.06, 0.03)
+ONE_CORE = "1 core"
+STAGES = ("extraction", "matching", "triangulation", "localization")
+PAPER = ("sift", "mkd", "tfeat")
+PAPER_DIMS = (64, 32, 24, 16)
+SCHEMES = ("sv", "ss", "us", "pca")
+
+
+def counted(rows: list[Row], measure: str) -> list[Row]:
+    """Return the rows to count a measure in: those of each place, or the one of all places."""
+    listed = [row for row in rows if row["place"] != ALL]
+    return listed if all(row[measure] for row in listed) else select(rows, place=ALL)
+
+
+def percent(rows: list[Row], measure: str) -> float:
+    """Return the share of all queries that a measure counts, in percent."""
+    return 100 * total(rows, measure) / total(rows, "queries")
+
+
+def total(rows: list[Row], measure: str) -> float:
+    """Return the sum of a measure."""
+    return sum(float(row[measure]) for row in counted(rows, measure))
+
+
+def inliers(rows: list[Row], place: str, part: str) -> str:
+    """Format the mean inliers of a query list."""
+    return f"{total(select(rows, place=place, list=part), 'inliers'):,.0f}"
+
+
+def chosen(feature: str, storage: str) -> list[Row]:
+    """Return the accuracy of a feature on all places."""
+    rows = select(read("accuracy"), feature=feature, storage=storage, variant="")
+    if not rows:
+        raise InputError(f"results/accuracy.csv has no rows of {feature}, {storage}.")
+    return rows
+
+
+def features_table() -> Table:
+    """Compare features on all places."""
+    table = [["feature", "storage", "bytes", "localized", "within 1 cm [%]", "5 cm [%]"]]
+    table[0] += ["median [cm]", "inliers, day", "night", "town, night"]
+    for feature, storage in FEATURES:
+        rows = chosen(feature, storage)
+        day, town = (
+            select(rows, place=place, list=part)[0]
+            for place, part in (("herz-jesus", "day"), ("demo_town", "night"))
+        )
+        table.append(
+            [
+                *(f"`{feature}`", f"`{storage}`", day["bytes"]),
+                f"{total(rows, 'localized'):.0f} of {total(rows, 'queries'):.0f}",
+                *(f"{percent(rows, f'within_{limit}cm'):.0f}" for limit in (1, 5)),
+                f"{float(day['median_cm']):.2f}" if day["median_cm"] else "",
+                *(inliers(rows, "herz-jesus", part) for part in ("day", "night")),
+                f"{town['localized']} of {town['queries']}",
+            ]
+        )
+    return table
+
+
+def readme_table() -> Table:
+    """Show how few bytes suffice."""
+    table = [["bytes", "`--feature`", "`--storage`", "inliers, day", "inliers, night"]]
+    table[0] += ["within 5 cm", "town at night"]
+    for feature, storage in README:
+        rows = chosen(feature, storage)
+        town = select(rows, place="demo_town", list="night")[0]
+        table.append(
+            [
+                *(rows[0]["bytes"], f"`{feature}`", f"`{storage}`"),
+                *(inliers(rows, "herz-jesus", part) for part in ("day", "night")),
+                f"{total(rows, 'within_5cm'):.0f} of {total(rows, 'queries'):.0f}",
+                f"{town['localized']} of {town['queries']}",
+            ]
+        )
+    return table
+
+
+def bytes_table() -> Table:
+    """Show what a byte of a descriptor buys, for each family of features."""
+    table = [["feature", *(f"{size} bytes" for size in SIZES)]]
+    for family, choices in FAMILIES.items():
+        cells = dict.fromkeys(SIZES, "")
+        for choice in choices:
+            rows = chosen(*choice)
+            localized, recall = total(rows, "localized"), percent(rows, "within_5cm")
+            cells[int(rows[0]["bytes"])] = f"{localized:.0f}, {recall:.0f} %"
+        table.append([f"`{family}`", *cells.values()])
+    return table
+
+
+def schemes_table() -> Table:
+    """Compare the paper's descriptors, schemes and dimensions by their matching AP."""
+    rows = select(read("matching_ap"), list="photo pairs", storage="float16")
+    found = {row["feature"]: f"{float(row['ap']):.1f}" for row in rows}
+    table = [["descriptor", "scheme", "128", *map(str, PAPER_DIMS)]]
+    for base in PAPER:
+        for scheme in SCHEMES:
+            cells = [found[f"{base}_{scheme}{dim}"] for dim in PAPER_DIMS]
+            table.append([f"`{base}`", f"`{scheme}`", found[base], *cells])
+    return table
+
+
+def maps_table() -> Table:
+    """Compare compact maps with the whole map of each feature."""
+    table = [["feature", "map", "KB", "points", "day", "cm", "inliers", "night", "cm", "inliers"]]
+    for feature, storage in MAPS:
+        rows = select(read("maps"), place="herz-jesus", feature=feature)
+        for variant in ("whole map", "all points", *(f"at most {size} MB" for size in MAP_SIZES)):
+            found = select(rows, variant=variant)
+            label = variant
+            if variant != "whole map":
+                found, label = select(found, storage=storage), f"`{storage}`, {variant}"
+            day, night = (select(found, list=part)[0] for part in ("day", "night"))
+            kilobytes = f"{1000 * float(day['mb']):,.0f}"
+            cells = [f"`{feature}`", label, kilobytes, thousands(day["points"])]
+            for row in (day, night):
+                cells.append(f"{row['within_25cm']} of {row['queries']}")
+                cells.append(f"{float(row['median_cm']):.2f} / {float(row['largest_cm']):.1f}")
+                cells.append(thousands(row["inliers"]))
+            table.append(cells)
+    return table
+
+
+def false_accepts_table() -> Table:
+    """Count wrong poses that were accepted, and own photos that were localized."""
+    table = [["feature", "storage", "photos that do not belong", "wrong focal length"]]
+    table[0] += ["own, with intrinsics", "own, without"]
+    rows = read("false_accepts")
+    keys = ("feature", "storage", "variant")
+    for chosen in sorted({tuple(row[key] for key in keys) for row in rows}):
+        trials = {row["list"]: row for row in select(rows, **dict(zip(keys, chosen, strict=True)))}
+        label = f"`{chosen[0]}`" + (f", {chosen[2]}" if chosen[2] else "")
+        cells = [label, f"`{chosen[1]}`"]
+        for kind in ("other places, black, noise, mirrored", "own, focal length 15 % too long"):
+            row = trials.get(kind)
+            cells.append(f"{row['wrong']} of {thousands(row['trials'])}" if row else "")
+        for kind in ("own, with intrinsics", "own, without intrinsics"):
+            row = trials.get(kind)
+            counts = " / ".join(row[key] for key in ("right", "near", "wrong")) if row else ""
+            cells.append(f"{counts} of {row['trials']}" if row else "")
+        table.append(cells)
+    return table
+
+
+def runs_table() -> Table:
+    """Compare whole runs with hloc's, stage by stage."""
+    table = [["seconds", *STAGES, "all", "hloc / this", "features [MB]", "matches [MB]"]]
+    runs = select(read("runs"), place="herz-jesus")
+    [reference] = select(runs, feature="hloc")
+    for row in sorted(runs, key=lambda row: -float(row["seconds"])):
+        cells = [f"{float(row[f'{stage}_s']):.1f}" for stage in STAGES]
+        cells += [f"{float(row['seconds']):.1f}"]
+        cells += [f"{float(reference['seconds']) / float(row['seconds']):.1f}"]
+        cells += [f"{float(row['feature_mb']):.1f}", f"{float(row['match_mb']):.2f}"]
+        table.append([f"`{row['feature']}`", *cells])
+    return table
+
+
+def extraction_table() -> Table:
+    """Show how long features of a photo take on a core of a CPU."""
+    table = [["feature", "keypoints", "CPU [s]"]]
+    for row in select(read("extraction"), variant=ONE_CORE):
+        seconds = f"{float(row['cpu_s']):.2f}"
+        table.append([f"`{row['feature']}`", thousands(row["keypoints"]), seconds])
+    return table
+
+
+def gpu_table() -> Table:
+    """Show how long features of a photo take with a GPU and some cores of a CPU."""
+    rows = [row for row in read("extraction") if "NVIDIA" in row["variant"]]
+    cores = sorted({row["variant"] for row in rows})
+    table = [["feature", *(variant.partition(" and ")[0] for variant in cores)]]
+    for feature in dict.fromkeys(row["feature"] for row in rows):
+        found = select(rows, feature=feature)
+        cells = [select(found, variant=variant)[0]["ms"] for variant in cores]
+        table.append([f"`{feature}`", *(f"{float(cell):.0f}" for cell in cells)])
+    return table
+
+
+def scale_table() -> Table:
+    """Show what all pairs of Aachen Day-Night cost, extrapolated."""
+    rows = select(read("scale"), list="whole", variant="8000 keypoints")
+    rows.sort(key=lambda row: -float(row["feature_mb"]))
+    heads = [f"{row['feature']}, `{row['storage']}`" for row in rows]
+    return [
+        ["", *heads],
+        ["feature file [MB]", *(thousands(row["feature_mb"]) for row in rows)],
+        ["match file [MB]", *(thousands(row["match_mb"]) for row in rows)],
+        ["matching [minutes]", *(f"{float(row['matching_s']) / 60:.0f}" for row in rows)],
+    ]
+
+
+def compact_scale_table() -> Table:
+    """Show what compact maps of parts of Aachen's size cost."""
+    columns = {"build_s": "build [s]", "build_mb": "build [MB]", "mb": "file [MB]"}
+    columns |= {"open_s": "open [s]", "resident_mb": "resident [MB]"}
+    columns |= {f"{stage}_s": f"{stage} [s]" for stage in ("retrieval", "matching", "pose")}
+    table = [["images", "points", *columns.values(), "localized"]]
+    for row in read("compact_scale"):
+        cells = [f"{float(row[key]):,.3g}" for key in columns]
+        counts = thousands(row["photos"]), thousands(row["points"])
+        table.append([*counts, *cells, f"{row['localized']} of {row['queries']}"])
+    return table
+
+
+def matching_table() -> Table:
+    """Show how long a pair of images takes to match, by dimensions and storage."""
+    rows, table = read("matching"), [["numbers", "hloc", "floats", "`uint8`", "`uint4`"]]
+    for dim in (128, 64, 32, 24, 16):
+        chosen = select(rows, feature=f"{dim} numbers")
+        hloc = select(chosen, variant="hloc") or select(chosen, variant="torch")
+        found = [*hloc, *select(chosen, variant="ours, run")]
+        found += [row for size in ("uint8", "uint4") for row in select(chosen, storage=size)]
+        table.append([str(dim), *(f"{float(row['ms']):.0f}" for row in found)])
+    return table
+
+
+def thousands(number: str) -> str:
+    """Format a number with commas."""
+    return f"{float(number):,.0f}"
+
+
+TABLES: dict[str, Callable[[], Table]] = {
+    "features": features_table,
+    "readme": readme_table,
+    "bytes": bytes_table,
+    "schemes": schemes_table,
+    "maps": maps_table,
+    "false_accepts": false_accepts_table,
+    "runs": runs_table,
+    "extraction": extraction_table,
+    "gpu": gpu_table,
+    "scale": scale_table,
+    "compact_scale": compact_scale_table,
+    "matching": matching_table,
+}

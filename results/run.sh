@@ -1,0 +1,51 @@
+#!/bin/sh
+# Measure all rows that are missing, in hours, and render the documentation: `make results`.
+# An interrupted run resumes. With --again, rows that exist are measured again, too.
+set -eu
+python=${PYTHON:-python}
+data=datasets
+scene() { echo "$data/scenes/$1/images:$data/scenes/$1/sparse"; }
+run() { echo "benchmarks.$*"; name=$1; shift; "$python" -m "benchmarks.$name" "$@"; }
+[ "${1:-}" = "" ] || [ "$1" = --again ] || { echo "usage: results/run.sh [--again]" >&2; exit 2; }
+
+# places
+[ -e $data/demo_town/queries/ground_truth_poses.txt ] ||
+    "$python" -c 'from pathlib import Path; from hloc_reduce import demo; demo.main(Path("datasets/demo_town"))'
+for place in fountain-P11 sceaux; do
+    [ -e $data/dark-$place ] || run darken_place --map "$(scene $place)" --output $data/dark-$place
+    [ -e $data/dusk-$place ] || run darken_place --map "$(scene $place)" --output $data/dusk-$place --gain 0.3 0.5
+done
+
+# which feature? how many bytes?
+run accuracy results/accuracy.yaml "$@"
+run matching_ap --map "$(scene fountain-P11)" --map "$(scene sceaux)" --map "$(scene kitchen)" \
+    --map $data/herz-jesus/images_upright:$data/herz-jesus/3D-models/aachen_v_1_1 "$@"
+
+# how small a map?
+run small_maps --dataset $data/herz-jesus --feature colmap_sift_sv32 xfeat_sv32 mini32 --storage uint4 uint2 \
+    --max_mb 0.02 0.03 0.06 0.1 "$@"
+[ -e $data/demo_town-400 ] || "$python" -m pipelines.aachen --demo --demo_photos 400
+run small_maps --dataset $data/demo_town-400 --feature colmap_sift_sv32 --storage uint4 uint2 \
+    --max_mb 0.1 0.25 0.5 1 "$@"
+
+# how often wrong?
+for place in bronze-statue cyprus entry-P10 fountain-P11 fox kitchen liberty-statue monstree sceaux south-building; do
+    run photos_alone --map "$(scene $place)" "$@"
+done
+for place in fox kitchen liberty-statue south-building; do
+    run photos_alone --map "$(scene $place)" --subset 10 --subsets 3 "$@"
+done
+
+# how fast?
+run extraction --dataset $data/herz-jesus "$@" \
+    --feature colmap_sift colmap_sift_sv64 sift_sv64 mini32 mini64 edgepoint2_m32 edgepoint2_m64 xfeat aliked
+run matching "$@"
+run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 64 "$@"
+run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 32 --storage uint4 "$@"
+run compact_scale --data $data/aachen_v1.1 --share 0.1 1 "$@"
+if "$python" -c "import hloc" 2> /dev/null; then
+    run against_hloc --dataset $data/herz-jesus "$@" \
+        --feature sift_sv64 colmap_sift_sv64 colmap_sift colmap_sift_sv16
+fi
+
+run render
