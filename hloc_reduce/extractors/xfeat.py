@@ -50,7 +50,10 @@ class XFeat(NetworkExtractor):
         weights = grid_sample(reliability, self._grid(pixels[None], image), align_corners=False)
         keypoints, scores = strongest_fixed(
             pixel_shuffle(logits.softmax(dim=1)[:, :-1], 8)[0, 0],
-            *(RADIUS, self.conf["detection_threshold"], RADIUS, self.conf["max_keypoints"]),
+            RADIUS,
+            self.conf["detection_threshold"],
+            RADIUS,
+            self.conf["max_keypoints"],
             weights[0, 0],
         )
         descriptors = grid_sample(

@@ -149,7 +149,11 @@ class CompactMap:
         orientations = {int(one) for one in metadata.get("orientations", [])}
         told = intrinsics.MapCameras(
             {str(name): intrinsics.from_list(values) for name, values in known},
-            *(sizes, models, intrinsics.to_range(focal), typical, orientations),
+            sizes,
+            models,
+            intrinsics.to_range(focal),
+            typical,
+            orientations,
         )
         self.cameras = intrinsics.with_lenses(told, self.camera_of.values())
 

@@ -133,8 +133,12 @@ def mutual_nearest(
     if descriptors0.dtype == torch.int16:
         numbers = None if rows is None else rows.numpy()
         arrays = integers.mutual_nearest(
-            *(descriptors0.numpy(), descriptors1.numpy(), ratio_threshold, numbers),
-            *(distance_threshold, mutual),
+            descriptors0.numpy(),
+            descriptors1.numpy(),
+            ratio_threshold,
+            numbers,
+            distance_threshold,
+            mutual,
         )
         return torch.from_numpy(arrays[0]), torch.from_numpy(arrays[1])
     chosen = descriptors0 if rows is None else descriptors0[rows]
@@ -262,7 +266,10 @@ class NearestNeighbor(Matcher):
         if not self.conf["do_mutual_check"]:
             return super().match_rows(descriptors0, descriptors1, rows1)
         matches1, cosine = mutual_nearest(
-            *(descriptors1, descriptors0, self.conf["ratio_threshold"], rows1),
+            descriptors1,
+            descriptors0,
+            self.conf["ratio_threshold"],
+            rows1,
             distance_threshold=self.conf["distance_threshold"],
         )
         matched = matches1 >= 0

@@ -116,6 +116,9 @@ def fetch_weights(name: str, given: Path | str | None = None) -> Path:
         return WEIGHTS / network.file
     otherwise = "or set TORCH_HOME to the folder whose hub/checkpoints has them"
     return downloads.fetch(
-        *(downloads.cache() / network.file, network.urls, network.sha256),
-        *(f"The weights of {name}", otherwise),
+        downloads.cache() / network.file,
+        network.urls,
+        network.sha256,
+        f"The weights of {name}",
+        otherwise,
     )

@@ -67,7 +67,11 @@ def list_images(
         if others:
             logger.warning(
                 "%d photos and videos in %s are ignored, as only %s are read: %s.%s",
-                *(len(others), within, read, some(others), hint),
+                len(others),
+                within,
+                read,
+                some(others),
+                hint,
             )
         return check_names(names, within)
     names = image_names(image_list)

@@ -201,7 +201,8 @@ def _warn(folder: Path, absent: int) -> None:
     logger.warning(
         "%s: images and points disagree on which keypoints show which points. The images are taken "
         "as right; %d keypoints whose points are not there are taken as ones without points.",
-        *(folder, absent),
+        folder,
+        absent,
     )
 
 
