@@ -9,7 +9,6 @@ the extraction, which jobs share.
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 
 import yaml
@@ -20,6 +19,7 @@ from hloc_reduce.evaluation.poses import ERRORS, counted_errors
 from hloc_reduce.runtime.executors import EXECUTORS
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.files import MEGABYTE, replacing
+from hloc_reduce.utils.options import flat
 from pipelines import batch
 from pipelines.batch import jobs
 from pipelines.batch.jobs import Job
@@ -89,7 +89,7 @@ def _main() -> None:
 
 def _options(job: Job) -> dict[str, object]:
     """Return the options of a job that are not the default, as a job file has them."""
-    given = {key: value for key, value in asdict(job).items() if value is not None}
+    given = {key: value for key, value in flat(job).items() if value is not None}
     return {key: str(value) if isinstance(value, Path) else value for key, value in given.items()}
 
 

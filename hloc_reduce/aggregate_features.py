@@ -3,6 +3,7 @@
 import hashlib
 from contextlib import closing
 from pathlib import Path
+from typing import Annotated
 
 import h5py
 import numpy as np
@@ -11,11 +12,12 @@ from . import logger
 from .confs import retrieval as retrieval_confs
 from .runtime import parallel
 from .runtime.group_writer import failures, resume_or_replace
-from .utils import cli, colmap
+from .utils import cli, colmap, options
 from .utils.cli import InputError
 from .utils.feature_files import get_descriptors
 from .utils.files import file_sha256, replacing
 from .utils.h5 import file_provenance, list_h5_names, open_h5
+from .utils.options import Option
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
@@ -125,19 +127,30 @@ def _sample(file: h5py.File, names: list[str], max_samples: int) -> np.ndarray:
     return np.concatenate(samples)
 
 
+@strings_as_paths
+def of_map(
+    features: Path,
+    model: Path,
+    conf: Annotated[dict, Option("aggregation", confs)],
+    export_dir: Path | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Compute global descriptors, with a vocabulary of the images of a map.
+
+    Args:
+        features: feature file.
+        model: COLMAP model of the map images.
+        conf: how local features are aggregated.
+        export_dir: folder for the output; default: that of the features.
+        overwrite: compute all descriptors again.
+    """
+    images = [image.name for image in colmap.read_model(model).images.values()]
+    return main(conf, features, images, export_dir, overwrite)
+
+
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__, "--features outputs/feats-dog-colmap_sift_sv64.h5 --model outputs/sfm"
-    )
-    parser.add_argument("--features", type=Path, required=True, help="feature file")
-    parser.add_argument("--model", type=Path, required=True, help="COLMAP model of the map images")
-    parser.add_argument("--conf", default="vlad", help=f"one of {', '.join(confs)}")
-    parser.add_argument("--export_dir", type=Path, help="folder for the output")
-    parser.add_argument("--overwrite", action="store_true", help="compute all descriptors again")
-    args = parser.parse_args()
-    images = [image.name for image in colmap.read_model(args.model).images.values()]
-    conf = confs[cli.choose("aggregation", args.conf, confs)]
-    main(conf, args.features, images, args.export_dir, args.overwrite)
+    example = "--features outputs/feats-dog-colmap_sift_sv64.h5 --model outputs/sfm"
+    options.call(of_map, __doc__, example, conf="vlad")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from . import __version__, logger, projections
 from .confs import features as features_confs
-from .utils import cli
+from .utils import cli, options
 from .utils.cli import InputError
 from .utils.files import replacing
 from .utils.paths import strings_as_paths
@@ -59,10 +59,11 @@ def main(
     """Write an ONNX file and check that ONNX Runtime computes the same with it as torch.
 
     Args:
-        feature: a key of `confs.features.confs`, or a YAML file of a feature.
+        feature: feature, see pipelines.aachen --list_features, or its YAML file.
         output: the ONNX file.
-        projection: file of another projection of the same base.
-        projection_only: write the projection alone, which every feature that has one can do.
+        projection: file of another projection of the feature's descriptors.
+        projection_only: write the projection alone, from descriptors to fewer dimensions, which
+            every feature that has one can do.
 
     Returns:
         `output`.
@@ -88,7 +89,11 @@ def main(
     logger.info(
         "Wrote %s (%.1f MB). ONNX Runtime and torch agree on %d descriptors of %d numbers: at most "
         "%.0e apart.",
-        *(output, output.stat().st_size / 1e6, number, dim, difference),
+        output,
+        output.stat().st_size / 1e6,
+        number,
+        dim,
+        difference,
     )
     return output
 
@@ -261,22 +266,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--feature edgepoint2_m32 --output edgepoint2_m32.onnx")
-    parser.add_argument(
-        "--feature",
-        required=True,
-        help="feature, see pipelines.aachen --list_features, or its YAML file",
-    )
-    parser.add_argument("--output", type=Path, required=True, help="ONNX file")
-    parser.add_argument(
-        "--projection", type=Path, help="file of another projection of the feature's descriptors"
-    )
-    parser.add_argument(
-        "--projection_only",
-        action="store_true",
-        help="write the projection alone, from descriptors to fewer dimensions",
-    )
-    main(**vars(parser.parse_args()))
+    options.call(main, __doc__, "--feature edgepoint2_m32 --output edgepoint2_m32.onnx")
 
 
 if __name__ == "__main__":

@@ -5,23 +5,25 @@ from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from . import logger, projections
 from .confs import features as features_confs
 from .descriptors import DESCRIPTORS, check_weights
+from .detectors.dog import KEYPOINTS, KeypointSettings
 from .networks import NETWORKS, NOISE_REDUCTION, fetch_weights
 from .runtime import parallel, processes
 from .runtime.executors import SERIAL, Executor, Results
 from .runtime.group_writer import FAILURE, Arrays, Group, GroupWriter, failures, fill
 from .runtime.trace import span
-from .utils import cli
+from .utils import cli, options
 from .utils.cli import InputError
-from .utils.codes import FLOATS, STORAGES, store
+from .utils.codes import FLOATS, STORAGES, Storage, store
 from .utils.files import file_sha256
 from .utils.images import UnreadableImage, check_readable, list_images, with_reasons
+from .utils.options import HIDDEN
 from .utils.parsers import image_names
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
@@ -45,16 +47,17 @@ def main(
     overwrite: bool = False,
     executor: Executor = SERIAL,
     strict: bool = True,
-    queries: Collection[str] = (),
+    queries: Annotated[Collection[str], HIDDEN] = (),
 ) -> Path:
     """Extract the features of all images of a folder, or of a list of them.
 
     Args:
         conf: an entry of `confs`.
-        image_dir: the folder that image names are relative to.
-        export_dir: folder of the feature file, `<conf["output"]>.h5`.
+        image_dir: folder of images, which image names are relative to.
+        export_dir: folder for the feature file, `<conf["output"]>.h5`.
         as_half: store everything but keypoints as float16, unless `conf` has a `storage`.
-        image_list: names, or a text file of them; default: every image of the folder.
+        image_list: text file of names, one per line (in Python, also the names); default: every
+            image of the folder.
         feature_path: the feature file itself, instead of `export_dir`.
         overwrite: extract all features again.
         executor: runs the extraction.
@@ -338,24 +341,28 @@ def without(left_out: list[str], names: list[str], accept_partial: bool, reason:
     return [name for name in names if name not in dropped]
 
 
+def _conf(
+    conf: str = features_confs.RECOMMENDED,
+    storage: Storage = STORAGES[0],
+    keypoints: KeypointSettings = KEYPOINTS[0],
+) -> dict:
+    """Return the configuration of a feature.
+
+    Args:
+        conf: feature, see pipelines.aachen --list_features, or its YAML file.
+        storage: storage of descriptors.
+        keypoints: settings of the DoG detector.
+    """
+    return features_confs.get(conf, storage=storage, keypoints=keypoints)[1]
+
+
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--conf colmap_sift_sv64 --image_dir photos --export_dir outputs")
-    parser.add_argument("--image_dir", type=Path, required=True, help="folder of images")
-    parser.add_argument("--export_dir", type=Path, help="folder for the feature file")
-    parser.add_argument("--feature_path", type=Path, help="feature file, instead of --export_dir")
-    parser.add_argument(
-        "--conf",
-        default=features_confs.RECOMMENDED,
-        help="feature, see pipelines.aachen --list_features, or its YAML file",
-    )
-    parser.add_argument("--image_list", type=Path, help="text file of names, one per line")
-    features_confs.add_storage_option(parser)
-    features_confs.add_keypoints_option(parser)
-    parser.add_argument("--overwrite", action="store_true", help="extract all features again")
-    args = vars(parser.parse_args())
-    settings = {name: args.pop(name) for name in ("storage", "keypoints")}
-    _, args["conf"] = features_confs.get(args["conf"], **settings)
-    main(**args)
+    example = "--conf colmap_sift_sv64 --image_dir photos --export_dir outputs"
+    parser = options.Parser(__doc__, example)
+    parser.add(main)
+    parser.add(_conf)
+    given = parser.read()
+    main(conf=_conf(**options.taken(_conf, given)), **options.taken(main, given))
 
 
 if __name__ == "__main__":

@@ -14,12 +14,12 @@ import pycolmap
 from . import logger
 from .confs import features as features_confs
 from .descriptors import COLMAP
-from .descriptors.normalization import NORMALIZATIONS
+from .descriptors.normalization import NORMALIZATIONS, Normalization
 from .detectors.dog import NOISE
-from .reduce import Described, Reduction, add_options, sampled, told_by
-from .utils import cli, colmap
+from .reduce import Described, Reduction, sampled, told_by
+from .utils import cli, colmap, options
 from .utils.cli import InputError
-from .utils.codes import STORAGES
+from .utils.codes import STORAGES, Storage
 from .utils.colmap import SIFT, StoredDatabase
 from .utils.files import file_sha256
 from .utils.parsers import check_names
@@ -37,22 +37,22 @@ def main(
     feature: str = features_confs.RECOMMENDED,
     model: Path | pycolmap.Reconstruction | None = None,
     projection: Path | None = None,
-    storage: str = STORAGES[0],
-    normalization: str | None = None,
+    storage: Storage = STORAGES[0],
+    normalization: Normalization | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write a feature file of the images of a COLMAP database.
 
     Args:
-        database: of any version of COLMAP; it is only read.
-        output: the feature file. Images that it has already are skipped.
-        feature: key of `confs.features` of the base colmap_sift, or a YAML file.
+        database: COLMAP database of any version; it is only read.
+        output: the new feature file. Images that it has already are skipped.
+        feature: colmap_sift or a projection of it, see pipelines.aachen --list_features, or a YAML
+            file.
         model: COLMAP model made from the database: only its images are written, and their keypoints
-            are compared; None for all images that have descriptors.
-        projection: file of another projection of the same base.
-        storage: of the descriptors, one of `STORAGES`.
-        normalization: of COLMAP's SIFT descriptors, one of `NORMALIZATIONS`; default: told by
-            their numbers.
+            are compared; default: all images that have descriptors.
+        projection: file of another projection of its base.
+        storage: storage of descriptors.
+        normalization: normalization of SIFT descriptors; default: detected.
         overwrite: write all images again.
 
     Returns:
@@ -219,23 +219,8 @@ def _read(database: StoredDatabase, reduction: Reduction, names: list[str]) -> I
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__, "--database database.db --model sparse/0 --output outputs/feats-colmap.h5"
-    )
-    parser.add_argument("--database", type=Path, required=True, help="COLMAP database")
-    parser.add_argument("--output", type=Path, required=True, help="the new feature file")
-    parser.add_argument(
-        "--feature",
-        default=features_confs.RECOMMENDED,
-        help=f"{COLMAP} or a projection of it, see pipelines.aachen --list_features",
-    )
-    parser.add_argument(
-        "--model",
-        type=Path,
-        help="COLMAP model made from the database: only its images are written (default: all)",
-    )
-    add_options(parser)
-    main(**vars(parser.parse_args()))
+    example = "--database database.db --model sparse/0 --output outputs/feats-colmap.h5"
+    options.call(main, __doc__, example)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from collections.abc import Generator, Iterable, Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pycolmap
@@ -20,10 +21,11 @@ from .localization.references import ScanMap, point_group
 from .runtime import provenance
 from .runtime.executors import SERIAL, Executor
 from .runtime.group_writer import Group, GroupWriter, failures, fill
-from .utils import cli, colmap
+from .utils import cli, colmap, options
 from .utils.cli import InputError
 from .utils.feature_files import get_image_size, get_keypoints
 from .utils.h5 import open_file, open_h5
+from .utils.options import HIDDEN
 from .utils.parsers import parse_retrieval
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
@@ -43,7 +45,7 @@ def main(
     ransac_thresh: float = RANSAC_THRESH,
     overwrite: bool = False,
     executor: Executor = SERIAL,
-    points: Path | None = None,
+    points: Annotated[Path, HIDDEN] | None = None,
     gate: Gate = DEFAULT_GATE,
     mirror_images: MirrorImages | None = None,
 ) -> dict[str, dict]:
@@ -54,14 +56,14 @@ def main(
     kept.
 
     Args:
-        dataset_dir: the folder that image names are relative to.
-        retrieval: pairs of queries and cutouts, best first.
+        dataset_dir: folder of the data set, which image names are relative to.
+        retrieval: text file of pairs of queries and cutouts, best first.
         features: feature file of queries and cutouts.
         matches: match file of the pairs.
         results: text file of poses, camera from world, one line for every query that has one.
         skip_matches: leave out cutouts with fewer matches.
-        queries: names and intrinsics, or a query list, or a glob of several; default: all queries
-            of the pairs, with the intrinsics of `by_iphone7`.
+        queries: query list with intrinsics, or a glob of several (in Python, also names and
+            intrinsics); default: the queries of `retrieval`, with those of an iPhone 7.
         ransac_thresh: RANSAC inlier threshold in pixels of a photo of 4032 pixels, of others
             in proportion.
         overwrite: localize all queries again.
@@ -100,7 +102,11 @@ def main(
     }
     return stage.main(
         partial(_load, points, features, poses),
-        *(queries, retrieved, features, matches, results),
+        queries,
+        retrieved,
+        features,
+        matches,
+        results,
         partial(_config, ransac_thresh),
         provenance.of_inputs(options, [p for p in (retrieval, features, matches) if p.exists()]),
         overwrite,
@@ -183,23 +189,12 @@ def _lift(
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__,
+    example = (
         "--dataset_dir datasets/inloc --retrieval pairs-query-netvlad40.txt "
         "--features outputs/feats-dog-colmap_sift_sv64.h5 --matches outputs/matches.h5 "
-        "--results outputs/poses.txt",
+        "--results outputs/poses.txt"
     )
-    parser.add_argument("--dataset_dir", type=Path, required=True, help="folder of the data set")
-    parser.add_argument(
-        "--queries",
-        type=Path,
-        help="query list with intrinsics, or a glob (default: the queries of --retrieval, with "
-        "those of an iPhone 7)",
-    )
-    parser.add_argument("--skip_matches", type=int, help="ignore cutouts with fewer matches")
-    pixels = "pixels for a photo of 4032 pixels, scaled for other sizes"
-    stage.add_options(parser, RANSAC_THRESH, pixels)
-    stage.run(parser, main)
+    options.call(main, __doc__, example)
 
 
 if __name__ == "__main__":

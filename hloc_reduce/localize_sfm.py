@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Annotated
 
 import pycolmap
 
@@ -14,7 +15,8 @@ from .localization.query import merged, ransac_options
 from .localization.references import SfmMap
 from .runtime import provenance
 from .runtime.executors import SERIAL, Executor
-from .utils import cli, colmap
+from .utils import cli, colmap, options
+from .utils.options import HIDDEN
 from .utils.parsers import parse_retrieval
 from .utils.paths import strings_as_paths
 
@@ -35,7 +37,7 @@ def main(
     config: dict | None = None,
     overwrite: bool = False,
     refinements: Mapping[str, dict] | None = None,
-    full_names: bool = False,
+    full_names: Annotated[bool, HIDDEN] = False,
     executor: Executor = SERIAL,
     gate: Gate = DEFAULT_GATE,
     mirror_images: MirrorImages | None = None,
@@ -45,18 +47,18 @@ def main(
     Takes the arguments of hloc's `localize_sfm.main`.
 
     Args:
-        reference_sfm: the map, made from the same features.
-        queries: query list with intrinsics, or a glob of several; or names and intrinsics, None
-            if these are not known.
-        retrieval: pairs of queries and map images, best first.
+        reference_sfm: folder of the map, made from the same features; in Python, also the map.
+        queries: query list with intrinsics, or a glob of several; in Python, also names and
+            intrinsics, None if these are not known.
+        retrieval: text file of pairs of queries and map images, best first.
         features: feature file of the queries.
         matches: match file of the pairs.
         results: text file of poses, one line for every query.
         ransac_thresh: RANSAC inlier threshold in pixels; larger in proportion in photos whose
-            longer side exceeds 1,600 pixels. A threshold in `config` is taken as it is.
+            longer side exceeds 1,600 pixels. A threshold in the config is taken as it is.
         covisibility_clustering: localize in each cluster of retrieved images that see common points
             separately, and keep the pose with the highest confidence.
-        prepend_camera_name: write `folder/basename` instead of `basename`.
+        prepend_camera_name: write folder/basename of each query instead of its basename.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement".
         overwrite: localize all queries again.
         refinements: more options, as in `config`, for queries with inexact intrinsics.
@@ -98,7 +100,12 @@ def main(
         options["covisibility_clustering"] = True
     try:
         return stage.main(
-            *(load, listed, retrieved, features, matches, results),
+            load,
+            listed,
+            retrieved,
+            features,
+            matches,
+            results,
             partial(_config, ransac_thresh, config, refinements or {}),
             provenance.of_inputs(options, [path for path in inputs if path.exists()]),
             overwrite,
@@ -128,27 +135,12 @@ def _config(
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__,
+    example = (
         "--reference_sfm outputs/sfm --queries queries.txt --retrieval pairs.txt "
         "--matches outputs/matches.h5 --features outputs/feats-dog-colmap_sift_sv64.h5 "
-        "--results outputs/poses.txt",
+        "--results outputs/poses.txt"
     )
-    parser.add_argument("--reference_sfm", type=Path, required=True, help="folder of the map")
-    parser.add_argument(
-        "--queries", type=Path, required=True, help="query list with intrinsics, or a glob"
-    )
-    parser.add_argument(
-        "--covisibility_clustering",
-        action="store_true",
-        help="localize separately in each cluster of covisible images",
-    )
-    parser.add_argument(
-        "--prepend_camera_name", action="store_true", help="write folder/basename of each query"
-    )
-    pixels = "pixels for photos of up to 1600 pixels, scaled for larger ones"
-    stage.add_options(parser, RANSAC_THRESH, pixels)
-    stage.run(parser, main)
+    options.call(main, __doc__, example)
 
 
 if __name__ == "__main__":

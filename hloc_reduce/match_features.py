@@ -6,7 +6,7 @@ from contextlib import closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import h5py
 import numpy as np
@@ -17,12 +17,13 @@ from .confs import matchers as matchers_confs
 from .runtime import parallel
 from .runtime.executors import SERIAL, Executor, Results
 from .runtime.group_writer import Arrays, Group, GroupWriter, fill
-from .utils import cli
+from .utils import cli, options
 from .utils.cli import InputError
 from .utils.codes import to_integers
 from .utils.feature_files import Levels, StoredDescriptors, coded_by, read_descriptors
 from .utils.h5 import file_provenance, open_h5
 from .utils.match_files import check_distinct, names_to_pair
+from .utils.options import HIDDEN, Option
 from .utils.parsers import parse_pairs
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
@@ -41,12 +42,12 @@ DescribedPair = tuple[str, Described, Described]  # name of its group, descripto
 
 @strings_as_paths
 def main(
-    conf: dict,
+    conf: Annotated[dict, Option("matcher", confs)],
     pairs: Path,
     features: Path | str,
     export_dir: Path | None = None,
     matches: Path | None = None,
-    features_ref: Path | None = None,
+    features_ref: Annotated[Path, HIDDEN] | None = None,
     overwrite: bool = False,
     gpu_bytes: int | None = None,
     executor: Executor = SERIAL,
@@ -56,14 +57,15 @@ def main(
     With `features_ref`, whose images may have the same names, match each ordered pair once.
 
     Args:
-        conf: an entry of `confs`.
-        pairs: text file of pairs.
-        features: feature file, or its name in `export_dir` without suffix.
+        conf: matcher; in Python an entry of confs.matchers.
+        pairs: text file of image pairs.
+        features: name of the features in `export_dir`, without .h5, or the feature file.
         export_dir: folder of the features and of `<features>_<conf["output"]>_<pairs>.h5`.
         matches: the match file itself; needed if `features` is a path.
         features_ref: feature file of the second images; default: `features`.
         overwrite: match all pairs again.
-        gpu_bytes: GPU memory that a matcher may use at once; default: 1 GiB.
+        gpu_bytes: GPU memory in bytes that a matcher may use at once, ignored without a GPU;
+            default: 1 GiB.
         executor: runs the matching.
 
     Returns:
@@ -267,28 +269,9 @@ def _nbytes(descriptors: Described) -> int:
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__, "--pairs pairs.txt --features feats-dog-colmap_sift_sv64 --export_dir outputs"
-    )
-    parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
-    parser.add_argument(
-        "--features",
-        default=features_confs.confs[features_confs.RECOMMENDED]["output"],
-        help="name of the features, without .h5",
-    )
-    parser.add_argument("--export_dir", type=Path, required=True, help="folder of the features")
-    parser.add_argument("--matches", type=Path, help="the match file itself")
-    parser.add_argument("--conf", default="NN-ratio", help=f"one of {', '.join(confs)}")
-    parser.add_argument("--overwrite", action="store_true", help="match all pairs again")
-    parser.add_argument(
-        "--gpu_bytes",
-        type=int,
-        help="GPU memory in bytes that a matcher may use at once (default: 1 GiB); ignored without "
-        "a GPU",
-    )
-    args = parser.parse_args()
-    args.conf = confs[cli.choose("matcher", args.conf, confs)]
-    main(**vars(args))
+    example = "--pairs pairs.txt --features feats-dog-colmap_sift_sv64 --export_dir outputs"
+    features = features_confs.confs[features_confs.RECOMMENDED]["output"]
+    options.call(main, __doc__, example, conf="NN-ratio", features=features)
 
 
 if __name__ == "__main__":

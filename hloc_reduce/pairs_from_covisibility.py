@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 
 from . import logger
-from .utils import cli, colmap
+from .utils import cli, colmap, options
 from .utils.parsers import write_pairs
 from .utils.paths import strings_as_paths
 
@@ -85,13 +85,8 @@ def most_covisible(point3D_ids: Iterable[np.ndarray], number: int) -> Iterator[n
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--model 3D-models/aachen_v_1_1 --output pairs.txt")
-    parser.add_argument("--model", type=Path, required=True, help="COLMAP model folder")
-    parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
-    parser.add_argument(
-        "--num_matched", type=int, default=20, help="maximum number of pairs per image"
-    )
-    main(**vars(parser.parse_args()))
+    example = "--model 3D-models/aachen_v_1_1 --output pairs.txt"
+    options.call(main, __doc__, example, num_matched=20)
 
 
 if __name__ == "__main__":

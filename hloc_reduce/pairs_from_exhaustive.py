@@ -5,7 +5,7 @@ from itertools import combinations, product
 from pathlib import Path
 
 from . import logger
-from .utils import cli
+from .utils import cli, options
 from .utils.cli import InputError
 from .utils.h5 import list_h5_names
 from .utils.parsers import check_names, image_names, write_pairs
@@ -26,9 +26,10 @@ def main(
 
     Args:
         output: text file of pairs.
-        image_list: names of the images, or a text file of them.
+        image_list: text file of the images' names; in Python, also the names.
         features: feature file of the images, instead of `image_list`.
-        ref_list: names of the reference images, or a text file of them; default: the images.
+        ref_list: text file of the reference images' names (in Python, also the names); default:
+            pair the images with each other.
         ref_features: feature file of the reference images, instead of `ref_list`.
 
     Returns:
@@ -67,21 +68,9 @@ def _names(images: Path | str | Iterable[str] | None, features: Path | None) -> 
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__, "--output pairs.txt --features outputs/feats-dog-colmap_sift_sv64.h5"
-    )
-    parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
-    images = parser.add_mutually_exclusive_group(required=True)
-    images.add_argument("--image_list", type=Path, help="text file of the images' names")
-    images.add_argument("--features", type=Path, help="feature file of the images")
-    references = parser.add_mutually_exclusive_group()
-    references.add_argument(
-        "--ref_list",
-        type=Path,
-        help="text file of the reference images' names (default: pair the images with each other)",
-    )
-    references.add_argument("--ref_features", type=Path, help="feature file of reference images")
-    main(**vars(parser.parse_args()))
+    example = "--output pairs.txt --features outputs/feats-dog-colmap_sift_sv64.h5"
+    exclusive = ("image_list", "features"), ("ref_list", "ref_features")
+    options.call(main, __doc__, example, exclusive=exclusive)
 
 
 if __name__ == "__main__":

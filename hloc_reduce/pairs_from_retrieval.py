@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from . import logger
-from .utils import cli, colmap
+from .utils import cli, colmap, options
 from .utils.cli import InputError
 from .utils.h5 import get_array, list_h5_names, open_h5
 from .utils.parsers import check_names, image_names, parse_retrieval, write_pairs
@@ -34,15 +34,15 @@ def main(
     """Write the `num_matched` most similar database images of every query, best first.
 
     Args:
-        descriptors: h5 file with a `global_descriptor` (G,) of every image.
+        descriptors: h5 file with a global_descriptor (G,) of every image.
         output: text file of pairs.
         num_matched: maximum number of pairs per query.
-        query_prefix: the queries are the names with this prefix, or one of these.
-        query_list: names of the queries, or a text file of them; default: all names.
+        query_prefix: the queries are the names with this prefix, or one of several.
+        query_list: text file of the queries' names (in Python, also the names); default: all.
         db_prefix: as `query_prefix`, for the database.
         db_list: as `query_list`, for the database.
         db_model: COLMAP model whose images are the database.
-        db_descriptors: h5 file of the database; default: `descriptors`.
+        db_descriptors: h5 file of global descriptors of the database; default: `descriptors`.
 
     Returns:
         `output`.
@@ -204,21 +204,8 @@ def read_global(path: Path, names: list[str]) -> np.ndarray:
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__, "--descriptors global.h5 --output pairs.txt --query_prefix query/ --db_prefix db/"
-    )
-    parser.add_argument("--descriptors", type=Path, required=True, help="global descriptors")
-    parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
-    parser.add_argument(
-        "--num_matched", type=int, default=50, help="maximum number of pairs per query"
-    )
-    parser.add_argument("--query_prefix", nargs="+", help="prefixes of the queries' names")
-    parser.add_argument("--query_list", type=Path, help="text file of the queries' names")
-    parser.add_argument("--db_prefix", nargs="+", help="prefixes of the database's names")
-    parser.add_argument("--db_list", type=Path, help="text file of the database's names")
-    parser.add_argument("--db_model", type=Path, help="COLMAP model of the database")
-    parser.add_argument("--db_descriptors", type=Path, help="global descriptors of the database")
-    main(**vars(parser.parse_args()))
+    example = "--descriptors global.h5 --output pairs.txt --query_prefix query/ --db_prefix db/"
+    options.call(main, __doc__, example, num_matched=50)
 
 
 if __name__ == "__main__":

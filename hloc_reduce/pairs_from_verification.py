@@ -15,7 +15,7 @@ from .mapping.overlays import drop_overlays
 from .pairs_from_retrieval import rank, read_global, similarity
 from .runtime import provenance
 from .triangulation import Pair, Verified, read_matches
-from .utils import cli, colmap
+from .utils import cli, colmap, options
 from .utils.cli import InputError
 from .utils.h5 import file_provenance, list_h5_names, open_h5
 from .utils.images import list_images
@@ -37,7 +37,7 @@ def main(
     descriptors: Path,
     num_matched: int,
     num_covis: int = 0,
-    camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
+    camera_mode: colmap.CameraMode = pycolmap.CameraMode.AUTO,
     image_list: Path | str | Iterable[str] | None = None,
 ) -> Path:
     """Write a list of pairs, and more pairs of poorly connected images.
@@ -51,15 +51,16 @@ def main(
     Args:
         output: text file of pairs: those of `pairs`, then the new ones.
         image_dir: folder of the images.
-        pairs: text file of pairs.
+        pairs: text file of matched pairs.
         features: feature file.
         matches: match file, with all of `pairs`.
         descriptors: h5 file of global descriptors.
         num_matched: maximum number of new pairs of a poorly connected image with similar images,
             and again with neighbours of its neighbours.
         num_covis: maximum number of new pairs of any other image with neighbours of its neighbours.
-        camera_mode: which images share a camera.
-        image_list: the images, names or a text file of them; default: those of `features`.
+        camera_mode: which photos share a camera.
+        image_list: text file of names, one per line (in Python, also the names); default: the
+            images of `features`.
 
     Returns:
         `output`.
@@ -122,7 +123,10 @@ def more_pairs(
     logger.info(
         "%d components of verified pairs, the largest of %d of %d images; %d images have fewer "
         "than %d verified pairs.",
-        *(len(sizes), sizes.max(), len(names), sum(degrees[i] < MIN_PAIRS for i in weak)),
+        len(sizes),
+        sizes.max(),
+        len(names),
+        sum(degrees[i] < MIN_PAIRS for i in weak),
         MIN_PAIRS,
     )
     limits = dict.fromkeys(names, num_covis) | {names[i]: num_matched for i in weak}
@@ -206,30 +210,11 @@ def _verify(
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__,
+    example = (
         "--output more.txt --image_dir photos --pairs pairs.txt --features features.h5 "
-        "--matches matches.h5 --descriptors global.h5",
+        "--matches matches.h5 --descriptors global.h5"
     )
-    parser.add_argument("--output", type=Path, required=True, help="text file of pairs")
-    parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
-    parser.add_argument("--pairs", type=Path, required=True, help="text file of matched pairs")
-    parser.add_argument("--features", type=Path, required=True, help="feature file")
-    parser.add_argument("--matches", type=Path, required=True, help="match file")
-    parser.add_argument("--descriptors", type=Path, required=True, help="global descriptors")
-    parser.add_argument(
-        "--num_matched", type=int, default=20, help="maximum number of new pairs per image"
-    )
-    parser.add_argument(
-        "--num_covis",
-        type=int,
-        default=0,
-        help="maximum number of new pairs per well connected image",
-    )
-    colmap.add_camera_mode(parser)
-    parser.add_argument("--image_list", type=Path, help="text file of names, one per line")
-    args = parser.parse_args()
-    main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})
+    options.call(main, __doc__, example, num_matched=20)
 
 
 if __name__ == "__main__":

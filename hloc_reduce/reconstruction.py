@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Annotated
 
 import pycolmap
 
@@ -10,11 +11,12 @@ from .mapping import registration
 from .mapping.mapper import RULES, Mapper, attempts_for
 from .mapping.overlays import drop_overlays
 from .runtime import provenance
-from .triangulation import MADE_FROM, add_options, read_matches, replacing_map
-from .utils import cli, colmap
+from .triangulation import MADE_FROM, read_matches, replacing_map
+from .utils import cli, colmap, options
 from .utils.cli import InputError
 from .utils.h5 import list_h5_names
 from .utils.images import list_images
+from .utils.options import HIDDEN
 from .utils.paths import strings_as_paths
 
 # COLMAP would drop parts of fewer than 10 images
@@ -28,7 +30,7 @@ def main(
     pairs: Path,
     features: Path,
     matches: Path,
-    camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
+    camera_mode: colmap.CameraMode = pycolmap.CameraMode.AUTO,
     verbose: bool = False,
     skip_geometric_verification: bool = False,
     min_match_score: float | None = None,
@@ -37,7 +39,7 @@ def main(
     mapper_options: dict | None = None,
     overwrite: bool = False,
     accept_partial: bool = False,
-    once: bool = False,
+    once: Annotated[bool, HIDDEN] = False,
     checked: bool = True,
 ) -> pycolmap.Reconstruction:
     """Reconstruct poses, intrinsics and points with COLMAP's incremental mapper.
@@ -59,18 +61,20 @@ def main(
     Args:
         sfm_dir: folder of the new COLMAP model; a model made from the same inputs is read instead.
         image_dir: folder of the images, whose EXIF data give the initial intrinsics.
-        pairs: text file of pairs.
+        pairs: text file of image pairs.
         features: feature file.
         matches: match file.
-        camera_mode: which images share a camera.
+        camera_mode: which photos share a camera.
         verbose: show COLMAP's log.
-        skip_geometric_verification: use all matches, without two-view geometry.
+        skip_geometric_verification: use all matches, unverified.
         min_match_score: use only matches with a higher score.
-        image_list: the images, names or a text file of them; default: those of `features`.
+        image_list: text file of names, one per line (in Python, also the names); default: the
+            images of `features`.
         image_options: of pycolmap's ImageReaderOptions.
         mapper_options: of pycolmap's IncrementalPipelineOptions; if given, there is one attempt.
-        overwrite: reconstruct again.
-        accept_partial: also return a model that `registration.check` refuses.
+        overwrite: replace an existing model.
+        accept_partial: accept a map that has fewer than half of the photos, or may be wrong, see
+            registration.check.
         once: make one attempt only.
         checked: report missing images, see `registration.check`.
 
@@ -111,7 +115,12 @@ def main(
             keypoints, _, found = read_matches(names, pairs, features, matches, min_match_score)
             found = drop_overlays(keypoints, found)
             Mapper(
-                *(building, image_dir, names, image_options or {}, keypoints, found),
+                building,
+                image_dir,
+                names,
+                image_options or {},
+                keypoints,
+                found,
                 unverified=None if skip_geometric_verification else pairs,
                 attempts=[{**options, **changed} for changed in attempts],
                 once=once,
@@ -125,21 +134,11 @@ def main(
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__,
+    example = (
         "--sfm_dir outputs/sfm --image_dir photos --pairs pairs.txt "
-        "--features outputs/feats-dog-colmap_sift_sv64.h5 --matches outputs/matches.h5",
+        "--features outputs/feats-dog-colmap_sift_sv64.h5 --matches outputs/matches.h5"
     )
-    add_options(parser)
-    colmap.add_camera_mode(parser)
-    parser.add_argument(
-        "--accept_partial",
-        action="store_true",
-        help="accept a map that has fewer than half of the photos, or may be wrong",
-    )
-    parser.add_argument("--image_list", type=Path, help="text file of names, one per line")
-    args = parser.parse_args()
-    main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})
+    options.call(main, __doc__, example)
 
 
 if __name__ == "__main__":

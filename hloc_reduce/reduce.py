@@ -17,12 +17,12 @@ import numpy as np
 from . import logger, projections
 from .confs import features as features_confs
 from .descriptors import COLMAP
-from .descriptors.normalization import NORMALIZATIONS, detect, to_colmap_sift
+from .descriptors.normalization import NORMALIZATIONS, Normalization, detect, to_colmap_sift
 from .runtime import parallel
 from .runtime.group_writer import Group, GroupWriter
-from .utils import cli
+from .utils import cli, options
 from .utils.cli import InputError
-from .utils.codes import STORAGES, store
+from .utils.codes import STORAGES, Storage, store
 from .utils.feature_files import get_descriptors, read_others
 from .utils.h5 import file_provenance, list_h5_names, open_h5
 from .utils.paths import strings_as_paths
@@ -41,8 +41,8 @@ def main(
     output: Path,
     feature: str,
     projection: Path | None = None,
-    storage: str = STORAGES[0],
-    normalization: str | None = None,
+    storage: Storage = STORAGES[0],
+    normalization: Normalization | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write a feature file with projected descriptors; other data sets are copied.
@@ -50,12 +50,12 @@ def main(
     Args:
         features: feature file, with descriptors (B, N) of the base of `feature`.
         output: the new feature file. Images that it has already are skipped.
-        feature: key of `confs.features`, such as colmap_sift_sv32, or a YAML file.
-        projection: file of another projection of the same base.
-        storage: of the new descriptors, one of `STORAGES`.
-        normalization: of COLMAP's SIFT descriptors, one of `NORMALIZATIONS`; default: told by
-            their numbers.
-        overwrite: reduce all images again.
+        feature: target feature: colmap_sift_sv32 for SIFT of hloc or COLMAP, aliked_sv32 for hloc's
+            aliked-n16, and others of pipelines.aachen --list_features, or a YAML file.
+        projection: file of another projection of its base.
+        storage: storage of descriptors.
+        normalization: normalization of SIFT descriptors; default: detected.
+        overwrite: write all images again.
 
     Returns:
         `output`.
@@ -219,32 +219,8 @@ def _read(file: h5py.File, reduction: Reduction, names: list[str]) -> Iterator[D
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__,
-        "--features feats-sift.h5 --feature colmap_sift_sv32 --storage uint4 --output small.h5",
-    )
-    parser.add_argument("--features", type=Path, required=True, help="feature file")
-    parser.add_argument("--output", type=Path, required=True, help="the new feature file")
-    parser.add_argument(
-        "--feature",
-        required=True,
-        help="target feature: colmap_sift_sv32 for SIFT of hloc or COLMAP, aliked_sv32 for "
-        "hloc's aliked-n16, and others of pipelines.aachen --list_features",
-    )
-    add_options(parser)
-    main(**vars(parser.parse_args()))
-
-
-def add_options(parser: cli.Parser) -> None:
-    """Add the options for the projection, the storage and the normalization."""
-    parser.add_argument("--projection", type=Path, help="file of another projection of its base")
-    features_confs.add_storage_option(parser)
-    parser.add_argument(
-        "--normalization",
-        help=f"normalization of SIFT descriptors, one of {', '.join(NORMALIZATIONS)}: COLMAP's "
-        "names, and rootsift for hloc's (default: detected)",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="write all images again")
+    example = "--features feats.h5 --feature colmap_sift_sv32 --storage uint4 --output small.h5"
+    options.call(main, __doc__, example)
 
 
 if __name__ == "__main__":

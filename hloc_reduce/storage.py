@@ -9,16 +9,18 @@ numbers. What rounding has lost stays lost when descriptors are converted back t
 
 from contextlib import suppress
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from . import logger, projections
 from .runtime.group_writer import GroupWriter
-from .utils import cli
+from .utils import cli, options
 from .utils.cli import InputError
 from .utils.codes import CODED, QUANTIZED, STORAGES, store
 from .utils.feature_files import Levels, read_descriptors, read_others
 from .utils.h5 import file_provenance, list_h5_names, open_h5
+from .utils.options import Option
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
@@ -27,7 +29,7 @@ from .utils.progress import progress
 def main(
     features: Path,
     output: Path,
-    storage: str = "float16",
+    storage: Annotated[str, Option("storage", STORAGES)] = "float16",
     overwrite: bool = False,
     projection: str | Path | None = None,
 ) -> Path:
@@ -36,10 +38,10 @@ def main(
     Args:
         features: feature file.
         output: the new feature file. Images that it has already are skipped.
-        storage: one of `STORAGES`.
+        storage: the new storage.
         overwrite: convert all images again.
-        projection: name or file of the projection of the features, whose levels are needed for
-            uint4, uint2 and uint1.
+        projection: projection of the features, by name or file; for uint4, uint2 and uint1, which
+            need its levels, see hloc_reduce.training.levels.
 
     Returns:
         `output`.
@@ -95,17 +97,7 @@ def _levels(projection: str | Path) -> dict[str, tuple[np.ndarray, str]]:
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--features feats-dog-sift_sv16.h5 --output for_hloc.h5")
-    parser.add_argument("--features", type=Path, required=True, help="feature file")
-    parser.add_argument("--output", type=Path, required=True, help="the new feature file")
-    parser.add_argument("--storage", default="float16", help=f"one of {', '.join(STORAGES)}")
-    parser.add_argument(
-        "--projection",
-        help="projection of the features, by name or file; for uint4, uint2 and uint1, which need "
-        "its levels, see hloc_reduce.training.levels",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="convert all images again")
-    main(**vars(parser.parse_args()))
+    options.call(main, __doc__, "--features feats-dog-sift_sv16.h5 --output for_hloc.h5")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import pycolmap
 from . import logger
 from .mapping import database as databases
 from .triangulation import read_matches
-from .utils import cli, colmap
+from .utils import cli, colmap, options
 from .utils.cli import InputError
 from .utils.files import replacing
 from .utils.h5 import list_h5_names
@@ -28,7 +28,7 @@ def main(
     matches: Path,
     image_dir: Path,
     database: Path,
-    camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
+    camera_mode: colmap.CameraMode = pycolmap.CameraMode.AUTO,
     overwrite: bool = False,
     verbose: bool = False,
 ) -> Path:
@@ -38,8 +38,8 @@ def main(
         features: feature file.
         matches: match file; pairs with other images are left out.
         image_dir: folder of the images, whose EXIF data give the intrinsics.
-        database: the new file.
-        camera_mode: which images share a camera.
+        database: the new database.
+        camera_mode: which photos share a camera.
         overwrite: replace a file that exists.
         verbose: show COLMAP's log.
 
@@ -71,26 +71,20 @@ def main(
             database.with_name(f"{database.name}{left}").unlink(missing_ok=True)
     logger.info(
         "%d images, %d of %d pairs with verified matches: %s",
-        *(len(names), len(verified), len(found), database),
+        len(names),
+        len(verified),
+        len(found),
+        database,
     )
     return database
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__,
+    example = (
         "--features outputs/feats-dog-colmap_sift_sv64.h5 --matches outputs/matches.h5 "
-        "--image_dir photos --database new.db",
+        "--image_dir photos --database new.db"
     )
-    parser.add_argument("--features", type=Path, required=True, help="feature file")
-    parser.add_argument("--matches", type=Path, required=True, help="match file")
-    parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
-    parser.add_argument("--database", type=Path, required=True, help="the new database")
-    colmap.add_camera_mode(parser)
-    parser.add_argument("--overwrite", action="store_true", help="replace a file that exists")
-    parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
-    args = parser.parse_args()
-    main(**{**vars(args), "camera_mode": colmap.camera_mode(args.camera_mode)})
+    options.call(main, __doc__, example)
 
 
 if __name__ == "__main__":

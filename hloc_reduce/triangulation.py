@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pycolmap
@@ -14,12 +15,13 @@ from .mapping import sizes
 from .mapping.epipolar import agreeing
 from .runtime import provenance
 from .runtime.group_writer import failures
-from .utils import cli, colmap
+from .utils import cli, colmap, options
 from .utils.cli import InputError
 from .utils.feature_files import get_colmap_keypoints, get_image_size
 from .utils.files import announce
 from .utils.h5 import open_h5
 from .utils.match_files import get_matches
+from .utils.options import Option
 from .utils.parsers import parse_retrieval
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
@@ -35,7 +37,7 @@ Verified = dict[Pair, tuple[np.ndarray, np.ndarray | None]]
 @strings_as_paths
 def main(
     sfm_dir: Path,
-    reference_model: Path,
+    reference_model: Annotated[Path, Option(flags=("--reference_sfm_model", "--reference_model"))],
     image_dir: Path,
     pairs: Path,
     features: Path,
@@ -56,18 +58,18 @@ def main(
         reference_model: COLMAP model with the cameras and poses of all images of the pairs. A
             camera whose photos were all resized in the same way is scaled to them.
         image_dir: folder of the images, which give the points their colours.
-        pairs: text file of pairs.
+        pairs: text file of image pairs.
         features: feature file.
         matches: match file.
-        skip_geometric_verification: triangulate all matches.
-        estimate_two_view_geometries: triangulate the matches that agree with two-view geometries
-            that COLMAP estimates from them, instead of the known poses.
+        skip_geometric_verification: use all matches, unverified.
+        estimate_two_view_geometries: verify with geometries that COLMAP estimates from the matches,
+            not with the known poses.
         min_match_score: use only matches with a higher score.
         verbose: show COLMAP's log.
         mapper_options: of pycolmap's IncrementalPipelineOptions. By default the largest
             reprojection errors are 4 pixels, or larger in proportion if the median longer side
             exceeds 1,600 pixels.
-        overwrite: triangulate again.
+        overwrite: replace an existing model.
 
     Returns:
         The map. It has the keypoints of the feature file, in the same order.
@@ -141,7 +143,9 @@ def _warn_of_images_without_points(reconstruction: pycolmap.Reconstruction) -> N
     if alone := sorted(image.name for image in images if image.num_points3D == 0):
         logger.warning(
             "%d of %d photos have no point in the map, so no query is localized with them: %s.",
-            *(len(alone), len(images), cli.some(alone)),
+            len(alone),
+            len(images),
+            cli.some(alone),
         )
 
 
@@ -271,44 +275,13 @@ def _verify_by_poses(
     return verified
 
 
-def add_options(parser: cli.Parser) -> None:
-    """Add the options of making a model from matches, with or without known poses."""
-    parser.add_argument("--sfm_dir", type=Path, required=True, help="folder of the new model")
-    parser.add_argument("--image_dir", type=Path, required=True, help="folder of the images")
-    parser.add_argument("--pairs", type=Path, required=True, help="text file of image pairs")
-    parser.add_argument("--features", type=Path, required=True, help="feature file")
-    parser.add_argument("--matches", type=Path, required=True, help="match file")
-    parser.add_argument(
-        "--skip_geometric_verification", action="store_true", help="use all matches, unverified"
-    )
-    parser.add_argument(
-        "--min_match_score", type=float, help="use only matches with a higher score"
-    )
-    parser.add_argument("--verbose", action="store_true", help="show COLMAP's log")
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing model")
-
-
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__,
+    example = (
         "--sfm_dir outputs/sfm --reference_model 3D-models/aachen_v_1_1 --image_dir images "
         "--pairs pairs.txt --features outputs/feats-dog-colmap_sift_sv64.h5 "
-        "--matches outputs/matches.h5",
+        "--matches outputs/matches.h5"
     )
-    parser.add_argument(
-        "--reference_model",
-        "--reference_sfm_model",
-        type=Path,
-        required=True,
-        help="model with the poses",
-    )
-    add_options(parser)
-    parser.add_argument(
-        "--estimate_two_view_geometries",
-        action="store_true",
-        help="verify with geometries estimated from the matches, not with the known poses",
-    )
-    main(**vars(parser.parse_args()))
+    options.call(main, __doc__, example)
 
 
 if __name__ == "__main__":

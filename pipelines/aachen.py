@@ -4,33 +4,51 @@ Extracts features, triangulates a map with the poses of the reference model, ret
 for each query and estimates its pose. An interrupted run resumes.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Unpack
+from typing import Annotated, Any
 
 from hloc_reduce import demo, localize_sfm, pairs_from_covisibility, triangulation
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import thresholds
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.options import ABOVE_0, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
-from .common import compact_map, options
-from .common.dataset import DatasetRun, Settings
+from .common import command, compact_map
+from .common.dataset import DatasetRun
+from .common.options import DatasetOptions, Positive
 
-NUMBERS = {"num_covis": 20, "num_loc": 50}
 Place = Aachen
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(DatasetOptions):
+    """The options of the pipeline.
+
+    Args:
+        ground_truth: true poses of the queries; default:
+            <dataset>/queries/ground_truth_poses.txt.
+        num_covis: other images that each map image is matched with.
+        compact: pack the map into one file and localize in that; the file and the results are in
+            the folder compact of `outputs`; whole and compact maps share the features.
+        max_mb: with `compact`: size of the file in 1,000,000 bytes; the folder is
+            compact-<size>MB; default: all points.
+    """
+
+    num_covis: Positive = 20
+    compact: bool = False
+    max_mb: Annotated[float, ABOVE_0] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        compact_map.check(self.compact, self.max_mb, self.retrieval)
 
 
 @strings_as_paths
 def main(
-    dataset: Path,
-    outputs: Path,
-    feature: str = features_confs.RECOMMENDED,
-    num_covis: int = NUMBERS["num_covis"],
-    num_loc: int = NUMBERS["num_loc"],
-    compact: bool = False,
-    max_mb: float | None = None,
-    **settings: Unpack[Settings],
+    dataset: Path, outputs: Path, feature: str = features_confs.RECOMMENDED, **options: Any
 ) -> dict:
     """Run all stages and return the summary, as in summary.json.
 
@@ -38,26 +56,19 @@ def main(
         dataset: data set folder.
         outputs: folder for the results.
         feature: name of a feature, or its YAML file.
-        num_covis: other images that each map image is matched with.
-        num_loc: retrieved map images per query.
-        compact: localize in a compact map, one file, instead of the whole map. The file and the
-            results are in a folder of `outputs`, see `compact_map.folder`; whole and compact maps
-            share the features.
-        max_mb: the size of this file in 1,000,000 bytes; default: all points.
-        settings: further arguments of `DatasetRun`.
+        options: further `Options`.
     """
-    compact_map.check(compact, max_mb, settings.get("retrieval", "vlad"))
-    place = Aachen(dataset)
+    given, place = Options(feature=feature, **options), Aachen(dataset)
     lists = {name: [query for query, _ in part] for name, part in place.query_lists().items()}
-    with DatasetRun(place, outputs, feature, num_loc, {"num_covis": num_covis}, **settings) as run:
+    with DatasetRun(place, outputs, given) as run:
         features = run.extract_features()
         reference = place.reference_model
         if run.is_partial:
             part = outputs / "sfm_reference"
             reference = colmap.write_part(reference, set(run.map_names), part)
-        sfm_pairs = outputs / f"pairs-db-covis{num_covis}.txt"
+        sfm_pairs = outputs / f"pairs-db-covis{given.num_covis}.txt"
         with run.stage("pairs_from_covisibility"):
-            pairs_from_covisibility.main(reference, sfm_pairs, num_covis)
+            pairs_from_covisibility.main(reference, sfm_pairs, given.num_covis)
         sfm_matches = run.match("match_map", sfm_pairs, features)
         sfm = outputs / f"sfm_{run.feature}+{run.matcher}"
         with run.stage("triangulation"):
@@ -66,65 +77,56 @@ def main(
             )
         limits = {name: thresholds(name) for name in lists}
         loc_pairs = run.retrieve()
-        if compact:
-            return compact_map.main(run, place, sfm, max_mb, lists, limits)
+        if given.compact:
+            return compact_map.main(run, place, sfm, given.max_mb, lists, limits)
         loc_matches = run.match("match_queries", loc_pairs, features)
         poses = outputs / f"Aachen-v1.1_hloc_{run.label}.txt"
         with run.stage("localization"):
             records = localize_sfm.main(
-                *(sfm, place.queries, loc_pairs, features, loc_matches, poses),
-                executor=run.executor,
-                gate=run.gate,
+                sfm,
+                place.queries,
+                loc_pairs,
+                features,
+                loc_matches,
+                poses,
+                executor=given.executor,
+                gate=given.gate,
                 mirror_images=run.mirror_images_of_dataset(),
             )
         sizes = {"map_points3D": reconstruction.num_points3D(), "map_bytes": run.map_bytes(sfm)}
         return run.finish_dataset(lists, limits, records, poses, loc_matches, sfm, **sizes)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Command(command.DatasetCommand):
+    """The command line of the pipeline.
+
+    Args:
+        dataset: data set folder; default: datasets/aachen_v1.1.
+        demo: render a small town in the data set's layout and localize there (default `dataset`:
+            datasets/demo_town).
+        demo_photos: number of map photos that `demo` renders, with a query by day and one by night
+            for each eight, but at least ten; default: 32.
+    """
+
+    demo: bool = False
+    demo_photos: int | None = None
+
+
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--feature colmap_sift_sv64 --demo")
-    truth = "<dataset>/queries/ground_truth_poses.txt"
-    options.add_dataset_options(parser, "datasets/aachen_v1.1", truth, NUMBERS["num_loc"])
-    parser.add_argument(
-        "--demo",
-        action="store_true",
-        help="render a small town in the data set's layout and localize there "
-        "(default --dataset: datasets/demo_town)",
-    )
-    parser.add_argument(
-        "--demo_photos",
-        type=int,
-        help="number of map photos that --demo renders, with a query by day and one by night for "
-        "each eight, but at least ten (default: 32)",
-    )
-    parser.add_argument(
-        "--num_covis",
-        type=int,
-        default=NUMBERS["num_covis"],
-        help="other images that each map image is matched with",
-    )
-    parser.add_argument(
-        "--compact",
-        action="store_true",
-        help="pack the map into one file and localize in that; the file and the results are in the "
-        "folder compact of --outputs",
-    )
-    parser.add_argument(
-        "--max_mb",
-        type=float,
-        help="with --compact: size of the file in 1,000,000 bytes; the folder is compact-<size>MB",
-    )
-    given = options.parse(parser)
-    is_demo, num_photos = given.pop("demo"), given.pop("demo_photos")
-    if num_photos is not None and not is_demo:
+    parser = Parser(__doc__, "--feature colmap_sift_sv64 --demo")
+    parser.add(Command)
+    parser.add(Options)
+    values = command.read(parser)
+    called, given = Command(**taken(Command, values)), Options(**taken(Options, values))
+    if called.demo_photos is not None and not called.demo:
         parser.error("--demo_photos needs --demo")
-    town = "datasets/demo_town" if num_photos is None else f"datasets/demo_town-{num_photos}"
-    default = town if is_demo else "datasets/aachen_v1.1"
-    dataset = given.pop("dataset") or Path(default)
-    if is_demo:
-        features_confs.get(given["feature"], given["projection"])  # fails before the rendering
-        demo.main(dataset, num_photos=num_photos)
-    options.run_on_dataset(main, dataset, given)
+    town = f"demo_town-{called.demo_photos}" if called.demo_photos else "demo_town"
+    dataset = called.dataset or Path("datasets") / (town if called.demo else "aachen_v1.1")
+    if called.demo:
+        features_confs.get(given.feature, given.projection)  # fails before the rendering
+        demo.main(dataset, num_photos=called.demo_photos)
+    command.run_on_dataset(main, dataset, called, given)
 
 
 if __name__ == "__main__":

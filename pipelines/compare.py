@@ -10,24 +10,25 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from hloc_reduce import logger, report
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.evaluation import plots
-from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate, add_gate_options
+from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.report import runs
 from hloc_reduce.runtime import provenance
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.files import MEGABYTE, write_csv
+from hloc_reduce.utils.options import ABOVE_0, Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned, joined
 
 from . import aachen
 from .common import compact_map
-from .common.options import add_retrieval_option
+from .common.options import Retrieval
 from .layouts import pipeline_of
 
 
@@ -36,12 +37,12 @@ def main(
     dataset: Path,
     features: Iterable[str],
     outputs: Path,
-    page: Path | None = None,
-    retrieval: str = "vlad",
+    page: Annotated[Path, Option(flags=("-o", "--output"))] | None = None,
+    retrieval: Retrieval = "vlad",
     ground_truth: Path | None = None,
     gate: Gate = DEFAULT_GATE,
-    max_mb: Iterable[float] = (),
-    storages: Iterable[str] = (),
+    max_mb: Annotated[Iterable[float], ABOVE_0] = (),
+    storages: Annotated[Iterable[str], Option("storage", STORAGES, flags=("--storage",))] = (),
 ) -> dict[str, str]:
     """Localize the queries of a data set with several features, print a table, write a report.
 
@@ -49,18 +50,17 @@ def main(
     compare.svg is drawn, too.
 
     Args:
-        dataset: data set folder.
-        features: names of features, or their YAML files.
-        outputs: folder for compare.csv and the outputs folder of each feature.
-        page: the report; default: `<outputs>/report.html`.
-        retrieval: "vlad", or a file of pairs or of global descriptors.
-        ground_truth: true poses of the queries; default: those that a finished run had, else
-            those of the data set.
+        dataset: folder of the data set.
+        features: names of features, see pipelines.aachen --list_features, or their YAML files.
+        outputs: folder for compare.csv, with a folder for each feature; default: outputs/<dataset>.
+        page: the report; default: <outputs>/report.html.
+        retrieval: vlad, or hloc's text file of pairs or h5 file of global descriptors.
+        ground_truth: true poses of the queries; default: as in finished runs, else those of the
+            data set.
         gate: what a pose must have for the query to be called localized.
-        max_mb: sizes of compact maps in 1,000,000 bytes. Those above the first one that all points
-            fit into are left out.
-        storages: how the descriptors of map images are stored, each feature in all of these ways;
-            default: float16.
+        max_mb: sizes of compact maps in 1,000,000 bytes, to be compared with the whole maps. Those
+            above the first one that all points fit into are left out.
+        storages: run each feature with each of these storages of map descriptors; default: float16.
 
     Returns:
         The error message of each feature, storage and size of a map that failed.
@@ -110,7 +110,7 @@ def _check_sizes(dataset: Path, sizes: list[float], retrieval: str) -> None:
             "--max_mb is for data sets in the layout of Aachen: others have no compact maps."
         )
     for size in sizes:
-        compact_map.check(True, size, retrieval)
+        aachen.Options(compact=True, max_mb=size, retrieval=retrieval)  # raises for wrong ones
 
 
 def _run_sizes(
@@ -231,48 +231,12 @@ def _megabytes(size: int | None) -> str:
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--dataset datasets/demo_town --features sift sift_sv64 sift_sv16")
-    parser.add_argument("--dataset", type=Path, required=True, help="folder of the data set")
-    parser.add_argument(
-        "--features",
-        nargs="+",
-        required=True,
-        help="see pipelines.aachen --list_features, or YAML files",
-    )
-    parser.add_argument(
-        "--outputs",
-        type=Path,
-        help="folder with a folder for each feature (default: outputs/<dataset>)",
-    )
-    page = "the report (default: <outputs>/report.html)"
-    parser.add_argument("-o", "--output", type=Path, dest="page", metavar="OUTPUT", help=page)
-    parser.add_argument(
-        "--storage",
-        nargs="+",
-        default=[],
-        dest="storages",
-        metavar="STORAGE",
-        help="run each feature with each of these storages of map descriptors: "
-        f"{', '.join(STORAGES)} (default: {STORAGES[0]})",
-    )
-    add_retrieval_option(parser)
-    parser.add_argument(
-        "--ground_truth",
-        type=Path,
-        help="true poses of the queries (default: as in finished runs, else those of the data set)",
-    )
-    parser.add_argument(
-        "--max_mb",
-        type=float,
-        nargs="+",
-        default=[],
-        help="sizes of compact maps in 1,000,000 bytes, to be compared with the whole maps",
-    )
-    add_gate_options(parser)
-    args = vars(parser.parse_args())
-    args["outputs"] = args["outputs"] or Path("outputs") / args["dataset"].resolve().name
-    gate = Gate(args.pop("min_confidence"), args.pop("min_inliers"))
-    if failed := main(**args, gate=gate):
+    example = "--dataset datasets/demo_town --features sift sift_sv64 sift_sv16"
+    parser = Parser(__doc__, example)
+    parser.add(main, outputs=None)
+    given = taken(main, parser.read())
+    given["outputs"] = given["outputs"] or Path("outputs") / given["dataset"].resolve().name
+    if failed := main(**given):
         raise InputError(
             f"These failed, see above: {', '.join(failed)}. The others are in the report."
         )

@@ -7,13 +7,14 @@ is built. A new map has the feature colmap_sift_sv64 and its matcher unless you 
 """
 
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from hloc_reduce import compact, extract_features, localize_sfm, logger, maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
-from hloc_reduce.detectors.dog import KEYPOINTS
+from hloc_reduce.detectors.dog import KEYPOINTS, KeypointSettings
 from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import trace
@@ -21,32 +22,33 @@ from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.codes import STORAGES
+from hloc_reduce.utils.codes import STORAGES, Storage
+from hloc_reduce.utils.options import Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
-from .common import changes, options
+from .common import changes, command
+from .common.options import Matcher, Positive
 from .common.queries import LISTED, Photos, Queries, identity, results_folder
 from .common.retrieval import retrieve_in_map
 from .common.run import Run, readable
 
 MADE_FROM = "made_from.json"  # the map and the photos of the queries
-OF_MAP = "feature", "projection", "matcher", "storage", "keypoints", "camera_mode"  # options
 
 
 @strings_as_paths
 def open_map(
     outputs: Path,
     map_images: Path | None = None,
-    model_or_map: Path | None = None,
+    model_or_map: Annotated[Path, Option(flags=("--map",), metavar="MODEL|MAP")] | None = None,
     feature: str | None = None,
     projection: Path | None = None,
-    matcher: str | None = None,
-    num_covis: int = 20,
+    matcher: Matcher | None = None,
+    num_covis: Positive = 20,
     overwrite: bool = False,
-    storage: str | None = None,
-    keypoints: str | None = None,
+    storage: Storage | None = None,
+    keypoints: KeypointSettings | None = None,
     accept_partial: bool = False,
-    camera_mode: str | None = None,
+    camera_mode: Annotated[str, colmap.CAMERA_MODE] | None = None,
     database: Path | None = None,
 ) -> Map:
     """Build a map, or open one that was built before.
@@ -54,23 +56,26 @@ def open_map(
     None stands for the default of a new map, and for whatever an old map was built with.
 
     Args:
-        outputs: a new map goes into its folder `map`.
-        map_images: folder of the map's photos; None to open an old map.
-        model_or_map: COLMAP model of the photos, or an old map, or a file of
-            `hloc_reduce.compact`, which is unpacked into the folder `map`.
-        feature: name of a feature, or its YAML file; default: colmap_sift_sv64.
+        outputs: results folder: the map goes to OUTPUTS/map, poses to OUTPUTS/queries-<name of
+            `queries` or `query_images`>.
+        map_images: photos of the map; without `map` they are reconstructed.
+        model_or_map: COLMAP model of `map_images` or `database`, or a folder with one model in it;
+            or a map of an earlier run: its folder or .hlm file, which is unpacked.
+        feature: local feature, see `list_features`, or a YAML file with its configuration; default:
+            colmap_sift_sv64.
         projection: projection file to use with the base descriptor of `feature`.
-        matcher: default: the feature's.
+        matcher: matcher; default: the feature's, see `list_features`.
         num_covis: other images that each map image is matched with.
-        overwrite: rebuild the map.
-        storage: how descriptors are stored; default: float16.
+        overwrite: recompute existing results.
+        storage: storage of the descriptors of map images (those of queries stay floats); default:
+            float16.
         keypoints: settings of the DoG detector; default: adaptive.
-        accept_partial: build the map without photos that are missing, unreadable or not
-            reconstructed, and even if its focal lengths, positions or matches show that it may be
-            wrong.
-        camera_mode: which photos share a camera, as in COLMAP; default: auto.
-        database: COLMAP database that the model was made from: its keypoints and descriptors make
-            the map. Photos, if given, only tell more about the cameras.
+        accept_partial: build the map without photos that are missing, unreadable or, in a map of
+            photos alone, not reconstructed; and use a map whose focal lengths, positions or matches
+            show that it may be wrong.
+        camera_mode: which photos share a camera; default: auto.
+        database: COLMAP database that `map` was made from: its keypoints and descriptors make the
+            map, without photos. Photos, if given, only tell more about the cameras.
 
     Raises:
         InputError: when an old map was built with other options, or something is missing or wrong.
@@ -135,7 +140,7 @@ def main(
     query_images: Path,
     outputs: Path,
     queries: Path | None = None,
-    num_loc: int = 50,
+    num_loc: Positive = 50,
     ground_truth: Path | None = None,
     overwrite: bool = False,
     strict: bool = False,
@@ -145,14 +150,14 @@ def main(
 
     Args:
         built: the map.
-        query_images: folder of the photos.
+        query_images: folder of the photos to localize.
         outputs: folder for the results.
-        queries: query list with intrinsics, or a glob of several; default: all photos of the
-            folder, with inferred intrinsics.
+        queries: query list with intrinsics, or a glob of several; default: all photos of
+            `query_images`, with intrinsics from EXIF data or guessed.
         num_loc: retrieved map images per query.
-        ground_truth: true poses of the queries.
+        ground_truth: true poses of the queries; default: none.
         overwrite: recompute existing results.
-        strict: stop at an unreadable query photo instead of recording it as not localized.
+        strict: fail at an unreadable query photo instead of recording it as not localized.
         gate: what a pose must have for the query to be called localized.
 
     Raises:
@@ -178,7 +183,9 @@ def main(
         wanted.log()
         with run.stage("extract_features"):
             features = extract_features.main(
-                *(built.conf, query_images, outputs),
+                built.conf,
+                query_images,
+                outputs,
                 image_list=names,
                 strict=strict,
                 queries=names,
@@ -192,7 +199,12 @@ def main(
         poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
         with run.stage("localization"):
             records = localize_sfm.main(
-                *(built.sfm, listed, loc_pairs, features, matches, poses),
+                built.sfm,
+                listed,
+                loc_pairs,
+                features,
+                matches,
+                poses,
                 refinements=wanted.refinements,
                 full_names=True,
                 gate=gate,
@@ -222,52 +234,25 @@ def main(
         return run.finish(summary, wanted.lists, records, truth, limits, features, poses, files)
 
 
-def _parser() -> cli.Parser:
+@dataclass(frozen=True, kw_only=True)
+class Command(command.Command):
+    """The command line of the pipeline.
+
+    Args:
+        compact: write the map into one small file, too.
+    """
+
+    compact: Annotated[Path, Option(metavar="FILE.hlm")] | None = None
+
+
+def _parser() -> Parser:
     """Return the parser of the command line."""
-    parser = cli.Parser(
-        __doc__, "--map sparse --map_images photos --query_images new --outputs outputs/place"
-    )
-    parser.add_argument(
-        "--map",
-        type=Path,
-        metavar="MODEL|MAP",
-        help="COLMAP model of --map_images or --database, or a folder with one model in it; or a "
-        "map of an earlier run: its folder or .hlm file",
-    )
-    parser.add_argument(
-        "--map_images", type=Path, help="photos of the map; without --map they are reconstructed"
-    )
-    parser.add_argument(
-        "--database",
-        type=Path,
-        help="COLMAP database that --map was made from: its keypoints and descriptors make the "
-        "map, without photos",
-    )
-    parser.add_argument(
-        "--compact", type=Path, metavar="FILE.hlm", help="write the map into one small file, too"
-    )
-    parser.add_argument("--query_images", type=Path, help="folder of the photos to localize")
-    parser.add_argument(
-        "--queries",
-        type=Path,
-        help="query list with intrinsics, or a glob of several (default: all photos of "
-        "--query_images, with intrinsics from EXIF data or guessed)",
-    )
-    parser.add_argument(
-        "--outputs",
-        type=Path,
-        help="results folder: the map goes to OUTPUTS/map, poses to OUTPUTS/queries-<name of "
-        "--queries or --query_images>",
-    )
-    parser.add_argument(
-        "--num_covis", type=int, default=20, help="other images that each map image is matched with"
-    )
-    changes.add_options(parser)
-    colmap.add_camera_mode(parser)
-    options.add_feature_options(parser)
-    options.add_localization_options(parser, "none", 50)
-    # None: what an old map was built with
-    parser.set_defaults(feature=None, storage=None, keypoints=None, camera_mode=None)
+    example = "--map sparse --map_images photos --query_images new --outputs outputs/place"
+    parser = Parser(__doc__, example)
+    parser.add(open_map, outputs=None)
+    parser.add(main, query_images=None)
+    parser.add(changes.main)
+    parser.add(Command)
     return parser
 
 
@@ -278,63 +263,54 @@ def _check(given: dict, is_changed: bool) -> None:
         given: the options.
         is_changed: whether photos are added to a map or removed from it.
     """
-    for name, names in (("storage", STORAGES), ("keypoints", KEYPOINTS)):
-        if given[name] is not None:
-            cli.choose(name, given[name], names)
     if given["outputs"] is None and (given["query_images"] is not None or not is_changed):
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
     if given["compact"] is not None:
         compact.check_output(given["compact"])
-        if given["map"] is not None and maps.is_compact(given["map"]):
-            raise InputError(f"--map {given['map']} is a compact map: leave out --compact.")
+        if (folder := given["model_or_map"]) is not None and maps.is_compact(folder):
+            raise InputError(f"--map {folder} is a compact map: leave out --compact.")
 
 
 def _main() -> None:
-    given = options.parse(_parser())
-    change = {name: given.pop(name) for name in changes.NAMES}
+    given = command.read(_parser())
+    change = taken(changes.main, given)
     _check(given, any(change.values()))
-    profiled = given.pop("profile") and given["outputs"] is not None
-    trace_file = given["outputs"] / "trace.json" if profiled else None
-    with trace.recording(trace_file):
+    outputs, folder = given["outputs"], given["model_or_map"]
+    with trace.recording(outputs / "trace.json" if given["profile"] and outputs else None):
         if any(change.values()):
-            folder = given["map"]
-            changes.check(given, **change)
-            built = open_map(folder, model_or_map=folder, **{name: given[name] for name in OF_MAP})
-            if given["outputs"] is None:  # the map is not opened again
+            changes.check(folder, given["map_images"] or given["database"], **change)
+            built = open_map(**taken(open_map, given) | {"outputs": folder})
+            if outputs is None:  # the map is not opened again
                 built.warn()
             changes.main(folder, **change)
-        if given["outputs"] is not None:
+        if outputs is not None:
             _run(given)
         elif given["compact"] is not None:
-            compact.main(given["compact"], given["map"])
+            compact.main(given["compact"], folder)
 
 
 def _run(given: dict) -> None:
     """Build or open the map, and localize the queries in it."""
-    outputs, query_images, queries = (given.pop(k) for k in ("outputs", "query_images", "queries"))
-    of_queries = {name: given.pop(name) for name in ("num_loc", "ground_truth", "strict", "gate")}
-    small = given.pop("compact")
-    built = open_map(outputs, model_or_map=given.pop("map"), **given)
+    built = open_map(**taken(open_map, given))
     if given["map_images"] is None and given["database"] is None:  # others warn as they are built
         built.warn()
-    if small is not None:
-        compact.main(small, built.folder)
+    if given["compact"] is not None:
+        compact.main(given["compact"], built.folder)
+    query_images, queries = given["query_images"], given["queries"]
     if query_images is None:
         print(f"The map {built.folder} is ready. Localize photos in it with --query_images.")
         return
-    results = results_folder(outputs, query_images, queries)
-    summary = main(
-        built, query_images, results, queries, overwrite=given["overwrite"], **of_queries
-    )
+    results = results_folder(given["outputs"], query_images, queries)
+    summary = main(built, **taken(main, given) | {"outputs": results})
     if built.doubts:
         logger.warning(
             "The map may be wrong, and poses in it may be off by a tenth of the distance or more: "
             "it has %s.",
             " and ".join(built.doubts),
         )
-    options.print_result(summary, results, "The poses, camera from world, are in {}.")
+    command.print_result(summary, results, "The poses, camera from world, are in {}.")
 
 
 if __name__ == "__main__":

@@ -25,9 +25,11 @@ from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, RunFolder
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.codes import Storage
 from hloc_reduce.utils.feature_files import get_keypoints
 from hloc_reduce.utils.files import MEGABYTE, write_csv
 from hloc_reduce.utils.h5 import iterate_h5_names, list_h5_names, open_h5
+from hloc_reduce.utils.options import Parser
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned
 
@@ -45,7 +47,7 @@ def main(
     hloc_outputs: Path,
     outputs: Path,
     feature: str = FEATURE,
-    storage: str = STORAGE,
+    storage: Storage = STORAGE,
     features: Path | None = None,
     sfm: Path | None = None,
     queries: Path | None = None,
@@ -57,10 +59,10 @@ def main(
     """Reduce the features and the map of an outputs folder of hloc, and compare.
 
     Args:
-        hloc_outputs: the folder, which is not changed.
-        outputs: folder of the reduced feature file, the compact map, and the table, shrink.csv.
-        feature: name of a feature, or its YAML file.
-        storage: how descriptors are stored, one of `utils.codes.STORAGES`.
+        hloc_outputs: hloc's outputs folder, which is not changed.
+        outputs: folder for the reduced feature file, the compact map, and the table, shrink.csv.
+        feature: what to reduce hloc's descriptors to: name of a feature, or its YAML file.
+        storage: how descriptors are stored.
         features: hloc's feature file, with the queries; default: the only one in the folder.
         sfm: COLMAP model of its keypoints; default: the only one in the folder.
         queries: query list with intrinsics, or a glob of several.
@@ -107,7 +109,13 @@ def main(
         with folder.stage("compact"):
             described = aggregate_features.main(RETRIEVAL, small, map_names)
             compact.main(
-                *(packed, None, sfm, small, described, feature), storage=storage, max_mb=max_mb
+                packed,
+                sfm=sfm,
+                features=small,
+                global_descriptors=described,
+                feature=feature,
+                storage=storage,
+                max_mb=max_mb,
             )
         built = maps.unpack(packed, outputs / "map", overwrite)
         sizes = {
@@ -248,30 +256,14 @@ def _localize(
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--hloc_outputs outputs/aachen --outputs outputs/aachen_small")
-    parser.add_argument("--hloc_outputs", type=Path, required=True, help="hloc's outputs folder")
-    parser.add_argument("--outputs", type=Path, required=True, help="folder for the small files")
-    parser.add_argument("--feature", default=FEATURE, help="what to reduce hloc's descriptors to")
-    parser.add_argument("--storage", default=STORAGE, help="how descriptors are stored")
-    parser.add_argument(
-        "--features", type=Path, help="hloc's feature file (default: the only one in the folder)"
-    )
-    parser.add_argument(
-        "--sfm", type=Path, help="COLMAP model of its keypoints (default: the only one)"
-    )
-    parser.add_argument("--queries", type=Path, help="query list with intrinsics, or a glob")
-    parser.add_argument("--ground_truth", type=Path, help="true poses of the queries")
-    parser.add_argument("--num_loc", type=int, default=NUM_LOC, help="retrieved images per query")
-    parser.add_argument(
-        "--max_mb", type=float, help="size of the compact map in megabytes (default: all points)"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace earlier results")
-    args = parser.parse_args()
-    rows = main(**vars(args))
+    parser = Parser(__doc__, "--hloc_outputs outputs/aachen --outputs outputs/aachen_small")
+    parser.add(main)
+    given = parser.read()
+    rows = main(**given)
     columns = [column for column in COLUMNS if column in rows[0]]
     lines = [[f"{row[c]:.3f}" if c == "MB" else str(row[c]) for c in columns] for row in rows]
     print(aligned([columns, *lines]))
-    print(f"{args.outputs} has features.h5, map{SUFFIX} and {TABLE}.")
+    print(f"{given['outputs']} has features.h5, map{SUFFIX} and {TABLE}.")
 
 
 if __name__ == "__main__":

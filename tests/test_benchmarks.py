@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from benchmarks import accuracy, against_hloc, render, rows
 from hloc_reduce.utils.cli import InputError
+from pipelines.batch import jobs
 from pipelines.batch.jobs import Job
 
 ROOT = Path(__file__).parents[1]
@@ -78,7 +80,13 @@ def test_rows_of_a_finished_run(tmp_path, results):
             "c.jpg,day_time,failed,,,0",
         ):
             writer.writerow(dict(zip(header.split(","), line.split(","), strict=True)))
-    job = Job(Path("datasets/mill"), "colmap_sift_sv32", "NN-ratio", "uint2", num_loc=20)
+    job = Job(
+        dataset=Path("datasets/mill"),
+        feature="colmap_sift_sv32",
+        matcher="NN-ratio",
+        storage="uint2",
+        num_loc=20,
+    )
     rows.add("accuracy", [accuracy.what(job) | cells for cells in accuracy.measured(tmp_path)])
     (found,) = rows.read("accuracy")
     expected = {"place": "mill", "list": "night", "storage": "uint2", "variant": "num_loc20"}
@@ -114,3 +122,10 @@ def test_without_hloc_the_comparison_says_what_to_install(monkeypatch):
     monkeypatch.setattr("hloc_reduce.utils.hloc.is_installed", lambda: False)
     with pytest.raises(InputError, match="hloc is not installed: pip install"):
         against_hloc.stages_of("hloc")
+
+
+def test_jobs_without_rows_are_written_as_they_were_read(tmp_path):
+    read = jobs.read(Path(__file__).parents[1] / "results/accuracy.yaml")[1]
+    path = tmp_path / "missing.yaml"
+    path.write_text(yaml.safe_dump({"jobs": [accuracy._options(job) for job in read]}))
+    assert jobs.read(path)[1] == read

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -23,8 +24,9 @@ from ..maps.map import RETRIEVAL, Map
 from ..pairs_from_retrieval import read_global
 from ..utils import cli, colmap
 from ..utils.cli import InputError
-from ..utils.codes import STORAGES
+from ..utils.codes import STORAGES, Storage
 from ..utils.files import MEGABYTE, replacing
+from ..utils.options import ABOVE_0
 from ..utils.paths import strings_as_paths
 
 TRIES = 12  # sizes that are tried to come close to a limit
@@ -43,24 +45,25 @@ def main(
     global_descriptors: Path | None = None,
     feature: str | None = None,
     matcher: str | None = None,
-    storage: str | None = None,
-    max_mb: float | None = None,
+    storage: Storage | None = None,
+    max_mb: Annotated[float, ABOVE_0] | None = None,
 ) -> dict[str, int]:
     """Write a compact map.
 
     Args:
         output: the file, .hlm.
-        map: folder of a map of `pipelines.localize`; or else give the following four.
-        sfm: COLMAP model.
+        map: folder of a map of pipelines.localize; or else give the following four.
+        sfm: COLMAP model, instead of `map`.
         features: feature file of its images.
         global_descriptors: h5 file of their global descriptors, with the vocabulary beside it, from
-            `aggregate_features`; default: the one beside `features`.
-        feature: name of the feature, or its YAML file.
-        matcher: a key of `confs.matchers`; default: the map's, or the feature's, but NN-ratio90
-            instead of NN-ratio.
-        storage: of the points' descriptors; default: that of the map if it has codes, else uint4
-            for up to 32 dimensions of DoG's features, uint2 for others, and float16 without levels.
-        max_mb: the size of the file in 1,000,000 bytes; points that images need least are left out.
+            aggregate_features; default: the one beside `features`.
+        feature: name of the feature of `features`, or its YAML file.
+        matcher: matcher of queries; default: the map's, or the feature's, but NN-ratio90 instead of
+            NN-ratio.
+        storage: storage of the points' descriptors; default: the map's if it stores codes, else
+            uint4 for DoG features of up to 32 dimensions, uint2 for others, and float16 without
+            levels.
+        max_mb: size of the file in 1,000,000 bytes: points that images need least are left out.
 
     Returns:
         The bytes of each part of the file.
@@ -126,7 +129,10 @@ def write(
         temporary.write_bytes(content)
     logger.info(
         "%s has %s of %s points and %s bytes: %s.",
-        *(output, f"{number:,}", f"{len(everything):,}", f"{len(content):,}"),
+        output,
+        f"{number:,}",
+        f"{len(everything):,}",
+        f"{len(content):,}",
         ", ".join(f"{part} {size:,}" for part, size in parts.items()),
     )
     return parts
@@ -147,8 +153,14 @@ def matcher_of(matcher: str) -> str:
 def _of_map(built: Map) -> Source:
     """Return what a map of `pipelines.localize` gives, with its own matcher."""
     return Source(
-        *(colmap.read_model(built.sfm), built.feature, built.conf, built.matcher),
-        *(built.descriptors, built.vocabulary, built.cameras, built.doubts),
+        colmap.read_model(built.sfm),
+        built.feature,
+        built.conf,
+        built.matcher,
+        built.descriptors,
+        built.vocabulary,
+        built.cameras,
+        built.doubts,
     )
 
 

@@ -15,7 +15,7 @@ from ..descriptors import COLMAP, DESCRIPTORS, DIM
 from ..detectors.dog import HLOC, KEYPOINTS
 from ..networks import ALIKED, EDGEPOINT2, MINI, NETWORKS
 from ..projections.released import FILES as RELEASED
-from ..utils.cli import InputError, Parser, choose
+from ..utils.cli import InputError, choose
 from ..utils.codes import CODED, STORAGES
 from ..utils.parsers import read_yaml
 from ..utils.tables import aligned
@@ -254,28 +254,6 @@ def of_patches(name: str) -> tuple[str, str | None]:
     if descriptor in (None, COLMAP):
         raise InputError(f"{name} describes photos, not patches.")
     return choose("descriptor", descriptor, DESCRIPTORS), conf["model"].get("projection")
-
-
-def add_storage_option(parser: Parser, of: str = "descriptors") -> None:
-    """Add --storage."""
-    parser.add_argument(
-        "--storage",
-        default=STORAGES[0],
-        help=f"storage of {of}, one of {', '.join(STORAGES)}: uint8 keeps a number in a byte; "
-        "uint4, uint2 and uint1 keep it in 4, 2 and 1 bits and need a projection with levels, see "
-        "hloc_reduce.training.levels. hloc reads floats only",
-    )
-
-
-def add_keypoints_option(parser: Parser) -> None:
-    """Add --keypoints."""
-    parser.add_argument(
-        "--keypoints",
-        default=KEYPOINTS[0],
-        help=f"settings of the DoG detector, one of {', '.join(KEYPOINTS)}: adaptive finds more "
-        "keypoints in small, dark and hazy photos; colmap finds several times as many in every "
-        "photo; hloc uses hloc's settings for every photo",
-    )
 
 
 def read(path: Path) -> dict:

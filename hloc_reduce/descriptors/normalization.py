@@ -1,10 +1,12 @@
 """How descriptors of COLMAP's SIFT are normalized, and how to make them those of `colmap_sift`."""
 
 from collections.abc import Callable
+from typing import Annotated
 
 import numpy as np
 
 from ..utils.cli import InputError, choose
+from ..utils.options import Option
 
 # measured in photos of ten places, dark and blurred ones too: the share of zeros is 4 to 21 %
 # except in hloc's descriptors, whose numbers are at least 0.001 before the last rounding; mean
@@ -24,6 +26,9 @@ NORMALIZATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "L2": _root,
     "rootsift": np.square,
 }
+Normalization = Annotated[
+    str, Option("normalization", NORMALIZATIONS, "COLMAP's names, and rootsift for hloc's")
+]
 
 
 def detect(descriptors: np.ndarray) -> str:

@@ -7,18 +7,29 @@ there are enough.
 
 from collections.abc import Callable
 from functools import partial
+from typing import Annotated
 
 import cv2
 import numpy as np
 
 from ..utils import colmap
 from ..utils.cli import choose
+from ..utils.options import Option
 
 HLOC = {"first_octave": 0, "peak_threshold": 0.01}
 COLMAP = {"first_octave": -1, "peak_threshold": 0.0067}
 # name -> the settings to try first, and whether to try others if these find too few keypoints
 SETTINGS = {"adaptive": (HLOC, True), "colmap": (COLMAP, True), "hloc": (HLOC, False)}
 KEYPOINTS = tuple(SETTINGS)
+KeypointSettings = Annotated[
+    str,
+    Option(
+        "keypoints",
+        KEYPOINTS,
+        "adaptive finds more keypoints in small, dark and hazy photos; colmap finds several times "
+        "as many in every photo; hloc uses hloc's settings for every photo",
+    ),
+]
 
 ENOUGH = 2500  # keypoints of a photo
 PIXELS = 200  # per keypoint: fewer keypoints are enough in small photos

@@ -1,18 +1,20 @@
 """Evaluate poses, or features of patches on HPatches and PhotoTour."""
 
-import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import Annotated
 
 import torch
 
 from .. import logger, projections
 from ..confs import features as features_confs
-from ..datasets import INLOC_THRESHOLDS, thresholds
+from ..datasets import INLOC_THRESHOLDS
+from ..datasets import thresholds as thresholds_of
 from ..utils import cli
 from ..utils.cli import InputError
 from ..utils.files import write_csv
+from ..utils.options import Option, Parser
 from . import hpatches, patch_verification, plots, poses
 from .hpatches import data
 from .summaries import recall_table
@@ -20,20 +22,36 @@ from .summaries import recall_table
 MAX_FAILURES = 20  # of each kind are listed
 
 
-def evaluate_poses(args: argparse.Namespace) -> None:
-    """Compare estimated with true poses."""
-    given = args.thresholds or ["aachen"]
-    limits = parse_thresholds(given)
-    label = args.estimates.name.removesuffix("_logs.jsonl").removesuffix(".txt")
-    outputs = args.outputs or Path("outputs/evaluation") / label
+def evaluate_poses(
+    estimates: Path,
+    ground_truth: Annotated[list[Path], Option(repeated=True)],
+    thresholds: Annotated[Sequence[str], Option(metavar="aachen|inloc|M,DEG")] | None = None,
+    outputs: Path | None = None,
+) -> None:
+    """Compare estimated with true poses.
+
+    Both are camera from world. Gives recall, median errors and cumulative curves. A query without
+    an estimate is a failure. Estimates name queries in full, or by file name as in a submission.
+
+    Args:
+        estimates: text file of poses, or the *_logs.jsonl of a pipeline, whose fallback poses count
+            as failures in recall and curves.
+        ground_truth: text file of true poses; may be repeated.
+        thresholds: aachen (wider for queries in a folder night...), inloc, or pairs of metres and
+            degrees; default: aachen.
+        outputs: folder for errors and curves; default: outputs/evaluation/<estimates>.
+    """
+    limits = parse_thresholds(thresholds or ["aachen"])
+    label = estimates.name.removesuffix("_logs.jsonl").removesuffix(".txt")
+    outputs = outputs or Path("outputs/evaluation") / label
     cli.check_folder(outputs)
-    rows = compare(args.estimates, args.ground_truth)
+    rows = compare(estimates, ground_truth)
     lists: dict[str, list[dict]] = {}
     for row in rows:
         row["list"] = "all" if limits else list_of(row["query"])
         lists.setdefault(row["list"], []).append(row)
     summaries = {
-        name: poses.summarize_errors(listed, limits or thresholds(name))
+        name: poses.summarize_errors(listed, limits or thresholds_of(name))
         for name, listed in lists.items()
     }
     write_errors(chain(*lists.values()), outputs / "errors.csv")
@@ -48,7 +66,7 @@ def evaluate_poses(args: argparse.Namespace) -> None:
     logger.info("Errors and their curves are in %s.", outputs)
 
 
-def parse_thresholds(given: list[str]) -> list[tuple[float, float]] | None:
+def parse_thresholds(given: Sequence[str]) -> list[tuple[float, float]] | None:
     """Return pairs of metres and degrees; None for Aachen's, which depend on the query."""
     if given == ["aachen"]:
         return None
@@ -134,142 +152,93 @@ def print_failures(rows: list[dict]) -> None:
             print(f"Failures {kind}: {len(names)}", *names[:MAX_FAILURES], *more, sep="\n")
 
 
-def evaluate_hpatches(args: argparse.Namespace) -> None:
-    """Evaluate features on HPatches."""
-    cli.check_folder(args.outputs)
-    rows = hpatches.main(
-        args.root,
-        args.feature,
-        args.outputs,
-        args.split,
-        args.task_lists,
-        args.task or hpatches.TASKS,
-    )
+def evaluate_hpatches(
+    root: Path,
+    feature: list[str],
+    split: Annotated[str, Option("split", data.SPLITS)] = "a",
+    task_lists: Path | None = None,
+    task: Annotated[Sequence[str], Option("task", hpatches.TASKS)] | None = None,
+    outputs: Path = Path("outputs/hpatches"),
+) -> None:
+    """Evaluate features on HPatches.
+
+    The features are of patches. The tasks of HPatches are matching, verification and retrieval; the
+    mean average precision is shown in percent next to the paper's.
+
+    Args:
+        root: folder of the sequences.
+        feature: features of patches, see pipelines.aachen --list_features, or YAML files of them.
+        split: split of the sequences.
+        task_lists: folder of splits.json and of the lists of pairs, queries and distractors;
+            missing lists are drawn by the benchmark's rule; default: <root>/tasks.
+        task: tasks; default: all.
+        outputs: folder for the results.
+    """
+    cli.check_folder(outputs)
+    rows = hpatches.main(root, feature, outputs, split, task_lists, task or hpatches.TASKS)
     print(hpatches.table(rows))
-    scores = args.outputs / f"{args.split}_scores.csv"
-    picture = args.outputs / f"{args.split}.svg"
+    scores, picture = outputs / f"{split}_scores.csv", outputs / f"{split}.svg"
     if plots.available(picture):
         plots.save(plots.hpatches_bars(rows), picture)
-    logger.info("The scores are in %s, their means in %s.csv.", scores, args.outputs / args.split)
+    logger.info("The scores are in %s, their means in %s.csv.", scores, outputs / split)
 
 
-def evaluate_phototour(args: argparse.Namespace) -> None:
-    """Evaluate features on PhotoTour."""
-    cli.check_folder(args.outputs)
-    if Path(args.name).name != args.name:
-        raise InputError(f"--name {args.name}: name a folder in --root, without any /.")
+def evaluate_phototour(
+    root: Path, feature: list[str], name: str, outputs: Path = Path("outputs/phototour")
+) -> None:
+    """Evaluate features on PhotoTour.
+
+    Verifies the pairs m50_100000_100000_0.txt of a PhotoTour sequence: false positive rate at 95 %
+    recall.
+
+    Args:
+        root: folder of the sequences.
+        feature: features of patches, see pipelines.aachen --list_features, or YAML files of them.
+        name: folder of a sequence in `root`.
+        outputs: folder for the results.
+    """
+    cli.check_folder(outputs)
+    if Path(name).name != name:
+        raise InputError(f"--name {name}: name a folder in --root, without any /.")
     by_base: dict[str, dict[str, torch.nn.Module]] = {}
-    for feature in args.feature:
-        base, projection = features_confs.of_patches(feature)
+    for one in feature:
+        base, projection = features_confs.of_patches(one)
         project = torch.nn.Identity() if projection is None else projections.load(projection)
-        by_base.setdefault(base, {})[features_confs.get(feature)[0]] = project
+        by_base.setdefault(base, {})[features_confs.get(one)[0]] = project
     found: dict[str, float] = {}
     for base, projects in by_base.items():
-        folder, outputs = args.root / args.name, args.outputs / args.name
-        found |= patch_verification.main(folder, outputs, base, projects)
-    rows = [{"feature": name, "fpr95_percent": 100 * value} for name, value in found.items()]
-    write_csv(rows, args.outputs / f"{args.name}.csv")
-    for name, value in found.items():
-        print(f"FPR95 of {name} on {args.name}: {100 * value:.2f} %")
+        found |= patch_verification.main(root / name, outputs / name, base, projects)
+    rows = [{"feature": one, "fpr95_percent": 100 * value} for one, value in found.items()]
+    write_csv(rows, outputs / f"{name}.csv")
+    for one, value in found.items():
+        print(f"FPR95 of {one} on {name}: {100 * value:.2f} %")
+
+
+COMMANDS: dict[str, tuple[Callable, str]] = {
+    "poses": (evaluate_poses, "--estimates poses.txt --ground_truth ground_truth_poses.txt"),
+    "hpatches": (
+        evaluate_hpatches,
+        "--root hpatches-release --task_lists hpatches-benchmark/tasks --feature sift sift_sv64",
+    ),
+    "phototour": (
+        evaluate_phototour,
+        "--root phototour --name notredame --feature sift sift_sv64",
+    ),
+}
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__)
-    commands = parser.add_subparsers(required=True, metavar="poses|hpatches|phototour")
-    for add in (_add_poses, _add_hpatches, _add_phototour):
-        add(commands.add_parser)
-    args = parser.parse_args()
-    args.evaluate(args)
-
-
-def _add_poses(add: Callable[..., cli.Parser]) -> None:
-    command = add(
-        "poses",
-        help="compare estimated with true poses",
-        description="Compare estimated with true poses, both camera from world: recall, median "
-        "errors, cumulative curves. A query without an estimate is a failure. Estimates name "
-        "queries in full, or by file name as in a submission.",
-        example="--estimates poses.txt --ground_truth ground_truth_poses.txt",
-    )
-    command.add_argument(
-        "--estimates",
-        type=Path,
-        required=True,
-        help="text file of poses, or the *_logs.jsonl of a pipeline, whose fallback poses count as "
-        "failures in recall and curves",
-    )
-    command.add_argument(
-        "--ground_truth",
-        type=Path,
-        required=True,
-        action="append",
-        help="text file of true poses; may be repeated",
-    )
-    command.add_argument(
-        "--thresholds",
-        nargs="+",
-        metavar="aachen|inloc|M,DEG",
-        help="aachen (wider for queries in a folder night...), inloc, or pairs of metres and "
-        "degrees (default: aachen)",
-    )
-    command.add_argument(
-        "--outputs",
-        type=Path,
-        help="folder for errors and curves (default: outputs/evaluation/<estimates>)",
-    )
-    command.set_defaults(evaluate=evaluate_poses)
-
-
-def _add_hpatches(add: Callable[..., cli.Parser]) -> None:
-    command = add(
-        "hpatches",
-        help="evaluate features on HPatches",
-        description="Evaluate features of patches in the tasks of HPatches: matching, verification "
-        "and retrieval, mean average precision in percent next to the paper's.",
-        example="--root hpatches-release "
-        "--task_lists hpatches-benchmark/tasks --feature sift sift_sv64",
-    )
-    _add_features(command)
-    command.add_argument("--split", default="a", help=f"one of {', '.join(data.SPLITS)}")
-    command.add_argument(
-        "--task_lists",
-        type=Path,
-        help="folder of splits.json and of the lists of pairs, queries and distractors; missing "
-        "lists are drawn by the benchmark's rule (default: <root>/tasks)",
-    )
-    command.add_argument(
-        "--task", nargs="+", help=f"some of {', '.join(hpatches.TASKS)} (default: all)"
-    )
-    command.add_argument(
-        "--outputs", type=Path, default=Path("outputs/hpatches"), help="folder for the results"
-    )
-    command.set_defaults(evaluate=evaluate_hpatches)
-
-
-def _add_phototour(add: Callable[..., cli.Parser]) -> None:
-    command = add(
-        "phototour",
-        help="evaluate features on PhotoTour",
-        description="Verify the pairs m50_100000_100000_0.txt of a PhotoTour sequence: false "
-        "positive rate at 95 % recall.",
-        example="--root phototour --name notredame --feature sift sift_sv64",
-    )
-    _add_features(command)
-    command.add_argument("--name", required=True, help="folder of a sequence in --root")
-    command.add_argument(
-        "--outputs", type=Path, default=Path("outputs/phototour"), help="folder for the results"
-    )
-    command.set_defaults(evaluate=evaluate_phototour)
-
-
-def _add_features(command: cli.Parser) -> None:
-    command.add_argument("--root", type=Path, required=True, help="folder of the sequences")
-    command.add_argument(
-        "--feature",
-        nargs="+",
-        required=True,
-        help="features of patches, see pipelines.aachen --list_features, or YAML files of them",
-    )
+    parser = Parser(__doc__)
+    commands = parser.add_subparsers(required=True, metavar="|".join(COMMANDS))
+    for name, (evaluate, example) in COMMANDS.items():
+        about, _, _ = (evaluate.__doc__ or "").partition("Args:\n")
+        command = commands.add_parser(
+            name, help=about.partition(".")[0], description=about, example=example
+        )
+        command.add(evaluate)
+        command.set_defaults(evaluate=evaluate)
+    values = parser.read()
+    values.pop("evaluate")(**values)
 
 
 if __name__ == "__main__":

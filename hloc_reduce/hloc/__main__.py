@@ -3,14 +3,16 @@
 The module gets the arguments after its name.
 """
 
-import argparse
 import ast
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from ..utils import cli
+from ..utils import cli, options
 from ..utils.cli import InputError
 from ..utils.hloc import import_module
+from ..utils.options import Option
 from . import register
 
 
@@ -35,23 +37,25 @@ def main(name: str, args: list[str]) -> None:
     exec(code, {**vars(module), "__name__": "__main__"})
 
 
+def run(
+    module: Annotated[str, Option(flags=("module",))],
+    args: Annotated[list[str], Option(flags=("args",), rest=True)],
+    feature: Annotated[Sequence[Path], Option(repeated=True, metavar="FILE")] = (),
+) -> None:
+    """Register features, and run a module.
+
+    Args:
+        module: such as extract_features or match_features.
+        args: arguments of the module.
+        feature: YAML file of another feature to register, named after the file; may be repeated.
+    """
+    register(feature)
+    main(module, args)
+
+
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__, "extract_features --conf sift_sv64 --image_dir photos --export_dir outputs"
-    )
-    parser.add_argument(
-        "--feature",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="YAML file of another feature to register, named after the file",
-    )
-    parser.add_argument("module", help="such as extract_features or match_features")
-    parser.add_argument("args", nargs=argparse.REMAINDER, help="arguments of the module")
-    args = parser.parse_args()
-    register(args.feature)
-    main(args.module, args.args)
+    example = "extract_features --conf sift_sv64 --image_dir photos --export_dir outputs"
+    options.call(run, __doc__, example)
 
 
 if __name__ == "__main__":

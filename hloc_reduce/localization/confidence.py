@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass, replace
 from math import comb, log10
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pycolmap
 
 from ..utils.arrays import distinct
-from ..utils.cli import InputError, Parser
+from ..utils.cli import InputError
+from ..utils.options import HIDDEN
 from .projection import FOCAL, POSE, photo_scale, project, reprojection_errors
 
 SOLUTIONS = 4  # poses that a minimal sample may have
@@ -235,8 +236,9 @@ class Gate:
     """What a pose must have for the query to be called localized.
 
     Args:
-        min_confidence: the minimum `confidence`.
-        min_inliers: the minimum number of RANSAC's inliers.
+        min_confidence: minimum confidence of a localized query: -log10 of the number of poses with
+            as many inliers that are expected by chance.
+        min_inliers: minimum number of RANSAC's inliers of a localized query.
         min_agreement: pairs, in ascending order, of a confidence and the minimum `agreement` of
             poses with at least this confidence; default: by the matches, see `of_matches`.
         min_agreement_noisy: the same for photos whose noise was reduced.
@@ -251,7 +253,7 @@ class Gate:
     min_inliers: int = 8
     min_agreement: Steps | None = None
     min_agreement_noisy: Steps | None = None
-    max_mirrored: float | None = None
+    max_mirrored: Annotated[float, HIDDEN] | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
@@ -297,20 +299,3 @@ class Gate:
 
 
 DEFAULT_GATE = Gate()
-
-
-def add_gate_options(parser: Parser) -> None:
-    """Add --min_confidence and --min_inliers."""
-    parser.add_argument(
-        "--min_confidence",
-        type=float,
-        default=DEFAULT_GATE.min_confidence,
-        help="minimum confidence of a localized query: -log10 of the number of poses with as many "
-        "inliers that are expected by chance",
-    )
-    parser.add_argument(
-        "--min_inliers",
-        type=int,
-        default=DEFAULT_GATE.min_inliers,
-        help="minimum number of inliers of a localized query",
-    )

@@ -22,7 +22,7 @@ from ..utils.h5 import open_h5
 from ..utils.match_files import find_pair, get_matcher, get_matches, most_similar_first
 from ..utils.parsers import parse_query_lists, write_poses
 from ..utils.progress import progress
-from .confidence import DEFAULT_GATE, Gate, add_gate_options
+from .confidence import DEFAULT_GATE, Gate
 from .mirrored import MirrorImages, is_doubtful, mirror, mirror_options
 from .query import localize
 from .records import (
@@ -316,23 +316,3 @@ def _read(
 def read_queries(queries: Path) -> list[tuple[str, pycolmap.Camera]]:
     """Read the queries of all lists that match a glob."""
     return [query for part in parse_query_lists(queries).values() for query in part]
-
-
-def add_options(parser: cli.Parser, ransac_thresh: float, pixels: str) -> None:
-    """Add the options of `run`, with the default and the unit of --ransac_thresh."""
-    pairs = "pairs of queries and map images"
-    parser.add_argument("--retrieval", type=Path, required=True, help=pairs)
-    parser.add_argument("--features", type=Path, required=True, help="feature file")
-    parser.add_argument("--matches", type=Path, required=True, help="match file")
-    parser.add_argument("--results", type=Path, required=True, help="text file of poses")
-    text = f"RANSAC inlier threshold in {pixels}"
-    parser.add_argument("--ransac_thresh", type=float, default=ransac_thresh, help=text)
-    add_gate_options(parser)
-    parser.add_argument("--overwrite", action="store_true", help="localize all queries again")
-
-
-def run(parser: cli.Parser, main: Callable[..., object]) -> None:
-    """Call the `main` of a localization stage with the options of the command line."""
-    args = vars(parser.parse_args())
-    gate = Gate(args.pop("min_confidence"), args.pop("min_inliers"))
-    main(**args, gate=gate)

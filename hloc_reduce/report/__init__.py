@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
+from typing import Annotated
 
 from .. import __version__, logger
 from ..evaluation import plots
@@ -14,6 +15,7 @@ from ..evaluation.poses import ERRORS
 from ..utils import cli
 from ..utils.cli import InputError
 from ..utils.files import MEGABYTE, replacing
+from ..utils.options import POSITIVE, Option
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
 from . import pictures, runs, scene
@@ -27,20 +29,20 @@ ERROR = "median error [cm]"
 
 @strings_as_paths
 def main(
-    folders: list[Path],
-    output: Path,
+    folders: Annotated[list[Path], Option(flags=("folders",), metavar="OUTPUTS")],
+    output: Annotated[Path, Option(flags=("-o", "--output"))],
     queries: list[str] | None = None,
-    num_queries: int = NUM_QUERIES,
+    num_queries: Annotated[int, POSITIVE] = NUM_QUERIES,
     pictures_dir: Path | None = None,
 ) -> Path:
     """Write the report of runs.
 
     Args:
-        folders: outputs folders of runs, or folders with such folders, as for `runs.find`.
+        folders: outputs folders of runs, or folders with finished runs at most two levels below,
+            such as the outputs folder of a batch.
         output: the HTML file.
-        queries: the queries whose matches are shown; default: `num_queries` of them, spread evenly
-            from the worst to the best.
-        num_queries: how many queries are shown without `queries`.
+        queries: queries whose matches are shown; default: `num_queries` of them.
+        num_queries: number of queries shown without `queries`, spread evenly from worst to best.
         pictures_dir: also write plots (SVG) and pictures of matches (JPEG) to this folder.
 
     Returns:

@@ -3,46 +3,59 @@
 import asyncio
 import os
 from pathlib import Path
+from typing import Annotated
 
 from .. import logger
-from ..utils import cli
+from ..utils import cli, options
 from ..utils.cli import InputError
+from ..utils.options import ABOVE_0, POSITIVE
 from . import MAX_MB, QUEUE, __doc__, make_app
 
 MAX_PORT = 65_535
 UPLOADS = 32  # connections beside those that wait
 
 
-def _main() -> None:
-    parser = cli.Parser(__doc__, "--map place.hlm --port 8000")
-    add = parser.add_argument
-    add("--map", type=Path, required=True, help="map folder, or file of hloc_reduce.compact")
-    add("--onnx", type=Path, help="the map's feature, from hloc_reduce.export: needs no torch")
-    add("--host", default="127.0.0.1", help="address to listen on; 0.0.0.0 for all networks")
-    add("--port", type=int, default=8000, help="port to listen on")
-    add("--num_loc", type=int, default=50, help="retrieved map images per photo")
-    add("--max_mb", type=float, default=MAX_MB, help="largest photo in 1,000,000 bytes")
-    add("--queue", type=int, default=QUEUE, help="requests that may wait; others get status 503")
-    args = parser.parse_args()
-    cli.check_positive(args, "num_loc", "queue", "port")
-    if not args.max_mb > 0:
-        raise InputError(f"--max_mb {args.max_mb:g}: it must be above 0.")
-    if args.port > MAX_PORT:
-        raise InputError(f"--port {args.port}: at most {MAX_PORT}.")
+def serve(
+    map: Path,
+    onnx: Path | None = None,
+    host: str = "127.0.0.1",
+    port: Annotated[int, POSITIVE] = 8000,
+    num_loc: Annotated[int, POSITIVE] = 50,
+    max_mb: Annotated[float, ABOVE_0] = MAX_MB,
+    queue: Annotated[int, POSITIVE] = QUEUE,
+) -> None:
+    """Serve a map until the process is stopped.
+
+    Args:
+        map: map folder, or file of hloc_reduce.compact.
+        onnx: the map's feature, from hloc_reduce.export: needs no torch.
+        host: address to listen on; 0.0.0.0 for all networks.
+        port: port to listen on.
+        num_loc: retrieved map images per photo.
+        max_mb: largest photo in 1,000,000 bytes.
+        queue: requests that may wait; others get status 503.
+    """
+    if port > MAX_PORT:
+        raise InputError(f"--port {port}: at most {MAX_PORT}.")
     try:
         import uvicorn
     except ImportError:
         raise InputError("The service needs: pip install 'hloc-reduce[serve]'.") from None
     from ..maps.localizer import Localizer
 
-    check_address(args.host, args.port)  # before the map is loaded
-    localizer = Localizer(args.map, args.num_loc, onnx=args.onnx)
-    logger.info("Serving %s at http://%s:%d.", args.map, args.host, args.port)
-    app = make_app(localizer, args.max_mb, args.queue)
+    check_address(host, port)  # before the map is loaded
+    localizer = Localizer(map, num_loc, onnx=onnx)
+    logger.info("Serving %s at http://%s:%d.", map, host, port)
+    app = make_app(localizer, max_mb, queue)
     # photos that are being uploaded are in memory, too
-    most = args.queue + UPLOADS
-    address = {"host": args.host, "port": args.port}
-    uvicorn.run(app, **address, log_level="warning", limit_concurrency=most, timeout_keep_alive=30)
+    uvicorn.run(
+        app,
+        host=host,
+        port=port,
+        log_level="warning",
+        limit_concurrency=queue + UPLOADS,
+        timeout_keep_alive=30,
+    )
 
 
 def check_address(host: str, port: int) -> None:
@@ -61,6 +74,10 @@ def check_address(host: str, port: int) -> None:
         raise InputError(
             f"Cannot listen on {host}:{port}: {reason}. Choose another --port or --host."
         ) from None
+
+
+def _main() -> None:
+    options.call(serve, __doc__, "--map place.hlm --port 8000")
 
 
 if __name__ == "__main__":

@@ -4,9 +4,11 @@ Extracts, matches and triangulates the images of each map with the poses of its 
 from the tracks. A map built by pipelines.localize works, too.
 """
 
-import argparse
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 
@@ -20,6 +22,7 @@ from ..runtime.versions import versions
 from ..utils import cli
 from ..utils.cli import InputError
 from ..utils.files import file_sha256
+from ..utils.options import Option, Parser
 from ..utils.paths import strings_as_paths
 from . import levels, nested, patch_tracks, pca, raw, ss, sv, tracks, us
 
@@ -31,13 +34,49 @@ HIDDEN = {COLMAP: (256, 256)}
 HIDDEN_BY_DEFAULT = (512, 512)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """The options of the command line.
+
+    Args:
+        descriptor: base descriptors.
+        base: YAML file of a feature of any extractor, hloc's included, to project instead.
+        scheme: schemes.
+        dim: output dimensions; not for nested, raw.
+        map: maps to train on.
+        phototour: folder of a PhotoTour sequence to train on; may be repeated.
+        validate: folder of another PhotoTour sequence: print the FPR95 of its pairs.
+        recipe: recipe.
+        output: folder for the projections.
+        cache: folder for the tracks.
+        seed: seed of everything random.
+    """
+
+    descriptor: Annotated[Sequence[str], Option("descriptor", features_confs.BASES)] = ("sift",)
+    base: Annotated[Path, Option(metavar="FILE")] | None = None
+    scheme: Annotated[
+        Sequence[str],
+        Option("scheme", SCHEMES, "raw changes nothing and only fits levels for codes"),
+    ] = ("sv",)
+    dim: Sequence[int] = (64,)
+    map: Annotated[Sequence[str], tracks.MAPS] = ()
+    phototour: Annotated[Sequence[Path], Option(repeated=True, metavar="DIR")] = ()
+    validate: Annotated[Path, Option(metavar="DIR")] | None = None
+    recipe: Annotated[
+        str, Option("recipe", RECIPE_NAMES, "tune adapts the shipped projection to one's own map")
+    ] = "best"
+    output: Path = Path("outputs/training")
+    cache: Path = Path("outputs/training/maps")
+    seed: Annotated[int, Option(least=0)] = 0
+
+
 @strings_as_paths
 def main(
     maps: dict[str, tuple[Path, Path]],
-    sequences: list[Path],
+    sequences: Sequence[Path],
     descriptor: str,
     scheme: str,
-    dims: list[int],
+    dims: Sequence[int],
     output: Path,
     cache: Path,
     recipe: str = "best",
@@ -174,61 +213,7 @@ def validate(folder: Path, outputs: Path, descriptor: str, paths: list[Path]) ->
         print(f"FPR95 of {name} on {folder.resolve().name}: {100 * value:.2f} %")
 
 
-def _parse() -> argparse.Namespace:
-    parser = cli.Parser(
-        __doc__,
-        "--descriptor sift --scheme sv --dim 64 --map town/images:town/sparse --output weights",
-    )
-    add = parser.add_argument
-    base = parser.add_mutually_exclusive_group()
-    base.add_argument(
-        "--descriptor",
-        nargs="+",
-        default=["sift"],
-        help=f"base descriptors: {', '.join(features_confs.BASES)}",
-    )
-    base.add_argument(
-        "--base",
-        type=Path,
-        metavar="FILE",
-        help="YAML file of a feature of any extractor, hloc's included, to project instead",
-    )
-    add(
-        "--scheme",
-        nargs="+",
-        default=["sv"],
-        help=f"schemes: {', '.join(SCHEMES)}; raw changes nothing and only fits levels for codes",
-    )
-    add("--dim", type=int, nargs="+", default=[64], help="output dimensions; not for nested, raw")
-    tracks.add_map_option(parser, required=False)
-    add(
-        "--phototour",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="folder of a PhotoTour sequence to train on; may be repeated",
-    )
-    add(
-        "--validate",
-        type=Path,
-        metavar="DIR",
-        help="folder of another PhotoTour sequence: print the FPR95 of its pairs",
-    )
-    add(
-        "--recipe",
-        default="best",
-        help=f"one of {', '.join(RECIPE_NAMES)}; tune adapts the shipped projection to one's own "
-        "map",
-    )
-    outputs = Path("outputs/training")
-    add("--output", type=Path, default=outputs, help="folder for the projections")
-    add("--cache", type=Path, default=outputs / "maps", help="folder for the tracks")
-    add("--seed", type=int, default=0, help="seed of everything random")
-    return parser.parse_args()
-
-
-def _check(args: argparse.Namespace, conf: dict | None) -> None:
+def _check(args: Command, conf: dict | None) -> None:
     """Raise an InputError for wrong options, before any work is done."""
     of_patches = args.phototour or args.validate
     if conf:
@@ -243,17 +228,12 @@ def _check(args: argparse.Namespace, conf: dict | None) -> None:
             check_weights(descriptor)
         elif descriptor != COLMAP:
             extractors.load(features_confs.confs[descriptor]["model"])
-    for scheme in args.scheme:
-        cli.choose("scheme", scheme, SCHEMES)
     if "ss" in args.scheme:
         ss.check()
     for folder in (args.output, args.cache):
         cli.check_folder(folder)
-    cli.choose("recipe", args.recipe, RECIPE_NAMES)
     if not args.map and not args.phototour:
         raise InputError("There is nothing to train on. Give --map or --phototour.")
-    if args.seed < 0:
-        raise InputError(f"--seed {args.seed}: choose 0 or more.")
     if args.validate:
         layout.read_pairs(args.validate)
         layout.read_points(args.validate)
@@ -264,11 +244,16 @@ def _check(args: argparse.Namespace, conf: dict | None) -> None:
 
 
 def _main() -> None:
-    args, conf = _parse(), None
+    example = (
+        "--descriptor sift --scheme sv --dim 64 --map town/images:town/sparse --output weights"
+    )
+    parser = Parser(__doc__, example)
+    parser.add(Command, exclusive=[("descriptor", "base")])
+    args, conf = Command(**parser.read()), None
     if args.base:
         conf = features_confs.read(args.base)
         conf["model"] = features_confs.base_of(conf["model"])
-        args.descriptor = [args.base.stem]
+        args = replace(args, descriptor=[args.base.stem])
     _check(args, conf)
     maps = tracks.parse_maps(args.map)
     names = [*maps, *(folder.resolve().name for folder in args.phototour)]

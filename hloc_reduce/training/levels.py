@@ -7,6 +7,7 @@ projection first.
 """
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from torch import nn
 from .. import logger, projections
 from ..projections import network
 from ..projections.files import level_key
-from ..utils import cli
+from ..utils import cli, options
 from ..utils.cli import InputError
 from ..utils.codes import CODED
 from ..utils.files import file_sha256
@@ -120,20 +121,26 @@ def main(projection: Path, maps: dict[str, tuple[Path, Path]], cache: Path) -> P
     return projection
 
 
+def of_maps(
+    projection: list[str],
+    map: Annotated[list[str], tracks.MAPS],
+    cache: Path = Path("outputs/training/maps"),
+) -> None:
+    """Add levels to projections, or replace them.
+
+    Args:
+        projection: projections to change, by name or file.
+        map: maps to learn from.
+        cache: folder for the tracks.
+    """
+    maps = tracks.parse_maps(map)
+    for name in projection:
+        main(projections.find(name), maps, cache)
+
+
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__, "--projection weights/sift_sv32.safetensors --map town/images:town/sparse"
-    )
-    parser.add_argument(
-        "--projection", nargs="+", required=True, help="projections to change, by name or file"
-    )
-    tracks.add_map_option(parser, required=True)
-    default = Path("outputs/training/maps")
-    parser.add_argument("--cache", type=Path, default=default, help="folder for the tracks")
-    args = parser.parse_args()
-    maps = tracks.parse_maps(args.map)
-    for projection in args.projection:
-        main(projections.find(projection), maps, args.cache)
+    example = "--projection weights/sift_sv32.safetensors --map town/images:town/sparse"
+    options.call(of_maps, __doc__, example)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from ..networks import EDGEPOINT2, MINI, MINI_SIZE, fetch_weights
 from ..networks.edgepoint2 import EdgePoint2
 from ..networks.loading import load_weights, output_size, read_into
 from ..runtime.versions import versions
-from ..utils import cli
+from ..utils import cli, options
 from ..utils.cli import InputError
 from ..utils.files import file_sha256, replacing
 from ..utils.paths import strings_as_paths
@@ -156,17 +156,17 @@ def main(
 
     Args:
         images: folders of photos.
-        output: file of its weights, .safetensors.
-        dim: dimension of its descriptors.
-        towns: seeds of demo towns that are rendered by day and by night.
-        teacher: a model of EdgePoint2 with the same dimension, such as E32.
-        start: weights of an earlier training to start from; if its descriptors have another
-            dimension, the last layer starts from random weights. Default: all layers do.
+        output: file of the weights, .safetensors.
+        dim: dimension of the descriptors.
+        towns: seeds of demo towns to render by day and by night.
+        teacher: model of EdgePoint2 with the same dimension, such as E32; default: E<dim>.
+        start: weights of an earlier training to start from, to adapt them to other photos; if its
+            descriptors have another dimension, the last layer starts from random weights.
         steps: number of training steps.
-        cache: folder for the rendered photos.
-        batch: pairs of views of a step.
+        cache: folder for rendered photos.
+        batch: pairs of views of a step; a GPU takes 32 and more.
         lr: learning rate of Adam, which falls linearly to 0.
-        seed: of everything random.
+        seed: seed of everything random.
 
     Raises:
         InputError: when there are no photos, no such teacher, its dimension is another one, the
@@ -242,23 +242,8 @@ def _start_from(student: EdgePoint2, start: Path) -> None:
 
 
 def _main() -> None:
-    parser = cli.Parser(
-        __doc__, "--images scenes/fox/images --towns 1 2 --output weights/mini32.safetensors"
-    )
-    add = parser.add_argument
-    add("--images", type=Path, nargs="*", default=[], help="folders of photos")
-    add("--output", type=Path, required=True, help="file of the weights, .safetensors")
-    add("--dim", type=int, default=32, help="dimension of the descriptors")
-    add("--towns", type=int, nargs="*", default=[], help="seeds of demo towns to render")
-    add("--teacher", help="model of EdgePoint2 (default: E<dim>)")
-    add("--start", type=Path, help="weights to start from, to adapt them to other photos")
-    add("--steps", type=int, default=4000, help="number of training steps")
-    add("--batch", type=int, default=4, help="pairs of views of a step; a GPU takes 32 and more")
-    cache = Path("outputs/training/towns")
-    add("--cache", type=Path, default=cache, help="folder for rendered photos")
-    add("--lr", type=float, default=0.003, help="learning rate, which falls linearly to 0")
-    add("--seed", type=int, default=0, help="seed of everything random")
-    main(**vars(parser.parse_args()))
+    example = "--images scenes/fox/images --towns 1 2 --output weights/mini32.safetensors"
+    options.call(main, __doc__, example, images=[])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Training data: descriptors of the observations of a map's points."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,11 +23,12 @@ from ..runtime import provenance
 from ..runtime.group_writer import resume_or_replace
 from ..runtime.outputs import Lock
 from ..utils import colmap
-from ..utils.cli import InputError, Parser, choose
+from ..utils.cli import InputError, choose
 from ..utils.colmap import point3D_ids
 from ..utils.feature_files import get_colmap_keypoints, get_descriptors
 from ..utils.files import replacing
 from ..utils.h5 import get_dataset, open_h5
+from ..utils.options import Option
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
 from . import describers
@@ -35,6 +36,12 @@ from .completion import Completion
 
 NUM_COVIS = 20
 MATCHED = "sift"  # finds the tracks of all descriptors of patches
+MAPS = Option(
+    note="folder of images and folder of their COLMAP model, or a map of pipelines.localize; may "
+    "be repeated",
+    repeated=True,
+    metavar="IMAGES:MODEL|MAP",
+)
 KEYPOINTS = "hloc"  # settings of DoG that the shipped projections were trained with
 
 
@@ -67,20 +74,7 @@ class Tracks:
         return Tracks(**{key: value[kept] for key, value in vars(self).items()})
 
 
-def add_map_option(parser: Parser, required: bool) -> None:
-    """Add --map, whose values `parse_maps` takes."""
-    parser.add_argument(
-        "--map",
-        action="append",
-        default=[],
-        required=required,
-        metavar="IMAGES:MODEL|MAP",
-        help="folder of images and folder of their COLMAP model, or a map of pipelines.localize; "
-        "may be repeated",
-    )
-
-
-def parse_maps(values: list[str], option: str = "--map") -> dict[str, tuple[Path, Path]]:
+def parse_maps(values: Sequence[str], option: str = "--map") -> dict[str, tuple[Path, Path]]:
     """Parse `images:model`, or folders of maps of `pipelines.localize`.
 
     A map is named after the parent of its images folder, or of the folder of the built map.

@@ -5,13 +5,23 @@ codes of all images and maps compare.
 """
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
+
+from .options import Option
 
 FLOATS = ("float16", "float32")  # hloc has these, as `as_half`
 CODED = {"uint4": 4, "uint2": 2, "uint1": 1}  # bits of a number
 STORAGES = (*FLOATS, "uint8", *CODED)
 QUANTIZED = {storage: f"descriptors_{storage}" for storage in STORAGES if storage not in FLOATS}
+STORAGE = Option(
+    "storage",
+    STORAGES,
+    "uint8 keeps a number in a byte; uint4, uint2 and uint1 keep it in 4, 2 and 1 bits and need a "
+    "projection with levels, see hloc_reduce.training.levels; hloc reads floats only",
+)
+Storage = Annotated[str, STORAGE]
 STEPS = 255
 # The integer that stands for 1, and the least mean norm of what codes stand for. Products of
 # restored vectors are at most (UNIT / LEAST_NORM)**2 < 2**24, so a float32 represents them exactly;

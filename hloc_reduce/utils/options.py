@@ -23,7 +23,7 @@ LISTS = (list, tuple, Iterable, Collection, Sequence)
 REQUIRED = inspect.Parameter.empty
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # annotations must be hashable, and choices may be a dict
 class Option:
     """What a parameter has beyond its type, as in `Annotated[str, Option(...)]`.
 
@@ -33,9 +33,12 @@ class Option:
         note: help on the choices.
         least: the least number.
         above: what numbers must exceed.
+        lower: whether upper case means the same.
         repeated: one value each time that the option is given, not several at once.
+        rest: whether all arguments that follow are its values.
         flags: names instead of `--<parameter>`; a name without dashes is given by its position.
         metavar: stands for the value in the help.
+        hidden: whether only Python has the parameter.
     """
 
     kind: str = ""
@@ -43,12 +46,15 @@ class Option:
     note: str = ""
     least: float | None = None
     above: float | None = None
+    lower: bool = False
     repeated: bool = False
+    rest: bool = False
     flags: tuple[str, ...] = ()
     metavar: str | None = None
+    hidden: bool = False
 
 
-POSITIVE, ABOVE_0 = Option(least=1), Option(above=0)
+POSITIVE, ABOVE_0, HIDDEN = Option(least=1), Option(above=0), Option(hidden=True)
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,16 @@ class Parameter:
     option: Option
     default: Any
     text: str
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """What the parameter is called on a command line."""
+        return self.option.flags or (f"--{self.name}",)
+
+    @property
+    def is_option(self) -> bool:
+        """Whether command lines have it."""
+        return not (self.kind is None or self.option.hidden or self.default is True)
 
     def check(self, values: Any, what: str) -> None:
         """Raise an InputError, which begins with `what`, for a wrong value."""
@@ -91,13 +107,15 @@ class Parameter:
 
     def add_to(self, parser: argparse._ActionsContainer) -> None:
         """Add the option to a parser, or to a group of it."""
-        option, default = self.option, self.default
-        flags = option.flags or (f"--{self.name}",)
+        option, default, flags = self.option, self.default, self.flags
         settings: dict[str, Any] = {"help": self.help()}
+        metavar = option.metavar
         if flags[-1].startswith("-"):
+            metavar = metavar or flags[-1].strip("-").upper()
             settings |= {"dest": self.name, "required": default is REQUIRED}
         if default is not REQUIRED:
-            settings["default"] = list(default) if default and self.several else default
+            is_list = self.several and default is not None
+            settings["default"] = list(default) if is_list else default
         if self.kind is bool:
             parser.add_argument(*flags, action="store_true", **settings)
             return
@@ -106,9 +124,12 @@ class Parameter:
         elif self.kind is object and isinstance(option.choices, Mapping):
             keys = [key for key, value in option.choices.items() if value == default]
             settings |= {"default": keys[0]} if keys else {}
+        if option.lower:
+            settings["type"] = str.lower
         if self.several:
-            settings |= {"action": "append"} if option.repeated else {"nargs": "+"}
-        metavar = option.metavar or flags[-1].strip("-").upper()
+            nargs = "*" if settings.get("default") == [] else "+"
+            nargs = argparse.REMAINDER if option.rest else nargs
+            settings |= {"action": "append"} if option.repeated else {"nargs": nargs}
         parser.add_argument(*flags, metavar=metavar, **settings)
 
 
@@ -117,13 +138,25 @@ def parameters(source: Callable) -> dict[str, Parameter]:
     """Return the parameters of a function or a dataclass by name."""
     hints, texts = get_type_hints(source, include_extras=True), _texts(source)
     return {
-        name: Parameter(name, *_kind(hints[name]), parameter.default, texts.get(name, ""))
+        name: Parameter(name, *kind_of(hints[name]), parameter.default, texts.get(name, ""))
         for name, parameter in inspect.signature(source).parameters.items()
         if parameter.kind != parameter.VAR_KEYWORD
     }
 
 
-def _kind(annotation: Any) -> tuple[type | None, bool, Option]:
+def declared(source: Callable, **defaults: Any) -> dict[str, Parameter]:
+    """Return the options of a function or a dataclass by name, some with other defaults."""
+    found: dict[str, Parameter] = {}
+    for name, parameter in parameters(source).items():
+        default = defaults.get(name, parameter.default)
+        if is_dataclass(parameter.kind):
+            found |= declared(parameter.kind, **flat(default))
+        elif parameter.is_option:
+            found[name] = replace(parameter, default=default)
+    return found
+
+
+def kind_of(annotation: Any) -> tuple[type | None, bool, Option]:
     """Return the kind of an annotation, whether it has several values, and its `Option`."""
     members = [*_members(annotation)]
     single = {kind: option for kind, several, option in members if not several}
@@ -135,10 +168,10 @@ def _kind(annotation: Any) -> tuple[type | None, bool, Option]:
 
 
 def _members(annotation: Any) -> Iterator[tuple[type, bool, Option]]:
-    """Yield the kinds that a value may have, as in `_kind`, but for types that are no options."""
+    """Yield the kinds that a value may have, as in `kind_of`, but for types that are no options."""
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        for kind, several, _ in [*_members(parts[0])] or [(object, False, None)]:
+        for kind, several, _ in [*_members(parts[0])] or [(object, False, Option())]:
             yield kind, several, parts[1]
     elif origin in (Union, UnionType):
         for part in parts:
@@ -167,33 +200,27 @@ class Parser(cli.Parser):
 
     def __init__(self, description: str | None, example: str = "", **settings: Any):
         super().__init__(description, example, **settings)
-        self._added: list[Parameter] = []
+        self._added: dict[str, Parameter] = {}
 
     def add(
         self,
         source: Callable,
-        without: Collection[str] = (),
         exclusive: Collection[tuple[str, ...]] = (),
         **defaults: Any,
     ) -> None:
-        """Add options.
+        """Add options, but for those that the command line has already.
 
         Args:
             source: the function or the dataclass.
-            without: its parameters that are no options.
             exclusive: groups of parameters of which one may be given.
             defaults: other defaults of options.
         """
         groups = {group: self.add_mutually_exclusive_group() for group in exclusive}
-        for name, parameter in parameters(source).items():
-            default = defaults.get(name, parameter.default)
-            if is_dataclass(parameter.kind):
-                self.add(parameter.kind, without, **flat(default))
-            elif parameter.kind and name not in without and default is not True:
-                parameter = replace(parameter, default=default)
+        for name, parameter in declared(source, **defaults).items():
+            if name not in self._added:
                 group = next((group for names, group in groups.items() if name in names), self)
                 parameter.add_to(group)
-                self._added.append(parameter)
+                self._added[name] = parameter
 
     def read(self) -> dict[str, Any]:
         """Parse and check the options and return them by the names of the parameters.
@@ -202,11 +229,11 @@ class Parser(cli.Parser):
             InputError: for a wrong value.
         """
         values = vars(self.parse_args())
-        for parameter in self._added:
-            value, (*_, flag) = values[parameter.name], (parameter.name, *parameter.option.flags)
-            parameter.check(value, f"--{flag.strip('-')}")
-            if parameter.kind is object and isinstance(value, str):
-                values[parameter.name] = dict(parameter.option.choices)[value]
+        for name, parameter in self._added.items():
+            parameter.check(values[name], parameter.flags[-1])
+            choices = parameter.option.choices
+            if isinstance(choices, Mapping) and parameter.kind is object:
+                values[name] = choices.get(values[name])
         return values
 
 
@@ -223,7 +250,7 @@ def taken(source: Callable, values: Mapping[str, Any]) -> dict[str, Any]:
     for name, parameter in parameters(source).items():
         if is_dataclass(parameter.kind):
             arguments[name] = replace(parameter.default, **taken(parameter.kind, values))
-        elif name in values:
+        elif name in values and parameter.is_option:
             arguments[name] = values[name]
     return arguments
 
@@ -231,7 +258,8 @@ def taken(source: Callable, values: Mapping[str, Any]) -> dict[str, Any]:
 def flat(instance: Any) -> dict[str, Any]:
     """Return the fields of a dataclass by name, and those of dataclasses in it instead of these."""
     values: dict[str, Any] = {}
-    for name, parameter in parameters(type(instance)).items():
+    kind: Any = type(instance)
+    for name, parameter in parameters(kind).items():
         value = getattr(instance, name)
         values |= flat(value) if is_dataclass(parameter.kind) else {name: value}
     return values
@@ -245,7 +273,8 @@ class Checked:
     """
 
     def __post_init__(self) -> None:
-        for name, parameter in parameters(type(self)).items():
+        kind: Any = type(self)
+        for name, parameter in parameters(kind).items():
             value = getattr(self, name)
             if parameter.kind is Path and isinstance(value, str):
                 object.__setattr__(self, name, Path(value))

@@ -4,7 +4,9 @@ import inspect
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import ParamSpec, TypeVar, get_args
+from typing import ParamSpec, TypeVar
+
+from .options import kind_of
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -17,11 +19,8 @@ def strings_as_paths(function: Callable[Parameters, Result]) -> Callable[Paramet
     `Path | str` the function itself distinguishes them.
     """
     signature = inspect.signature(function)
-    kinds = {
-        name: get_args(parameter.annotation) or (parameter.annotation,)
-        for name, parameter in signature.parameters.items()
-    }
-    paths = [name for name, kind in kinds.items() if Path in kind and str not in kind]
+    kinds = {name: kind_of(given.annotation)[0] for name, given in signature.parameters.items()}
+    paths = [name for name, kind in kinds.items() if kind is Path]
 
     @wraps(function)
     def convert(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:

@@ -7,6 +7,7 @@ the others. An interrupted batch resumes.
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 from hloc_reduce import logger
 from hloc_reduce.runtime.executors import SERIAL, Executor
@@ -14,9 +15,11 @@ from hloc_reduce.runtime.outputs import SHARED, Lock
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.codes import STORAGES, descriptor_bytes
 from hloc_reduce.utils.h5 import list_h5_names
+from hloc_reduce.utils.options import Option, parameters
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned
 
+from ..common.options import Method
 from . import jobs, tables
 from .jobs import Job
 from .shared import Shared
@@ -29,7 +32,7 @@ FEATURE_BYTES, MATCH_BYTES, MAP_BYTES = 14, 0.75, 67
 
 @strings_as_paths
 def main(
-    job_file: Path,
+    job_file: Annotated[Path, Option(flags=("job_file",))],
     outputs: Path | None = None,
     overwrite: bool = False,
     strict: bool = False,
@@ -38,7 +41,7 @@ def main(
     """Run jobs; print and write their tables.
 
     Args:
-        job_file: YAML file of jobs, see `jobs`.
+        job_file: YAML file of jobs, see docs/operations.md.
         outputs: folder for jobs.csv, jobs.txt, failures.csv and a folder for each data set, with
             one for each job; default: the one that the file names.
         overwrite: recompute existing results.
@@ -66,23 +69,18 @@ def main(
             for job in shared.running():
                 logger.info("%s, %s:", shared.dataset.name, job.name)
                 with shared.failing([job]):
-                    summaries[job] = shared.pipeline.main(
-                        shared.dataset,
-                        folder_of(shared, job),
-                        job.feature,
-                        matcher=job.matcher,
-                        retrieval=shared.retrieval(job),
-                        ground_truth=job.ground_truth,
-                        overwrite=overwrite,
-                        storage=job.storage,
-                        keypoints=job.keypoints,
-                        executor=executor,
-                        features=shared.features[job],
-                        strict=strict,
-                        accept_partial=not strict,
-                        gate=job.gate,
-                        **job.numbers,
-                    )
+                    options = {name: getattr(job, name) for name in parameters(Method)}
+                    options |= shared.numbers(job)
+                    options |= {
+                        "retrieval": shared.retrieval(job),
+                        "features": shared.features[job],
+                        "overwrite": overwrite,
+                        "executor": executor,
+                        "strict": strict,
+                        "accept_partial": not strict,
+                    }
+                    folder = folder_of(shared, job)
+                    summaries[job] = shared.pipeline.main(shared.dataset, folder, **options)
                 tables.write(done, outputs)
         rows, text = tables.write(done, outputs)
     print(text)

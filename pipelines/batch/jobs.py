@@ -13,79 +13,55 @@ The options are those of `pipelines.aachen` and `pipelines.inloc`.
 
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import product
 from pathlib import Path
 
 from hloc_reduce.confs import features as features_confs
-from hloc_reduce.confs import matchers as matchers_confs
-from hloc_reduce.detectors.dog import KEYPOINTS
-from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.runtime.outputs import SHARED
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.codes import STORAGES
+from hloc_reduce.utils.options import declared, flat, taken
 from hloc_reduce.utils.parsers import read_yaml
 
+from ..common.options import Method, Positive
+
 SHIPPED = Path(__file__).parents[2] / "confs/jobs"
-# numeric options: their types, and how a message calls these
-NUMBERS: dict[str, tuple[type | tuple[type, ...], str]] = {
-    "num_covis": (int, "an integer"),
-    "num_loc": (int, "an integer"),
-    "min_confidence": ((int, float), "a number"),
-    "min_inliers": (int, "an integer"),
-}
+CALLED: dict[type | None, str] = {int: "an integer", float: "a number"}  # others are names
+# the options that name a job's folder if they are not the default, in this order
+NAMED = ("matcher", "storage", "keypoints", "retrieval")
+NUMBERS = ("num_covis", "num_loc", "min_confidence", "min_inliers")
 NAME_PARTS = ("descriptor", "scheme", "dim")  # of a feature's name
 
 
-@dataclass(frozen=True)
-class Job:
+@dataclass(frozen=True, kw_only=True)
+class Job(Method):
     """A run of a pipeline.
 
     Args:
         dataset: data set folder.
-        feature: name of a feature, or its YAML file.
-        matcher: name of a matcher; default: the feature's.
-        storage: how descriptors are stored.
-        keypoints: settings of the DoG detector.
         retrieval: "vlad", with the first feature of the data set, or a file.
-        ground_truth: true poses of the queries; default: those of the data set.
         num_covis: other images that each map image is matched with; default: the pipeline's.
         num_loc: retrieved map images per query; default: the pipeline's.
-        min_confidence: what a pose must have for the query to be called localized.
-        min_inliers: inliers that the pose must have, too.
     """
 
     dataset: Path
-    feature: str = features_confs.RECOMMENDED
-    matcher: str | None = None
-    storage: str = STORAGES[0]
-    keypoints: str = KEYPOINTS[0]
-    retrieval: str = "vlad"
-    ground_truth: Path | None = None
-    num_covis: int | None = None
-    num_loc: int | None = None
-    min_confidence: float = DEFAULT_GATE.min_confidence
-    min_inliers: int = DEFAULT_GATE.min_inliers
+    num_covis: Positive | None = None
 
     @property
     def name(self) -> str:
         """The name of its folder: the feature, and all options that are not the default."""
-        parts = [Path(self.feature).stem]
-        for field in fields(self)[2:]:
-            value = getattr(self, field.name)
-            default = self._matcher() if field.name == "matcher" else field.default
-            if value not in (None, default) and field.name != "ground_truth":
-                named = field.name in NUMBERS or field.name == "keypoints"
-                prefix = field.name if named else ""
-                text = f"{value:g}" if field.name in NUMBERS else Path(value).stem
+        parts, options = [Path(self.feature).stem], flat(self)
+        for name in (*NAMED, *NUMBERS):
+            value, default = options[name], OPTIONS[name].default
+            if name == "matcher":
+                default = features_confs.matcher_of(features_confs.get(self.feature)[1])
+            if value not in (None, default):
+                text = f"{value:g}" if name in NUMBERS else Path(value).stem
+                prefix = name if name in (*NUMBERS, "keypoints") else ""
                 parts.append(prefix + text.removeprefix("pairs-query-"))
         return "+".join(parts)
-
-    def _matcher(self) -> str:
-        """Return the default matcher of the feature."""
-        return features_confs.matcher_of(features_confs.get(self.feature)[1])
 
     @property
     def numbers(self) -> dict[str, int]:
@@ -93,13 +69,8 @@ class Job:
         given = {"num_covis": self.num_covis, "num_loc": self.num_loc}
         return {name: number for name, number in given.items() if number is not None}
 
-    @property
-    def gate(self) -> Gate:
-        """What a pose must have for a query to be called localized."""
-        return Gate(self.min_confidence, self.min_inliers)
 
-
-OPTIONS = tuple(field.name for field in fields(Job))
+OPTIONS = declared(Job)
 
 
 def read(path: Path) -> tuple[Path, list[Job]]:
@@ -173,28 +144,25 @@ def _features(item: str | dict) -> list[str]:
 def _job(options: dict) -> Job:
     """Make a job; raise an InputError for an option of the wrong type."""
     for name, value in options.items():
-        kind, called = NUMBERS.get(name, (str, "a name"))
-        is_right = isinstance(value, kind) and not isinstance(value, bool)
-        if not is_right:
+        called = CALLED.get(OPTIONS[name].kind, "a name")
+        kinds = {"an integer": int, "a number": int | float, "a name": str}[called]
+        if not isinstance(value, kinds) or isinstance(value, bool):
             raise InputError(f"{name} is {value!r}: {called} is needed.")
-        if name.startswith("num_") and value < 1:
-            raise InputError(f"{name} is {value}: at least 1.")
     paths = {
         name: Path(os.path.normpath(options[name]))
         for name in ("dataset", "ground_truth")
         if name in options
     }
-    job = Job(**options | paths)
-    _ = job.gate  # raises for bad values
+    job = Job(**taken(Job, options | paths))
     _, conf = features_confs.get(job.feature, storage=job.storage, keypoints=job.keypoints)
-    matcher = job.matcher or features_confs.matcher_of(conf)
-    return replace(job, matcher=cli.choose("matcher", matcher, matchers_confs.confs))
+    return replace(job, matcher=job.matcher or features_confs.matcher_of(conf))
 
 
 def _matches(job: Job, excluded: dict) -> bool:
     """Tell whether a job has one of the given values of each given option."""
+    options = flat(job)
     return all(
-        any(fnmatchcase(_text(getattr(job, name)), _text(value)) for value in _list(values))
+        any(fnmatchcase(_text(options[name]), _text(value)) for value in _list(values))
         for name, values in excluded.items()
     )
 
@@ -220,7 +188,8 @@ def _check(jobs: list[Job]) -> None:
             raise InputError(f"a feature cannot be called {SHARED}: rename {job.feature}.")
         other = folders.setdefault((path.name, job.name), job)
         if other != job:
-            differ = [name for name in OPTIONS if getattr(other, name) != getattr(job, name)]
+            options, others = flat(job), flat(other)
+            differ = [name for name in OPTIONS if options[name] != others[name]]
             raise InputError(
                 f"two jobs are called {job.name} of {job.dataset.name}, but differ in "
                 f"{' and '.join(differ)}: rename a file or a folder, or use two job files."

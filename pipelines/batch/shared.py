@@ -67,7 +67,7 @@ class Shared:
         from hloc_reduce import extractors
 
         for name in job.numbers:
-            cli.choose(f"option for {self.dataset.name}", name, self.pipeline.NUMBERS)
+            cli.choose(f"option for {self.dataset.name}", name, self.pipeline.Options().numbers)
         if job.retrieval != "vlad" and not Path(job.retrieval).is_file():
             raise InputError(f"retrieval {job.retrieval}: neither vlad nor an existing file.")
         num_loc, names = self.numbers(job)["num_loc"], (self.query_names, self.map_names)
@@ -113,7 +113,7 @@ class Shared:
 
     def numbers(self, job: Job) -> dict[str, int]:
         """Return the --num_... options of a job, with the defaults of its pipeline."""
-        return {**self.pipeline.NUMBERS, **job.numbers}
+        return self.pipeline.Options(**job.numbers).numbers
 
     def images(self) -> list[str]:
         """Return the images whose features are needed."""

@@ -1,46 +1,28 @@
 """Options of pipelines.localize that change a map: photos to add and to remove."""
 
 from pathlib import Path
+from typing import Annotated
 
 from hloc_reduce import maps
 from hloc_reduce.maps.map import Map
-from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.options import HIDDEN
 from hloc_reduce.utils.parsers import image_names
-
-NAMES = "add_images", "add_model", "refine_map", "remove_images"
-
-
-def add_options(parser: cli.Parser) -> None:
-    """Add the options that change a map."""
-    parser.add_argument(
-        "--add_images",
-        type=Path,
-        help="folder of photos to add to --map, a map that was built before",
-    )
-    parser.add_argument(
-        "--add_model",
-        type=Path,
-        help="COLMAP model with the poses of --add_images in the frame of the map, which are kept "
-        "(default: the photos are localized in the map)",
-    )
-    parser.add_argument(
-        "--refine_map",
-        action="store_true",
-        help="also adjust the poses of the photos that are already in the map",
-    )
-    parser.add_argument(
-        "--remove_images", type=Path, help="text file of the names of photos to remove from --map"
-    )
 
 
 def check(
-    given: dict, add_images: Path | None, add_model: Path | None, refine_map: bool, **_: object
+    folder: Path | None,
+    made_from: Path | None,
+    add_images: Path | None,
+    add_model: Path | None,
+    refine_map: bool,
+    **_: object,
 ) -> None:
     """Raise an InputError for options that do not go together.
 
     Args:
-        given: the other options of `pipelines.localize`.
+        folder: of the map.
+        made_from: photos or database to build a map from.
         add_images: folder of photos to add.
         add_model: COLMAP model of their poses.
         refine_map: also adjust the poses of the photos that are in the map.
@@ -49,14 +31,13 @@ def check(
         raise InputError(
             "--add_model and --refine_map are for photos that are added: --add_images."
         )
-    folder, others = given["map"], (given["map_images"], given["database"])
     if folder is not None and maps.is_compact(folder):
         raise InputError(
             f"--map {folder} is a compact map, which cannot be changed: add photos to the map "
             "that it was made from, or remove them there, and pack that again: --map FOLDER "
             f"--compact {folder}"
         )
-    if folder is None or any(others):
+    if folder is None or made_from:
         raise InputError(
             "--add_images and --remove_images change a map that was built before: give its folder, "
             "--map, without --map_images and --database."
@@ -64,20 +45,21 @@ def check(
 
 
 def main(
-    folder: Path,
-    add_images: Path | None,
-    add_model: Path | None,
-    refine_map: bool,
-    remove_images: Path | None,
+    folder: Annotated[Path, HIDDEN],
+    add_images: Path | None = None,
+    add_model: Path | None = None,
+    refine_map: bool = False,
+    remove_images: Path | None = None,
 ) -> None:
     """Remove photos from a map, and add others.
 
     Args:
         folder: of the map.
-        add_images: folder of photos to add.
-        add_model: COLMAP model of their poses, see `maps.add`.
-        refine_map: also adjust the poses of the photos that are in the map.
-        remove_images: text file of the names of photos to remove.
+        add_images: folder of photos to add to `map`, a map that was built before.
+        add_model: COLMAP model with the poses of `add_images` in the frame of the map, which are
+            kept; default: the photos are localized in the map.
+        refine_map: also adjust the poses of the photos that are already in the map.
+        remove_images: text file of the names of photos to remove from `map`.
 
     Raises:
         InputError: see `maps.add` and `maps.remove`.

@@ -24,11 +24,9 @@ MADE_FROM = "made_from.json"  # the model that the file was made from
 
 
 def check(is_compact: bool, max_mb: float | None, retrieval: str) -> None:
-    """Raise an InputError for options that do not go together, or a size that is none."""
+    """Raise an InputError for options that do not go together."""
     if max_mb is not None and not is_compact:
         raise InputError(f"--max_mb {max_mb:g} is the size of a compact map: give --compact, too.")
-    if max_mb is not None and not max_mb > 0:
-        raise InputError(f"--max_mb {max_mb:g}: it must be above 0.")
     if is_compact and retrieval != "vlad":
         raise InputError(
             "Images of a compact map are retrieved by what is in it: leave out --retrieval."
@@ -76,7 +74,7 @@ def main(
     with Run(results, run.feature, matcher, run.executor, run.folder) as part:
         provenance.write(outputs / MADE_FROM, made_from)
         built = _pack(run, part, place, sfm, max_mb)
-        features, num_loc = run.features, run.numbers["num_loc"]
+        features, num_loc = run.features, run.options.num_loc
         pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
         with part.stage("retrieval"):
             queries = readable(features, run.query_names)
@@ -86,21 +84,24 @@ def main(
         query_files = pairs, features, built.features
         with part.stage("localization"):
             records = localize_sfm.main(
-                *(built.sfm, place.queries, pairs, features, matches, poses),
+                built.sfm,
+                place.queries,
+                pairs,
+                features,
+                matches,
+                poses,
                 executor=run.executor,
-                gate=run.gate,
+                gate=run.options.gate,
                 mirror_images=part.mirror_images(run.conf, place.images, *query_files),
             )
         files = run.files(built.features, built.sfm, pairs, matches)
-        return part.finish(
-            run.summary(
-                compact=FILE,
-                map_images=built.num_images,
-                map_points3D=built.num_points3D,
-                map_bytes=(outputs / FILE).stat().st_size,
-            ),
-            *(lists, records, run.truth, limits, features, poses, files),
+        summary = run.summary(
+            compact=FILE,
+            map_images=built.num_images,
+            map_points3D=built.num_points3D,
+            map_bytes=(outputs / FILE).stat().st_size,
         )
+        return part.finish(summary, lists, records, run.truth, limits, features, poses, files)
 
 
 def _pack(run: DatasetRun, part: Run, place: Aachen, sfm: Path, max_mb: float | None) -> Map:
@@ -110,8 +111,13 @@ def _pack(run: DatasetRun, part: Run, place: Aachen, sfm: Path, max_mb: float | 
         if not file.exists():
             model = colmap.read_model(sfm)
             source = Source(
-                *(model, run.feature, run.conf, run.matcher, run.global_descriptors),
-                *(vocabulary_of(run.global_descriptors), intrinsics.of_map(model, place.images)),
+                model,
+                run.feature,
+                run.conf,
+                run.matcher,
+                run.global_descriptors,
+                vocabulary_of(run.global_descriptors),
+                intrinsics.of_map(model, place.images),
             )
             compact.write(file, source, run.features, max_mb=max_mb)
         return maps.unpack(file, part.folder.path / "map")

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TypedDict
 
 from hloc_reduce import extract_features
 from hloc_reduce.confs import features as features_confs
@@ -10,38 +9,18 @@ from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.inloc import InLoc
-from hloc_reduce.detectors.dog import KEYPOINTS
 from hloc_reduce.evaluation.summaries import map_bytes
-from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
 from hloc_reduce.localization.mirrored import MirrorImages
 from hloc_reduce.maps.map import RETRIEVAL
 from hloc_reduce.runtime import provenance
-from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.runtime.outputs import CONF, RunFolder
-from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.h5 import get_text, open_h5
-from hloc_reduce.utils.paths import strings_as_paths
 
+from .options import DatasetOptions
 from .retrieval import check_retrieval, retrieval_name, retrieve
 from .run import Run, Thresholds, check_queries, readable, relative
 
 SHARED_POINTS = "points3D.h5"  # beside given features of InLoc: the 3D points of their keypoints
-
-
-class Settings(TypedDict, total=False):
-    """The arguments that pipelines of data sets hand on to `DatasetRun`, which explains them."""
-
-    matcher: str
-    retrieval: str
-    ground_truth: Path | None
-    overwrite: bool
-    projection: Path | None
-    storage: str
-    keypoints: str
-    executor: Executor
-    strict: bool
-    accept_partial: bool
-    gate: Gate
 
 
 class DatasetRun(Run):
@@ -50,21 +29,7 @@ class DatasetRun(Run):
     Args:
         place: the data set.
         outputs: folder for the results.
-        feature: name of a feature, or its YAML file.
-        num_loc: retrieved map images per query.
-        numbers: further --num_... options of the pipeline.
-        matcher: name of the matcher.
-        retrieval: "vlad", or a file of pairs or of global descriptors.
-        ground_truth: true poses of the queries; default: those of the data set.
-        overwrite: recompute existing results.
-        projection: projection file to use with the base descriptor of `feature`.
-        storage: how descriptors of map images are stored.
-        keypoints: settings of the DoG detector.
-        executor: where the work is done.
-        features: feature file to use instead of extracting features.
-        strict: stop at an unreadable query photo instead of recording it as not localized.
-        accept_partial: build the map without photos that are missing or unreadable.
-        gate: what a pose must have for the query to be called localized.
+        options: the options of the pipeline.
 
     Attributes:
         conf: the configuration of the feature.
@@ -77,63 +42,46 @@ class DatasetRun(Run):
         InputError: when something is missing or wrong.
     """
 
-    @strings_as_paths
-    def __init__(
-        self,
-        place: Aachen | InLoc,
-        outputs: Path,
-        feature: str = features_confs.RECOMMENDED,
-        num_loc: int = 50,
-        numbers: Mapping[str, int] | None = None,
-        matcher: str | None = None,
-        retrieval: str = "vlad",
-        ground_truth: Path | None = None,
-        overwrite: bool = False,
-        projection: Path | None = None,
-        storage: str = STORAGES[0],
-        keypoints: str = KEYPOINTS[0],
-        executor: Executor = SERIAL,
-        features: Path | None = None,
-        strict: bool = False,
-        accept_partial: bool = False,
-        gate: Gate = DEFAULT_GATE,
-    ):
-        feature, self.conf = features_confs.get(feature, projection, storage, keypoints)
-        matcher = matcher or features_confs.matcher_of(self.conf)
-        self.place, self._retrieval, self.gate = place, retrieval, gate
-        self._strict, self._accept_partial = strict, accept_partial
-        self.numbers = {**(numbers or {}), "num_loc": num_loc}
-        retrieved = f"{retrieval_name(retrieval)}{num_loc}"
+    def __init__(self, place: Aachen | InLoc, outputs: Path, options: DatasetOptions):
+        method = options.feature, options.projection, options.storage, options.keypoints
+        feature, self.conf = features_confs.get(*method)
+        matcher = options.matcher or features_confs.matcher_of(self.conf)
+        self.place, self.options = place, options
+        retrieved = f"{retrieval_name(options.retrieval)}{options.num_loc}"
         self.label = f"{feature}+{matcher}_{retrieved}"
         self._pairs = outputs / f"pairs-query-{retrieved}.txt"
         self.query_names, map_names = place.query_names(), place.map_names()
-        used = check_retrieval(retrieval, self._pairs, num_loc, self.query_names, map_names)
-        needed = map_names if place.whole_map else used
+        used = check_retrieval(
+            options.retrieval, self._pairs, options.num_loc, self.query_names, map_names
+        )
+        needed, accept_partial = map_names if place.whole_map else used, options.accept_partial
         place.check([] if accept_partial and place.whole_map else needed)
         self.map_names = extract_features.keep_present(place.images, needed, accept_partial)
         self.is_partial = len(self.map_names) < len(needed)
-        if features is None:
-            check_queries(place.images, self.query_names, strict)
-        self.truth_file = ground_truth or place.ground_truth
-        self.truth = true_poses(self.query_names, self.truth_file, bool(ground_truth))
-        self._given, self.features = features, features or outputs / f"{self.conf['output']}.h5"
-        super().__init__(self._claim(outputs, matcher, overwrite), feature, matcher, executor)
+        if options.features is None:
+            check_queries(place.images, self.query_names, options.strict)
+        self.truth_file = options.ground_truth or place.ground_truth
+        self.truth = true_poses(self.query_names, self.truth_file, bool(options.ground_truth))
+        self.features = options.features or outputs / f"{self.conf['output']}.h5"
+        super().__init__(self._claim(outputs, matcher), feature, matcher, options.executor)
 
-    def _claim(self, outputs: Path, matcher: str, overwrite: bool) -> RunFolder:
+    def _claim(self, outputs: Path, matcher: str) -> RunFolder:
         """Claim the outputs folder. Results of given features are stale if these were redone."""
+        options = self.options
         conf = {
             "dataset": str(self.place.root.resolve()),
             "feature": extract_features.provenance(self.conf),
             "matcher": matchers_confs.confs[matcher]["model"],
-            "retrieval": self._retrieval,
-            **self.numbers,
+            "retrieval": options.retrieval,
+            **options.numbers,
         }
-        inputs = [] if self._retrieval == "vlad" else [Path(self._retrieval)]
+        inputs = [] if options.retrieval == "vlad" else [Path(options.retrieval)]
         if inputs and outputs.resolve().parent in inputs[0].resolve().parents:
             conf["retrieval"] = relative(inputs[0], outputs)  # both may be moved together
-        if self._given is not None:
-            with open_h5(self._given) as file:
-                conf["features"] = get_text(file, "id", str(self._given))
+        overwrite = options.overwrite
+        if options.features is not None:
+            with open_h5(options.features) as file:
+                conf["features"] = get_text(file, "id", str(options.features))
             before = provenance.read(outputs / CONF)
             redone = before.get("features") not in (None, conf["features"])
             overwrite |= redone and {**before, "features": conf["features"]} == conf
@@ -144,17 +92,18 @@ class DatasetRun(Run):
     def extract_features(self) -> Path:
         """Extract the features of all images, unless they are given."""
         with self.stage("extract_features"):
-            if self._given is None:
+            if self.options.features is None:
                 extract_features.main(
-                    *(self.conf, self.place.images),
+                    self.conf,
+                    self.place.images,
                     feature_path=self.features,
                     image_list=[*self.map_names, *self.query_names],
                     executor=self.executor,
-                    strict=self._strict,
+                    strict=self.options.strict,
                     queries=self.query_names,
                 )
             kept = extract_features.keep_readable(
-                self.features, self.map_names, self._accept_partial
+                self.features, self.map_names, self.options.accept_partial
             )
             self.is_partial |= len(kept) < len(self.map_names)
             self.map_names = kept
@@ -178,8 +127,8 @@ class DatasetRun(Run):
         """Write the pairs of the readable queries and map images."""
         with self.stage("retrieval"):
             queries = readable(self.features, self.query_names)
-            num_loc = self.numbers["num_loc"]
-            retrieve(self._retrieval, self.features, self._pairs, num_loc, queries, self.map_names)
+            source, num_loc = self.options.retrieval, self.options.num_loc
+            retrieve(source, self.features, self._pairs, num_loc, queries, self.map_names)
         return self._pairs
 
     def finish_dataset(
@@ -207,17 +156,15 @@ class DatasetRun(Run):
             The summary.
         """
         files = self.files(self.features, built, self._pairs, matches)
-        return self.finish(
-            *(self.summary(**more), lists, records, self.truth, thresholds),
-            *(self.features, poses, files),
-        )
+        summary, truth = self.summary(**more), self.truth
+        return self.finish(summary, lists, records, truth, thresholds, self.features, poses, files)
 
     def summary(self, **more: object) -> dict:
         """Return what the summary begins with; `more` are further entries."""
         return {
-            "retrieval": self._retrieval,
+            "retrieval": self.options.retrieval,
             "dataset": str(self.place.root),
-            **self.numbers,
+            **self.options.numbers,
             "map_images": len(self.map_names),
             **more,
         }

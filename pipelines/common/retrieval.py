@@ -72,13 +72,16 @@ def retrieve_in_map(
         write_pairs([], output)
         return
     descriptors = aggregate_features.main(
-        *(RETRIEVAL, features),
+        RETRIEVAL,
+        features,
         export_dir=output.parent,
         vocabulary=built.vocabulary,
         image_list=query_names,
     )
     pairs_from_retrieval.main(
-        *(descriptors, output, num_loc),
+        descriptors,
+        output,
+        num_loc,
         query_list=query_names,
         db_list=map_names,
         db_descriptors=built.descriptors,

@@ -84,7 +84,9 @@ class Run:
         matches = self.folder.path / f"{features.stem}_{conf['output']}_{pairs.stem}.h5"
         if next(parse_pairs(pairs), None) is not None:  # else no query could be read
             match_features.main(
-                *(conf, pairs, features),
+                conf,
+                pairs,
+                features,
                 matches=matches,
                 features_ref=features_ref,
                 executor=self.executor,
@@ -145,7 +147,9 @@ class Run:
             logger.warning(
                 "%d of %d queries are unreadable and not localized: %s. Run the same command again "
                 "to retry them.",
-                *(len(failed), len(rows), with_reasons(failed)),
+                len(failed),
+                len(rows),
+                with_reasons(failed),
             )
         write_csv(rows, outputs / "queries.csv")
         summary = {

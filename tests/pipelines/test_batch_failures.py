@@ -50,7 +50,7 @@ def test_a_bug_in_one_job_does_not_stop_the_others(aachen_layout, run_batch, mon
     original = aachen.main
 
     def broken(*args, **kwargs):
-        if args[2] == "sift":
+        if kwargs["feature"] == "sift":
             raise ZeroDivisionError("a bug")
         return original(*args, **kwargs)
 

@@ -101,7 +101,7 @@ def test_a_job_without_a_list_of_another(aachen_layout, tmp_path):
     size = {"descriptor": 32, "feature_file": 40.0}
     found |= {"queries": 3, "localized": 2}
     rest = {"bytes_per_keypoint": size, "seconds": {}, "queries": 3, "queries_localized": 2}
-    made = [Job(aachen_layout, "sift", num_loc=n) for n in (1, 2)]
+    made = [Job(dataset=aachen_layout, feature="sift", num_loc=n) for n in (1, 2)]
     shared = Shared(aachen_layout, made, tmp_path / "shared")
     summaries = {
         made[0]: {"lists": {"DUC1": found}, **rest},

@@ -1,5 +1,9 @@
 """Command lines that follow from signatures."""
 
+import argparse
+import ast
+import importlib
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +13,10 @@ import pytest
 
 from hloc_reduce.utils import options
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.options import ABOVE_0, POSITIVE, Checked, Option
+from hloc_reduce.utils.options import ABOVE_0, HIDDEN, POSITIVE, Checked, Option
 
+ROOT = Path(__file__).parents[2]
+ELSEWHERE = {"--list_features"}  # of pipelines.aachen
 SIZES = {"small": (1, 1), "large": (9, 9)}
 Colour = Annotated[str, Option("colour", ("red", "green"), "green is as grass")]
 
@@ -25,7 +31,7 @@ class Limits(Checked):
     """
 
     most: Annotated[float, ABOVE_0] = 100.0
-    hidden: int = 3
+    hidden: Annotated[int, HIDDEN] = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +110,7 @@ def test_arguments_have_the_types_of_the_signature(monkeypatch):
 
 def test_help_is_that_of_the_docstrings(monkeypatch, capsys):
     with pytest.raises(SystemExit):
-        run(monkeypatch, "--help", without=("hidden", "pairs"), size="small")
+        run(monkeypatch, "--help", size="small")
     text = " ".join(capsys.readouterr().out.split())
     for said in (
         "--images IMAGES folder of --names",
@@ -114,7 +120,7 @@ def test_help_is_that_of_the_docstrings(monkeypatch, capsys):
         "example: work --images a",
     ):
         assert said in text
-    assert not any(word in text for word in ("--conf", "--checked", "hidden", "pairs"))
+    assert not any(word in text for word in ("--conf", "--checked", "hidden"))
     told = {name: p.help() for name, p in options.parameters(Longer).items()}
     assert told["number"] == "how many there are (default: as in --place)"
     assert told["place"] == "folder of the place"
@@ -156,3 +162,35 @@ def test_dataclasses_are_checked_and_taken_from_options():
             Longer(place="a", **wrong)
     with pytest.raises(TypeError):
         Longer(place="a", place_=1)
+
+
+COMMANDS = sorted(
+    ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    for top in ("hloc_reduce", "pipelines")
+    for path in (ROOT / top).rglob("*.py")
+    if "cli.run(_main)" in path.read_text()
+)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_documents_its_options(command, monkeypatch, capsys):
+    """Each option has a help text, and those that texts name exist."""
+    module = importlib.import_module(command)
+    monkeypatch.setattr("sys.argv", [command, "--help"])
+    monkeypatch.setattr(options.Parser, "format_help", lambda parser: repr(_documented(parser)))
+    with pytest.raises(SystemExit):
+        module._main()
+    documented = ast.literal_eval(capsys.readouterr().out)
+    assert documented and all(text and text != "None" for text in documented.values()), documented
+    named = set(re.findall(r"--\w+", " ".join(documented.values())))
+    assert named <= documented.keys() | ELSEWHERE
+
+
+def _documented(parser):
+    texts = {}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                texts |= _documented(command)
+        texts |= dict.fromkeys(action.option_strings or [str(action.dest)], action.help)
+    return {name: str(text) for name, text in texts.items() if name != "==SUPPRESS=="}

@@ -3,7 +3,8 @@
 import pycolmap
 
 from .databases import (
-    add_camera_mode,
+    CAMERA_MODE,
+    CameraMode,
     camera_mode,
     count_verified,
     import_images,

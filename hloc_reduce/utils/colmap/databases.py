@@ -8,17 +8,27 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 import pycolmap
 
-from ..cli import InputError, Parser, choose, some
+from ..cli import InputError, choose, some
 from ..images import check_format, check_readable
 from ..locks import has_locks
+from ..options import Option
 
 Options = TypeVar("Options")
 
+CAMERA_MODES = {name.lower(): mode for name, mode in pycolmap.CameraMode.__members__.items()}
+CAMERA_MODE = Option(
+    "camera mode",
+    CAMERA_MODES,
+    "as in COLMAP; auto: those whose EXIF data have the same make, model, focal length and size, "
+    "and tell of no digital zoom and no crop",
+    lower=True,
+)
+CameraMode = Annotated[pycolmap.CameraMode, CAMERA_MODE]
 FULL = 2**16  # free bytes, below which COLMAP cannot even open a database
 
 
@@ -81,20 +91,7 @@ def camera_mode(name: str) -> pycolmap.CameraMode:
     Raises:
         InputError: for an unknown name.
     """
-    modes = {mode.lower(): value for mode, value in pycolmap.CameraMode.__members__.items()}
-    return modes[choose("camera mode", name.lower(), modes)]
-
-
-def add_camera_mode(parser: Parser) -> None:
-    """Add --camera_mode."""
-    modes = ", ".join(mode.lower() for mode in pycolmap.CameraMode.__members__)
-    parser.add_argument(
-        "--camera_mode",
-        default="auto",
-        help=f"which photos share a camera, as in COLMAP: {modes}; auto: those "
-        "whose EXIF data have the same make, model, focal length and size, and tell of no digital "
-        "zoom and no crop",
-    )
+    return CAMERA_MODES[choose("camera mode", name.lower(), CAMERA_MODES)]
 
 
 def parse_options(kind: Callable[[dict], Options], options: dict, what: str) -> Options:
