@@ -1,4 +1,4 @@
-"""Localize the queries of Aachen Day-Night v1.1, or of any place in its layout.
+"""Localize the queries of Aachen Day-Night v1.1, or of another place with a COLMAP model.
 
 Extracts features, triangulates a map with the poses of the reference model, retrieves map images
 for each query and estimates its pose. An interrupted run resumes.
@@ -10,8 +10,7 @@ from typing import Annotated, Any
 
 from hloc_reduce import demo, localize_sfm, pairs_from_covisibility, triangulation
 from hloc_reduce.confs import features as features_confs
-from hloc_reduce.datasets import thresholds
-from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.datasets.layouts import open_model_place
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.options import ABOVE_0, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
@@ -20,15 +19,13 @@ from .common import command, compact_map
 from .common.dataset import DatasetRun
 from .common.options import DatasetOptions, Positive
 
-Place = Aachen
-
 
 @dataclass(frozen=True, kw_only=True)
 class Options(DatasetOptions):
     """The options of the pipeline.
 
     Args:
-        ground_truth: true poses of the queries; default:
+        ground_truth: true poses of the queries; default: those of the data set, such as
             <dataset>/queries/ground_truth_poses.txt.
         num_covis: other images that each map image is matched with.
         compact: pack the map into one file and localize in that; the file and the results are in
@@ -58,11 +55,11 @@ def main(
         feature: name of a feature, or its YAML file.
         options: further `Options`.
     """
-    given, place = Options(feature=feature, **options), Aachen(dataset)
+    given, place = Options(feature=feature, **options), open_model_place(dataset)
     lists = {name: [query for query, _ in part] for name, part in place.query_lists().items()}
     with DatasetRun(place, outputs, given) as run:
         features = run.extract_features()
-        reference = place.reference_model
+        reference = place.reference(outputs / "reference")
         if run.is_partial:
             part = outputs / "sfm_reference"
             reference = colmap.write_part(reference, set(run.map_names), part)
@@ -75,12 +72,12 @@ def main(
             reconstruction = triangulation.main(
                 sfm, reference, place.images, sfm_pairs, features, sfm_matches
             )
-        limits = {name: thresholds(name) for name in lists}
+        limits = {name: place.thresholds(name) for name in lists}
         loc_pairs = run.retrieve()
         if given.compact:
             return compact_map.main(run, place, sfm, given.max_mb, lists, limits)
         loc_matches = run.match("match_queries", loc_pairs, features)
-        poses = outputs / f"Aachen-v1.1_hloc_{run.label}.txt"
+        poses = outputs / f"{place.results}_hloc_{run.label}.txt"
         with run.stage("localization"):
             records = localize_sfm.main(
                 sfm,
@@ -89,6 +86,7 @@ def main(
                 features,
                 loc_matches,
                 poses,
+                full_names=place.full_names,
                 executor=given.executor,
                 gate=given.gate,
                 mirror_images=run.mirror_images_of_dataset(),
@@ -121,7 +119,7 @@ def _main() -> None:
     called, given = Command(**taken(Command, values)), Options(**taken(Options, values))
     if called.demo_photos is not None and not called.demo:
         parser.error("--demo_photos needs --demo")
-    town = f"demo_town-{called.demo_photos}" if called.demo_photos else "demo_town"
+    town = "demo_town" if called.demo_photos is None else f"demo_town-{called.demo_photos}"
     dataset = called.dataset or Path("datasets") / (town if called.demo else "aachen_v1.1")
     if called.demo:
         features_confs.get(given.feature, given.projection)  # fails before the rendering

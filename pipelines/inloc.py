@@ -20,8 +20,6 @@ from .common import command
 from .common.dataset import SHARED_POINTS, DatasetRun
 from .common.options import DatasetOptions, Positive
 
-Place = InLoc
-
 
 @dataclass(frozen=True, kw_only=True)
 class Options(DatasetOptions):

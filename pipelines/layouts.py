@@ -1,13 +1,12 @@
-"""The pipeline for each data set layout."""
+"""The pipeline for each data set."""
 
 from pathlib import Path
 from types import ModuleType
 
-from hloc_reduce.utils.cli import InputError, no_folder
+from hloc_reduce.datasets.inloc import InLoc
+from hloc_reduce.datasets.layouts import layout_of
 
 from . import aachen, inloc
-
-PIPELINES = {"3D-models": aachen, "database": inloc}  # by a folder that a layout has
 
 
 def pipeline_of(dataset: Path) -> ModuleType:
@@ -16,9 +15,4 @@ def pipeline_of(dataset: Path) -> ModuleType:
     Raises:
         InputError: when its layout is unknown.
     """
-    if not dataset.is_dir():
-        raise no_folder(dataset)
-    for folder, pipeline in PIPELINES.items():
-        if (dataset / folder).is_dir():
-            return pipeline
-    raise InputError(f"{dataset} has neither of the folders {' and '.join(PIPELINES)}.")
+    return inloc if layout_of(dataset) is InLoc else aachen

@@ -9,7 +9,7 @@ import pycolmap
 from ..utils import colmap
 from ..utils.cli import InputError
 from ..utils.parsers import parse_query_lists
-from . import SOURCE, refuse
+from . import SOURCE, Queries, check_folders, refuse, thresholds, true_poses
 
 MODEL = "3D-models/aachen_v_1_1"
 AACHEN_SOURCE = f"{SOURCE} (Aachen Day-Night v1.1); --demo makes a small town in its layout."
@@ -27,19 +27,34 @@ class Aachen:
     """
 
     root: Path
-    whole_map: ClassVar[bool] = True  # all map images are needed, not only the retrieved ones
+    whole_map: ClassVar[bool] = True
+    results: ClassVar[str] = "Aachen-v1.1"
+    full_names: ClassVar[bool] = False  # as the benchmark wants them
+    source: ClassVar[str] = AACHEN_SOURCE
 
     def __post_init__(self) -> None:
-        model = self.root / MODEL
-        folders = (self.images, model, self.queries.parent)
-        missing = [path for path in folders if not path.is_dir()]
-        for part in ("cameras", "images", "points3D"):
-            inside = (any(model.glob(f"{folder}{part}.*")) for folder in ("", "*/"))
-            if model.is_dir() and not any(inside):
-                missing.append(model / f"{part}.*")
+        missing = [path for path in (self.images, self.queries.parent) if not path.is_dir()]
+        missing += self._missing_model()
         if self.queries.parent.is_dir() and not any(self.queries.parent.glob(self.queries.name)):
             missing.append(self.queries)
-        refuse(self.root, missing, AACHEN_SOURCE)
+        refuse(self.root, missing, self.source)
+
+    def _missing_model(self) -> list[Path]:
+        """Return what is missing of the model."""
+        model = self.root / MODEL
+        if not model.is_dir():
+            return [model]
+        parts = ("cameras", "images", "points3D")
+        return [
+            model / f"{part}.*"
+            for part in parts
+            if not any(any(model.glob(f"{folder}{part}.*")) for folder in ("", "*/"))
+        ]
+
+    @classmethod
+    def recognizes(cls, root: Path) -> bool:
+        """Tell whether a folder has this layout."""
+        return (root / "3D-models").is_dir()
 
     def check(self, map_names: list[str]) -> None:
         """Check before any work that the folders of map images and of all queries exist.
@@ -47,9 +62,7 @@ class Aachen:
         Raises:
             InputError: naming every missing folder.
         """
-        names = [*map_names, *self.query_names()]
-        folders = sorted({(self.images / name).parent for name in names})
-        refuse(self.root, [path for path in folders if not path.is_dir()], AACHEN_SOURCE)
+        check_folders(self.root, self.images, [*map_names, *self.query_names()], self.source)
 
     @property
     def images(self) -> Path:
@@ -71,7 +84,19 @@ class Aachen:
         """The true poses of the queries, which the original does not have."""
         return self.root / "queries/ground_truth_poses.txt"
 
-    def query_lists(self) -> dict[str, list[tuple[str, pycolmap.Camera]]]:
+    def reference(self, folder: Path) -> Path:
+        """Return `reference_model`; nothing is written."""
+        return self.reference_model
+
+    def true_poses(self) -> dict[str, pycolmap.Rigid3d]:
+        """Read the true poses of queries, camera from world; none if there is no such file."""
+        return true_poses(self.query_names(), self.ground_truth, False)
+
+    def thresholds(self, query_list: str) -> tuple[tuple[float, float], ...]:
+        """Return the thresholds of a list: those of night or, if not, of day."""
+        return thresholds(query_list)
+
+    def query_lists(self) -> dict[str, Queries]:
         """Read the queries of each list."""
         return parse_query_lists(self.queries)
 

@@ -14,7 +14,7 @@ from ..utils.feature_files import get_image_size
 from ..utils.h5 import open_h5
 from ..utils.images import list_images
 from ..utils.parsers import parse_query_list
-from . import SOURCE, refuse, scans
+from . import SOURCE, refuse, scans, true_poses
 
 INLOC_SOURCE = f"{SOURCE} (InLoc)."
 RANSAC_SIZE = 4032  # the longer side of an iPhone 7's photo, for which thresholds are
@@ -40,6 +40,15 @@ class InLoc:
     def __post_init__(self) -> None:
         folders = (self.root / "query", self.cutouts, self.alignments)
         refuse(self.root, [path for path in folders if not path.is_dir()], INLOC_SOURCE)
+
+    @classmethod
+    def recognizes(cls, root: Path) -> bool:
+        """Tell whether a folder has this layout."""
+        return (root / "database").is_dir()
+
+    def true_poses(self) -> dict[str, pycolmap.Rigid3d]:
+        """Read the true poses of queries, camera from world; none if there is no such file."""
+        return true_poses(self.query_names(), self.ground_truth, False)
 
     @property
     def images(self) -> Path:

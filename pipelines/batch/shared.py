@@ -9,6 +9,7 @@ from pathlib import Path
 from hloc_reduce import extract_features, logger
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import true_poses
+from hloc_reduce.datasets.layouts import layout_of
 from hloc_reduce.detectors.dog import KEYPOINTS
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.executors import Executor
@@ -55,7 +56,7 @@ class Shared:
         self._truths: set[Path | None] = set()  # checked values of ground_truth
         with self.failing(jobs):
             self.pipeline = pipeline_of(dataset)
-            self._place = self.pipeline.Place(dataset)
+            self._place = layout_of(dataset)(dataset)
             self.map_names = self._place.map_names()
             self.query_names = self._place.query_names()
             for job in jobs:
@@ -74,8 +75,10 @@ class Shared:
         used = check_retrieval(job.retrieval, self.folder, num_loc, *names)
         self._place.check(used)
         if job.ground_truth not in self._truths:
-            truth = job.ground_truth or self._place.ground_truth
-            true_poses(self.query_names, truth, job.ground_truth is not None)
+            if job.ground_truth is None:
+                self._place.true_poses()
+            else:
+                true_poses(self.query_names, job.ground_truth, True)
             self._truths.add(job.ground_truth)
         _, conf = features_confs.get(job.feature, None, job.storage, job.keypoints)
         extract_features.provenance(conf)

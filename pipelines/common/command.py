@@ -91,6 +91,10 @@ def print_result(summary: dict, outputs: Path, unknown: str) -> None:
     )
     if any("recall_percent" in result for result in summary["lists"].values()):
         print(recall_table(summary["feature"], summary["lists"]))
+        for name, result in summary["lists"].items():
+            if (metres := result.get("median_position_error_m")) is not None:
+                degrees = result["median_rotation_error_deg"]
+                print(f"{name}: median errors {metres:.3f} m, {degrees:.3f} deg")
     elif not summary["queries_localized"]:
         print(f"No query is localized. {outputs / 'queries.csv'} gives the reasons.")
     else:

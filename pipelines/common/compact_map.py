@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hloc_reduce import compact, localize_sfm, logger, maps
 from hloc_reduce.aggregate_features import vocabulary_of
-from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.datasets import ModelPlace
 from hloc_reduce.hlm.reader import SUFFIX
 from hloc_reduce.hlm.writer import Source
 from hloc_reduce.localization import intrinsics
@@ -42,7 +42,7 @@ def folder(outputs: Path, is_compact: bool, max_mb: float | None) -> Path:
 
 def main(
     run: DatasetRun,
-    place: Aachen,
+    place: ModelPlace,
     sfm: Path,
     max_mb: float | None,
     lists: Mapping[str, Iterable[str]],
@@ -80,7 +80,7 @@ def main(
             queries = readable(features, run.query_names)
             retrieve_in_map(built, features, pairs, num_loc, queries, built.names())
         matches = part.match("match_queries", pairs, features, built.features)
-        poses = outputs / f"Aachen-v1.1_hloc_{run.feature}+{matcher}_vlad{num_loc}.txt"
+        poses = outputs / f"{place.results}_hloc_{run.feature}+{matcher}_vlad{num_loc}.txt"
         query_files = pairs, features, built.features
         with part.stage("localization"):
             records = localize_sfm.main(
@@ -90,6 +90,7 @@ def main(
                 features,
                 matches,
                 poses,
+                full_names=place.full_names,
                 executor=run.executor,
                 gate=run.options.gate,
                 mirror_images=part.mirror_images(run.conf, place.images, *query_files),
@@ -104,7 +105,7 @@ def main(
         return part.finish(summary, lists, records, run.truth, limits, features, poses, files)
 
 
-def _pack(run: DatasetRun, part: Run, place: Aachen, sfm: Path, max_mb: float | None) -> Map:
+def _pack(run: DatasetRun, part: Run, place: ModelPlace, sfm: Path, max_mb: float | None) -> Map:
     """Pack a map into a file, unless that is there, and unpack it, in which stages localize."""
     file = part.folder.path / FILE
     with part.stage("compact"):

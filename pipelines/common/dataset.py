@@ -6,20 +6,20 @@ from pathlib import Path
 from hloc_reduce import extract_features
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
-from hloc_reduce.datasets import true_poses
-from hloc_reduce.datasets.aachen import Aachen
-from hloc_reduce.datasets.inloc import InLoc
+from hloc_reduce.datasets import Place, true_poses
 from hloc_reduce.evaluation.summaries import map_bytes
 from hloc_reduce.localization.mirrored import MirrorImages
 from hloc_reduce.maps.map import RETRIEVAL
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, RunFolder
 from hloc_reduce.utils.h5 import get_text, open_h5
+from hloc_reduce.utils.parsers import write_poses
 
 from .options import DatasetOptions
 from .retrieval import check_retrieval, retrieval_name, retrieve
 from .run import Run, Thresholds, check_queries, readable, relative
 
+TRUTH = "ground_truth_poses.txt"  # written if the poses of the queries are those of a model
 SHARED_POINTS = "points3D.h5"  # beside given features of InLoc: the 3D points of their keypoints
 
 
@@ -42,7 +42,7 @@ class DatasetRun(Run):
         InputError: when something is missing or wrong.
     """
 
-    def __init__(self, place: Aachen | InLoc, outputs: Path, options: DatasetOptions):
+    def __init__(self, place: Place, outputs: Path, options: DatasetOptions):
         method = options.feature, options.projection, options.storage, options.keypoints
         feature, self.conf = features_confs.get(*method)
         matcher = options.matcher or features_confs.matcher_of(self.conf)
@@ -61,7 +61,11 @@ class DatasetRun(Run):
         if options.features is None:
             check_queries(place.images, self.query_names, options.strict)
         self.truth_file = options.ground_truth or place.ground_truth
-        self.truth = true_poses(self.query_names, self.truth_file, bool(options.ground_truth))
+        self.truth = (
+            true_poses(self.query_names, options.ground_truth, True)
+            if options.ground_truth
+            else place.true_poses()
+        )
         self.features = options.features or outputs / f"{self.conf['output']}.h5"
         super().__init__(self._claim(outputs, matcher), feature, matcher, options.executor)
 
@@ -173,7 +177,10 @@ class DatasetRun(Run):
         self, map_features: Path, built: Path, pairs: Path, matches: Path
     ) -> dict[str, Path | None]:
         """Return the files that a report reads, see `finish`."""
-        images = self.place.images
+        images, truth = self.place.images, self.truth_file
+        if self.truth and (truth is None or not truth.is_file()):
+            truth = self.folder.path / TRUTH
+            write_poses(self.truth, truth, None)
         return {
             "query_images": images,
             "map_images": images,
@@ -181,5 +188,5 @@ class DatasetRun(Run):
             "map": built,
             "pairs": pairs,
             "matches": matches,
-            "ground_truth": self.truth_file if self.truth else None,
+            "ground_truth": truth if self.truth else None,
         }

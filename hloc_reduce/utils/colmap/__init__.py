@@ -38,6 +38,7 @@ from .models import (
     remove_images,
     visibility,
     with_cameras,
+    write_model,
     write_part,
 )
 from .origin import near_from_world, near_origin, transformed

@@ -220,6 +220,11 @@ def write_part(path: Path, names: Collection[str], output: Path) -> Path:
     """
     model = read_model(path)
     model = remove_images(model, {image.name for image in model.images.values()} - {*names})
+    return write_model(model, output)
+
+
+def write_model(model: pycolmap.Reconstruction, output: Path) -> Path:
+    """Write a COLMAP model into a folder, which is returned; unchanged files keep their times."""
     written = output.with_name(f".{output.name}.tmp")
     shutil.rmtree(written, ignore_errors=True)
     written.mkdir(parents=True)

@@ -1,0 +1,235 @@
+"""The layouts of hloc's data sets: each opens, says what is missing, and can be localized in."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from command import table
+
+from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.datasets.aachen_v1 import NVM, AachenV1, read_nvm
+from hloc_reduce.datasets.cambridge import Cambridge
+from hloc_reduce.datasets.inloc import InLoc
+from hloc_reduce.datasets.layouts import LAYOUTS, layout_of, open_model_place
+from hloc_reduce.utils import colmap
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.parsers import to_line
+from pipelines import aachen, compare
+
+QUERY = "4.png"  # of the plane
+
+
+def write_nvm(model: pycolmap.Reconstruction, path: Path) -> Path:
+    """Write an NVM file and the list of its intrinsics, which is returned."""
+    ids = sorted(model.reg_image_ids())
+    lines, intrinsics = ["NVM_V3", "", str(len(ids))], ""
+    for image in map(model.image, ids):
+        pose, camera = image.cam_from_world(), image.camera
+        x, y, z, w = pose.rotation.quat
+        centre = pose.inverse().translation
+        numbers = (w, x, y, z, *centre)
+        lines.append(to_line(image.name, camera.focal_length, *numbers, 0, 0).strip())
+        size = camera.model.name, camera.width, camera.height
+        intrinsics += to_line(image.name, *size, *camera.params)
+    lines += ["", str(model.num_points3D())]
+    for point in model.points3D.values():
+        seen = []
+        for element in point.track.elements:
+            xy = model.image(element.image_id).points2D[element.point2D_idx].xy
+            seen += [ids.index(element.image_id), element.point2D_idx, *xy]
+        number = len(point.track.elements)
+        lines.append(" ".join(map(str, [*point.xyz, *point.color, number, *seen])))
+    path.write_text("\n".join([*lines, "", "0"]))
+    listed = path.with_name("database_intrinsics.txt")
+    listed.write_text(intrinsics)
+    return listed
+
+
+def synthetic() -> pycolmap.Reconstruction:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 3, 2, 20
+    options.num_points2D_without_point3D = 0
+    pycolmap.set_random_seed(0)
+    return pycolmap.synthesize_dataset(options)
+
+
+def test_an_nvm_file_has_the_poses_and_tracks_of_its_model(tmp_path):
+    model = synthetic()
+    found = read_nvm(tmp_path / "m.nvm", write_nvm(model, tmp_path / "m.nvm"))
+    assert found.num_reg_images() == 6 and found.num_points3D() == 20
+    images = {image.name: image for image in found.images.values()}
+    for image in model.images.values():
+        other = images[image.name]
+        np.testing.assert_allclose(
+            other.cam_from_world().matrix(), image.cam_from_world().matrix(), atol=1e-6
+        )
+        np.testing.assert_allclose(other.camera.params, image.camera.params)
+        assert other.num_points3D == image.num_points3D
+    positions = {tuple(np.round(point.xyz, 4)): point for point in model.points3D.values()}
+    for point in found.points3D.values():
+        same = positions[tuple(np.round(point.xyz, 4))]
+        assert (point.color == same.color).all()
+        names = [
+            sorted(one.image(element.image_id).name for element in seen.track.elements)
+            for one, seen in ((found, point), (model, same))
+        ]
+        assert names[0] == names[1]
+
+
+def test_a_broken_nvm_file_is_refused(tmp_path):
+    path = tmp_path / "m.nvm"
+    listed = write_nvm(synthetic(), path)
+    lines = path.read_text().splitlines()
+    for broken, message in (
+        (lines[:5], "ends early: 4 lines"),
+        ([*lines[:3], lines[3].rsplit(maxsplit=4)[0], *lines[4:]], "m.nvm:4: not an image"),
+        ([*lines[:3], lines[3].replace(" ", " x", 1), *lines[4:]], None),
+        ([*lines[:12], lines[12].rsplit(maxsplit=1)[0], *lines[13:]], "m.nvm:13: not a point"),
+        (["NVM_V3", "x"], "m.nvm:2: not a number of lines"),
+        ([], "not a number of lines"),
+    ):
+        path.write_text("\n".join(broken))
+        if message is None:  # the focal length is not used
+            assert read_nvm(path, listed).num_reg_images() == 6
+            continue
+        with pytest.raises(InputError, match=message):
+            read_nvm(path, listed)
+    write_nvm(synthetic(), path)
+    listed.write_text("".join(listed.read_text().splitlines(keepends=True)[1:]))
+    with pytest.raises(InputError, match="database_intrinsics.txt lacks .*, which is in m.nvm"):
+        read_nvm(path, listed)
+
+
+@pytest.fixture
+def nvm_layout(aachen_layout) -> Path:
+    """The plane in the layout of Aachen Day-Night v1.0."""
+    folder = aachen_layout / "3D-models/aachen_v_1_1"
+    write_nvm(colmap.read_model(folder), aachen_layout / NVM)
+    shutil.rmtree(folder)
+    return aachen_layout
+
+
+def write_scene(plane: Path, root: Path, sequence: str) -> pycolmap.Reconstruction:
+    """Write the photos of the plane as a scene, and return the model of all of them."""
+    (root / sequence).mkdir(parents=True)
+    model = pycolmap.Reconstruction(plane / "model")
+    for image in model.images.values():
+        shutil.copy(plane / "images" / image.name, root / sequence / image.name)
+        image.name = f"{sequence}/{image.name}"
+    return model
+
+
+@pytest.fixture
+def cambridge_layout(plane) -> Path:
+    """The plane as a scene of Cambridge Landmarks, whose models are of photos of half the size."""
+    root = plane / "cambridge/Plane"
+    models = root.parent / Cambridge.models / root.name
+    model = write_scene(plane, root, "seq1")
+    for camera in model.cameras.values():
+        camera.rescale(0.5)
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = point.xy / 2
+    for folder in ("empty_all", "model_train"):
+        (models / folder).mkdir(parents=True)
+    empty = pycolmap.Reconstruction(model)
+    for point in list(empty.points3D):
+        empty.delete_point3D(point)
+    empty.write_text(models / "empty_all")
+    query = model.find_image_with_name(f"seq1/{QUERY}")
+    model.deregister_frame(query.frame_id)
+    model.write_binary(models / "model_train")
+    (models / "list_query.txt").write_text(f"seq1/{QUERY}\n")
+    return root
+
+
+KINDS = {
+    "aachen_layout": Aachen,
+    "nvm_layout": AachenV1,
+    "cambridge_layout": Cambridge,
+    "inloc_layout": InLoc,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_layouts_are_recognized(kind, request, monkeypatch):
+    root = request.getfixturevalue(kind)
+    assert layout_of(root) is KINDS[kind]
+    assert [layout for layout in LAYOUTS if layout.recognizes(root)][0] is KINDS[kind]
+    place = KINDS[kind](root)
+    assert place.map_names() and not {*place.map_names()} & {*place.query_names()}
+    assert all((place.images / n).is_file() for n in (*place.map_names(), *place.query_names()))
+    place.check(place.map_names())
+    assert place.true_poses().keys() <= {*place.query_names()}
+    monkeypatch.chdir(root)
+    assert layout_of(Path(".")) is KINDS[kind]
+
+
+@pytest.mark.parametrize("kind", ["nvm_layout", "cambridge_layout"])
+def test_the_queries_of_a_layout_are_localized(kind, request, tmp_path):
+    root = request.getfixturevalue(kind)
+    summary = aachen.main(root, tmp_path / "outputs", "sift_sv16")
+    assert summary["map_images"] == 4 and summary["map_points3D"] > 100
+    (found,) = [one for name, one in summary["lists"].items() if not name.startswith("night")]
+    assert found["recall_percent"][-1] == (100 if kind != "nvm_layout" else 50)
+    if kind != "nvm_layout":
+        assert found["queries"] == 1 and found["median_position_error_m"] < 0.02
+        assert (tmp_path / "outputs" / summary["files"]["ground_truth"]).is_file()
+        name = (tmp_path / "outputs" / summary["poses"]).read_text().split()[0]
+        assert name == open_model_place(root).query_names()[0]
+
+
+def test_intrinsics_of_queries_are_those_of_their_photos(cambridge_layout):
+    place = Cambridge(cambridge_layout)
+    ((name, camera),) = place.queries
+    height, width = cv2.imread(str(place.images / name)).shape[:2]
+    assert (camera.width, camera.height) == (width, height)
+
+
+@pytest.mark.parametrize(
+    "kind, part, said",
+    [
+        ("nvm_layout", "3D-models/database_intrinsics.txt", "visuallocalization.net"),
+        ("nvm_layout", "queries", "visuallocalization.net"),
+        ("cambridge_layout", f"../{Cambridge.models}/Plane/list_query.txt", "Cambridge/README.md"),
+        ("cambridge_layout", f"../{Cambridge.models}/Plane/empty_all", "Cambridge/README.md"),
+    ],
+)
+def test_what_is_missing_is_named(kind, part, said, request):
+    root = request.getfixturevalue(kind)
+    path = (root / part).resolve()
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+    with pytest.raises(InputError) as error:
+        layout_of(root)(root)
+    assert path.name in str(error.value) and said in str(error.value)
+
+
+def test_queries_without_a_pose_are_named(cambridge_layout):
+    (Cambridge.folder(cambridge_layout) / "list_query.txt").write_text("seq-01/9.png\n")
+    with pytest.raises(InputError, match="seq-01/9.png are not in the model empty_all"):
+        Cambridge(cambridge_layout).query_names()
+
+
+def test_a_converted_model_is_kept_until_the_file_changes(nvm_layout, tmp_path):
+    place, folder = AachenV1(nvm_layout), tmp_path / "reference"
+    before = {path: path.stat().st_mtime_ns for path in place.reference(folder).iterdir()}
+    assert {path: path.stat().st_mtime_ns for path in place.reference(folder).iterdir()} == before
+    path = nvm_layout / NVM
+    path.write_text(path.read_text().replace("\ndb/0.png", "\ndb/0.png", 1) + "\n")
+    place.reference(folder)
+    assert (folder / "made_from.json").stat().st_mtime_ns != before[folder / "made_from.json"]
+
+
+def test_a_batch_and_a_comparison_take_them(cambridge_layout, run_batch, tmp_path):
+    folder = run_batch({"dataset": str(cambridge_layout), "feature": "sift_sv16"})
+    rows = table(folder / "jobs.csv")
+    assert {row["dataset"] for row in rows} == {"Plane"} and not any(row["error"] for row in rows)
+    assert {row["recall_percent"] for row in rows} == {"100.0"}
+    assert compare.main(cambridge_layout, ["sift_sv16"], tmp_path / "c", max_mb=[1]) == {}
+    assert len(table(tmp_path / "c/compare.csv")) == 6  # the whole map and a compact one
