@@ -9,9 +9,10 @@ from .aachen_v1 import AachenV1
 from .cambridge import Cambridge
 from .inloc import InLoc
 from .scenes import Scene
+from .sevenscenes import SevenScenes
 
 # the first one that recognizes a folder reads it
-MODEL_LAYOUTS: tuple[type[ModelPlace], ...] = (AachenV1, Aachen, Cambridge)
+MODEL_LAYOUTS: tuple[type[ModelPlace], ...] = (AachenV1, Aachen, Cambridge, SevenScenes)
 LAYOUTS: tuple[type[Place], ...] = (*MODEL_LAYOUTS, InLoc)
 
 

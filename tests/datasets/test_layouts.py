@@ -14,6 +14,7 @@ from hloc_reduce.datasets.aachen_v1 import NVM, AachenV1, read_nvm
 from hloc_reduce.datasets.cambridge import Cambridge
 from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.datasets.layouts import LAYOUTS, layout_of, open_model_place
+from hloc_reduce.datasets.sevenscenes import SevenScenes
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.parsers import to_line
@@ -146,10 +147,22 @@ def cambridge_layout(plane) -> Path:
     return root
 
 
+@pytest.fixture
+def sevenscenes_layout(plane) -> Path:
+    """The plane as a scene of 7Scenes."""
+    root = plane / "7scenes/plane"
+    folder = root.parent / SevenScenes.models / root.name / "triangulated"
+    folder.mkdir(parents=True)
+    write_scene(plane, root, "seq-01").write_binary(folder)
+    (folder / "list_test.txt").write_text(f"seq-01/{QUERY}\n")
+    return root
+
+
 KINDS = {
     "aachen_layout": Aachen,
     "nvm_layout": AachenV1,
     "cambridge_layout": Cambridge,
+    "sevenscenes_layout": SevenScenes,
     "inloc_layout": InLoc,
 }
 
@@ -168,7 +181,7 @@ def test_layouts_are_recognized(kind, request, monkeypatch):
     assert layout_of(Path(".")) is KINDS[kind]
 
 
-@pytest.mark.parametrize("kind", ["nvm_layout", "cambridge_layout"])
+@pytest.mark.parametrize("kind", ["nvm_layout", "cambridge_layout", "sevenscenes_layout"])
 def test_the_queries_of_a_layout_are_localized(kind, request, tmp_path):
     root = request.getfixturevalue(kind)
     summary = aachen.main(root, tmp_path / "outputs", "sift_sv16")
@@ -196,6 +209,7 @@ def test_intrinsics_of_queries_are_those_of_their_photos(cambridge_layout):
         ("nvm_layout", "queries", "visuallocalization.net"),
         ("cambridge_layout", f"../{Cambridge.models}/Plane/list_query.txt", "Cambridge/README.md"),
         ("cambridge_layout", f"../{Cambridge.models}/Plane/empty_all", "Cambridge/README.md"),
+        ("sevenscenes_layout", "../" + SevenScenes.models + "/plane/triangulated", "7Scenes/READ"),
     ],
 )
 def test_what_is_missing_is_named(kind, part, said, request):
@@ -210,10 +224,11 @@ def test_what_is_missing_is_named(kind, part, said, request):
     assert path.name in str(error.value) and said in str(error.value)
 
 
-def test_queries_without_a_pose_are_named(cambridge_layout):
-    (Cambridge.folder(cambridge_layout) / "list_query.txt").write_text("seq-01/9.png\n")
-    with pytest.raises(InputError, match="seq-01/9.png are not in the model empty_all"):
-        Cambridge(cambridge_layout).query_names()
+def test_queries_without_a_pose_are_named(sevenscenes_layout):
+    folder = SevenScenes.folder(sevenscenes_layout) / "triangulated"
+    (folder / "list_test.txt").write_text("seq-01/9.png\n")
+    with pytest.raises(InputError, match="seq-01/9.png are not in the model triangulated"):
+        SevenScenes(sevenscenes_layout).query_names()
 
 
 def test_a_converted_model_is_kept_until_the_file_changes(nvm_layout, tmp_path):
@@ -226,10 +241,15 @@ def test_a_converted_model_is_kept_until_the_file_changes(nvm_layout, tmp_path):
     assert (folder / "made_from.json").stat().st_mtime_ns != before[folder / "made_from.json"]
 
 
-def test_a_batch_and_a_comparison_take_them(cambridge_layout, run_batch, tmp_path):
-    folder = run_batch({"dataset": str(cambridge_layout), "feature": "sift_sv16"})
+def test_a_batch_and_a_comparison_take_them(
+    cambridge_layout, sevenscenes_layout, run_batch, tmp_path
+):
+    folder = run_batch(
+        {"dataset": [str(cambridge_layout), str(sevenscenes_layout)], "feature": "sift_sv16"}
+    )
     rows = table(folder / "jobs.csv")
-    assert {row["dataset"] for row in rows} == {"Plane"} and not any(row["error"] for row in rows)
-    assert {row["recall_percent"] for row in rows} == {"100.0"}
+    assert {row["dataset"] for row in rows} == {"Plane", "plane"}
+    assert not any(row["error"] for row in rows)
+    assert {row["recall_percent"] for row in rows if row["threshold_m"] == "0.05"} == {"100.0"}
     assert compare.main(cambridge_layout, ["sift_sv16"], tmp_path / "c", max_mb=[1]) == {}
     assert len(table(tmp_path / "c/compare.csv")) == 6  # the whole map and a compact one
