@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 
 from . import logger
-from .mapping.database import CAMERAS, import_images
-from .mapping.overlays import drop_overlays
+from .mapping.checks.overlays import drop_overlays
+from .mapping.database import INFERRED_CAMERAS, import_images
 from .pairs_from_retrieval import rank, read_global, similarity
 from .runtime import provenance
 from .triangulation import Pair, Verified, read_matches
@@ -185,7 +185,7 @@ def _verify(
             "features": file_provenance(feature_file),
             "matches": file_provenance(match_file),
             "camera_mode": camera_mode.name,
-            "inferred": CAMERAS,
+            "inferred": INFERRED_CAMERAS,
         }
     before = provenance.read(path)
     known = before.get("pairs", {}) if before.get("made_from") == made_from else {}

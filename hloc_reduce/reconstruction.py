@@ -7,9 +7,9 @@ from typing import Annotated
 import pycolmap
 
 from . import logger
-from .mapping import registration
+from .mapping import checks, findings, registration
+from .mapping.checks.overlays import drop_overlays
 from .mapping.mapper import RULES, Mapper, attempts_for
-from .mapping.overlays import drop_overlays
 from .runtime import provenance
 from .triangulation import MADE_FROM, read_matches, replacing_map
 from .utils import cli, colmap, options
@@ -50,7 +50,7 @@ def main(
     If images are missing (of more than 100 images, more than a fifth), further attempts follow, and
     the model with the most images is kept: an attempt with lower thresholds and, for up to 30
     images, some with other initial pairs, as many at once as there are cores; none of these begins
-    after they have taken `mapper.PATIENCE` seconds, which is said. With `camera_mode`
+    after they have taken `mapper.MAPPER_PATIENCE` seconds, which is said. With `camera_mode`
     AUTO, if at most two thirds of the images are in the model, or focal lengths differ by more than
     a factor of 1.2, and one camera may have taken all of them, the mapper runs with one shared
     camera. Its model is kept if it has at least 1.5 times as many images, or 1.5 times as many
@@ -73,10 +73,10 @@ def main(
         image_options: of pycolmap's ImageReaderOptions.
         mapper_options: of pycolmap's IncrementalPipelineOptions; if given, there is one attempt.
         overwrite: replace an existing model.
-        accept_partial: accept a map that has fewer than half of the photos, or may be wrong, see
-            registration.check.
+        accept_partial: accept a map that has fewer than half of the photos, or focal lengths that
+            differ too much.
         once: make one attempt only.
-        checked: report missing images, see `registration.check`.
+        checked: report missing images and focal lengths that differ, see `mapping.checks`.
 
     Returns:
         The model with the most images. It has the keypoints of the feature file, in the same order.
@@ -129,7 +129,11 @@ def main(
         sfm = colmap.read_model(sfm_dir)
         logger.info("The map %s:\n%s", sfm_dir, sfm.summary())
     if checked:
-        registration.warn(registration.check(sfm_dir, accept_partial))
+        known = registration.read(sfm_dir)
+        judged = checks.run(checks.Inputs(sfm, registration=known), ["partial", "focal_lengths"])
+        judged += known.dropped
+        findings.check_accepted(judged, accept_partial)
+        findings.warn(judged)
     return sfm
 
 

@@ -11,7 +11,7 @@ import pycolmap
 
 from . import logger
 from .localization.projection import median_photo_scale
-from .mapping import sizes
+from .mapping.checks import sizes
 from .mapping.epipolar import agreeing
 from .runtime import provenance
 from .runtime.group_writer import failures
@@ -76,7 +76,7 @@ def main(
 
     Raises:
         InputError: when an input is missing, photos do not have the size of their cameras, see
-            `mapping.sizes`, or no point can be triangulated.
+            `mapping.checks.sizes`, or no point can be triangulated.
     """
     options = {"random_seed": 0, "num_threads": 1, **(mapper_options or {})}
     colmap.mapper_options(options)  # raises for a wrong one

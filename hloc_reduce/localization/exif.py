@@ -1,6 +1,6 @@
 """What the EXIF data of photos tell about their intrinsics."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,10 +13,8 @@ WIDTH, HEIGHT = 0xA002, 0xA003  # as the camera wrote it
 FOCAL_PLANE, UNIT = 0xA20E, 0xA210  # pixels of the sensor in a unit of length
 UNITS = {2: 25.4, 3: 10.0}  # millimetres
 ORIENTATIONS = range(1, 9)
-MAX_ZOOM = 1.01
-RESHAPED = 1.02  # ratio of aspect ratios: a copy of another size differs by rounding only
+ROUNDED = 0.02  # relative difference of zooms, shapes and focal lengths that are the same
 MAX_RATIO = 10.0  # of width and height in EXIF data: others are nonsense
-SAME = 0.01  # relative difference of focal lengths that are the same
 WELL_KNOWN = 3  # images from which the map knows the intrinsics of their camera
 
 
@@ -68,7 +66,7 @@ def exif_camera(image: Path) -> ExifCamera | None:
         return None
     name, lens = f"{make} {model}", f"{make} {model} {focal_length:g} mm"
     full_size = (taken[1], _in_pixels(more)) if taken else (0.0, 0.0)
-    return ExifCamera(name, lens, size, zoom > MAX_ZOOM, _is_cropped(size, taken), full_size)
+    return ExifCamera(name, lens, size, zoom > 1 + ROUNDED, _is_cropped(size, taken), full_size)
 
 
 def orientation(image: Path) -> int | None:
@@ -105,7 +103,7 @@ def correct(camera: pycolmap.Camera, exif: ExifCamera) -> bool:
     side, focal_length = exif.full_size
     if not (camera.has_prior_focal_length and exif.is_original and max(exif.size) < side):
         return False
-    if not abs(camera.mean_focal_length() - focal_length) < SAME * focal_length:
+    if not abs(camera.mean_focal_length() - focal_length) < ROUNDED * focal_length:
         return False
     params = camera.params.copy()
     params[list(camera.focal_length_idxs())] *= max(exif.size) / side
@@ -128,42 +126,7 @@ def _sides(taken: Sequence[object]) -> tuple[float, float] | None:
 def _is_cropped(size: tuple[int, int], taken: tuple[float, float] | None) -> bool:
     """Tell whether a size is square or has another aspect ratio than one in EXIF data, if known."""
     aspect = max(size) / min(size)
-    if aspect < RESHAPED or taken is None:
-        return aspect < RESHAPED
+    if aspect < 1 + ROUNDED or taken is None:
+        return aspect < 1 + ROUNDED
     shorter, longer = taken
-    return not 1 / RESHAPED <= aspect * shorter / longer <= RESHAPED
-
-
-def of_another_size(image_dir: Path, names: Iterable[str]) -> list[str]:
-    """Return photos whose size tells that their intrinsics are unlike those of most of a lens.
-
-    Most are those with one longer side, if they are more than half of the photos of the lens. One
-    or two photos with another longer side are smaller copies or were cropped; three are another
-    setting of the camera. Photos that were cropped by their EXIF data differ however many there
-    are. Digital zooms, which EXIF data tell, do not count.
-
-    Args:
-        image_dir: the folder of the photos.
-        names: the photos.
-    """
-    whole: dict[str, dict[int, list[str]]] = {}
-    cut: dict[str, list[str]] = {}
-    for name in names:
-        exif = exif_camera(image_dir / name)
-        if exif is not None and exif.cropped:
-            cut.setdefault(exif.lens, []).append(name)
-        elif exif is not None and not exif.zoomed:
-            whole.setdefault(exif.lens, {}).setdefault(max(exif.size), []).append(name)
-    found: list[str] = []
-    for lens, sides in whole.items():
-        most, cropped = max(map(len, sides.values())), cut.get(lens, [])
-        if most >= WELL_KNOWN and 2 * most > sum(map(len, sides.values())) + len(cropped):
-            few = [named for named in sides.values() if len(named) < WELL_KNOWN]
-            found += sum(few, cropped)
-    return sorted(found)
-
-
-def cropped(image_dir: Path, names: Iterable[str]) -> list[str]:
-    """Return the photos of a folder that were cropped by their EXIF data or shape, sorted."""
-    found = {name: exif_camera(image_dir / name) for name in names}
-    return sorted(name for name, exif in found.items() if exif is not None and exif.cropped)
+    return not 1 / (1 + ROUNDED) <= aspect * shorter / longer <= 1 + ROUNDED

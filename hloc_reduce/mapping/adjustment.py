@@ -13,14 +13,13 @@ from .extension import OPTIONS
 
 Model = pycolmap.CameraModelId
 # of cameras whose intrinsics the mapper estimates
-ESTIMATED = {Model.SIMPLE_PINHOLE, Model.PINHOLE, Model.SIMPLE_RADIAL, Model.RADIAL}
+ESTIMATED_MODELS = {Model.SIMPLE_PINHOLE, Model.PINHOLE, Model.SIMPLE_RADIAL, Model.RADIAL}
 
-
-LARGEST = 200  # images: adjusting more takes minutes, and more photos bend a map less
+MOST_ADJUSTED = 200  # images: adjusting more takes minutes, and more photos bend a map less
 # cropped photos, and others with wrong focal lengths, gain 18 % and more, those of sound maps at
 # most 10 % (docs/maps.md)
-GAIN = 0.12
-PRECISE = 0.1  # pixels, of the best keypoints: smaller errors tell nothing
+GAIN_OF_FREE = 0.12
+PRECISE_KEYPOINTS = 0.1  # pixels, of the best keypoints: smaller errors tell nothing
 
 
 def with_own_cameras(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -57,7 +56,7 @@ def gain_of_free_intrinsics(sfm: pycolmap.Reconstruction) -> float:
 
     Returns:
         The share by which the median reprojection error falls with free intrinsics. That of
-        `PRECISE` keypoints is added to it.
+        `PRECISE_KEYPOINTS` keypoints is added to it.
     """
     errors = []
     for options in ({"known": [*sfm.cameras]}, {"refine_principal_point": True}):
@@ -66,7 +65,7 @@ def gain_of_free_intrinsics(sfm: pycolmap.Reconstruction) -> float:
             _adjuster(adjusted, **options).solve()
         adjusted.update_point_3d_errors()
         median = np.median([point.error for point in adjusted.points3D.values()])
-        errors.append(float(np.hypot(PRECISE, median)))
+        errors.append(float(np.hypot(PRECISE_KEYPOINTS, median)))
     known, free = errors
     return 1 - free / known
 
@@ -75,7 +74,7 @@ def focal_length_deviations(sfm: pycolmap.Reconstruction) -> dict[int, float]:
     """Estimate how precisely an adjustment of a model determines its focal lengths.
 
     Poses, points and distortions are as unknown as these. Cameras of other models than
-    `ESTIMATED`, which somebody gave, are taken for known.
+    `ESTIMATED_MODELS`, which somebody gave, are taken for known.
 
     Returns:
         From camera to the standard deviation of its focal length, as a share, to first order from
@@ -83,7 +82,7 @@ def focal_length_deviations(sfm: pycolmap.Reconstruction) -> dict[int, float]:
     """
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     cameras = {image.camera_id: sfm.cameras[image.camera_id] for image in images}
-    cameras = {i: camera for i, camera in cameras.items() if camera.model in ESTIMATED}
+    cameras = {i: camera for i, camera in cameras.items() if camera.model in ESTIMATED_MODELS}
     squares = np.concatenate([_errors(sfm, image) for image in images]) ** 2
     squares = squares[np.isfinite(squares)]  # not those of points behind a camera
     redundancy = 2 * len(squares) - 3 * sfm.num_points3D() - POSE * len(images)

@@ -10,7 +10,9 @@ from ..localization.intrinsics import GUESSED_FOCAL
 from ..utils import colmap
 
 # what the provenance of what is made from such a database says of its cameras
-CAMERAS = "of zooms, crops and squares: their own; of photos that were made smaller: scaled"
+INFERRED_CAMERAS = (
+    "of zooms, crops and squares: their own; of photos that were made smaller: scaled"
+)
 
 
 def import_images(

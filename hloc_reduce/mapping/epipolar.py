@@ -6,11 +6,9 @@ import numpy as np
 import pycolmap
 
 from ..utils import colmap
-from . import groups
 
-MAX_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
-# verified matches of a pair that are evidence, and the share of an image's that must agree
-EVIDENCE, AGREEING = 15, 0.5
+EPIPOLAR_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
+EVIDENCE = 15  # verified matches: fewer tell nothing of a pair
 
 Pair = tuple[str, str]
 
@@ -35,7 +33,7 @@ def agreeing(
     images, thresholds = list(images), {}
     for image in images:
         assert image.camera is not None  # it belongs to a model
-        pixels = MAX_ERROR * (1 if uncertainty is None else uncertainty[image.name])
+        pixels = EPIPOLAR_ERROR * (1 if uncertainty is None else uncertainty[image.name])
         thresholds[image.name] = image.camera.cam_from_img_threshold(pixels)
     return {
         (name0, name1): (errors0 <= thresholds[name0]) & (errors1 <= thresholds[name1])
@@ -65,46 +63,6 @@ def errors_of_pairs(
             relative = poses[name1] * poses[name0].inverse()
             points = rays[name0][indices[:, 0]], rays[name1][indices[:, 1]]
             yield (name0, name1), *epipolar_errors(relative, *points)
-
-
-def misplaced(
-    model: pycolmap.Reconstruction,
-    keypoints: Mapping[str, np.ndarray],
-    verified: Mapping[Pair, np.ndarray],
-) -> list[str]:
-    """Return the images whose poses contradict their matches.
-
-    A mapper may place an image, or a group of images, by a few wrong matches, in spite of all the
-    other ones. Those are then far from their epipolar lines. The image that contradicts its matches
-    most is taken away, or, if none does, the smaller one of two groups whose matches with each
-    other do; and so on with the others.
-
-    Args:
-        model: the map.
-        keypoints: (N, 2) of each image, COLMAP's pixels.
-        verified: the matches (M, 2) of pairs that agree with a two-view geometry.
-    """
-    images = [model.images[i] for i in sorted(model.reg_image_ids())]
-    row = {image.name: i for i, image in enumerate(images)}
-    agree, number = np.zeros((2, len(images), len(images)))
-    evidence = {pair: rows for pair, rows in verified.items() if len(rows) >= EVIDENCE}
-    for (name0, name1), valid in agreeing(images, keypoints, evidence).items():
-        i, j = row[name0], row[name1]
-        agree[i, j] = agree[j, i] = valid.sum()
-        number[i, j] = number[j, i] = len(valid)
-    left = np.arange(len(images))
-    while len(left) and (found := _worst(agree[np.ix_(left, left)], number[np.ix_(left, left)])):
-        left = np.delete(left, found)
-    return sorted(set(row).difference(images[i].name for i in left))
-
-
-def _worst(agree: np.ndarray, number: np.ndarray) -> list[int]:
-    """Return the image, or else the group, of (N, N) matches of which the fewest agree, if any."""
-    of_each = number.sum(axis=1)
-    shares = np.divide(agree.sum(axis=1), of_each, out=np.ones(len(agree)), where=of_each > 0)
-    if shares.min() < AGREEING:
-        return [int(shares.argmin())]
-    return groups.contradicting(agree, number, AGREEING, lambda wanted, *_: wanted >= EVIDENCE)
 
 
 @np.errstate(invalid="ignore")  # points that no camera sees are infinite

@@ -12,9 +12,9 @@ from ..localization.projection import median_photo_scale
 from ..utils import colmap
 from .epipolar import agreeing
 
-ROUNDS = 2  # of completing tracks, adjusting and filtering
-SETTINGS = {"num_threads": 1, "random_seed": 0}
-OPTIONS = colmap.mapper_options(SETTINGS)  # without a scale
+COMPLETIONS = 2  # of completing tracks, adjusting and filtering
+REPEATABLE = {"num_threads": 1, "random_seed": 0}
+OPTIONS = colmap.mapper_options(REPEATABLE)  # without a scale
 
 Pair = tuple[str, str]
 
@@ -74,7 +74,7 @@ def extend(
         graph = _graph(model, keypoints, uncertainty, matches)
         observations = pycolmap.ObservationManager(model, graph)
         triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
-        options = colmap.mapper_options(SETTINGS, pixel_scale)
+        options = colmap.mapper_options(REPEATABLE, pixel_scale)
         tracks, limits = options.get_triangulation(), options.get_mapper()
         # the graph has no matches of two images of the model, so longer tracks look like these
         tracks.ignore_two_view_tracks = False
@@ -82,7 +82,7 @@ def extend(
             triangulator.triangulate_image(tracks, image_id)
         free = {ids[name] for name, image in near.items() if not image.fixed}
         unknown = {model.images[ids[n]].camera_id for n, image in near.items() if not image.known}
-        for _ in range(ROUNDS):
+        for _ in range(COMPLETIONS):
             triangulator.complete_tracks(tracks, _points_of(model, ids.values()))
             triangulator.merge_tracks(tracks, _points_of(model, ids.values()))
             _adjust(model, ids.values(), free, unknown, refine_map)

@@ -13,29 +13,18 @@ import numpy as np
 import pycolmap
 
 from .. import logger
-from ..runtime import parallel, provenance
+from ..runtime import parallel
 from ..utils import cli, colmap
 from ..utils.interrupts import interruptible
-from . import copies, epipolar
 from . import database as databases
 from .adjustment import adjusted_error, with_one_camera
-from .plausibility import (
-    COPY,
-    DISTORTION,
-    DOUBTFUL,
-    FEW,
-    FEW_POINTS,
-    FEWEST,
-    MAX_DISTORTION,
-    MISPLACED,
-    SPREAD,
-    VIEWPOINTS,
-    Models,
-    focal_length_spread,
-    keep_plausible,
-    size,
-)
-from .registration import ENOUGH, REGISTRATION, NoModelError, nothing
+from .checks import Inputs, copies, lenses
+from .checks.focal_lengths import FEW_IMAGES, SPREAD, SPREAD_OF_FEW, are_alike, of_spread
+from .checks.partial import ENOUGH_REGISTERED
+from .epipolar import EVIDENCE
+from .findings import names_in, without
+from .plausibility import Models, focal_length_spread, keep_plausible, size
+from .registration import VIEWPOINTS, NoModelError, Registration, nothing
 
 # half of COLMAP's thresholds, for missing images; a quarter of them gave wrong poses
 RELAXED = {
@@ -48,11 +37,13 @@ RELAXED = {
 FALLBACK = "structure_less_registration_fallback"
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
 SEEDS = (1, 2, 3)
-PATIENCE = 300.0  # seconds of further attempts, after which none begins: most maps take far less
-MORE = 1.5  # times as many images show that one camera took all
+MAPPER_PATIENCE = (
+    300.0  # seconds of further attempts, after which none begins: most maps take far less
+)
+MORE_IMAGES = 1.5  # times as many images show that one camera took all
 # Images that one camera took fit up to 10 % better with cameras of their own, in nine of twelve
-# models whose focal lengths differ by more than DOUBTFUL. Where one of them was enlarged by 8 %,
-# they fit at least 11 % better, in most models over 30 %.
+# models whose focal lengths differ by more than SPREAD_OF_FEW. Where one of them was enlarged by
+# 8 %, they fit at least 11 % better, in most models over 30 %.
 MISFIT = 0.1
 ALMOST = 0.9  # times as many points with one camera as with several
 # Focal length in longer sides from which photos hardly tell a distortion: it may make up for wrong
@@ -61,17 +52,19 @@ NARROW = 2.5
 UNDISTORTED = {"ba_refine_extra_params": False}
 # what the provenance of a model says of how it was chosen
 RULES = {
-    "inferred": databases.CAMERAS,
-    "cameras": f"plausible, distortion {MAX_DISTORTION}, one for {MORE} times as many images",
-    "points": f"{MORE} times as many where focal lengths differ",
-    "doubtful": f"from {DOUBTFUL}, misfit {MISFIT}, {ALMOST} times as many points",
+    "inferred": databases.INFERRED_CAMERAS,
+    "cameras": f"plausible, distortion {lenses.MAX_DISTORTION}, one for {MORE_IMAGES} times as "
+    "many images",
+    "points": f"{MORE_IMAGES} times as many where focal lengths differ",
+    "doubtful": f"from {SPREAD_OF_FEW}, misfit {MISFIT}, {ALMOST} times as many points",
     "lenses": "others without the implausible ones, by the best attempt",
     "narrow": f"no distortion from {NARROW} longer sides if it is implausible",
     "spread": SPREAD,
     "viewpoints": VIEWPOINTS,
-    "misplaced": f"{epipolar.AGREEING} of {epipolar.EVIDENCE} matches or more, {FEWEST} points",
-    "copies": f"sharing less than {copies.SHARE} of the points expected in {copies.ENOUGH}, any "
-    f"less than {copies.APART}",
+    "misplaced": f"0.5 of {EVIDENCE} matches or more, 8 points",
+    "copies": f"sharing less than {copies.JOINED_SHARE} of the points expected in "
+    f"{copies.TELLING}, any less than {copies.APART_SHARE}",
+    "dropped": "findings",
 }
 
 
@@ -107,7 +100,9 @@ class Mapper:
         """Write the best model, its database and its registration."""
         database = self.write_database(camera_mode)
         models, dropped = self.run(database, self.once)
-        alike = camera_mode == pycolmap.CameraMode.AUTO and _are_alike(database)
+        alike = camera_mode == pycolmap.CameraMode.AUTO and are_alike(
+            colmap.read_cameras(database).values()
+        )
         if alike and (shared := self._with_one_camera(models, database)):
             (models, dropped), database = shared
             alike = False
@@ -116,17 +111,23 @@ class Mapper:
         models[0].write(self.folder)
         parts = _parts(models)
         missing = sorted(set(self.names) - set(parts[0]))
-        state = {
-            "images": len(self.names),
-            "parts": parts,
-            "missing": missing,
-            "unmatched": sorted(set(self.names) - _matched(database)),
-            "implausible": {name: what for name, what in dropped.items() if name in missing},
-            "alike": alike,
-            "spread": round(focal_length_spread(models), 2),
-            "attempts_left_out": self.left_out,
-        }
-        provenance.write(self.folder / REGISTRATION, state)
+        registration = Registration(
+            images=len(self.names),
+            parts=parts,
+            missing=missing,
+            unmatched=sorted(set(self.names) - _matched(database)),
+            dropped=without(dropped, parts[0]),
+            alike=alike,
+            spread=round(focal_length_spread(models), 2),
+            attempts_left_out=self.left_out,
+        )
+        registration.write(self.folder)
+        if alike and not of_spread(registration.spread, registration.images):
+            logger.info(
+                "EXIF data do not say which images share a camera, so each has its own. If one "
+                "camera with a fixed zoom took all, --camera_mode single --overwrite gives better "
+                "poses."
+            )
         database.rename(self.folder / "database.db")
         for other in self.folder.glob("database-*"):
             other.unlink()
@@ -139,16 +140,18 @@ class Mapper:
         # a photo may have been dropped for its own focal length
         spread = focal_length_spread(models, with_dropped=True)
         several = len(self.attempts) > 1 and not self.once
-        few = several and MORE * registered <= len(_matched(database))
-        fits = DOUBTFUL < spread <= SPREAD and _fits_one_camera(models[0])
+        few = several and MORE_IMAGES * registered <= len(_matched(database))
+        fits = SPREAD_OF_FEW < spread <= SPREAD and _fits_one_camera(models[0])
         if not (few or fits or spread > SPREAD):
             return None
         logger.info("Trying again with one camera for all images.")
         shared = self.write_database(pycolmap.CameraMode.SINGLE)
         found = self.run(shared, self.once and not fits)
         images, more = _size(found[0])
-        enough = more >= MORE * points if spread > SPREAD else fits and more >= ALMOST * points
-        if found[0] and (images >= MORE * registered or (images >= registered and enough)):
+        enough = (
+            more >= MORE_IMAGES * points if spread > SPREAD else fits and more >= ALMOST * points
+        )
+        if found[0] and (images >= MORE_IMAGES * registered or (images >= registered and enough)):
             return found, shared
         return None
 
@@ -163,10 +166,14 @@ class Mapper:
         """Return the plausible models of the best attempt; stop when enough images are in one."""
         if _largest_group(database) < VIEWPOINTS:
             logger.info("No %d images have verified matches that connect them.", VIEWPOINTS)
-            return [], {}
-        evidence = colmap.read_cameras(database), self.keypoints, colmap.read_verified(database)
+            return [], []
+        known = partial(
+            Inputs,
+            cameras=colmap.read_cameras(database),
+            verified=colmap.read_verified(database),
+        )
         number = len(self.names)
-        enough = number if number <= FEW else ENOUGH * number
+        enough = number if number <= FEW_IMAGES else ENOUGH_REGISTERED * number
         enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
 
         def attempted(changed: dict, alone: bool = True) -> Models:
@@ -177,10 +184,11 @@ class Mapper:
                 found = colmap.incremental_mapping(
                     own, self.image_dir, Path(folder) / "models", options, self.verbose
                 )
-            is_narrow = any(_is_narrow(model) for model in found)
-            models, dropped = keep_plausible(found, *evidence)
-            distorted = any(what.startswith(DISTORTION) for what in dropped.values())
-            if not (distorted and is_narrow) or UNDISTORTED.items() <= changed.items():
+            cameras = [camera for model in found for camera in _cameras(model)]
+            is_narrow = any(_is_narrow(camera) for camera in cameras)
+            is_distorted = any(lenses.is_distorted(camera) for camera in cameras)
+            models, dropped = keep_plausible([known(model) for model in found])
+            if not (is_narrow and is_distorted) or UNDISTORTED.items() <= changed.items():
                 return models, dropped
             logger.info("Trying again without distortion.")
             others = attempted({**changed, **UNDISTORTED}, alone)
@@ -199,16 +207,14 @@ class Mapper:
             if registered >= enough:
                 break
         models, dropped = best
-        lenses = {
-            name for name, what in dropped.items() if what not in (MISPLACED, COPY, FEW_POINTS)
-        }
-        if models and lenses:
+        implausible = names_in(dropped, "lenses")
+        if models and implausible:
             # a photo with an implausible lens has bent the model of the others
-            logger.info("Trying again without %s.", cli.some(sorted(lenses)))
-            names = [name for name in self.names if name not in lenses]
+            logger.info("Trying again without %s.", cli.some(sorted(implausible)))
+            names = [name for name in self.names if name not in implausible]
             others, more = attempted({**options, "image_names": names})
             if _size(others)[0] >= _size(models)[0]:
-                return others, more | dropped
+                return others, dropped + more
         return best
 
     def _in_turn(self, attempted: Callable[..., Models], attempts: list[dict]) -> Iterator[Models]:
@@ -218,7 +224,7 @@ class Mapper:
         """
         cores, number = parallel.cores(), len(attempts)
         for first in (0, *range(1, number, cores)):
-            if first and self.seconds > PATIENCE:
+            if first and self.seconds > MAPPER_PATIENCE:
                 self.left_out += number - first
                 logger.warning(
                     "%d of %d attempts are left out, as further ones took %.0f s.",
@@ -235,10 +241,14 @@ class Mapper:
             self.seconds += time.monotonic() - start if first else 0
 
 
-def _is_narrow(model: pycolmap.Reconstruction) -> bool:
-    """Tell whether any camera of the images of a model has a narrow view."""
-    cameras = [model.cameras[model.images[i].camera_id] for i in model.reg_image_ids()]
-    return any(c.mean_focal_length() > NARROW * max(c.width, c.height) for c in cameras)
+def _cameras(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
+    """Return the camera of each image of a model."""
+    return [model.cameras[model.images[i].camera_id] for i in model.reg_image_ids()]
+
+
+def _is_narrow(camera: pycolmap.Camera) -> bool:
+    """Tell whether a camera has a narrow view."""
+    return camera.mean_focal_length() > NARROW * max(camera.width, camera.height)
 
 
 def _matched(database: Path) -> set[str]:
@@ -261,15 +271,9 @@ def _largest_group(database: Path) -> int:
     return int(np.bincount(group).max())
 
 
-def _are_alike(database: Path) -> bool:
-    """Tell whether one camera may have taken all images, although each has its own."""
-    cameras = colmap.read_cameras(database).values()
-    return len(cameras) > len({(c.width, c.height, *c.params) for c in cameras}) == 1
-
-
 def _fits_one_camera(model: pycolmap.Reconstruction) -> bool:
     """Tell whether the images of a model fit nearly as well with one camera as with their own."""
-    if model.num_reg_images() > FEW:
+    if model.num_reg_images() > FEW_IMAGES:
         return False
     own = adjusted_error(copy.deepcopy(model))
     return own >= (1 - MISFIT) * adjusted_error(with_one_camera(model))

@@ -1,76 +1,42 @@
 """Which images of a reconstructed model are plausible, and which models can be used."""
 
-from collections import Counter
-from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
 
 from .. import logger
-from ..localization.confidence import focal_lengths
 from ..utils import colmap
-from . import copies
-from .epipolar import Pair, misplaced
+from .checks import CHECKS, Inputs
+from .findings import Finding, merged, names_in
+from .registration import VIEWPOINTS
 
-# ratios of focal lengths of images that one camera may have taken: one camera for all is tried
-SPREAD = 1.2  # above it, always
-DOUBTFUL = 1.05  # above it, for few images, if these fit with one
-FEW = 100  # images: further attempts take little time, even for one missing image
-MAX_DISTORTION = 1.0  # COLMAP's limit for images that it registers
-FEWEST = 8  # points of an image: fewer determine no pose for certain
-# A few points hold an image like a hinge: it fits them, but its pose is often wrong by degrees.
-# Of images with fewer than 30 points, and than an eighth of the median of their map, three of four
-# were wrong, in 103 maps.
-HINGE, SHARE = 30, 1 / 8
-MANY = 3  # images of one camera estimate its focal length better than EXIF data do
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
-VIEWPOINTS = 3  # at least, of a model: two do not determine the focal lengths
+DROPPING = "lenses", "misplaced", "copies", "few_points"  # checks, in this order
 
-# in place of an implausible lens; see `epipolar.misplaced` and `copies`
-DISTORTION = "distortion"  # begins what is implausible about a lens
-MISPLACED, COPY, FEW_POINTS = "misplaced", "another side or a copy", "few points"
-
-Models = tuple[list[pycolmap.Reconstruction], dict[str, str]]  # see `keep_plausible`
+Models = tuple[list[pycolmap.Reconstruction], list[Finding]]  # see `keep_plausible`
 
 
-def keep_plausible(
-    models: list[pycolmap.Reconstruction],
-    cameras: dict[int, pycolmap.Camera],
-    keypoints: Mapping[str, np.ndarray] | None = None,
-    verified: Mapping[Pair, np.ndarray] | None = None,
-) -> Models:
+def keep_plausible(models: list[Inputs]) -> Models:
     """Drop images from models: implausible lenses, misplaced ones, copies, and with few points.
 
     Args:
-        models: of COLMAP's mapper.
-        cameras: from id to the initial camera.
-        keypoints: (N, 2) of each image, COLMAP's pixels; with `verified`.
-        verified: the matches (M, 2) of pairs that agree with a two-view geometry; default: no image
-            is taken for misplaced.
+        models: of COLMAP's mapper, changed in place.
 
     Returns:
-        The models that have points, the largest first; and from the name of each dropped image to
-        what is implausible: the lens, or `MISPLACED`, `COPY` or `FEW_POINTS`.
+        The models that have points, the largest first; and what was found of the images that were
+        dropped.
     """
-    dropped: dict[str, str] = {}
-    for model in models:
-        images = _registered(model)
-        shared = Counter(image.camera_id for image in images)
-        lenses = {}
-        for image in images:
-            camera_id = image.camera_id
-            lens = _implausible(model.cameras[camera_id], cameras[camera_id], shared[camera_id])
-            if lens is not None:
-                lenses[image.name] = lens
-        dropped |= _drop(model, lenses)
-        wrong = misplaced(model, keypoints or {}, verified) if verified else []
-        dropped |= _drop(model, dict.fromkeys(wrong, MISPLACED))
-        while found := copies.find(model):
-            dropped |= _drop(model, dict.fromkeys(found, COPY))
-        while few := _held_by_few(model):
-            dropped |= _drop(model, dict.fromkeys(few, FEW_POINTS))
+    dropped: list[Finding] = []
+    for one in models:
+        for kind in DROPPING:
+            while found := CHECKS[kind].find(replace(one)):  # the model has changed
+                dropped += found
+                # in place: the mapper's images have their own frames
+                colmap.remove_images(one.model, names_in(found))
+                _keep_connected(one.model)
     whole = []
-    for model in models:
+    for model in (one.model for one in models):
         if min(size(model)) < 2:
             continue
         if (number := count_viewpoints(model)) >= VIEWPOINTS:
@@ -80,31 +46,7 @@ def keep_plausible(
             "A model of %d photos is not used: %d viewpoints do not determine focal lengths.",
             *(model.num_reg_images(), number),
         )
-    return sorted(whole, key=size, reverse=True), dropped
-
-
-def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    return [model.images[i] for i in model.reg_image_ids()]
-
-
-def _held_by_few(model: pycolmap.Reconstruction) -> list[str]:
-    """Return the images that too few points hold: those with the fewest, as others share these."""
-    number = {image.name: image.num_points3D for image in _registered(model)}
-    if not number:
-        return []
-    least = max(FEWEST, min(HINGE, SHARE * np.median(list(number.values()))))
-    fewest = min(number.values())
-    return [name for name, points in number.items() if points == fewest < least]
-
-
-def _implausible(camera: pycolmap.Camera, initial: pycolmap.Camera, number: int) -> str | None:
-    """Say what is implausible about the refined camera of a number of images, if anything."""
-    low, high = focal_lengths(initial, not initial.has_prior_focal_length or number >= MANY)
-    focal_length = camera.mean_focal_length()
-    if not low <= focal_length <= high:
-        return f"focal length {focal_length:.0f}" if focal_length > 0 else "no focal length fits"
-    distortion = max(camera.params[list(camera.extra_params_idxs())], key=abs, default=0.0)
-    return f"{DISTORTION} {distortion:.1f}" if abs(distortion) > MAX_DISTORTION else None
+    return sorted(whole, key=size, reverse=True), merged(dropped)
 
 
 def count_viewpoints(model: pycolmap.Reconstruction) -> int:
@@ -126,14 +68,6 @@ def count_viewpoints(model: pycolmap.Reconstruction) -> int:
             if np.linalg.norm(centre - first) > SAME_VIEWPOINT * min(distance, other)
         ]
     return number
-
-
-def _drop(model: pycolmap.Reconstruction, dropped: dict[str, str]) -> dict[str, str]:
-    """Drop photos, and those that only these connect; return the photos."""
-    if dropped:
-        colmap.remove_images(model, dropped)  # in place: the mapper's images have their own frames
-        _keep_connected(model)
-    return dropped
 
 
 def _keep_connected(model: pycolmap.Reconstruction) -> None:
@@ -165,7 +99,8 @@ def focal_length_spread(models: list[pycolmap.Reconstruction], with_dropped: boo
     """
     if not models:
         return 1.0
-    images = models[0].images.values() if with_dropped else _registered(models[0])
-    cameras = {image.camera_id for image in images}
-    focal_lengths = [models[0].cameras[i].mean_focal_length() for i in cameras]
+    model = models[0]
+    ids = [*model.images] if with_dropped else model.reg_image_ids()
+    cameras = {model.images[i].camera_id for i in ids}
+    focal_lengths = [model.cameras[i].mean_focal_length() for i in cameras]
     return max(focal_lengths) / min(focal_lengths) if focal_lengths else 1.0

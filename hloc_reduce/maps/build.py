@@ -1,7 +1,9 @@
 """Build a map from photos, with or without a model of their poses."""
 
 import uuid
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
@@ -10,7 +12,10 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
 from ..extract_features import keep_present, without
-from ..mapping import registration, sizes
+from ..localization import intrinsics
+from ..mapping import registration
+from ..mapping.checks import Inputs, judging, run, sizes
+from ..mapping.findings import Finding, check_accepted, names_in, staying
 from ..runtime import provenance
 from ..runtime.outputs import CONF, RunFolder
 from ..utils import colmap
@@ -20,8 +25,8 @@ from ..utils.files import replacing
 from ..utils.images import list_images, stored_size
 from ..utils.match_files import check_distinct
 from ..utils.paths import strings_as_paths
-from .building import ROUNDS, Building, drop_others
-from .map import FINGERPRINTS, FINISHED, PLACE, Map
+from .attempts import PAIR_ROUNDS, Attempt, Photos, drop_others, of_model, of_photos_alone
+from .map import FINGERPRINTS, FINISHED, PLACE, Map, keep_projection, write
 
 MAX_EXHAUSTIVE = 100  # photos without covisibility that are all paired with each other
 
@@ -68,9 +73,9 @@ def main(
 
     Raises:
         InputError: if the folder has a map that was made from something else, something is missing
-            or wrong, photos do not have the size of their cameras in the model (`mapping.sizes`),
-            or the reconstruction is refused, see `registration.check`; what is finished
-            is kept, for a run with `accept_partial`.
+            or wrong, photos do not have the size of their cameras in the model (`checks.sizes`),
+            or a check refuses the reconstruction; what is finished is kept, for a run with
+            `accept_partial`.
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher = matcher or features_confs.matcher_of(conf)
@@ -99,16 +104,23 @@ def main(
     if exhaustive and not has_points:
         made_from |= {"num_covis": None, "pairs": "exhaustive"}
     elif model is None:
-        made_from |= {"pairs": f"retrieval, {ROUNDS} rounds of verification"}
+        made_from |= {"pairs": f"retrieval, {PAIR_ROUNDS} rounds of verification"}
     made_from |= {"normalized": True} if normalized else {}
     with claim(map_dir, made_from, overwrite, image_dir, model, projection) as folder:
         if not (map_dir / FINISHED).exists():
             begin(map_dir, fingerprints)
-            building = Building(
+            logger.info("Building the map %s of %d images.", map_dir, len(usable))
+            photos = Photos(
                 *(folder, image_dir, usable, matcher, num_covis, exhaustive),
                 *(accept_partial, camera_mode),
             )
-            return building.build(feature, conf, keypoints, model, reference)
+            conf = keep_projection(conf, map_dir)
+            if model is not None and reference is not None:
+                attempt = of_model(photos, conf, model, reference)
+                return _finish(attempt, [], True, feature, keypoints, model=str(model.resolve()))
+            attempt, findings = of_photos_alone(photos, conf)
+            mode = camera_mode.name.lower()
+            return _finish(attempt, findings, False, feature, keypoints, camera_mode=mode)
         built = Map(map_dir)
         if built.camera_mode not in (None, camera_mode.name.lower()):
             raise InputError(
@@ -118,6 +130,59 @@ def main(
         drop_others(folder, built)  # a killed run may have left some
         built.warn()
         return built
+
+
+def _finish(
+    attempt: Attempt,
+    found: list[Finding],
+    are_poses_given: bool,
+    feature: str,
+    keypoints: str,
+    **content: Any,
+) -> Map:
+    """Judge a model and write the map, unless it is refused.
+
+    Args:
+        attempt: the model.
+        found: what was found of its photos, and of those that are left out.
+        are_poses_given: its poses were not reconstructed.
+        feature: name of the feature.
+        keypoints: the settings of DoG that were asked for.
+        content: what else map.json says.
+    """
+    photos, sfm = attempt.photos, attempt.sfm
+    cameras = intrinsics.of_map(
+        sfm, photos.image_dir, attempt.names - names_in(found, "intrinsics")
+    )
+    if any(one.kind == "intrinsics" for one in found):
+        cameras = cameras._replace(known={}, typical={})  # they may be wrong
+    inputs = Inputs(sfm, matches=attempt.matches, image_dir=photos.image_dir)
+    if not are_poses_given:
+        dropped = names_in(one for one in found if one.verdict == "drop")
+        known = registration.read(attempt.sfm_dir, dropped)
+        verified = colmap.read_verified(attempt.sfm_dir / "database.db")
+        inputs = replace(inputs, verified=verified, registration=known, typical=cameras.typical)
+        found = [*found, *known.dropped]
+    with photos.folder.stage("judge"):
+        found = [*staying(run(inputs, judging(not are_poses_given))), *found]
+    check_accepted(found, photos.accept_partial)
+    written = write(
+        *(photos.folder.path, attempt.conf, sfm, cameras),
+        feature=feature,
+        matcher=photos.matcher,
+        image_dir=str(photos.image_dir.resolve()),
+        keypoints=keypoints,
+        sfm=attempt.sfm_dir.name,
+        images=len({*photos.names, *names_in(found, "another_size")}),
+        findings=[one.to_json() for one in found],
+        seconds=photos.folder.seconds(),
+        **content,
+    )
+    built = Map(photos.folder.path)
+    built.warn()
+    drop_others(photos.folder, built)
+    provenance.write(built.folder / FINISHED, written | {"bytes": photos.folder.bytes()})
+    return built
 
 
 def claim(map_dir: Path, made_from: dict, overwrite: bool, *inputs: Path | None) -> RunFolder:

@@ -9,7 +9,8 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
 from ..localization import intrinsics
-from ..mapping import copies
+from ..mapping.checks import Inputs, judging, run
+from ..mapping.findings import staying
 from ..reduce import Reduction
 from ..runtime.outputs import RunFolder
 from ..utils import colmap
@@ -87,7 +88,7 @@ def main(
                 conf = keep_projection(conf, map_dir)
                 _build(folder, opened, reduction, conf, names, reference, model, found)
                 with folder.stage("judge_poses"):
-                    contradicting = copies.find(reference)
+                    judged = staying(run(Inputs(reference), judging(are_poses_estimated=False)))
                 write(
                     *(map_dir, conf, reference, cameras),
                     feature=name,
@@ -98,7 +99,7 @@ def main(
                     keypoints=keypoints,
                     images=len(names),
                     images_with_pose=len(names),
-                    images_contradicting_others=contradicting,
+                    findings=[one.to_json() for one in judged],
                     seconds=folder.seconds(),
                     bytes=folder.bytes(),
                 )

@@ -14,7 +14,9 @@ import pycolmap
 
 from .. import logger
 from ..localization import intrinsics
-from ..mapping import copies, registration
+from ..mapping.adjustment import MOST_ADJUSTED
+from ..mapping.checks import CHECKS, Inputs, focal_lengths, judging, partial, run
+from ..mapping.findings import Finding, names_in, staying, warn, without
 from ..mapping.plausibility import focal_length_spread
 from ..runtime import provenance
 from ..runtime.group_writer import merge
@@ -25,9 +27,9 @@ from ..utils.files import announce, delete
 from ..utils.h5 import list_h5_names
 from ..utils.images import list_images
 from ..utils.paths import strings_as_paths
-from . import cropping, precision
-from .addition import GROWING, IMAGES, Addition, photo_of
+from . import older
 from .map import FINGERPRINTS, FINISHED, PLACE, SFM, Map, models
+from .placing import GROWING, PHOTO_KEYS, Addition, photo_of
 
 
 @strings_as_paths
@@ -111,7 +113,7 @@ def remove(built: Map, names: Iterable[str]) -> Map:
             sfm = colmap.remove_images(sfm, removed)
             if not sfm.num_points3D():
                 raise InputError(f"No point of the map {built.folder} would be left.")
-        if removed & {*inside, *built.mirrored, *built.unlike_others}:
+        if removed & (inside | names_in(built.findings)):
             _commit(built, sfm, -len(removed), removed=removed)
         for path in (built.features, built.descriptors):
             merge(path, [path], removed)
@@ -144,9 +146,12 @@ def _commit_addition(addition: Addition) -> None:
     merge(built.features, [addition.features], left_out)
     merge(built.descriptors, [addition.descriptors], left_out)
     known = provenance.read(built.folder / FINGERPRINTS)
-    new = {f"{IMAGES}{name}": addition.fingerprints[f"{IMAGES}{name}"] for name in addition.added}
+    new = {
+        f"{PHOTO_KEYS}{name}": addition.fingerprints[f"{PHOTO_KEYS}{name}"]
+        for name in addition.added
+    }
     provenance.write(built.folder / FINGERPRINTS, known | new)
-    alike = {*addition.added} - {*built.unlike_others}
+    alike = {*addition.added} - names_in(built.findings, "another_size")
     cameras = intrinsics.of_map(addition.sfm, addition.image_dir, alike)
     more = len(new.keys() - known.keys())
     _commit(built, addition.sfm, more, addition.added, cameras=cameras)
@@ -172,6 +177,7 @@ def _commit(
         cameras: what the new photos tell about intrinsics.
     """
     content = json.loads((built.folder / FINISHED).read_text())
+    content = {key: value for key, value in content.items() if key not in older.FIELDS}
     number = 2
     while built.sfm.name == f"{SFM}-{number}":
         number += 1
@@ -181,45 +187,66 @@ def _commit(
     folder.mkdir()
     sfm.write_binary(folder)
     sfm = colmap.read_model(folder)  # without images that were removed
-    contradicting = sorted(({*built.contradicting} - {*removed}) | {*copies.find(sfm)})
-    uncertain = built.uncertain
-    fit = built.cropping._replace(altered=sorted({*built.cropping.altered} - {*removed}))
-    if content.get("model") is None:
-        uncertain = precision.find(sfm)
-        if sfm.num_reg_images() <= cropping.LARGEST:
-            fit = cropping.find(sfm)
-    precision.warn({name: share for name, share in uncertain.items() if name in added})
-    if built.cropping.gain <= cropping.GAIN or {*fit.altered} - {*built.cropping.altered}:
-        cropping.warn(fit)
-    factor = built.doubtful_focal_lengths
-    if factor > 1:
-        factor = registration.doubtful(focal_length_spread([sfm]), sfm.num_reg_images())
+    images = content.get("images", built.num_images) + more
+    findings = _judge_again(built, sfm, images, {*added, *removed}, content.get("model") is None)
+    warn(one for one in findings if _is_new(one, built.findings))
     content |= {
         "id": uuid.uuid4().hex,
         "sfm": folder.name,
-        "images": content.get("images", built.num_images) + more,
+        "images": images,
         "images_with_pose": sfm.num_reg_images(),
         "images_added": sorted(({*content.get("images_added", ())} | {*added}) - {*removed}),
-        "images_contradicting_others": contradicting,
-        "images_of_uncertain_position": uncertain,
-        "images_fitting_badly": [name for name in built.fitting_badly if name not in removed],
-        "gain_of_free_principal_points": fit.gain,
-        "images_altered": fit.altered,
-        "images_cropped": sorted({*built.cropped} - {*removed}),
-        "doubtful_focal_lengths": factor,
-        "images_mirrored": sorted({*built.mirrored} - {*added} - {*removed}),
-        "images_unlike_others": sorted({*built.unlike_others} - {*added} - {*removed}),
+        "findings": [one.to_json() for one in findings],
         "points3D": sfm.num_points3D(),
     }
     told = built.cameras if cameras is None else intrinsics.merged(built.cameras, cameras)
-    if fit.gain > cropping.GAIN:
+    if any(one.kind == "intrinsics" for one in findings):
         told = told._replace(known={}, typical={})  # they may be wrong
     else:
-        images = (image for image in sfm.images.values() if image.name not in fit.altered)
-        told = told._replace(typical=intrinsics.of_cameras(i.camera for i in images).typical)
+        cameras_now = (image.camera for image in sfm.images.values())
+        told = told._replace(typical=intrinsics.of_cameras(cameras_now).typical)
     told = intrinsics.with_lenses(told, (image.camera for image in sfm.images.values()))
     content |= intrinsics.to_dict(told)
     provenance.write(built.folder / FINISHED, content)
+
+
+def _judge_again(
+    built: Map,
+    sfm: pycolmap.Reconstruction,
+    images: int,
+    changed: Collection[str],
+    are_poses_estimated: bool,
+) -> list[Finding]:
+    """Return what may be wrong with a changed map.
+
+    What its model tells is found again. What matches and photos told stays, but for photos that
+    were added or removed.
+
+    Args:
+        built: the map before.
+        sfm: its changed model.
+        images: the number of photos that it is made from.
+        changed: names of the photos that were added or removed.
+        are_poses_estimated: from photos alone.
+    """
+    again = {kind for kind in judging(are_poses_estimated) if not CHECKS[kind].needs}
+    if are_poses_estimated and sfm.num_reg_images() <= MOST_ADJUSTED:
+        again.add("intrinsics")
+    before = {one.kind: one for one in built.findings}
+    kept = without(built.findings, changed)
+    missing = names_in(kept, "partial")
+    found = partial.of_numbers(sfm.num_reg_images(), images, sorted(missing))
+    if "focal_lengths" in before:
+        found += focal_lengths.of_spread(focal_length_spread([sfm]), sfm.num_reg_images())
+    found += staying(run(Inputs(sfm), [kind for kind in CHECKS if kind in again]))
+    replaced = {"partial", "focal_lengths", *again}
+    return found + [one for one in kept if one.kind not in replaced]
+
+
+def _is_new(finding: Finding, before: Collection[Finding]) -> bool:
+    """Tell whether findings before say nothing like it, or not of all of its photos."""
+    alike = [one for one in before if one.kind == finding.kind]
+    return not alike or not names_in(alike).issuperset(finding.names)
 
 
 def _drop_left(folder: RunFolder, built: Map) -> None:

@@ -14,7 +14,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..detectors.dog import KEYPOINTS
 from ..localization import intrinsics
-from ..mapping import registration
+from ..mapping.findings import Finding, warn
 from ..runtime import provenance
 from ..runtime.outputs import CONF
 from ..utils import colmap
@@ -22,9 +22,9 @@ from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import CODED, QUANTIZED, STORAGES
 from ..utils.feature_files import Levels, first_descriptors
 from ..utils.files import replacing
-from ..utils.h5 import Unavailable, file_provenance, get_dataset, list_h5_names, open_h5
+from ..utils.h5 import Unavailable, file_provenance, get_dataset, open_h5
 from ..utils.paths import strings_as_paths
-from . import contradictions, cropping, mirrored_photos, misfits, precision
+from .older import findings_of
 
 FINISHED = "map.json"  # is written last
 FINGERPRINTS = "fingerprints.json"
@@ -50,15 +50,7 @@ class Map:
         matcher: key of `confs.matchers`.
         images: folder of the photos.
         num_images: images with a pose.
-        contradicting: images whose poses contradict the others.
-        uncertain: images whose positions are uncertain, see `precision.find`.
-        fitting_badly: images whose matches fit their poses badly, see `misfits.find`.
-        doubtful_focal_lengths: their ratio if it makes the map doubtful, 1 otherwise, see
-            `registration.check`.
-        cropping: how much better the images fit with other intrinsics.
-        cropped: images that were cropped, by their EXIF data.
-        unlike_others: images that are left out, as their intrinsics are unlike those of the others.
-        mirrored: images that are left out because they are mirrored.
+        findings: what may be wrong with it, and which photos were left out.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
         cameras: what the map tells about the intrinsics of other photos.
@@ -101,17 +93,11 @@ class Map:
         self.matcher = choose("matcher", content["matcher"], matchers_confs.confs)
         self.images = Path(content["image_dir"])
         self.num_images = int(content["images_with_pose"])
-        self.contradicting = list(content.get("images_contradicting_others", []))
-        found = content.get("images_of_uncertain_position", {}).items()
-        self.uncertain = {str(name): min(float(share), 1.0) for name, share in found}
-        self.fitting_badly = list(content.get("images_fitting_badly", []))
-        self.doubtful_focal_lengths = float(content.get("doubtful_focal_lengths", 1))
-        gain = float(content.get("gain_of_free_principal_points", 0))
-        self.cropping = cropping.Fit(gain, list(content.get("images_altered", [])))
-        self.cropped = list(content.get("images_cropped", []))
-        self._doubts = list(content.get("doubts", []))
-        self.unlike_others = list(content.get("images_unlike_others", []))
-        self.mirrored = list(content.get("images_mirrored", []))
+        if "findings" in content:
+            self.findings = [Finding.from_json(one) for one in content["findings"]]
+        else:
+            self.findings = findings_of(content)
+        self._doubts = [str(doubt) for doubt in content.get("doubts", [])]
         self.num_points3D = int(content["points3D"])
         self.camera_mode = content.get("camera_mode")
         known = content.get("cameras", {}).items()
@@ -210,34 +196,14 @@ class Map:
             )
 
     @property
-    def is_partial(self) -> bool:
-        """Whether fewer than half of its photos have a pose."""
-        return self.num_images < registration.LEAST * len(list_h5_names(self.features))
-
-    @property
     def doubts(self) -> list[str]:
         """Why its photos may be misplaced, and queries with them, in a few words each."""
-        is_cropped = self.cropped or self.cropping.altered or self.cropping.gain > cropping.GAIN
-        factor = self.doubtful_focal_lengths
-        reasons = {
-            f"focal lengths that differ by a factor of {factor:.2f}": factor > 1,
-            "photos that others place elsewhere": self.contradicting,
-            "photos whose matches fit their poses badly": self.fitting_badly,
-            "photos that may be cropped or enlarged": is_cropped,
-            "photos whose positions are uncertain": self.uncertain,
-            "fewer than half of its photos": self.is_partial,
-        }
-        found = [reason for reason, is_one in reasons.items() if is_one]
-        return found + [doubt for doubt in self._doubts if doubt not in found]
+        found = [one.doubt for one in self.findings if one.doubt and one.verdict != "drop"]
+        return [*dict.fromkeys(found + self._doubts)]
 
     def warn(self) -> None:
         """Warn of what may be wrong with the map, as was found when it was built."""
-        registration.warn(self.doubtful_focal_lengths)
-        contradictions.warn(self.contradicting)
-        misfits.warn(self.fitting_badly)
-        precision.warn(self.uncertain)
-        cropping.warn(self.cropping, self.unlike_others, self.cropped)
-        mirrored_photos.warn(self.mirrored)
+        warn(self.findings)
 
     def names(self) -> list[str]:
         """List the images that have a pose.
@@ -310,15 +276,7 @@ def write(
         "sfm": SFM,
         "images": reconstruction.num_reg_images(),
         "images_with_pose": reconstruction.num_reg_images(),
-        "images_contradicting_others": [],
-        "images_of_uncertain_position": {},
-        "images_fitting_badly": [],
-        "doubtful_focal_lengths": 1.0,
-        "gain_of_free_principal_points": 0.0,
-        "images_altered": [],
-        "images_cropped": [],
-        "images_mirrored": [],
-        "images_unlike_others": [],
+        "findings": [],
         "points3D": reconstruction.num_points3D(),
     }
     conf = with_projection(conf, lambda path: Path(path).name)

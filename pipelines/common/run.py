@@ -17,7 +17,7 @@ from hloc_reduce.evaluation.summaries import (
     write_summary,
 )
 from hloc_reduce.localization.mirrored import MirrorImages
-from hloc_reduce.maps.mirroring import mirror_images
+from hloc_reduce.maps.mirror_images import mirror_images
 from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder

@@ -13,6 +13,7 @@ from hloc_reduce import Localizer, aggregate_features, compact, maps, projection
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.hlm.reader import CompactMap
+from hloc_reduce.mapping.checks import focal_lengths
 from hloc_reduce.maps.unpack import COMPACT
 from hloc_reduce.pairs_from_retrieval import read_global
 from hloc_reduce.retrieval.vlad import VOCABULARY, read_vocabulary
@@ -73,8 +74,9 @@ def test_a_file_localizes_as_its_map(built, tmp_path, run):
 
 def test_doubts_of_a_map_go_into_its_file(built, tmp_path, run, caplog):
     folder, images = built
+    doubtful = focal_lengths.finding(1.36).to_json()
     content = provenance.read(folder / "map.json")
-    provenance.write(folder / "map.json", content | {"doubtful_focal_lengths": 1.36})
+    provenance.write(folder / "map.json", content | {"findings": [doubtful]})
     compact.main(tmp_path / "place.hlm", folder)
     outputs = tmp_path / "of_file"
     new = ("--query_images", images / "query/day", "--outputs", outputs)

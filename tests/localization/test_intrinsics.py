@@ -12,6 +12,8 @@ from PIL.TiffImagePlugin import IFDRational
 
 from hloc_reduce.localization import exif, intrinsics
 from hloc_reduce.localization.intrinsics import MapCameras
+from hloc_reduce.mapping.checks.another_size import of_photos
+from hloc_reduce.mapping.findings import names_in
 from hloc_reduce.utils import colmap
 
 PARAMS = [500.0, 240.0, 180.0, -0.05]
@@ -192,6 +194,11 @@ def test_a_photo_of_the_size_of_the_map_is_hardly_cropped():
         assert camera.params.tolist() == [576, 240, 180, 0] and found == source
 
 
+def another_size(image_dir, names):
+    """Return the photos of another size than most by their lens, sorted."""
+    return sorted(names_in(of_photos(image_dir, names)))
+
+
 def test_photos_of_another_size_by_the_same_lens(tmp_path):
     """As crops whose EXIF data stay; three of a size are a setting, and a turn is none."""
     for i in range(4):
@@ -200,17 +207,17 @@ def test_photos_of_another_size_by_the_same_lens(tmp_path):
     write_photo(tmp_path / "wide.jpg", size=(480, 270))
     write_photo(tmp_path / "tele.jpg", focal_35mm=90, size=(240, 180))
     names = [path.name for path in tmp_path.iterdir()]
-    assert exif.of_another_size(tmp_path, names) == ["crop.jpg"]
-    assert exif.of_another_size(tmp_path, ["0.jpg", "1.jpg", "crop.jpg"]) == []
+    assert another_size(tmp_path, names) == ["crop.jpg"]
+    assert another_size(tmp_path, ["0.jpg", "1.jpg", "crop.jpg"]) == []
     for i in range(3):
         write_photo(tmp_path / f"half{i}.jpg", size=(240, 180))
     write_photo(tmp_path / "zoomed.jpg", size=(200, 150), zoom=2)  # has a camera of its own
     names = [path.name for path in tmp_path.iterdir()]
-    assert exif.of_another_size(tmp_path, names) == ["crop.jpg"]
+    assert another_size(tmp_path, names) == ["crop.jpg"]
     for i in range(3, 5):  # no size is that of most
         write_photo(tmp_path / f"half{i}.jpg", size=(240, 180))
     names = [path.name for path in tmp_path.iterdir()]
-    assert exif.of_another_size(tmp_path, names) == []
+    assert another_size(tmp_path, names) == []
 
 
 def test_photos_of_another_shape_than_exif_data_say(tmp_path):
@@ -220,9 +227,9 @@ def test_photos_of_another_shape_than_exif_data_say(tmp_path):
     names = [f"{i}.jpg" for i in range(7)]
     for i in range(4, 7):
         write_photo(tmp_path / names[i], taken=(4000, 2250))
-    assert exif.of_another_size(tmp_path, names) == names[4:]
-    assert exif.of_another_size(tmp_path, names[1:]) == []
-    assert exif.of_another_size(tmp_path, names[4:]) == []
+    assert another_size(tmp_path, names) == names[4:]
+    assert another_size(tmp_path, names[1:]) == []
+    assert another_size(tmp_path, names[4:]) == []
 
 
 def test_a_guess_knows_the_focal_lengths_of_the_map(tmp_path):

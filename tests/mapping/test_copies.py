@@ -6,8 +6,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hloc_reduce.mapping import copies, groups
-from hloc_reduce.mapping.plausibility import COPY, keep_plausible
+from hloc_reduce.mapping.checks import Inputs, copies, groups
+from hloc_reduce.mapping.findings import names_in
+from hloc_reduce.mapping.plausibility import keep_plausible
 from hloc_reduce.utils import colmap
 
 NUMBER = 5  # photos of each side
@@ -52,8 +53,8 @@ SIDES = [{f"{i}.jpg" for i in range(NUMBER)}, {f"{i + NUMBER}.jpg" for i in rang
 )
 def test_sides_that_share_too_few_points(common, turn, is_found):
     """Of photos from other directions, no common points are expected."""
-    found = copies.find(two_sides(common, turn))
-    assert set(found) in SIDES if is_found else found == []
+    found = copies.find(Inputs(two_sides(common, turn)))
+    assert names_in(found) in SIDES if is_found else found == []
 
 
 def test_photos_that_are_too_far_away_are_not_compared(monkeypatch):
@@ -96,18 +97,18 @@ def test_points_are_expected_from_similar_directions_and_distances():
 
 def test_some_of_the_points_are_enough(monkeypatch):
     monkeypatch.setattr(copies, "WORK", 2e4)
-    assert set(copies.find(two_sides(12))) in SIDES
-    assert copies.find(two_sides(200)) == []
+    assert names_in(copies.find(Inputs(two_sides(12)))) in SIDES
+    assert copies.find(Inputs(two_sides(200))) == []
 
 
 def test_one_side_is_left_out_of_a_map():
     """Queries of one side were localized at the other, with 691 inliers."""
     model = two_sides(12)
     given = {1: pycolmap.Camera(model.cameras[1].todict())}
-    (kept,), dropped = keep_plausible([model], given)
+    (kept,), (dropped,) = keep_plausible([Inputs(model, cameras=given)])
     names = {kept.images[i].name for i in kept.reg_image_ids()}
-    assert names in SIDES and set(dropped.values()) == {COPY}
-    assert names | set(dropped) == SIDES[0] | SIDES[1]
+    assert names in SIDES and dropped.kind == "copies" and dropped.verdict == "drop"
+    assert names | {*dropped.names} == SIDES[0] | SIDES[1]
 
 
 def test_sides_that_are_not_joined_directly():
@@ -122,15 +123,16 @@ def test_sides_that_are_not_joined_directly():
     def enough(wanted, first, second):
         return np.minimum(first, second) > 1
 
-    assert groups.contradicting(shared, expected, copies.SHARE, enough) == []
-    found = groups.contradicting(shared, expected, copies.SHARE, enough, copies.APART)
+    assert groups.contradicting(shared, expected, copies.JOINED_SHARE, enough) == []
+    found = groups.contradicting(shared, expected, copies.JOINED_SHARE, enough, copies.APART_SHARE)
     assert found in ([4, 5], [6, 7])
     shared[shared == 0] = 80  # as photos of another season
-    assert groups.contradicting(shared, expected, copies.SHARE, enough, copies.APART) == []
+    arguments = copies.JOINED_SHARE, enough, copies.APART_SHARE
+    assert groups.contradicting(shared, expected, *arguments) == []
 
 
 def test_few_photos_have_no_sides():
     model = two_sides(12)
     for image_id in list(model.reg_image_ids())[3:]:
         model.deregister_frame(model.images[image_id].frame_id)
-    assert copies.find(model) == []
+    assert copies.find(Inputs(model)) == []

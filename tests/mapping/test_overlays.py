@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from hloc_reduce.mapping.overlays import drop_overlays
+from hloc_reduce.mapping.checks.overlays import drop_overlays
 
 NAMES = [f"{i}.jpg" for i in range(6)]
 

@@ -7,12 +7,10 @@ import pycolmap
 import pytest
 
 from hloc_reduce.mapping import registration
-from hloc_reduce.mapping.plausibility import (
-    FEW_POINTS,
-    count_viewpoints,
-    focal_length_spread,
-    keep_plausible,
-)
+from hloc_reduce.mapping.checks import Inputs, partial
+from hloc_reduce.mapping.findings import Finding, names_in
+from hloc_reduce.mapping.plausibility import count_viewpoints, focal_length_spread, keep_plausible
+from hloc_reduce.mapping.registration import Registration
 from hloc_reduce.utils import colmap
 
 
@@ -41,6 +39,12 @@ def chain(cameras, places=None, links=()):
     return model, given
 
 
+def kinds(findings):
+    """Return the names of the photos by kind."""
+    assert all(one.verdict == "drop" for one in findings)
+    return {one.kind: sorted(one.names) for one in findings}
+
+
 def names_of(models):
     return [{model.images[i].name for i in model.reg_image_ids()} for model in models]
 
@@ -52,9 +56,9 @@ def test_an_image_that_has_lost_its_points_has_no_pose(left, is_kept):
     image = model.images[5]
     for index in [i for i, p in enumerate(image.points2D) if p.has_point3D()][left:]:
         model.delete_observation(5, index)
-    (found,), dropped = keep_plausible([model], given)
+    (found,), dropped = keep_plausible([Inputs(model, cameras=given)])
     assert found.num_reg_images() == 4 + is_kept
-    assert dropped == ({} if is_kept else {"4.jpg": FEW_POINTS})
+    assert kinds(dropped) == ({} if is_kept else {"few_points": ["4.jpg"]})
 
 
 def test_images_that_lose_their_points_to_such_an_image_have_no_pose_either():
@@ -65,9 +69,9 @@ def test_images_that_lose_their_points_to_such_an_image_have_no_pose_either():
         shared = [i for i in points if i < 10]  # with the image before
         for index in shared[7:]:
             model.delete_observation(number, index)
-    (found,), dropped = keep_plausible([model], given)
+    (found,), dropped = keep_plausible([Inputs(model, cameras=given)])
     assert names_of([found]) == [{f"{i}.jpg" for i in range(4)}]
-    assert dropped == dict.fromkeys(["4.jpg", "5.jpg"], FEW_POINTS)
+    assert kinds(dropped) == {"few_points": ["4.jpg", "5.jpg"]}
 
 
 @pytest.mark.parametrize(
@@ -81,8 +85,8 @@ def test_images_that_lose_their_points_to_such_an_image_have_no_pose_either():
 def test_images_that_few_points_hold_are_dropped(links, dropped):
     """Two photos of the back of a bag, 6 degrees off, had 23 and 35 points, the others 1,300."""
     model, given = chain([1] * 6, links=links)
-    (found,), found_dropped = keep_plausible([model], given)
-    assert found_dropped == dict.fromkeys(dropped, FEW_POINTS)
+    (found,), found_dropped = keep_plausible([Inputs(model, cameras=given)])
+    assert kinds(found_dropped) == ({"few_points": dropped} if dropped else {})
     assert found.num_reg_images() == 6 - len(dropped)
 
 
@@ -103,13 +107,14 @@ def test_focal_lengths_that_no_lens_has(focal_length, is_prior, is_kept):
     for camera in given.values():
         camera.has_prior_focal_length = is_prior
     model.cameras[4].focal_length = focal_length
-    found, dropped = keep_plausible([model], given)
+    found, dropped = keep_plausible([Inputs(model, cameras=given)])
     everything = {f"{i}.jpg" for i in range(4)}
     assert names_of(found) == [everything if is_kept else everything - {"3.jpg"}]
     spread = {1500.0: 3.0, 700.0: 1.4}[focal_length] if is_kept else 1.0  # of those that are kept
     assert focal_length_spread(found) == spread
     said = f"focal length {focal_length:.0f}" if focal_length > 0 else "no focal length fits"
-    assert dropped == ({} if is_kept else {"3.jpg": said})
+    assert kinds(dropped) == ({} if is_kept else {"lenses": ["3.jpg"]})
+    assert all(f"3.jpg ({said})" in one.message for one in dropped)
 
 
 @pytest.mark.parametrize(("distortion", "is_kept"), [(-0.6, True), (4.56, False), (-5.9, False)])
@@ -118,18 +123,19 @@ def test_distortions_that_no_lens_has(distortion, is_kept):
     model, given = chain([1, 2, 3, 4])
     params = [500, 320, 240, distortion]
     model.cameras[4].model, model.cameras[4].params = "SIMPLE_RADIAL", params
-    _, dropped = keep_plausible([model], given)
-    assert dropped == ({} if is_kept else {"3.jpg": f"distortion {distortion:.1f}"})
+    _, dropped = keep_plausible([Inputs(model, cameras=given)])
+    assert kinds(dropped) == ({} if is_kept else {"lenses": ["3.jpg"]})
+    assert all(f"3.jpg (distortion {distortion:.1f})" in one.message for one in dropped)
 
 
 def test_what_only_an_implausible_image_connects_is_dropped():
     model, given = chain([1, 2, 3, 4, 5, 6])
     model.cameras[3].focal_length = 1e6
-    found, dropped = keep_plausible([model], given)
-    assert names_of(found) == [{"3.jpg", "4.jpg", "5.jpg"}] and set(dropped) == {"2.jpg"}
+    found, dropped = keep_plausible([Inputs(model, cameras=given)])
+    assert names_of(found) == [{"3.jpg", "4.jpg", "5.jpg"}] and names_in(dropped) == {"2.jpg"}
     model, given = chain([1, 2, 3])
     model.cameras[2].focal_length = 1e6
-    assert keep_plausible([model], given)[0] == []
+    assert keep_plausible([Inputs(model, cameras=given)])[0] == []
 
 
 @pytest.mark.parametrize(
@@ -140,7 +146,7 @@ def test_bursts_from_two_viewpoints_are_no_map(places, viewpoints):
     """Nothing fixes their focal lengths, so that their poses may be wrong by 30 degrees."""
     model, given = chain([1, 2, 3, 4, 5], places)
     assert count_viewpoints(model) == viewpoints
-    found, dropped = keep_plausible([model], given)
+    found, dropped = keep_plausible([Inputs(model, cameras=given)])
     assert bool(found) == (viewpoints >= 3) and not dropped
 
 
@@ -150,56 +156,52 @@ def test_a_camera_of_many_photos_is_known_better_than_by_exif():
         model, given = chain(cameras)
         for camera in given.values():
             camera.focal_length, camera.has_prior_focal_length = 200, True
-        found, dropped = keep_plausible([model], given)
+        found, dropped = keep_plausible([Inputs(model, cameras=given)])
         assert bool(found) == is_kept and bool(dropped) != is_kept
 
 
 def test_no_plausible_image_at_all_is_said():
-    message = registration.nothing(Path("photos"), {"a.jpg": "focal length 12345"})
-    assert "no lens has" in message and "a.jpg (focal length 12345)" in message
-    assert "What to try: use the photos as the camera wrote them" in message
+    dropped = Finding("lenses", "No lens has these: {names}. Use the photos.", ("a.jpg",))
+    message = registration.nothing(Path("photos"), [dropped])
+    assert "No lens has these: a.jpg. Use the photos. What to try: take photos" in message
     assert "enough of them overlap" not in message
-    dropped = dict.fromkeys("ab", registration.MISPLACED) | {"c": registration.FEW_POINTS}
-    message = registration.nothing(Path("photos"), dropped)
-    assert "contradict" in message and "fewer than" in message and "in the map" not in message
-    assert message.endswith("the one before by two thirds.")
+    assert "Do enough of them overlap?" in registration.nothing(Path("photos"))
+    message = registration.nothing(Path("photos"), [], attempts_left_out=3)
+    assert message.endswith("left out for lack of time: 3.")
 
 
-def test_parts_that_do_not_connect():
+def message_of(**changed):
+    """Return what is said of the photos that are missing from a model."""
     state = {
         "images": 10,
         "parts": [["a", "b", "c", "d", "e"], ["f", "g", "h"]],
         "missing": ["f", "g", "h", "i", "j"],
         "unmatched": ["j"],
-        "implausible": {},
+        "dropped": [],
         "alike": False,
     }
-    message = registration.shortfall(Path("x"), **state)
+    registered = Registration(**state | changed)
+    (found,) = partial.find(Inputs(None, registration=registered))
+    return found.message
+
+
+def test_parts_that_do_not_connect():
+    message = message_of()
     assert "Only 5 of 10 photos" in message and "f, g, h, i, j." in message
     assert "2 parts that do not connect, of 5 and 3 photos" in message
     assert "the second has f, g, h." in message and "between the parts" in message
     assert "matches j." in message and "--camera_mode" not in message
-    message = registration.shortfall(Path("x"), **state, left_out=2)
-    assert "Only 5 of 12 photos" in message and "2 more are left out." in message
-    state |= {"implausible": {"i": "distortion 4.6"}, "alike": True}
-    message = registration.shortfall(Path("x"), **state)
-    assert "no lens has" in message and "i (distortion 4.6)." in message
-    assert "What to try: --camera_mode single, if one camera" in message
-    state["implausible"] = {"g": "another side or a copy", "h": "misplaced", "i": "distortion 4.6"}
-    message = registration.shortfall(Path("x"), **state)
-    assert "no lens has" in message and "i (distortion 4.6)." in message
-    assert "another side of the place that looks the same" in message and "them: g." in message
-    assert "contradict the poses that COLMAP found: h." in message
-    assert "make a map of each side" in message
-    everything = dict.fromkeys(state["missing"], "misplaced")
-    message = registration.shortfall(Path("x"), **{**state, "implausible": everything})
-    assert "contradict the poses that COLMAP found. " in message
+    assert "; --camera_mode single, if one camera" in message_of(alike=True)
 
 
-def test_there_is_always_something_to_try():
-    state = {"images": 4, "parts": [["a", "b", "c"]], "missing": ["d"], "unmatched": []}
-    lens = {"implausible": {"d": "focal length 9"}, "alike": False}
-    message = registration.shortfall(Path("x"), **state, **lens)
-    assert message.endswith(
-        "What to try: use the photos as the camera wrote them, neither cropped nor edited."
-    )
+def test_photos_that_were_left_out_are_counted():
+    message = message_of(images=12, missing=[*"fghijkl"], left_out=("x", "y"))
+    assert "Only 5 of 14 photos" in message and "2 more are left out." in message
+
+
+def test_photos_that_were_dropped_are_not_between_others():
+    """What to do about them is said with them."""
+    one = {"images": 4, "parts": [["a", "b", "c"]], "missing": ["d"], "unmatched": []}
+    assert "What to try: add photos between those in the map" in message_of(**one)
+    dropped = Finding("lenses", "No lens has these: {names}.", ("d",), verdict="drop")
+    assert "What to try" not in message_of(**one, dropped=[dropped])

@@ -1,74 +1,81 @@
 """What is said of the images that are in a model of photos alone."""
 
-import json
+from dataclasses import replace
 
 import pycolmap
 import pytest
 
 from hloc_reduce.mapping import mapper, registration
+from hloc_reduce.mapping.checks import Inputs, run
+from hloc_reduce.mapping.findings import Finding, check_accepted
+from hloc_reduce.mapping.registration import Registration
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
 
 
-def register(folder, number, images, **changed):
-    """Write that the first ones of some images are in a model."""
-    state = {
+def judged(number, images, left_out=(), **changed):
+    """Judge the registration of the first ones of some images."""
+    known = {
         "images": images,
         "missing": [f"{i}.jpg" for i in range(number, images)],
         "parts": [[f"{i}.jpg" for i in range(number)]],
         "unmatched": [],
-        "implausible": {},
+        "dropped": [],
         "alike": False,
-        "spread": 1.0,
     }
-    (folder / registration.REGISTRATION).write_text(json.dumps(state | changed))
+    registered = Registration(**known | changed, left_out=left_out)
+    return run(Inputs(None, registration=registered), ["partial", "focal_lengths"])
 
 
-def test_doubts_are_refused(tmp_path):
-    register(tmp_path, 16, 16)
-    with pytest.raises(InputError, match=r"^One\. Two\. To use .* --accept_partial\.$"):
-        registration.check(tmp_path, False, doubts=["One.", "Two."])
-    registration.check(tmp_path, True, doubts=["One."])
-    register(tmp_path, 4, 16, alike=True, spread=1.5)
-    message = r"Only 4 of 16 photos .* by a factor of 1\.50\. .* One\. To use"
-    with pytest.raises(InputError, match=message):
-        registration.check(tmp_path, False, doubts=["One."])
+def test_a_registration_is_written_and_read(tmp_path):
+    dropped = [Finding("few_points", "few: {names}", ("b",), {"b": 7.0}, "drop")]
+    known = Registration(3, [["a", "c"]], ["b"], [], dropped, True, 1.2, 4)
+    known.write(tmp_path)
+    file = tmp_path / registration.REGISTRATION
+    assert registration.read(tmp_path, {"x"}) == replace(known, left_out={"x"}, file=file)
 
 
 @pytest.mark.parametrize("number", [8, 14, 16])
 @pytest.mark.parametrize("spread", [1.02, 1.18, 1.36])
-def test_focal_lengths_that_differ_are_doubted_however_many_are_missing(
-    number, spread, tmp_path, caplog
-):
+def test_focal_lengths_that_differ_are_doubted_however_many_are_missing(number, spread):
     """Of 16 frames 8 were in a map, with focal lengths of 292 to 397 pixels."""
-    register(tmp_path, number, 16, alike=True, spread=spread)
-    if spread > 1.2:
-        with pytest.raises(InputError, match=r"factor of 1\.36.* --accept_partial"):
-            registration.check(tmp_path, accept_partial=False)
-    doubtful = registration.check(tmp_path, accept_partial=spread > 1.2)
-    assert doubtful == (spread if spread > 1.1 else 1)
-    registration.warn(doubtful)
-    assert (f"differ by a factor of {spread}" in caplog.text) == (spread > 1.1)
-    assert ("photos are in the map" in caplog.text) == (number == 8)
+    found = {one.kind: one for one in judged(number, 16, alike=True, spread=spread)}
+    assert ("partial" in found) == (number < 16)
+    assert ("focal_lengths" in found) == (spread > 1.1)
+    if spread > 1.1:
+        assert f"differ by a factor of {spread}" in found["focal_lengths"].message
+        assert found["focal_lengths"].verdict == ("refuse" if spread > 1.2 else "warn")
+    assert "focal_lengths" not in {one.kind for one in judged(number, 16, spread=spread)}
 
 
-def test_all_that_is_refused_is_said_at_once(tmp_path):
+def test_all_that_is_refused_is_said_at_once(caplog):
     """Because one option accepts it all."""
-    register(tmp_path, 4, 16, alike=True, spread=1.5)
+    found = judged(4, 16, alike=True, spread=1.5)
+    found.append(Finding("other", "Another thing is doubtful."))
     with pytest.raises(
-        InputError, match=r"Only 4 of 16 photos .* by a factor of 1\.50\. .*partial"
+        InputError, match=r"^Only 4 of 16 photos .* by a factor of 1\.50\. .* --accept_partial\.$"
     ):
-        registration.check(tmp_path, False)
+        check_accepted(found, False)
+    assert caplog.messages == ["Another thing is doubtful."]  # may be why
+    check_accepted(found, True)
+    check_accepted(found[2:], False)
 
 
 @pytest.mark.parametrize(("number", "images"), [(4, 13), (7, 13)])
-def test_photos_that_are_left_out_are_not_blamed_for_others(number, images, tmp_path):
+def test_photos_that_are_left_out_are_not_blamed_for_others(number, images):
     """Two of 15 photos of a facade were blamed although 9 others were missing, too."""
-    register(tmp_path, number, images)
-    with pytest.raises(InputError, match=f"Only {number} of 15 photos are in the map") as error:
-        registration.check(tmp_path, False, left_out=["a.jpg", "b.jpg"])
-    assert ("2 more are left out" in str(error.value)) == (number == 4)
-    assert ("Left out: a.jpg, b.jpg" in str(error.value)) == (number == 7)
+    refused, *others = judged(number, images, ["a.jpg", "b.jpg"])
+    assert refused.verdict == "refuse" and all(one.verdict == "warn" for one in others)
+    assert refused.message.startswith(f"Only {number} of 15 photos are in the map")
+    assert ("2 more are left out" in refused.message) == (number == 4)
+    assert ("Left out: a.jpg, b.jpg" in refused.message) == (number == 7)
+
+
+def test_fewer_than_half_are_refused():
+    (refused,) = judged(3, 3, ["d.jpg", "c.jpg", "b.jpg", "a.jpg"])
+    assert refused.verdict == "refuse" and refused.doubt == "fewer than half of its photos"
+    assert "Only 3 of 7 photos are in the map. Left out: a.jpg, b.jpg" in refused.message
+    assert judged(3, 3, ["c.jpg", "b.jpg", "a.jpg"]) == []
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -3,7 +3,7 @@
 import pycolmap
 import pytest
 
-from hloc_reduce.mapping import sizes
+from hloc_reduce.mapping.checks import sizes
 from hloc_reduce.utils import colmap
 
 BEFORE, HALF = (640, 480), (320, 240)

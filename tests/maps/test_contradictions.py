@@ -10,7 +10,8 @@ import pycolmap
 import pytest
 
 from hloc_reduce import maps
-from hloc_reduce.maps import contradictions
+from hloc_reduce.mapping.checks import Inputs, contradictions
+from hloc_reduce.mapping.findings import names_in
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
 
@@ -56,7 +57,7 @@ def test_the_warning_is_repeated(plane, photos, tmp_path, caplog):
     for _ in range(2):
         caplog.clear()
         built = maps.main(tmp_path / "map", plane / "images", model)
-        assert built.contradicting == ["2.png"] and "place 2.png elsewhere" in caplog.text
+        assert names_in(built.findings) == {"2.png"} and "place 2.png elsewhere" in caplog.text
 
 
 def test_names_that_match_files_confuse_are_refused(plane, photos, tmp_path):
@@ -109,4 +110,9 @@ def test_a_cropped_photo_that_the_mapper_misplaced_is_named(tmp_path):
         for first, second in itertools.combinations(names, 2):
             file[f"{first}/{second}/matches0"] = np.arange(300, dtype=np.int32)
             file[f"{first}/{second}/matching_scores0"] = np.ones(300, np.float16)
-    assert contradictions.judge(model, matches, names) == ["3.jpg"]
+    assert contradictions.judge(Inputs(model, matches=matches), names) == ["3.jpg"]
+    pairs = itertools.combinations(names, 2)
+    verified = dict.fromkeys(pairs, np.repeat(np.arange(300)[:, None], 2, axis=1))
+    (found,) = contradictions.find(Inputs(model, verified))  # as of a database
+    assert found.names == ("3.jpg",) and "place 3.jpg elsewhere" in found.message
+    assert contradictions.find(Inputs(model)) == []

@@ -5,14 +5,12 @@ from conftest import FOCAL
 from PIL import Image
 
 from hloc_reduce import Localizer, maps
-from hloc_reduce.mapping import registration
-from hloc_reduce.maps import build, cropping
-from hloc_reduce.runtime import provenance
-from hloc_reduce.utils.cli import InputError
+from hloc_reduce.mapping.checks import intrinsics
+from hloc_reduce.mapping.findings import names_in
+from hloc_reduce.maps import build
 from pipelines import localize
 
 PIPELINE = localize
-STATE = {"missing": [], "parts": [[]], "unmatched": [], "implausible": {}, "alike": False}
 
 
 @pytest.mark.parametrize("most", [100, 2])
@@ -32,7 +30,7 @@ def test_a_photo_of_another_size_by_the_same_camera_is_left_out(
     monkeypatch.setattr(build, "MAX_EXHAUSTIVE", most)
     run("--map_images", images, "--outputs", outputs, "--camera_mode", "single")
     built = maps.Map(outputs / "map")
-    assert built.unlike_others == ["1.jpg"]
+    assert names_in(built.findings, "another_size") == {"1.jpg"}
     assert built.names() == ["0.jpg", "2.jpg", "3.jpg", "4.jpg"]
     assert "Left out of the map, because their size" in caplog.text
     info = Localizer(built.folder).localize(images / "1.jpg")[1]
@@ -55,7 +53,7 @@ def test_photos_that_exif_data_call_cropped_are_named(
         path.unlink()
     run("--map_images", images, "--outputs", outputs, "--camera_mode", "single")
     built = maps.Map(outputs / "map")
-    assert built.cropped == [f"{i}.jpg" for i in range(number)]
+    assert sorted(names_in(built.findings, "cropped")) == [f"{i}.jpg" for i in range(number)]
     assert ("another ratio than their EXIF data say: 0.jpg, 1" in caplog.text) == (number > 0)
     info = Localizer(built.folder).localize(images / "1.jpg")[1]
     assert info["intrinsics"] == ("unknown" if number else "map")
@@ -74,31 +72,21 @@ def test_a_map_is_built_again_without_altered_photos(
 ):
     """If they are fewer than half, and the others fit."""
 
-    def find(sfm):
+    def measure(sfm):
         whole = sfm.num_reg_images() == 5
         fits = not whole and others_fit
-        return cropping.Fit(0.0, []) if fits else cropping.Fit(0.4, altered if whole else [])
+        return intrinsics.Fit(0.0, []) if fits else intrinsics.Fit(0.4, altered if whole else [])
 
-    monkeypatch.setattr(cropping, "find", find)
+    monkeypatch.setattr(intrinsics, "measure", measure)
     outputs = tmp_path / "outputs"
     run("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
     built = maps.Map(outputs / "map")
     [sfm] = [path.name for path in built.folder.glob("sfm*")]
     if others_fit and len(altered) == 1:
-        assert built.unlike_others == altered and sfm == "sfm-alike"
+        assert sorted(names_in(built.findings)) == altered and sfm == "sfm-alike"
         assert built.names() == ["0.png", "2.png", "3.png", "4.png"]
         assert "other photos: 1.png." in caplog.text and "may be wrong" not in caplog.text
     else:
-        assert not built.unlike_others and len(built.names()) == 5 and sfm == "sfm"
+        assert [one.kind for one in built.findings] == ["intrinsics"]
+        assert len(built.names()) == 5 and sfm == "sfm"
         assert "The map may be wrong." in caplog.text
-
-
-def test_fewer_than_half_are_accepted_on_demand(tmp_path, caplog):
-    provenance.write(tmp_path / registration.REGISTRATION, {**STATE, "images": 3})
-    with pytest.raises(
-        InputError, match="Only 3 of 7 photos are in the map. Left out: a.jpg, b.jpg"
-    ):
-        registration.check(tmp_path, False, {"d.jpg", "c.jpg", "b.jpg", "a.jpg"})
-    registration.check(tmp_path, True, {"d.jpg", "c.jpg", "b.jpg", "a.jpg"})
-    registration.check(tmp_path, False, {"c.jpg", "b.jpg", "a.jpg"})
-    assert not caplog.text

@@ -81,7 +81,7 @@ def test_a_stopped_build_goes_on(colmap_files, tmp_path, run, monkeypatch):
         def killed(*_):
             raise KeyboardInterrupt
 
-        context.setattr(maps.from_database.copies, "find", killed)
+        context.setattr(maps.from_database, "run", killed)
         with pytest.raises(SystemExit):
             run(*given)
     before = state(tmp_path / "place/map")

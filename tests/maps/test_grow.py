@@ -15,7 +15,15 @@ import rigs
 from command import contents, write
 
 from hloc_reduce import Localizer, maps
-from hloc_reduce.maps import addition, grow
+from hloc_reduce.mapping.checks import (
+    another_size,
+    cropped,
+    focal_lengths,
+    intrinsics,
+    mirrored,
+    misfits,
+)
+from hloc_reduce.maps import grow, placing
 from hloc_reduce.runtime import provenance
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.h5 import list_h5_names
@@ -60,23 +68,30 @@ def truth_of(model, name):
     return colmap.read_model(model).find_image_with_name(name).cam_from_world()
 
 
+def find(folder, *found):
+    """Have a map doubted."""
+    content = provenance.read(folder / "map.json")
+    content["findings"] = [one.to_json() for one in found]
+    provenance.write(folder / "map.json", content)
+
+
+def found_in(folder):
+    """Return the names of the photos that are doubted, by kind."""
+    return {one.kind: [*one.names] for one in maps.Map(folder).findings}
+
+
 def test_doubts_end_with_the_photos_that_raised_them(grown, tmp_path, run, caplog):
     """Focal lengths are compared again; those of this map are equal."""
     folder, new, model = grown
-    of_photos = dict.fromkeys(("images_cropped", "images_fitting_badly"), [BASE[0], BASE[1]])
-    doubtful = {**of_photos, "doubtful_focal_lengths": 1.3}
-    content = provenance.read(folder / "map.json")
-    provenance.write(folder / "map.json", content | doubtful)
+    found = cropped.finding(BASE[:2]), misfits.finding(BASE[:2])
+    find(folder, *found, focal_lengths.finding(1.3))
     assert len(maps.Map(folder).doubts) == 3
     caplog.clear()
     run("--map", folder, "--add_images", new, "--add_model", model)
     assert caplog.text.count("differ by a factor of 1.30") == 1
-    content = provenance.read(folder / "map.json")
-    assert of_photos.items() <= content.items()
-    assert content["doubtful_focal_lengths"] == 1
+    assert found_in(folder) == {"cropped": BASE[:2], "misfits": BASE[:2]}
     run("--map", folder, "--remove_images", write(tmp_path / "list.txt", f"{BASE[0]}\n"))
-    content = provenance.read(folder / "map.json")
-    assert [content[key] for key in of_photos] == [[BASE[1]], [BASE[1]]]
+    assert found_in(folder) == {"cropped": [BASE[1]], "misfits": [BASE[1]]}
 
 
 @pytest.mark.parametrize("gain", [0.0, 0.5])
@@ -86,36 +101,34 @@ def test_a_map_whose_intrinsics_may_be_wrong_tells_none(gain, grown, run):
     content = provenance.read(folder / "map.json")
     assert content["typical"]
     lens, wrong = content["typical"], [[360, 270, 0.7, 0.0]]
-    changed = {"gain_of_free_principal_points": gain, "typical": wrong}
-    provenance.write(folder / "map.json", content | changed)
+    provenance.write(folder / "map.json", content | {"typical": wrong})
+    find(folder, *([intrinsics.finding(intrinsics.Fit(gain, []))] if gain else []))
     run("--map", folder, "--add_images", new, "--add_model", model)
     assert provenance.read(folder / "map.json")["typical"] == ([] if gain else lens)
 
 
-@pytest.mark.parametrize("key", ["images_mirrored", "images_unlike_others"])
-def test_a_photo_that_was_left_out_is_added_and_removed(key, grown, tmp_path, run):
+@pytest.mark.parametrize("check", [mirrored, another_size])
+def test_a_photo_that_was_left_out_is_added_and_removed(check, grown, tmp_path, run):
     folder, new, model = grown
-    content = provenance.read(folder / "map.json")
-    provenance.write(folder / "map.json", {**content, key: ["left.jpg", NEW]})
+    left_out = check.finding(["left.jpg", NEW])
+    find(folder, left_out)
     run("--map", folder, "--add_images", new, "--add_model", model)
-    content = provenance.read(folder / "map.json")
-    assert content[key] == ["left.jpg"] and NEW in names(folder)
-    provenance.write(folder / "map.json", {**content, key: ["left.jpg", NEW]})
+    assert found_in(folder) == {left_out.kind: ["left.jpg"]} and NEW in names(folder)
+    find(folder, left_out)
     run("--map", folder, "--remove_images", write(tmp_path / "list.txt", f"{NEW}\n"))
-    assert provenance.read(folder / "map.json")[key] == ["left.jpg"]
+    assert found_in(folder) == {left_out.kind: ["left.jpg"]}
 
 
 def test_a_photo_that_is_only_left_out_is_removed(grown, tmp_path, refused, run):
     """It has features, like all photos of the folder, and is in no model."""
     folder, _, _ = grown
-    content = provenance.read(folder / "map.json")
     features = maps.Map(folder).features
     with h5py.File(features, "a") as file:
         file.copy(file[BASE[0]], NEW)
-    provenance.write(folder / "map.json", {**content, "images_unlike_others": [NEW]})
+    find(folder, another_size.finding([NEW]))
     arguments = "--map", folder, "--remove_images", write(tmp_path / "list.txt", f"{NEW}\n")
     run(*arguments)
-    assert provenance.read(folder / "map.json")["images_unlike_others"] == []
+    assert found_in(folder) == {}
     assert "has no photo" in refused(*arguments)
 
 
@@ -153,7 +166,7 @@ def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):
     assert {key: same[key] for key in features} == features
     assert list_h5_names(after.descriptors) == [*BASE, NEW]
     assert {path.name for path in folder.glob("sfm*")} == {after.sfm.name}
-    assert not (folder / addition.GROWING).exists()
+    assert not (folder / placing.GROWING).exists()
 
     # as well as a map that was built at once
     build, images, _ = place
@@ -181,7 +194,7 @@ def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):
 
 
 def test_photos_that_are_localized(place, tmp_path, monkeypatch, caplog, run, refused):
-    paired, pair = [], addition.pairs_from_retrieval.main
+    paired, pair = [], placing.pairs_from_retrieval.main
 
     def logged(descriptors, output, number, query_list, db_list):
         paired.append((output.name, query_list, db_list))
@@ -195,7 +208,7 @@ def test_photos_that_are_localized(place, tmp_path, monkeypatch, caplog, run, re
     cv2.imwrite(str(new / "noise.png"), np.random.default_rng(0).integers(0, 255, (270, 360)))
     (new / "broken.png").write_text("no photo")
     with monkeypatch.context() as context:
-        context.setattr(addition.pairs_from_retrieval, "main", logged)
+        context.setattr(placing.pairs_from_retrieval, "main", logged)
         run("--map", folder, "--add_images", new)
     assert names(folder) == ["a.png", *sorted(before)]
     everything = ["a.png", *sorted(before)]  # as when a map is built: new ones only among these
@@ -264,7 +277,7 @@ def test_a_photo_that_was_cropped_is_refused(height, width, grown, refused):
 def _kill(stage: str, folder, new, model) -> None:
     """Add photos in a process that is killed when a stage begins."""
     module, _, name = stage.rpartition(".")
-    target = getattr(addition, module) if module else grow
+    target = getattr(placing, module) if module else grow
     setattr(target, name, lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL))
     maps.add(maps.Map(folder), new, model)
 
@@ -281,7 +294,7 @@ def test_a_killed_change_goes_on(grown, stage):
     assert names(folder) == ([*BASE, NEW] if finished else BASE)  # whole at any moment
     maps.add(maps.Map(folder), new, model)
     assert names(folder) == [*BASE, NEW]
-    assert not (folder / addition.GROWING).exists() and len(list(folder.glob("sfm*"))) == 1
+    assert not (folder / placing.GROWING).exists() and len(list(folder.glob("sfm*"))) == 1
 
 
 def test_copies_in_the_map_keep_their_features(place, tmp_path, run):

@@ -57,11 +57,9 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
     message = refused("--map", moved, "--outputs", outputs, "--map_images", images)
     assert "leave out --map_images" in message
 
-    # what was found when it was built is said again; older maps do not have it
+    # what was found when it was built is said again; older maps have a field for each kind
     content = json.loads((moved / "map.json").read_text())
-    assert content.pop("gain_of_free_principal_points") == 0 and "may be cropped" not in caplog.text
-    assert content.pop("images_altered") == [] and content.pop("doubtful_focal_lengths") == 1
-    assert content.pop("images_fitting_badly") == []
+    assert content.pop("findings") == [] and "may be cropped" not in caplog.text
     gain = {"gain_of_free_principal_points": 0.2}
     for more, said in (
         ({}, ""),
@@ -69,13 +67,20 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
         ({"images_fitting_badly": ["db/3.png"]}, "worse than those of the others: db/3.png."),
         (gain, "may be cropped"),
         (gain | {"images_altered": ["db/2.png"]}, "than the others: db/2.png"),
+        ({"images_of_uncertain_position": {"db/0.png": 0.07}}, "their distance: db/0.png (7 %)"),
+        ({"images_contradicting_others": ["db/1.png"]}, "other photos place db/1.png elsewhere"),
+        ({"images_cropped": ["db/1.png"]}, "EXIF data say: db/1.png. They were cropped"),
+        ({"images_mirrored": ["x.png"]}, "Mirrored photos are not in the map: x.png."),
+        ({"images_unlike_others": ["x.png"]}, "Left out of the map, because their size"),
+        ({"images": 9}, "Only 4 of 9 photos are in the map."),
     ):
         caplog.clear()
         (moved / "map.json").write_text(json.dumps(content | more))
         run(*given)
         assert said in caplog.text
-        assert len(maps.Map(moved).doubts) == bool(more)
-        assert ("cropped" in caplog.text) == ("gain_of_free_principal_points" in more)
+        left_out = {"images_mirrored", "images_unlike_others"}
+        assert len(maps.Map(moved).doubts) == bool(more.keys() - left_out)
+    (moved / "map.json").write_text(json.dumps(content | gain))
     # and of poses in it
     run(*given, "--query_images", images / "query/day")
     assert outcome(outputs / "queries-day")[0]["map_doubts"] == [
@@ -178,6 +183,9 @@ def test_a_deletion_that_was_cut_short_goes_on(place, monkeypatch, run):
     assert (outputs / "map/feats-dog-colmap_sift_sv64.h5").read_bytes() != old  # it has another id
 
 
+FINDING = {"kind": "a", "text": "b", "names": [], "values": {}, "verdict": "warn", "doubt": ""}
+
+
 def test_a_broken_map_is_refused(place, tmp_path, run, refused):
     build, images, outputs = place
     run(*build)
@@ -193,6 +201,10 @@ def test_a_broken_map_is_refused(place, tmp_path, run, refused):
         ("cameras", []),
         ("cameras", {"a": ["PINHOLE", 9, 9]}),
         ("sizes", [[1e999, 1]]),
+        ("findings", [{}]),
+        ("findings", [{**FINDING, "verdict": "perhaps"}]),
+        ("findings", [{**FINDING, "values": {"a": "b"}}]),
+        ("findings", [{**FINDING, "names": None}]),
         ("typical", [[480, 360, 1e9, 0]]),
         ("typical", [[480, 360, 10**400, 0]]),
     ):

@@ -9,7 +9,9 @@ import pytest
 from command import state
 
 from hloc_reduce import maps
-from hloc_reduce.maps import mirrored_photos
+from hloc_reduce.mapping.checks import Inputs, contradictions, mirrored
+from hloc_reduce.mapping.findings import names_in
+from hloc_reduce.maps.by_others import ByOthers
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize
@@ -28,7 +30,7 @@ def build_with_one_mirrored(plane, outputs, run):
     arguments = "--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single"
     run(*arguments)
     built = maps.Map(outputs / "map")
-    assert built.mirrored == ["1.png"] and built.names() == OTHERS
+    assert names_in(built.findings, "mirrored") == {"1.png"} and built.names() == OTHERS
     [sfm] = [path.name for path in built.folder.glob("sfm*")]
     assert sfm.endswith("-unmirrored")
     assert not (built.folder / "mirrored").exists()
@@ -61,7 +63,7 @@ def test_the_others_are_tried_when_one_is_mirrored(plane, symmetric, tmp_path, m
     for name in ("1.png", "3.png"):
         mirror(plane / "images" / name)
     sound = {"0.png", "1.png", "2.png", "4.png"}
-    monkeypatch.setattr(mirrored_photos, "_largest_group", lambda _: sound)
+    monkeypatch.setattr(mirrored, "largest_group", lambda _: sound)
     folder = tmp_path / "outputs/map"
     arguments = "--map_images", plane / "images", "--outputs", folder.parent
     arguments += "--camera_mode", "single"
@@ -70,12 +72,13 @@ def test_the_others_are_tried_when_one_is_mirrored(plane, symmetric, tmp_path, m
         raise InputError("stopped")
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit):
-        patch.setattr(maps.building.contradictions, "find", stops)
+        patch.setattr(contradictions, "judge", stops)
         run(*arguments)
     assert (folder / "mirrored").exists() and len(list(folder.glob("sfm*"))) > 1
     run(*arguments)
     built = maps.Map(folder)
-    assert built.mirrored == ["1.png", "3.png"] and built.names() == ["0.png", "2.png", "4.png"]
+    assert names_in(built.findings, "mirrored") == {"1.png", "3.png"}
+    assert built.names() == ["0.png", "2.png", "4.png"]
     assert not (folder / "mirrored").exists() and len(list(folder.glob("sfm*"))) == 1
 
 
@@ -84,29 +87,30 @@ def test_photos_without_keypoints(plane, tmp_path, run):
     outputs = tmp_path / "outputs"
     run("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
     built = maps.Map(outputs / "map")
-    assert not built.mirrored and built.names() == [f"{i}.png" for i in range(5)]
+    assert names_in(built.findings) == {"black.png"} == names_in(built.findings, "partial")
+    assert built.names() == [f"{i}.png" for i in range(5)]
 
 
-def test_only_what_is_beyond_doubt_is_named(plane, tmp_path, monkeypatch):
-    """Lower confidences and agreements of mirror images are those of symmetric places."""
-    built = maps.main(tmp_path / "map", plane / "images", camera_mode=pycolmap.CameraMode.SINGLE)
-    judge = mirrored_photos._Judge(
-        *(colmap.read_model(built.sfm), built.conf, built.matcher, built.images),
-        *(built.features, built.descriptors, tmp_path / "mirrored"),
-    )
-    for as_it_is, mirrored, agreement, named in (
+@pytest.mark.parametrize(
+    ("as_it_is", "of_mirror_image", "agreement", "is_named"),
+    [
         (20.0, 400.0, 0.95, True),
         (500.0, 400.0, 0.95, False),
         (20.0, 200.0, 0.95, False),
         (20.0, 400.0, 0.8, False),
-    ):
-        confidences = {"photos": as_it_is, "mirrored": mirrored}
+    ],
+)
+def test_only_what_is_beyond_doubt_is_named(as_it_is, of_mirror_image, agreement, is_named):
+    """Lower confidences and agreements of mirror images are those of symmetric places."""
 
-        def localize(judge, reference, by, what, *files, at=agreement, known=confidences):
-            return {"0.png": {"confidence": known[what], "agreement": at}}
+    def localize(names, by, is_mirrored):
+        confidence = of_mirror_image if is_mirrored else as_it_is
+        return {name: {"confidence": confidence, "agreement": agreement} for name in names}
 
-        monkeypatch.setattr(mirrored_photos._Judge, "_localize", localize)
-        assert judge.find({"0.png"}, {*OTHERS}) == ({"0.png"} if named else set())
+    expected = {"0.png"} if is_named else set()
+    assert mirrored.mirrored(localize, {"0.png"}, {*OTHERS}) == expected
+    assert mirrored.mirrored(localize, {"0.png"}, {*OTHERS[:2]}) == set()  # too few tell
+    assert mirrored.mirrored(lambda *_: {}, {"0.png"}, {*OTHERS}) == set()
 
 
 def test_photos_that_share_little_are_not_judged(tmp_path):
@@ -127,8 +131,8 @@ def test_photos_that_share_little_are_not_judged(tmp_path):
         model.add_point3D(np.array([0, 0, 1.0 + row]), pycolmap.Track(elements))
     for i in seen:
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((100, 100), np.uint8))
-    names = [f"{i}.png" for i in seen]
-    assert not mirrored_photos.find(model, names, {}, "", tmp_path, *3 * [tmp_path / "none"])
+    by_others = ByOthers(model, {}, "", tmp_path, *3 * [tmp_path / "none"])
+    assert mirrored.find(Inputs(model, localize=by_others)) == []
 
 
 @pytest.mark.parametrize("symmetric", [0.0, 1.0])
@@ -137,14 +141,14 @@ def test_no_photo_is_mirrored(plane, symmetric, tmp_path, caplog, run):
     outputs = tmp_path / "outputs"
     run("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
     built = maps.Map(outputs / "map")
-    assert not built.mirrored and len(built.names()) == 5
+    assert not built.findings and len(built.names()) == 5
     assert "Mirrored" not in caplog.text
     sfm = colmap.read_model(built.sfm)
     names = built.names()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mirrored_photos, "_largest_group", lambda _: {*names[1:]})
-        found = mirrored_photos.find(
-            *(sfm, names, built.conf, built.matcher, built.images),
+        patch.setattr(mirrored, "largest_group", lambda _: {*names[1:]})
+        by_others = ByOthers(
+            *(sfm, built.conf, built.matcher, built.images),
             *(built.features, built.descriptors, tmp_path / "mirrored"),
         )
-    assert not found
+        assert mirrored.find(Inputs(sfm, localize=by_others)) == []

@@ -15,7 +15,8 @@ from PIL import Image
 from hloc_reduce import Localizer, maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.mapping import registration
-from hloc_reduce.maps import cropping
+from hloc_reduce.mapping.checks import intrinsics
+from hloc_reduce.mapping.findings import names_in
 from hloc_reduce.utils import colmap, parsers
 from pipelines import localize
 
@@ -80,8 +81,12 @@ def test_focal_lengths_that_differ(plane, tmp_path, monkeypatch, caplog, run, re
     caplog.clear()
     monkeypatch.setattr(colmap, "incremental_mapping", None)
     run(*build, "--accept_partial")
-    assert caplog.text.count("The map may be wrong") == 1
-    factor = maps.Map(tmp_path / "outputs/map").doubtful_focal_lengths
+    assert caplog.text.count("focal lengths differ by a factor") == 1
+    [factor] = [
+        one.values["factor"]
+        for one in maps.Map(tmp_path / "outputs/map").findings
+        if one.kind == "focal_lengths"
+    ]
     assert factor > 1.2 and f"{factor:.2f}" in message
     run(*build)  # is accepted for good
 
@@ -115,14 +120,14 @@ def files_of(folder, keypoints):
 def test_photos_are_missing_so_there_are_more_keypoints(plane, tmp_path, monkeypatch, caplog, run):
     """And queries get them, too; the map is the same command's."""
     caplog.set_level("INFO")
-    reconstruct = maps.building.reconstruction.main
+    reconstruct = maps.attempts.reconstruction.main
 
     def fails_once(*args, once, **options):
         if once:
             raise registration.NoModelError("COLMAP could not reconstruct the images.")
         return reconstruct(*args, once=once, **options)
 
-    monkeypatch.setattr(maps.building.reconstruction, "main", fails_once)
+    monkeypatch.setattr(maps.attempts.reconstruction, "main", fails_once)
     outputs = tmp_path / "outputs"
     build = ("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
     run(*build)
@@ -160,14 +165,14 @@ def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatc
     """As is said of a photo that matches no other; most of them are a map."""
     caplog.set_level("INFO")
     draw_noise(plane / "images", ["other"])
-    reconstruct = maps.building.reconstruction.main
+    reconstruct = maps.attempts.reconstruction.main
 
     def fails_again(*args, once, **options):
         if once:
             return reconstruct(*args, once=once, **options)
         raise registration.NoModelError("COLMAP could not reconstruct the images.")
 
-    monkeypatch.setattr(maps.building.reconstruction, "main", fails_again)
+    monkeypatch.setattr(maps.attempts.reconstruction, "main", fails_again)
     outputs = tmp_path / "outputs"
     run("--map_images", plane / "images", "--outputs", outputs, "--accept_partial")
     assert caplog.text.count("5 of 6 photos are in the map.") == 3
@@ -191,7 +196,7 @@ def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch, ru
     def apart(descriptors, output, num_matched):
         parsers.write_pairs([("0.png", "1.png"), ("1.png", "2.png"), ("3.png", "4.png")], output)
 
-    monkeypatch.setattr(maps.building.pairs_from_retrieval, "main", apart)
+    monkeypatch.setattr(maps.attempts.pairs_from_retrieval, "main", apart)
     run(*build)
     built = maps.Map(outputs / "map")
     assert len(built.names()) == 5
@@ -222,9 +227,9 @@ def test_a_map_of_other_pairs_is_refused(plane, tmp_path, monkeypatch, run, refu
 def test_enlarged_photos_get_cameras_of_their_own(named, plane, tmp_path, monkeypatch, caplog, run):
     """Although EXIF data say that one camera took all photos; whichever they are, if not named."""
     caplog.set_level("INFO")
-    find = cropping.find
+    measure = intrinsics.measure
     if not named:
-        monkeypatch.setattr(cropping, "find", lambda sfm: find(sfm)._replace(altered=[]))
+        monkeypatch.setattr(intrinsics, "measure", lambda sfm: measure(sfm)._replace(altered=[]))
     images = tmp_path / "photos"
     images.mkdir()
     for number in range(5):
@@ -243,7 +248,7 @@ def test_enlarged_photos_get_cameras_of_their_own(named, plane, tmp_path, monkey
     )  # their own cameras leave the positions of a flat scene uncertain
     built = maps.Map(tmp_path / "outputs/map")
     assert "Trying again with a camera for each photo." in caplog.text
-    assert built.sfm.name == "sfm-per_image" and built.cropping.altered == []
+    assert built.sfm.name == "sfm-per_image" and not names_in(built.findings, "intrinsics")
     assert not (built.folder / "sfm").exists()
     model = colmap.read_model(built.sfm)
     focal_lengths = {i.name: i.camera.mean_focal_length() for i in model.images.values()}

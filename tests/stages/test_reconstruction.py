@@ -11,7 +11,9 @@ from alignment import similarity
 from command import state
 
 from hloc_reduce import match_features, reconstruction
-from hloc_reduce.mapping import mapper, plausibility
+from hloc_reduce.mapping import mapper
+from hloc_reduce.mapping.checks import CHECKS, Check
+from hloc_reduce.mapping.findings import Finding
 from hloc_reduce.mapping.registration import NoModelError
 from hloc_reduce.runtime import parallel
 from hloc_reduce.utils import colmap, parsers
@@ -96,11 +98,12 @@ def test_photos_of_a_narrow_view_are_tried_without_distortion(
     assert all(camera.params[3] == 0 for camera in model.cameras.values())
 
 
-def test_further_attempts_where_images_are_missing(scene, matched, tmp_path, monkeypatch):
+def test_further_attempts_where_images_are_missing(scene, matched, tmp_path, monkeypatch, caplog):
     """With one camera for all, which the scene has, and with lower thresholds."""
     monkeypatch.setattr(parallel, "cores", lambda: 1)
     names, pairs, matches = matched
     attempts, mapping = [], colmap.incremental_mapping
+    caplog.set_level("INFO")
 
     def fails_first(database, image_dir, output, options, verbose):
         cameras = len(colmap.read_cameras(database))
@@ -118,6 +121,8 @@ def test_further_attempts_where_images_are_missing(scene, matched, tmp_path, mon
         assert model.num_reg_images() == 6
         assert model.num_cameras() == (6 if succeeds < 9 else 1)
         assert attempts == tried[:succeeds]
+        assert ("so each has its own" in caplog.text) == (succeeds < 9)
+        caplog.clear()
         assert len(list((tmp_path / f"{succeeds}").glob("*.db"))) == 1
         attempts.clear()
     per_image = pycolmap.CameraMode.PER_IMAGE
@@ -135,7 +140,7 @@ def test_further_attempts_where_images_are_missing(scene, matched, tmp_path, mon
 def test_further_attempts_begin_while_there_is_time(scene, matched, tmp_path, monkeypatch, caplog):
     """The first one with each choice of cameras is always made."""
     monkeypatch.setattr(parallel, "cores", lambda: 1)
-    monkeypatch.setattr(mapper, "PATIENCE", 0.0)
+    monkeypatch.setattr(mapper, "MAPPER_PATIENCE", 0.0)
     names, pairs, matches = matched
     attempts, mapping = [], colmap.incremental_mapping
 
@@ -259,10 +264,10 @@ def test_a_photo_with_an_implausible_lens_does_not_bend_the_others(
 
 def test_why_no_model_is_plausible_is_said(scene, matched, tmp_path, monkeypatch):
     names, pairs, matches = matched
-    dropped = dict.fromkeys(names, "focal length 25000")
-    monkeypatch.setattr(mapper, "keep_plausible", lambda *_: ([], dropped))
+    dropped = Finding("lenses", "No lens has these: {names}.", tuple(names), verdict="drop")
+    monkeypatch.setitem(CHECKS, "lenses", Check(lambda inputs: [dropped] if inputs.names else []))
     arguments = (tmp_path / "sfm", scene.images, pairs, scene.features, matches)
-    with pytest.raises(NoModelError, match=r"focal lengths in pixels .*\(focal length 25000\)"):
+    with pytest.raises(NoModelError, match=f"No lens has these: {names[0]}"):
         reconstruction.main(*arguments, image_list=names, once=True)
 
 
@@ -272,7 +277,7 @@ def test_focal_lengths_that_differ_are_doubted(
 ):
     """Of 12 frames of one camera; the map was bent, and 12 of 19 photos localized wrongly in it."""
     names, pairs, matches = matched
-    monkeypatch.setattr(plausibility, "misplaced", lambda *_: [])
+    monkeypatch.setitem(CHECKS, "misplaced", Check(lambda _: []))
     mapping = colmap.incremental_mapping
 
     def bent(database, *arguments):

@@ -1,4 +1,4 @@
-"""Find parts of a map that show the same place twice, merged by mistake.
+"""Parts of a map that show the same place twice, merged by mistake.
 
 Two sides of a symmetric building, or two copies of a thing, have some matches, by which a mapper
 may put one upon the other. Then their photos seem to be taken from the same viewpoints, but few
@@ -8,9 +8,11 @@ points are seen by both: what differs between the sides does not match.
 import numpy as np
 import pycolmap
 
-from ..localization.projection import reprojection_errors
-from ..utils.colmap import point3D_ids
+from ...localization.projection import reprojection_errors
+from ...utils.colmap import point3D_ids
+from ..findings import Finding
 from . import groups
+from .inputs import TELLING, Inputs
 
 # a point is expected in a photo if another photo sees it from a direction that differs by at most
 # as many degrees, and from a distance that differs by at most this factor
@@ -18,35 +20,41 @@ ANGLE, DISTANCE = 15.0, 1.5
 # the largest distance between two such photos, in distances from the first one to the point
 REACH = np.sqrt(1 + DISTANCE**2 - 2 * DISTANCE * np.cos(np.radians(ANGLE)))
 # Two groups of photos that share less of the expected points contradict each other, if a photo of
-# one expects enough of them in one of the other, on average. Sound maps share a quarter and more,
-# the two that were merged by mistake 1 and 10 % (docs/maps.md).
-SHARE, ENOUGH = 0.15, 100
+# one expects `TELLING` of them in one of the other, on average. Sound maps share a quarter and
+# more, the two that were merged by mistake 1 and 10 % (docs/maps.md).
+JOINED_SHARE = 0.15
 # The same for any two groups, also of sides that the mapper did not connect directly: sound maps
 # share a tenth and more, a pillar with two equal sides 0 %.
-APART = 0.05
+APART_SHARE = 0.05
 WORK = 2e8  # pairs of observations and photos: above, only some of the points are used
 
 
-def find(model: pycolmap.Reconstruction) -> list[str]:
-    """Find the photos of a map that show another side of the place, or a copy of it.
+def find(inputs: Inputs) -> list[Finding]:
+    """Find the photos that show another side of the place, or a copy of it.
 
-    Args:
-        model: the map.
-
-    Returns:
-        The smaller one of two groups that contradict each other; none if no groups do.
+    They are the smaller one of two groups that contradict each other.
     """
-    images = [model.images[i] for i in sorted(model.reg_image_ids())]
+    images = inputs.images
     if len(images) < 4:
         return []
-    expected, shared, used = _count(model, images)
+    expected, shared, used = _count(inputs.model, images)
 
     def enough(wanted: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         several = np.minimum(first, second) > 1
-        return several & (wanted >= ENOUGH * used * 2 * first * second)
+        return several & (wanted >= TELLING * used * 2 * first * second)
 
-    found = groups.contradicting(shared, expected, SHARE, enough, APART)
-    return sorted(images[i].name for i in found)
+    found = groups.contradicting(shared, expected, JOINED_SHARE, enough, APART_SHARE)
+    if not found:
+        return []
+    text = (
+        "These photos show another side of the place that looks the same, or a copy of it: "
+        "{names}. From where they are placed, they would see many points of the others, but they "
+        "match few of them. Make a map of each side, because other photos may be at the wrong "
+        "side, too, or add photos all the way from one side to the other."
+    )
+    names = tuple(sorted(images[i].name for i in found))
+    doubt = "photos that others place elsewhere"
+    return [Finding("copies", text, names, {}, "drop", doubt)]
 
 
 def _count(

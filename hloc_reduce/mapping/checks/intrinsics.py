@@ -1,23 +1,21 @@
-"""Tell whether a map of photos alone fits much better with intrinsics of each photo's own."""
+"""Photos that fit much better with other intrinsics: they were cropped or enlarged."""
 
 import copy
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
-from .. import logger
-from ..mapping.adjustment import GAIN, LARGEST, adjusted_error, with_own_cameras
-from ..utils import cli
+from ..adjustment import GAIN_OF_FREE, MOST_ADJUSTED, adjusted_error, with_own_cameras
+from ..findings import Finding
+from .inputs import TELLING, Inputs
 
 # photos that share a camera gain by cameras of their own, too: if none is unlike the others, up to
 # 21 % in sound maps, and 31 % and more if many were cropped
 GAIN_OF_OWN = 0.25
-# a photo is altered if its intrinsics differ by more from those of the others
-ZOOMED = 1.1  # ratio of focal lengths
-OFF_CENTRE = 0.1  # of the longer side, between principal points
-OBSERVATIONS = 100  # fewer do not determine intrinsics
+# a photo is altered if its focal length differs by more than this share of those of the others, or
+# its principal point by this share of the longer side
+UNLIKE = 0.1
 
 
 class Fit(NamedTuple):
@@ -37,7 +35,7 @@ class Fit(NamedTuple):
 NOT_TRIED = Fit(0.0, [])
 
 
-def find(sfm: pycolmap.Reconstruction) -> Fit:
+def measure(sfm: pycolmap.Reconstruction) -> Fit:
     """Adjust copies of a map with a camera for each photo and free principal points, and as it is.
 
     A principal point that is assumed in the centre, although a photo was cropped, bends the poses
@@ -48,13 +46,13 @@ def find(sfm: pycolmap.Reconstruction) -> Fit:
         sfm: the map, all of whose poses and intrinsics may be wrong.
 
     Returns:
-        NOT_TRIED for more than LARGEST images, or too few points to tell.
+        NOT_TRIED for more than MOST_ADJUSTED images, or too few points to tell.
     """
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     cameras = {i: len(sfm.cameras[i].params) for i in {image.camera_id for image in images}}
     own = sum(cameras[image.camera_id] for image in images)
     residuals = 2 * sfm.compute_num_observations() - 3 * sfm.num_points3D() - 6 * len(images)
-    if len(images) > LARGEST or residuals <= 2 * own:
+    if len(images) > MOST_ADJUSTED or residuals <= 2 * own:
         return NOT_TRIED
     adjusted = copy.deepcopy(sfm)
     error = adjusted_error(adjusted)
@@ -67,7 +65,7 @@ def find(sfm: pycolmap.Reconstruction) -> Fit:
     if len(cameras) < len(images):
         adjusted_error(separate)
     of_own = gain(separate, own - sum(cameras.values()) + 2 * len(cameras))
-    if of_own > GAIN and (altered := _altered(separate, _focal_lengths(adjusted))):
+    if of_own > GAIN_OF_FREE and (altered := _altered(separate, _focal_lengths(adjusted))):
         return Fit(of_own, altered)
     if len(cameras) == len(images) or of_own > GAIN_OF_OWN:
         return Fit(of_own, [])
@@ -90,9 +88,9 @@ def _altered(sfm: pycolmap.Reconstruction, assumed: dict[str, float]) -> list[st
     images = sorted((sfm.images[i] for i in sfm.reg_image_ids()), key=lambda image: image.name)
     zoom = np.array([np.log(found[image.name] / assumed[image.name]) for image in images])
     centre = np.array([_off_centre(sfm.cameras[image.camera_id]) for image in images])
-    zoomed = np.abs(zoom[:, None] - zoom) > np.log(ZOOMED)
-    moved = np.abs(centre[:, None] - centre).max(axis=2) > OFF_CENTRE
-    seen = np.array([image.num_points3D for image in images]) >= OBSERVATIONS
+    zoomed = np.abs(zoom[:, None] - zoom) > np.log1p(UNLIKE)
+    moved = np.abs(centre[:, None] - centre).max(axis=2) > UNLIKE
+    seen = np.array([image.num_points3D for image in images]) >= TELLING
     differs = (zoomed | moved) & seen & seen[:, None]
     # of a photo that differs from the fewest of those that tell
     like_most = differs[np.where(seen, differs.sum(axis=1), len(images)).argmin()]
@@ -106,43 +104,28 @@ def _off_centre(camera: pycolmap.Camera) -> np.ndarray:
     return (principal_point - size / 2) / size.max()
 
 
-def warn(fit: Fit, unlike_others: Sequence[str] = (), cropped: Sequence[str] = ()) -> None:
-    """Warn of photos that may be cropped.
+def find(inputs: Inputs) -> list[Finding]:
+    """Find out whether the photos fit much better with other intrinsics, see `measure`."""
+    fit = measure(inputs.model)
+    return [finding(fit)] if fit.gain > GAIN_OF_FREE else []
 
-    Args:
-        fit: of the map, from `find`.
-        unlike_others: photos that were left out of it.
-        cropped: photos in it that were cropped, see `exif.cropped`.
-    """
-    if cropped:
-        logger.warning(
-            "The map may be wrong. Photos that are square, or whose width and height have another "
-            "ratio than their EXIF data say: %s. They were cropped or stretched, perhaps by the "
-            "camera, so their principal points are not known: use the original photos.",
-            cli.some(cropped),
-        )
-    if unlike_others:
-        logger.warning(
-            "Left out of the map, because their size, focal length or principal point is not that "
-            "of the other photos: %s. Either these or the others were cropped or resized: use "
-            "photos as the camera took them.",
-            cli.some(unlike_others),
-        )
+
+def finding(fit: Fit) -> Finding:
+    """Return the finding for photos that fit much better with other intrinsics."""
+    better = f"{100 * fit.gain:.0f} % better"
     if fit.altered:
-        logger.warning(
+        text = (
             "The map may be wrong. Photos with another focal length or principal point than the "
-            "others: %s. With other intrinsics, all photos fit %.0f %% better. Either these or the "
-            "others were cropped or enlarged, and are misplaced, or the place is flat: use the "
-            "original photos.",
-            cli.some(fit.altered),
-            100 * fit.gain,
+            f"others: {{names}}. With other intrinsics, all photos fit {better}. Either these or "
+            "the others were cropped or enlarged, and are misplaced, or the place is flat: use the "
+            "original photos."
         )
-    elif fit.gain > GAIN:
-        logger.warning(
-            "The photos fit %.0f %% better if their principal points are not in their centres: "
-            "they may be cropped, or have wrong focal lengths, and positions may be off by a tenth "
-            "of the distance and more. Uncropped photos or a COLMAP model with known intrinsics "
-            "help; so does --camera_mode single, if one camera took all photos and the map has "
-            "several.",
-            100 * fit.gain,
+    else:
+        text = (
+            f"The photos fit {better} if their principal points are not in their centres: they may "
+            "be cropped, or have wrong focal lengths, and positions may be off by a tenth of the "
+            "distance and more. Uncropped photos or a COLMAP model with known intrinsics help; so "
+            "does --camera_mode single, if one camera took all photos and the map has several."
         )
+    doubt = "photos that may be cropped or enlarged"
+    return Finding("intrinsics", text, tuple(fit.altered), {"gain": fit.gain}, doubt=doubt)

@@ -6,7 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hloc_reduce.maps import precision
+from hloc_reduce.mapping import findings
+from hloc_reduce.mapping.checks import Inputs, positions
 from hloc_reduce.utils import colmap
 
 
@@ -54,27 +55,28 @@ def test_photos_of_uncertain_positions_are_named(
     distances, depth, one_camera, turn, expected, caplog
 ):
     """Also those that are uncertain together: a photo of a facade was 25 % off without a word."""
-    found = precision.find(seen_from(distances, depth, one_camera, turn))
-    assert expected == sorted(found)
-    precision.warn(found)
+    found = positions.find(Inputs(seen_from(distances, depth, one_camera, turn)))
+    assert expected == sorted(findings.names_in(found))
+    findings.warn(found)
     assert all(f"{name} (" in caplog.text for name in expected)
     assert bool(caplog.text) == bool(found)
 
 
-def test_photos_that_see_little_do_not_make_others_uncertain(caplog):
+def test_photos_that_see_little_do_not_make_others_uncertain():
     """Some with hardly a point, and one far away that sees a few; JSON has no infinity."""
     model = seen_from([4, 4, 4, 4, 4, 4, 40], 1)
     for image_id, kept in ((5, 3), (6, 0), (7, 8)):
         for i in range(kept, 200):
             model.delete_observation(image_id, i)
-    found = precision.find(model)
-    assert found.keys() == {"4.jpg", "5.jpg", "6.jpg"} and found["4.jpg"] == found["5.jpg"] == 1
-    precision.warn(found)
-    assert "4.jpg (at least 100 %)" in caplog.text
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    (found,) = positions.find(Inputs(model))
+    assert {*found.names} == {"4.jpg", "5.jpg", "6.jpg"}
+    assert found.values["4.jpg"] == found.values["5.jpg"] == 1
+    assert "4.jpg (at least 100 %)" in found.message
+    content = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert findings.Finding.from_json(content) == found
 
 
-def test_given_intrinsics_are_known(caplog):
+def test_given_intrinsics_are_known():
     """Such as those of a photo that was added with them: their models may be degenerate."""
     model = seen_from([4, 4, 4, 4, 4, 4], 1)
     camera = model.cameras[6]
@@ -83,7 +85,7 @@ def test_given_intrinsics_are_known(caplog):
     model.cameras[6] = pycolmap.Camera(
         model="FULL_OPENCV", width=1000, height=800, params=params, camera_id=6
     )
-    assert precision.find(model) == {}
+    assert positions.find(Inputs(model)) == []
 
 
 @pytest.mark.parametrize(
@@ -96,11 +98,13 @@ def test_given_intrinsics_are_known(caplog):
         (5, True, [(1000, 800)], True),  # one camera always agrees with itself
     ],
 )
-def test_a_map_with_many_uncertain_positions_may_be_wrong(number, one_camera, typical, refused):
+def test_a_map_with_many_uncertain_positions_may_be_wrong(
+    number, one_camera, typical, refused, monkeypatch
+):
     """Six photos by tourists were 5 to 25 % off in maps that only had a warning."""
-    sfm = seen_from([4] * number, 1, one_camera)
-    said = precision.doubts({"0.jpg": 0.07}, sfm, typical)
-    assert bool(said) == refused
+    monkeypatch.setattr(positions, "measure", lambda _: {"0.jpg": 0.07})
+    (found,) = positions.find(Inputs(seen_from([4] * number, 1, one_camera), typical=typical))
+    assert found.names == ("0.jpg",) and "0.jpg (7 %)" in found.message
+    assert found.verdict == ("refuse" if refused else "warn")
     if refused:
-        assert f"the positions of 1 of its {number} photos are uncertain" in said[0]
-    assert precision.doubts({}, sfm, typical) == []
+        assert f"the positions of 1 of its {number} photos are uncertain" in found.message

@@ -1,35 +1,87 @@
-"""Find photos of a map of photos alone whose positions its points hardly determine."""
+"""Photos whose positions the points of a map hardly determine."""
 
 import copy
 from collections import Counter
-from collections.abc import Collection, Mapping
 
 import pycolmap
 
-from .. import logger
-from ..localization.confidence import MAX_POSITION, uncertainty
-from ..localization.projection import FOCAL, POSE
-from ..mapping.adjustment import focal_length_deviations
-from ..mapping.plausibility import MANY
-from ..utils import cli, colmap
+from ...localization import intrinsics
+from ...localization.confidence import MAX_POSITION, uncertainty
+from ...localization.exif import WELL_KNOWN
+from ...localization.projection import FOCAL, POSE
+from ...utils import cli, colmap
+from ..adjustment import MOST_ADJUSTED, focal_length_deviations
+from ..findings import PHOTOS_NAMED, Finding
+from .inputs import Inputs
 
 # Photos whose focal lengths a map determines to 2 to 7 % were 5 to 37 % off: the points of a bent
 # map err together, so that its photos are off by a multiple of what independent errors explain.
-BENT = 2.5
+BENT_TOGETHER = 2.5
 VAGUE = 0.1  # share of the focal length: photos whose points tell it less are not tried with others
-LARGEST = 200  # photos: of more, the focal lengths are not tried
 # Share of the photos: a map with at least as many uncertain ones is refused. Of 28 photos localized
 # in maps of tourists' photos with a fifth of them 8 were wrong, of 24 in those with a tenth 1, and
 # of 30 in maps with a typical lens none.
 MANY_UNCERTAIN = 0.1
-Size = tuple[int, int]  # width and height in pixels
 HELP = (
     "More photos between them and the others help, or intrinsics: a COLMAP model, EXIF data, or "
     "--camera_mode single --overwrite if one camera with a fixed zoom took all."
 )
 
 
-def find(sfm: pycolmap.Reconstruction) -> dict[str, float]:
+def find(inputs: Inputs) -> list[Finding]:
+    """Find the photos whose positions are uncertain, see `measure`.
+
+    A map with many is refused. Photos with cameras of their own and a typical lens do not count:
+    their focal lengths, estimated one by one, agree.
+    """
+    uncertain = measure(inputs.model)
+    cameras = {image.name: inputs.model.cameras[image.camera_id] for image in inputs.images}
+    typical = inputs.typical
+    if typical is None:
+        typical = intrinsics.of_cameras(cameras.values()).typical
+    taken = Counter(camera.camera_id for camera in cameras.values())
+    counted = {}
+    for name, share in uncertain.items():
+        camera = cameras[name]
+        is_known = taken[camera.camera_id] >= WELL_KNOWN
+        if is_known or (camera.width, camera.height) not in typical:
+            counted[name] = share
+    if counted and len(counted) >= MANY_UNCERTAIN * len(cameras):
+        return [_many(uncertain, counted, len(cameras))]
+    return [finding(uncertain)] if uncertain else []
+
+
+def finding(uncertain: dict[str, float]) -> Finding:
+    """Return the finding for photos, and the shares by which their positions are uncertain."""
+    text = (
+        f"The positions of these photos are uncertain by more than {100 * MAX_POSITION:.0f} % of "
+        f"their distance: {_named(uncertain)}. Queries near them may be localized as far off. "
+        f"{HELP}"
+    )
+    return Finding("positions", text, tuple(uncertain), uncertain, "warn", _DOUBT)
+
+
+_DOUBT = "photos whose positions are uncertain"
+
+
+def _many(uncertain: dict[str, float], counted: dict[str, float], number: int) -> Finding:
+    text = (
+        f"The map may be wrong: the positions of {len(counted)} of its {number} photos are "
+        f"uncertain by more than {100 * MAX_POSITION:.0f} % of their distance: {_named(counted)}. "
+        f"{HELP}"
+    )
+    return Finding("positions", text, tuple(uncertain), uncertain, "refuse", _DOUBT)
+
+
+def _named(uncertain: dict[str, float]) -> str:
+    named = [
+        f"{name} ({'at least ' * (share == 1)}{100 * share:.0f} %)"
+        for name, share in uncertain.items()
+    ]
+    return cli.some(named, PHOTOS_NAMED)
+
+
+def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
     """Find photos whose positions are less certain than `MAX_POSITION`.
 
     A distant photo of a nearly flat scene hardly tells a longer focal length from a larger
@@ -46,7 +98,7 @@ def find(sfm: pycolmap.Reconstruction) -> dict[str, float]:
     """
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     taken = Counter(image.camera_id for image in images)
-    several = {camera_id for camera_id, number in taken.items() if number >= MANY}
+    several = {camera_id for camera_id, number in taken.items() if number >= WELL_KNOWN}
     found, vague = {}, []
     for image in images:
         view = image.cam_from_world(), sfm.cameras[image.camera_id]
@@ -55,11 +107,11 @@ def find(sfm: pycolmap.Reconstruction) -> dict[str, float]:
         found[image.name] = own.position
         if not (own.position < 1 and own.focal_length < VAGUE):
             vague.append(image.name)
-    if len(images) - len(vague) > 1 and len(images) <= LARGEST:
+    if len(images) - len(vague) > 1 and len(images) <= MOST_ADJUSTED:
         deviations = focal_length_deviations(_without(sfm, vague))
         for image in images:
             if image.camera_id in deviations and image.camera_id not in several:
-                together = BENT * deviations[image.camera_id]
+                together = BENT_TOGETHER * deviations[image.camera_id]
                 found[image.name] = max(found[image.name], together)
     uncertain = {name: min(share, 1.0) for name, share in found.items() if share > MAX_POSITION}
     return dict(sorted(uncertain.items(), key=lambda item: -item[1]))
@@ -74,50 +126,3 @@ def _without(sfm: pycolmap.Reconstruction, names: list[str]) -> pycolmap.Reconst
     return colmap.with_cameras(
         rest, lambda image_id: copy.deepcopy(sfm.cameras[sfm.images[image_id].camera_id])
     )
-
-
-def doubts(
-    uncertain: Mapping[str, float], sfm: pycolmap.Reconstruction, typical: Collection[Size]
-) -> list[str]:
-    """Say that a map may be wrong because the positions of many photos are uncertain.
-
-    Photos with cameras of their own and a typical lens do not count: their focal lengths, estimated
-    one by one, agree.
-
-    Args:
-        uncertain: as `find` returns it.
-        sfm: the map.
-        typical: sizes (width, height) of photos with a typical lens, see `intrinsics.MapCameras`.
-    """
-    ids = {sfm.images[i].name: sfm.images[i].camera_id for i in sfm.reg_image_ids()}
-    taken = Counter(ids.values())
-    counted = {}
-    for name, share in uncertain.items():
-        camera = sfm.cameras[ids[name]]
-        if taken[ids[name]] >= MANY or (camera.width, camera.height) not in typical:
-            counted[name] = share
-    if not counted or len(counted) < MANY_UNCERTAIN * len(ids):
-        return []
-    return [
-        f"The map may be wrong: the positions of {len(counted)} of its {len(ids)} photos are "
-        f"uncertain by more than {100 * MAX_POSITION:.0f} % of their distance: {_named(counted)}. "
-        f"{HELP}"
-    ]
-
-
-def warn(uncertain: Mapping[str, float]) -> None:
-    """Warn of photos whose positions are uncertain, if there are any."""
-    if uncertain:
-        logger.warning(
-            "The positions of these photos are uncertain by more than %.0f %% of their distance: "
-            "%s. Queries near them may be localized as far off. %s",
-            *(100 * MAX_POSITION, _named(uncertain), HELP),
-        )
-
-
-def _named(uncertain: Mapping[str, float]) -> str:
-    named = [
-        f"{name} ({'at least ' * (share == 1)}{100 * share:.0f} %)"
-        for name, share in uncertain.items()
-    ]
-    return cli.some(named)

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hloc_reduce.maps import cropping
+from hloc_reduce.mapping.checks import Inputs, intrinsics
 from hloc_reduce.utils import colmap
 
 SIZE = np.array([1000, 800])
@@ -62,35 +62,36 @@ def reconstructed(
 
 
 @pytest.mark.parametrize(("shift", "is_cropped"), [(0.0, False), (0.2, True)])
-def test_cropped_photos_fit_better_with_free_principal_points(shift, is_cropped, caplog):
+def test_cropped_photos_fit_better_with_free_principal_points(shift, is_cropped):
     model = reconstructed(shift)
     before = model.compute_mean_reprojection_error()
     poses = {i: image.cam_from_world() for i, image in model.images.items()}
-    fit = cropping.find(model)
+    fit = intrinsics.measure(model)
     assert model.compute_mean_reprojection_error() == before
     assert all(image.cam_from_world() == poses[i] for i, image in model.images.items())
     assert fit.gain > 0.3 if is_cropped else abs(fit.gain) < 0.02
-    cropping.warn(fit)
-    assert ("cropped or enlarged" in caplog.text) == is_cropped
+    found = intrinsics.find(Inputs(model))
+    assert len(found) == is_cropped and all("cropped" in one.message for one in found)
 
 
 @pytest.mark.parametrize(("shift", "gain"), [(0.0, 0.0), (0.1, 0.9)])
 def test_few_points_are_adjusted_to_the_end(shift, gain):
     """Their gradient is small from the start."""
-    assert cropping.find(reconstructed(shift, number=40, noise=0.1)).gain == pytest.approx(
+    assert intrinsics.measure(reconstructed(shift, number=40, noise=0.1)).gain == pytest.approx(
         gain, abs=0.05
     )
 
 
 @pytest.mark.parametrize("zoomed", [(), (2,), (1, 4, 6)])
-def test_enlarged_photos_of_a_shared_camera_are_named(zoomed, caplog):
+def test_enlarged_photos_of_a_shared_camera_are_named(zoomed):
     """As photos whose EXIF data do not say that they were enlarged."""
-    fit = cropping.find(reconstructed(zoomed=zoomed, is_shared=True))
+    model = reconstructed(zoomed=zoomed, is_shared=True)
+    fit = intrinsics.measure(model)
     assert fit.altered == [f"{i}.jpg" for i in zoomed]
     assert fit.gain > 0.3 if zoomed else abs(fit.gain) < 0.02
-    cropping.warn(fit)
-    assert all(f"{i}.jpg" in caplog.text for i in zoomed)
-    assert ("are misplaced" in caplog.text) == bool(zoomed)
+    found = intrinsics.find(Inputs(model))
+    assert [one.names for one in found] == ([tuple(fit.altered)] if zoomed else [])
+    assert all("are misplaced" in one.message and "{" not in one.message for one in found)
 
 
 def test_photos_with_few_points_hide_no_others():
@@ -101,20 +102,19 @@ def test_photos_with_few_points_hide_no_others():
         for row in range(60, 300):
             model.delete_observation(image.image_id, row)
     assert [image.num_points3D for image in few] == [60] * 3
-    fit = cropping.find(model)
-    assert fit.altered == ["2.jpg"] and fit.gain > cropping.GAIN
+    fit = intrinsics.measure(model)
+    assert fit.altered == ["2.jpg"] and fit.gain > intrinsics.GAIN_OF_FREE
 
 
-def test_crops_of_a_shared_camera_gain_by_cameras_of_their_own(caplog):
+def test_crops_of_a_shared_camera_gain_by_cameras_of_their_own():
     """The principal points differ by less than tells one photo from the others."""
-    fit = cropping.find(reconstructed(0.03, is_shared=True))
-    assert fit.altered == [] and fit.gain > cropping.GAIN_OF_OWN
-    cropping.warn(fit)
-    assert "their principal points are not in their centres" in caplog.text
+    (found,) = intrinsics.find(Inputs(reconstructed(0.03, is_shared=True)))
+    assert found.names == () and found.values["gain"] > intrinsics.GAIN_OF_OWN
+    assert "their principal points are not in their centres" in found.message
 
 
 def test_one_half_is_named_if_the_other_was_enlarged():
-    fit = cropping.find(reconstructed(zoomed=(0, 3, 5, 6), is_shared=True))
+    fit = intrinsics.measure(reconstructed(zoomed=(0, 3, 5, 6), is_shared=True))
     halves = [["0.jpg", "3.jpg", "5.jpg", "6.jpg"], ["1.jpg", "2.jpg", "4.jpg", "7.jpg"]]
     assert fit.altered in halves and fit.gain > 0.3
 
@@ -126,9 +126,9 @@ def test_photos_that_were_removed_do_not_count():
         point.xy += 3.0
     model.update_point_3d_errors()
     colmap.remove_images(model, [worst.name])
-    assert abs(cropping.find(model).gain) < 0.02
+    assert abs(intrinsics.measure(model).gain) < 0.02
 
 
 def test_large_maps_are_not_judged(monkeypatch):
-    monkeypatch.setattr(cropping, "LARGEST", 7)
-    assert cropping.find(reconstructed(0.2)) == cropping.NOT_TRIED
+    monkeypatch.setattr(intrinsics, "MOST_ADJUSTED", 7)
+    assert intrinsics.measure(reconstructed(0.2)) == intrinsics.NOT_TRIED

@@ -1,12 +1,15 @@
-"""Cameras of a model whose photos have another size."""
+"""Photos of another size than their cameras in a model."""
 
 from collections import Counter
 from collections.abc import Mapping
 
 import pycolmap
 
-from ..utils import cli
-from .adjustment import GAIN, LARGEST, gain_of_free_intrinsics
+from ...utils import cli
+from ...utils.images import stored_size
+from ..adjustment import GAIN_OF_FREE, MOST_ADJUSTED, gain_of_free_intrinsics
+from ..findings import Finding
+from .inputs import Inputs
 
 Size = tuple[int, int]  # width, height
 
@@ -16,6 +19,19 @@ TURN = (
     "If EXIF data tell how photos are turned, magick mogrify -auto-orient turns the pixels of "
     "copies."
 )
+
+
+def find(inputs: Inputs) -> list[Finding]:
+    """Find photos of another size than their cameras, unless all of a camera were resized."""
+    if inputs.image_dir is None:
+        return []
+    known = {name: stored_size(inputs.image_dir / name) for name in inputs.names}
+    _, unfit = compare(inputs.model, {name: size for name, size in known.items() if size})
+    if not unfit:
+        return []
+    doubt = "photos of another size than their cameras"
+    text = f"These photos {complaint(unfit)}."
+    return [Finding("sizes", text, tuple(unfit), verdict="refuse", doubt=doubt)]
 
 
 def is_resized(before: Size, after: Size) -> bool:
@@ -86,7 +102,7 @@ def scale_cameras(model: pycolmap.Reconstruction, found: Mapping[int, Size]) -> 
 def check_scaled(model: pycolmap.Reconstruction) -> None:
     """Check that photos fit the cameras that were scaled to them: cropped ones do not.
 
-    Of a model of more than `LARGEST` images this is not tried.
+    Of a model of more than `MOST_ADJUSTED` images this is not tried.
 
     Args:
         model: with the points that were triangulated with these cameras.
@@ -94,10 +110,10 @@ def check_scaled(model: pycolmap.Reconstruction) -> None:
     Raises:
         InputError: if they fit much better with other intrinsics.
     """
-    if model.num_reg_images() > LARGEST:
+    if model.num_reg_images() > MOST_ADJUSTED:
         return
     gain = gain_of_free_intrinsics(model)
-    if gain > GAIN:
+    if gain > GAIN_OF_FREE:
         raise cli.InputError(
             "The photos have another size than their cameras in the model, and do not fit the "
             f"cameras scaled to it: with other intrinsics they fit {100 * gain:.0f} % better. They "

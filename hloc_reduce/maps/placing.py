@@ -19,7 +19,8 @@ from ..confs import matchers as matchers_confs
 from ..localization import intrinsics
 from ..localization.confidence import DEFAULT_GATE
 from ..localization.records import camera_of, pose_of
-from ..mapping import extension, sizes
+from ..mapping import extension
+from ..mapping.checks import Inputs, contradictions, sizes
 from ..mapping.extension import Placed
 from ..runtime import provenance
 from ..runtime.group_writer import failures, merge
@@ -32,18 +33,17 @@ from ..utils.files import announce, delete, is_readable
 from ..utils.h5 import open_h5
 from ..utils.match_files import check_distinct
 from ..utils.parsers import parse_pairs
-from . import contradictions
+from .by_others import NUM_LOC
 from .map import FINGERPRINTS, RETRIEVAL, Map
-from .mirroring import mirror_images
+from .mirror_images import mirror_images
 
 GROWING = "growing"  # the folder of an addition, in that of the map
-NUM_LOC = 20  # most similar images that a new photo is matched with
-IMAGES = "images/"  # begins the names of photos in the fingerprints of a map
+PHOTO_KEYS = "images/"  # begins the names of photos in the fingerprints of a map
 
 
 def photo_of(key: str) -> str | None:
     """Return the name of a photo in the fingerprints of a map, None for other files."""
-    return key.removeprefix(IMAGES) if key.startswith(IMAGES) else None
+    return key.removeprefix(PHOTO_KEYS) if key.startswith(PHOTO_KEYS) else None
 
 
 def _digests(fingerprints: Mapping[str, list]) -> dict[str, str]:
@@ -85,7 +85,9 @@ class Addition:
         """Return the photos that are new; begin anew unless their addition was interrupted."""
         broken = [name for name in names if not is_readable(self.image_dir / name)]
         self._leave_out("not readable", broken)
-        files = {f"{IMAGES}{name}": self.image_dir / name for name in names if name not in broken}
+        files = {
+            f"{PHOTO_KEYS}{name}": self.image_dir / name for name in names if name not in broken
+        }
         known = provenance.read(self.built.folder / FINGERPRINTS)
         self.fingerprints = provenance.fingerprints(files, {})
         digests, before = _digests(self.fingerprints), _digests(known)
@@ -234,7 +236,7 @@ class Addition:
             [name for name in placed if shared[name] < DEFAULT_GATE.min_inliers],
         )
         left = [name for name in placed if shared[name] >= DEFAULT_GATE.min_inliers]
-        wrong = contradictions.judge(self.sfm, self.matches, left)
+        wrong = contradictions.judge(Inputs(self.sfm, matches=self.matches), left)
         self._drop("contradicting the map", wrong)
         self.added += [name for name in left if name not in wrong]
 
