@@ -22,6 +22,7 @@ ROOMS = (
         STAGES,
         "hlm",
         "maps",
+        "check",
         "compact",
         "serve",
         "evaluation",

@@ -102,7 +102,7 @@ def check(
         names = check_names(sorted(described), database.path)
     else:
         names = sorted(model.images[i].name for i in model.reg_image_ids())
-        _check_model(database, model, keypoints)
+        check_model(database, model)
     if not names:
         raise InputError("The model has no image with a pose.")
     lacking = [name for name in names if described.get(name, 0) != keypoints.get(name, 0)]
@@ -156,10 +156,9 @@ def _check_type(database: StoredDatabase, reduction: Reduction) -> None:
         )
 
 
-def _check_model(
-    database: StoredDatabase, model: pycolmap.Reconstruction, keypoints: dict[str, int]
-) -> None:
+def check_model(database: StoredDatabase, model: pycolmap.Reconstruction) -> None:
     """Raise an InputError if a model was made from another database."""
+    keypoints = database.numbers("keypoints")
 
     def of_another(names: list[str], reason: str) -> InputError:
         return InputError(

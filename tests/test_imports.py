@@ -65,6 +65,7 @@ COMMANDS = [
     *(
         f"hloc_reduce.{name} --help"
         for name in (
+            "check",
             "export",
             "extract_features",
             "match_features",

@@ -6,7 +6,7 @@ import pycolmap
 import pytest
 from command import outcome
 
-from hloc_reduce import Localizer, maps
+from hloc_reduce import Localizer, check, maps
 from hloc_reduce.mapping.checks import CHECKS, Check, Inputs
 from hloc_reduce.mapping.findings import Finding, merged, names_in, staying, without
 from pipelines import localize
@@ -46,6 +46,8 @@ def test_a_new_check_is_seen_everywhere(toy, plane, tmp_path, run, caplog, capsy
     caplog.clear()
     run(*given)  # opens it
     assert caplog.messages.count(said) == 1
+    found, _ = check.main(built.sfm)
+    assert found == [DIM]
 
 
 @pytest.mark.parametrize("verdict", ["refuse", "warn", "drop"])

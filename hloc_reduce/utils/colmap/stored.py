@@ -7,10 +7,11 @@ the type of descriptors where there is one.
 import fcntl
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 
 from ..cli import InputError
 from ..locks import has_locks
@@ -97,6 +98,38 @@ class StoredDatabase:
         """Return the descriptors of an image (N, D), bytes: those of floats have four a number."""
         found = self._array("descriptors", name, np.uint8)
         return found if len(found) else np.zeros((0, 128), np.uint8)
+
+    def cameras(self) -> dict[int, pycolmap.Camera]:
+        """Return the cameras by their ids, without those of models that pycolmap does not know."""
+        found = {}
+        asked = "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras"
+        for camera_id, model, width, height, params, is_prior in self._rows(asked):
+            with suppress(TypeError, ValueError, RuntimeError):
+                found[camera_id] = pycolmap.Camera(
+                    camera_id=camera_id,
+                    model=pycolmap.CameraModelId(model),
+                    width=width,
+                    height=height,
+                    params=np.frombuffer(params, np.float64),
+                    has_prior_focal_length=bool(is_prior),
+                )
+        return {i: camera for i, camera in found.items() if camera.verify_params()}
+
+    def verified(self) -> dict[tuple[str, str], np.ndarray]:
+        """Return the verified matches (M, 2) int of each pair of images that has any."""
+        names = {image_id: name for name, image_id in self.images.items()}
+        found = {}
+        asked = "SELECT pair_id, rows, cols, data FROM two_view_geometries WHERE rows > 0"
+        for pair_id, number, width, data in self._rows(asked):
+            ids = pycolmap.pair_id_to_image_pair(pair_id)
+            if width != 2 or 4 * number * width != len(data or b"") or not names.keys() >= {*ids}:
+                raise InputError(
+                    f"Cannot read the database {self.path} (the verified matches of the images "
+                    f"{ids[0]} and {ids[1]} are broken)."
+                )
+            first, second = (names[i] for i in ids)
+            found[first, second] = np.frombuffer(data, np.uint32).reshape(-1, 2).astype(np.int64)
+        return found
 
     def _array(self, table: str, name: str, dtype: type) -> np.ndarray:
         """Return the array of an image in a table; an empty one if there is none."""
