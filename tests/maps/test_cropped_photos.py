@@ -32,7 +32,7 @@ def test_a_photo_of_another_size_by_the_same_camera_is_left_out(
     built = maps.Map(outputs / "map")
     assert names_in(built.findings, "another_size") == {"1.jpg"}
     assert built.names() == ["0.jpg", "2.jpg", "3.jpg", "4.jpg"]
-    assert "Left out of the map, because their size" in caplog.text
+    assert "do not belong in the map, because their size" in caplog.text
     info = Localizer(built.folder).localize(images / "1.jpg")[1]
     assert "1.jpg" not in info["retrieved"] and info["intrinsics"] == "unknown"
 
@@ -85,7 +85,7 @@ def test_a_map_is_built_again_without_altered_photos(
     if others_fit and len(altered) == 1:
         assert sorted(names_in(built.findings)) == altered and sfm == "sfm-alike"
         assert built.names() == ["0.png", "2.png", "3.png", "4.png"]
-        assert "other photos: 1.png." in caplog.text and "may be wrong" not in caplog.text
+        assert "that of the others: 1.png." in caplog.text and "may be wrong" not in caplog.text
     else:
         assert [one.kind for one in built.findings] == ["intrinsics"]
         assert len(built.names()) == 5 and sfm == "sfm"

@@ -70,8 +70,8 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
         ({"images_of_uncertain_position": {"db/0.png": 0.07}}, "their distance: db/0.png (7 %)"),
         ({"images_contradicting_others": ["db/1.png"]}, "other photos place db/1.png elsewhere"),
         ({"images_cropped": ["db/1.png"]}, "EXIF data say: db/1.png. They were cropped"),
-        ({"images_mirrored": ["x.png"]}, "Mirrored photos are not in the map: x.png."),
-        ({"images_unlike_others": ["x.png"]}, "Left out of the map, because their size"),
+        ({"images_mirrored": ["x.png"]}, "Mirrored photos do not belong in the map: x.png."),
+        ({"images_unlike_others": ["x.png"]}, "do not belong in the map, because their size"),
         ({"images": 9}, "Only 4 of 9 photos are in the map."),
     ):
         caplog.clear()

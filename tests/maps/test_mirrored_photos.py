@@ -39,7 +39,7 @@ def build_with_one_mirrored(plane, outputs, run):
 
 def test_a_mirrored_photo_is_named(plane, tmp_path, caplog, run):
     build_with_one_mirrored(plane, tmp_path / "outputs", run)
-    assert "Mirrored photos are not in the map: 1.png." in caplog.text
+    assert "Mirrored photos do not belong in the map: 1.png." in caplog.text
     assert "images are not in the map" not in caplog.text
 
 
@@ -54,7 +54,7 @@ def test_one_that_the_mapper_places_is_left_out(plane, symmetric, tmp_path, capl
     caplog.clear()
     run(*arguments)
     assert state(folder) == written
-    assert "Mirrored photos are not in the map: 1.png." in caplog.text
+    assert "Mirrored photos do not belong in the map: 1.png." in caplog.text
 
 
 @pytest.mark.parametrize("symmetric", [0.25])

@@ -43,9 +43,9 @@ def of_photos(image_dir: Path, names: Iterable[str]) -> list[Finding]:
 def finding(names: Iterable[str]) -> Finding:
     """Return the finding for photos with another size, focal length or principal point."""
     text = (
-        "Left out of the map, because their size, focal length or principal point is not that of "
-        "the other photos: {names}. Either these or the others were cropped or resized: use photos "
-        "as the camera took them."
+        "These photos do not belong in the map, because their size, focal length or principal "
+        "point is not that of the others: {names}. Either these or the others were cropped or "
+        "resized: use photos as the camera took them."
     )
     doubt = "photos that may be cropped or enlarged"
     return Finding("another_size", text, tuple(names), {}, "drop", doubt)

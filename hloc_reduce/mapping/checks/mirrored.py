@@ -36,8 +36,8 @@ def find(inputs: Inputs) -> list[Finding]:
 def finding(names: Iterable[str]) -> Finding:
     """Return the finding for mirrored photos."""
     text = (
-        "Mirrored photos are not in the map: {names}. Their mirror images fit to the other photos. "
-        "Either these were mirrored, or all others: use photos as the camera took them."
+        "Mirrored photos do not belong in the map: {names}. Their mirror images fit the other "
+        "photos. Either these were mirrored, or all others: use photos as the camera took them."
     )
     return Finding("mirrored", text, tuple(names), {}, "drop", "mirrored photos")
 
