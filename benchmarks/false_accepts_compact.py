@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from false_accepts_tables import add_places
 
 from hloc_reduce import Localizer, compact, maps
 from hloc_reduce.runtime import provenance
@@ -85,7 +84,17 @@ def _main() -> None:
         "--map scenes/fox/images:scenes/fox/sparse "
         "--map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv32",
     )
-    add_places(parser)
+    parser.add_argument(
+        "--map", action="append", default=[], metavar="IMAGES:MODEL", help="may be repeated"
+    )
+    parser.add_argument(
+        "--same",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar="PLACE",
+        help="places that see each other, whose photos are not tried as wrong ones",
+    )
     parser.add_argument("--feature", default="colmap_sift_sv32", help="local feature")
     parser.add_argument("--storage", choices=STORAGES, help="of the points; as hloc_reduce.compact")
     parser.add_argument("--max_mb", type=float, help="largest size of a file; all points if absent")

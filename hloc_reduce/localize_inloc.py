@@ -14,7 +14,7 @@ from . import logger
 from .datasets import scans
 from .datasets.inloc import RANSAC_SIZE, RANSAC_THRESH, by_iphone7
 from .localization import stage
-from .localization.confidence import DEFAULT_GATE, Gate
+from .localization.gate import DEFAULT_GATE, Gate
 from .localization.intrinsics import to_lists
 from .localization.mirrored import MirrorImages
 from .localization.references import ScanMap, point_group

@@ -8,7 +8,7 @@ from typing import Annotated
 import pycolmap
 
 from .localization import stage
-from .localization.confidence import DEFAULT_GATE, Gate
+from .localization.gate import DEFAULT_GATE, Gate
 from .localization.intrinsics import to_lists
 from .localization.mirrored import MirrorImages
 from .localization.query import merged, ransac_options

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 from hloc_reduce import logger, report
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.evaluation import plots
-from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.report import runs
 from hloc_reduce.runtime import provenance
 from hloc_reduce.utils import cli

@@ -15,7 +15,7 @@ from hloc_reduce import compact, extract_features, localize_sfm, logger, maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS, KeypointSettings
-from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import trace
 from hloc_reduce.runtime.group_writer import failures

@@ -8,26 +8,18 @@ import numpy as np
 import pycolmap
 
 from ..utils import colmap
-from .calibration import STRETCHED, UNCLEAR_CROPPED, calibrate
-from .confidence import (
-    MAX_POSITION,
-    MAX_ROTATION,
-    MIN_MATCHES,
-    RIVAL,
-    Gate,
-    agreement,
-    confidence,
-    uncertainty,
-)
-from .pose import Matches, Pose, differ, quality
+from . import gate as gates
+from .gate import ALTERNATIVES, Gate
+from .hypotheses import Alternatives, alternative, rival, with_other_intrinsics
+from .measures import MIN_MATCHES, Measures, agreement, confidence, uncertainty
+from .pose import Matches, Pose, quality
 from .projection import ALL, FOCAL, POSE, reprojection_errors
-from .refusals import refusal
 
 SEED = 0
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
-ROUNDS = 3  # of estimation from the inliers among all matches
+REESTIMATIONS = 3  # from the inliers among all matches
 RIVAL_SAMPLE = 500  # matches, at most, from which a rival is estimated
 # The lens of the map's photos has probably taken a photo if the confidence with it is at least this
 # multiple of that with estimated intrinsics, and its focal length is within this many standard
@@ -76,63 +68,97 @@ def estimate(
             tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
             poses += pool.map(lambda chosen: _estimate(matches, chosen[:MOST_SIMILAR]), tried)
         first = max(poses, key=quality)
-        rivals = pool.submit(_rivals, matches, first) if workers > 1 else None
-        best, doubt = calibrate(matches, first)
-        poses += rivals.result() if rivals and best is first else _rivals(matches, best)
-    best = replace(best, agreement=agreement(best.inliers, images))
-    best = replace(best, refusal=refusal(matches, best, poses, gate, doubt))
-    best = _with_typical_lens(matches, best, images, poses, gate) or best
+        outliers = pool.submit(_of_outliers, matches, first) if workers > 1 else None
+        best, others = with_other_intrinsics(matches, first)
+        poses += outliers.result() if outliers and best is first else _of_outliers(matches, best)
+    if best.cam_from_world is not None:
+        others |= rival(best, poses, matches.points3D)
+    best = replace(best, measures=_measures(matches, best, images, others))
+    best = _with_typical_lens(matches, best)
+    best = replace(best, refusal=gates.refusal(best.measures, gate))
     if best.cam_from_world is None:
         return best
     world_from_near = near_from_world.inverse()
     return replace(best, cam_from_world=world_from_near.transform_camera_world(best.cam_from_world))
 
 
-def _with_typical_lens(
-    matches: Matches, pose: Pose, images: list[np.ndarray], others: list[Pose], gate: Gate
-) -> Pose | None:
-    """Estimate a trusted pose anew with the lens of the map's photos.
+def _measures(
+    matches: Matches, pose: Pose, images: list[np.ndarray], others: Alternatives
+) -> Measures:
+    """Measure a pose."""
+    camera = matches.camera
+    center = camera.principal_point_x, camera.principal_point_y
+    measures = Measures(
+        num_matches=len(matches),
+        num_inliers=pose.num_inliers,
+        confidence=pose.confidence,
+        agreement=agreement(pose.inliers, images),
+        degrees_of_freedom=pose.degrees_of_freedom,
+        may_be_cropped=matches.may_be_cropped(pose),
+        longer_side=max(camera.width, camera.height),
+        is_focal_length_free=matches.is_focal_length_free,
+        focal_length=pose.camera.mean_focal_length(),
+        given_focal_length=camera.mean_focal_length(),
+        focal_range=gates.focal_lengths(camera, matches.is_focal_length_guessed),
+        off_centre=_off_centre(camera, *center),
+        off_centre_swapped=_off_centre(camera, *center[::-1]),
+        alternatives=others,
+    )
+    if pose.cam_from_world is None:
+        return measures
+    inliers = *matches.inliers(pose), pose.cam_from_world, pose.camera
+    precision = uncertainty(*inliers, pose.degrees_of_freedom)
+    return replace(measures, uncertainty=precision, uncropped=uncertainty(*inliers, ALL))
 
-    All photos of a map determine their lens better than the matches of one more photo do.
+
+def _off_centre(camera: pycolmap.Camera, x: float, y: float) -> float:
+    """Return how far a point is from the centre, as a share of the size."""
+    return float(np.abs(np.array([x / camera.width, y / camera.height]) - 0.5).max())
+
+
+def _with_typical_lens(matches: Matches, pose: Pose) -> Pose:
+    """Estimate a measured pose anew with the lens of the map's photos, if that fits.
+
+    All photos of a map determine their lens better than the matches of one more photo do. But that
+    this lens has taken the photo is likely, not certain: the new pose counts as no more precise.
 
     Returns:
-        The new pose, or the old one with a refusal. None if the lens is not known, may not have
-        taken the photo, or gives no trusted pose.
+        The new pose, or the old one if the lens is not known or does not fit. If all intrinsics
+        were estimated, the pose with this lens is an alternative.
     """
     known = matches.with_typical_lens()
-    if known is None or pose.cam_from_world is None or pose.refusal is not None:
-        return None
-    if matches.may_be_cropped(pose):
-        return None
-    inliers = matches.inliers(pose)
-    view = pose.cam_from_world, pose.camera
+    if known is None or pose.cam_from_world is None or pose.measures.may_be_cropped:
+        return pose
     typical = _estimate(known, np.flatnonzero(pose.inliers))
+    if typical.cam_from_world is None:
+        return pose
     if pose.degrees_of_freedom == ALL:
-        fits = typical.confidence >= UNCLEAR_CROPPED * pose.confidence
-        differs = differ(pose, typical, matches.points3D, MAX_POSITION, MAX_ROTATION)
-        return replace(pose, refusal=STRETCHED) if fits and differs else None
-    if typical.cam_from_world is None or typical.confidence < CONFIDENCE_RATIO * pose.confidence:
-        return None
+        others = {"typical_lens": alternative(pose, typical, matches.points3D)}
+        others = {**pose.measures.alternatives, **others}
+        return replace(pose, measures=replace(pose.measures, alternatives=others))
+    if typical.confidence < CONFIDENCE_RATIO * pose.confidence:
+        return pose
+    inliers, view = matches.inliers(pose), (pose.cam_from_world, pose.camera)
     ratio = pose.camera.mean_focal_length() / known.camera.mean_focal_length()
-    deviation = uncertainty(*inliers, *view, pose.degrees_of_freedom).focal_length
+    deviation = pose.measures.uncertainty.focal_length
     errors, _ = reprojection_errors(*inliers, *view)
     its_errors, _ = reprojection_errors(*inliers, typical.cam_from_world, typical.camera)
     # an estimated focal length may be off by more if it makes up for a distortion, or for points
     # whose errors are alike
     is_better = (its_errors**2).sum() <= (errors**2).sum()
     if not (is_better or abs(np.log(ratio)) <= max(DEVIATIONS * deviation, SHARE)):
-        return None
-    typical = replace(typical, agreement=agreement(typical.inliers, images))
-    return None if refusal(known, typical, others, gate, None) else typical
+        return pose
+    number, value = typical.num_inliers, typical.confidence
+    return replace(typical, measures=replace(pose.measures, num_inliers=number, confidence=value))
 
 
-def _rivals(matches: Matches, pose: Pose) -> list[Pose]:
+def _of_outliers(matches: Matches, pose: Pose) -> list[Pose]:
     """Return the pose that the outliers of a pose give, none if they are few."""
-    others = np.flatnonzero(~pose.inliers)
-    if not len(others) >= RIVAL * pose.num_inliers > 0:
+    others, share = np.flatnonzero(~pose.inliers), ALTERNATIVES["rival"].ratio
+    if not len(others) >= share * pose.num_inliers > 0:
         return []
     # half as many inliers as a rival of this confidence is expected to have
-    least = RIVAL / 2 * pose.num_inliers / len(others)
+    least = share / 2 * pose.num_inliers / len(others)
     sample = np.random.default_rng(SEED).permutation(others)[:RIVAL_SAMPLE]
     return [_estimate(matches, sample, max(LEAST_RATIO, least))]
 
@@ -148,7 +174,7 @@ def _estimate(matches: Matches, chosen: np.ndarray, least_ratio: float = LEAST_R
     points2D, points3D, number = matches.points2D, matches.points3D, len(matches)
     ransac = {"min_inlier_ratio": least_ratio}
     pose = Pose(None, matches.camera, np.zeros(number, bool))
-    for _ in range(1 if len(chosen) == number else ROUNDS):
+    for _ in range(1 if len(chosen) == number else REESTIMATIONS):
         camera = copy.deepcopy(pose.camera)
         chosen_points = points2D[chosen], points3D[chosen]
         found = colmap.estimate_pose(*chosen_points, camera, matches.config, ransac)

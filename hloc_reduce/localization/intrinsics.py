@@ -12,8 +12,8 @@ from ..utils import cli, colmap
 from ..utils.files import replacing
 from ..utils.images import UnreadableImage
 from ..utils.parsers import parse_camera, to_line
-from .confidence import FOCAL_LENGTHS
 from .exif import WELL_KNOWN, ExifCamera, correct, exif_camera, orientation
+from .gate import FOCAL_LENGTHS
 from .lenses import PLAIN, Size, split
 from .pose import OF_SIZE
 

@@ -1,21 +1,16 @@
 """The pose of a query whose lens may be one of several, or is not known at all."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pycolmap
 
 from . import absolute_pose
-from .calibration import UNCLEAR_CROPPED
-from .confidence import MAX_POSITION, MAX_ROTATION
+from . import gate as gates
+from .gate import Gate
+from .hypotheses import alternative
 from .intrinsics import from_list
-from .pose import Matches, Pose, differ, quality
-
-SEVERAL = (
-    "another lens of the map's photos of its size fits about as well, and the pose differs; known "
-    "intrinsics would help"
-)
+from .pose import Matches, Pose, quality
 
 
 def estimate(
@@ -24,7 +19,9 @@ def estimate(
     images: list[np.ndarray],
     camera: pycolmap.Camera,
     config: dict,
-    *options: Any,
+    gate: Gate,
+    thorough: bool = True,
+    workers: int = 1,
 ) -> Pose:
     """Estimate a pose with a camera and with each other lens that may have taken the photo.
 
@@ -38,20 +35,31 @@ def estimate(
         camera: intrinsics.
         config: as in `absolute_pose.estimate`; under "photo" also the other "lenses", or a
             "refusal" if no lens is known, see `intrinsics.refinement`.
-        options: the other arguments of `absolute_pose.estimate`.
+        gate: what a pose must have to be trusted.
+        thorough: as in `absolute_pose.estimate`.
+        workers: as in `absolute_pose.estimate`.
     """
     photo = config.get("photo", {})
     if reason := photo.get("refusal"):
         return Pose(None, camera, np.zeros(len(points2D), bool), refusal=reason)
     tried = [Matches(points2D, points3D, camera, config)]
     tried += [tried[0].with_lens(from_list(lens)) for lens in photo.get("lenses", ())]
+    options = gate, thorough, workers
     poses = [
         absolute_pose.estimate(points2D, points3D, images, matches.camera, matches.config, *options)
         for matches in tried
     ]
     best = max(poses, key=quality)
-    for other in poses:
-        rivals = other.confidence >= UNCLEAR_CROPPED * best.confidence
-        if rivals and differ(best, other, points3D, MAX_POSITION, MAX_ROTATION):
-            return replace(best, refusal=best.refusal or SEVERAL)
-    return best
+    if best.cam_from_world is None:
+        return best
+    found = [
+        alternative(best, other, points3D)
+        for other in poses
+        if other is not best and other.cam_from_world is not None
+    ]
+    found = [one for one in found if gates.differ(one, gates.ALIKE)]
+    if not found:
+        return best
+    others = {**best.measures.alternatives, "lens": max(found)}
+    measures = replace(best.measures, alternatives=others)
+    return replace(best, measures=measures, refusal=gates.refusal(measures, gate))

@@ -14,21 +14,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from .confidence import Gate
 from .intrinsics import from_list, to_list
 
-# agreement and confidence below which poses are doubtful. Those of most mirrored photos have an
-# agreement of at most 0.85 or a confidence of at most 125; two of a castle 0.92 and 432.
-DOUBTFUL = 0.9, 500.0
 SIDED = ("p2", "sx1", "p0", "s0", "s1")  # parameters of OpenCV's models and of Aria's
 
 # from names of queries to files of the features and of the matches of their mirror images
 MirrorImages = Callable[[list[str]], tuple[Path, Path]]
-
-
-def is_doubtful(agreement: float, confidence: float) -> bool:
-    """Return whether a pose is so uncertain that that of the mirror image may be the right one."""
-    return agreement < DOUBTFUL[0] or confidence < DOUBTFUL[1]
 
 
 def mirror(camera: pycolmap.Camera) -> pycolmap.Camera:
@@ -48,19 +39,3 @@ def mirror_options(options: dict) -> dict:
         return options
     lenses = [to_list(mirror(from_list(lens))) for lens in photo["lenses"]]
     return {**options, "photo": {**photo, "lenses": lenses}}
-
-
-def refusal(confidence: float, of_mirror_image: float, gate: Gate) -> str | None:
-    """Return why a pose is not trusted in view of that of the mirror image, None if it is.
-
-    Args:
-        confidence: of the pose.
-        of_mirror_image: that of the pose of the mirror image.
-        gate: what a pose must have to be trusted.
-    """
-    if not gate.is_mirrored(confidence, of_mirror_image):
-        return None
-    return (
-        f"it may be mirrored: the confidence is {confidence:.1f}, that of its mirror image "
-        f"{of_mirror_image:.1f}"
-    )

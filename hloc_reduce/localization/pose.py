@@ -5,15 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from .confidence import RIVAL
+from . import gate
+from .measures import Measures
 from .projection import POSE
 
 MAX_ERROR = 12.0  # pixels, pycolmap's default
-# poses that differ by more are rivals
-SAME_ROTATION = 10.0  # degrees
-SAME_POSITION = 0.25  # of the median depth of the inliers
 OF_SIZE = {"of_map": True, "by_size": True}  # options of a photo by a lens of the map's photos
-ZOOMED = 1.05  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
 
 
 @dataclass(frozen=True)
@@ -25,18 +22,18 @@ class Pose:
         camera: intrinsics, estimated if the configuration says so.
         inliers: (M,) bool.
         confidence: -log10 of the number of such poses that are expected by chance.
-        agreement: the largest share of an image's matches that agree, minus one standard deviation.
-        refusal: why it is not trusted, None if it is.
         degrees_of_freedom: the number of estimated parameters, see `projection`.
+        measures: all that `gate` needs.
+        refusal: why it is not trusted, None if it is.
     """
 
     cam_from_world: pycolmap.Rigid3d | None
     camera: pycolmap.Camera
     inliers: np.ndarray
     confidence: float = -np.inf
-    agreement: float = 0.0
-    refusal: str | None = None
     degrees_of_freedom: int = POSE
+    measures: Measures = Measures()
+    refusal: str | None = None
 
     @property
     def num_inliers(self) -> int:
@@ -80,7 +77,7 @@ class Matches:
         """
         photo = self.config.get("photo", {})
         low, high = photo.get("focal_lengths", (0, np.inf))
-        fits = low / ZOOMED <= pose.camera.mean_focal_length() <= ZOOMED * high
+        fits = low / gate.ZOOMED <= pose.camera.mean_focal_length() <= gate.ZOOMED * high
         return bool(photo.get("cropped")) or not fits
 
     def with_typical_lens(self) -> "Matches | None":
@@ -128,40 +125,29 @@ def quality(pose: Pose) -> tuple[float, int]:
     return pose.confidence, pose.num_inliers
 
 
-def is_rival(pose: Pose, other: Pose, points3D: np.ndarray) -> bool:
-    """Return whether another pose, from other matches, makes a pose ambiguous.
+def apart(pose: Pose, other: Pose, points3D: np.ndarray) -> tuple[float, float]:
+    """Return how far apart two poses are.
 
     Args:
-        pose: the best one.
-        other: from the same matches (M).
-        points3D: (M, 3) their points.
-    """
-    if other.confidence < RIVAL * pose.confidence:
-        return False
-    shared = (other.inliers & pose.inliers).sum()
-    return bool(2 * shared < other.num_inliers) and differ(pose, other, points3D)
-
-
-def differ(
-    pose: Pose,
-    other: Pose,
-    points3D: np.ndarray,
-    position: float = SAME_POSITION,
-    rotation: float = SAME_ROTATION,
-) -> bool:
-    """Return whether two poses differ by more than a position or a rotation.
-
-    Args:
-        pose: one of them.
+        pose: one of them, with inliers.
         other: the other one.
         points3D: (M, 3) the points of the first one's matches.
-        position: in units of the median depth of the first one's inliers.
-        rotation: in degrees.
+
+    Returns:
+        The distance of their positions in units of the median depth of the first one's inliers, and
+        the angle between their rotations in degrees.
     """
-    if pose.cam_from_world is None or other.cam_from_world is None:
-        return False
+    assert pose.cam_from_world is not None and other.cam_from_world is not None
     relative = pose.cam_from_world * other.cam_from_world.inverse()
     inliers = points3D[pose.inliers]
     depths = inliers @ pose.cam_from_world.rotation.matrix().T + pose.cam_from_world.translation
     moved = np.linalg.norm(relative.translation) / np.median(depths[:, 2])
-    return np.degrees(relative.rotation.angle()) > rotation or moved > position
+    return float(moved), float(np.degrees(relative.rotation.angle()))
+
+
+def differ(pose: Pose, other: Pose, points3D: np.ndarray, tolerance: gate.Tolerance) -> bool:
+    """Return whether there are two poses, and they differ by more than a tolerance, see `apart`."""
+    if pose.cam_from_world is None or other.cam_from_world is None:
+        return False
+    position, rotation = apart(pose, other, points3D)
+    return position > tolerance.position or rotation > tolerance.rotation

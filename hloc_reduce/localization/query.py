@@ -1,13 +1,16 @@
 """Localize one query: 2D-3D matches through retrieved images, PnP + RANSAC."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
 
+from . import gate as gates
 from . import lens_choice
-from .confidence import DEFAULT_GATE, RIVAL_BY_OTHERS, Gate
-from .pose import differ
+from .gate import DEFAULT_GATE, Gate
+from .measures import Alternative, covariance_of_pose
+from .pose import Pose, apart
 from .projection import photo_scale
 from .references import Reference
 
@@ -38,11 +41,14 @@ def localize(
 
     Returns:
         The pose (camera from world) or None, and info on the cluster of map images with the best
-        pose: `reason`, why the pose is not trusted, None if it is; `confidence`, at least 0, and
-        `agreement`, see `confidence`; `num_inliers`; `num_matches`, matches with a 3D point, and
+        pose: `reason`, why the pose is not trusted, None if it is; `measures`, see `Measures`, and
+        of these `confidence`, at least 0, and `agreement`; `num_inliers`; `num_matches`, matches
+        with a 3D point, and
         `num_correspondences`, the different ones of these (M); `num_without_point`, the other
         matches; `camera`, the intrinsics of the pose; `db`, the best retrieved image; `keypoints`
-        (M,), indices of the query's; `point3D_ids` (M,); `points3D` (M, 3); `inliers` (M,) bool.
+        (M,), indices of the query's; `point3D_ids` (M,); `points3D` (M, 3); `inliers` (M,) bool;
+        `covariance` (6, 6) of the pose, None if the inliers do not determine it, see
+        `measures.covariance_of_pose`.
     """
     solved = []
     for names in reference.clusters(list(matches)) if matches else [[]]:
@@ -51,30 +57,43 @@ def localize(
         found = lens_choice.estimate(*points, images, camera, config, gate, thorough, workers)
         info |= {
             "reason": _reason(len(keypoints), names, info) or found.refusal,
-            "confidence": round(max(0.0, found.confidence), 2),
-            "agreement": round(found.agreement, 3),
+            "measures": found.measures,
             "camera": found.camera,
             "num_inliers": found.num_inliers,
             "inliers": found.inliers,
+            "covariance": _covariance(*points, found),
             "db": names[0] if names else None,
         }
         solved.append((found, info))
     best, info = max(solved, key=lambda both: _quality(both[1]))
-    for other, its_info in solved:
-        if info["reason"] is None is its_info["reason"] and other is not best:
-            rivals = other.num_inliers >= RIVAL_BY_OTHERS * best.num_inliers
-            if rivals and differ(best, other, info["points3D"]):
-                info["reason"] = (
-                    f"ambiguous: a pose by other images has {other.num_inliers} inliers, this one "
-                    f"{best.num_inliers}"
-                )
+    if best.cam_from_world is not None and info["num_matches"]:
+        rivals = []
+        for other, its_info in solved:
+            if other is not best and other.cam_from_world is not None and not its_info["reason"]:
+                ratio = other.num_inliers / best.num_inliers
+                distance = apart(best, other, info["points3D"])
+                rivals.append(Alternative(ratio, *distance, detail=other.num_inliers))
+        if rivals := [one for one in rivals if gates.differ(one, gates.RIVALS)]:
+            others = {**best.measures.alternatives, "other_images": max(rivals)}
+            info["measures"] = replace(best.measures, alternatives=others)
+            info["reason"] = gates.refusal(info["measures"], gate)
     if info["reason"] and len(keypoints) and (turned := config.get("photo", {}).get("turned")):
         info["reason"] += f"; {turned}"
+    info["confidence"] = round(max(0.0, info["measures"].confidence), 2)
+    info["agreement"] = round(info["measures"].agreement, 3)
     return best.cam_from_world, info
 
 
+def _covariance(points2D: np.ndarray, points3D: np.ndarray, pose: Pose) -> np.ndarray | None:
+    """Return the covariance (6, 6) of a pose, None if its inliers do not determine it."""
+    if pose.cam_from_world is None:
+        return None
+    view = pose.cam_from_world, pose.camera, pose.degrees_of_freedom
+    return covariance_of_pose(points2D[pose.inliers], points3D[pose.inliers], *view)
+
+
 def _quality(info: dict) -> tuple[bool, float, int]:
-    return info["reason"] is None, info["confidence"], info["num_inliers"]
+    return info["reason"] is None, info["measures"].confidence, info["num_inliers"]
 
 
 def _reason(num_keypoints: int, names: list[str], info: dict) -> str | None:

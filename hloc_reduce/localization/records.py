@@ -1,6 +1,7 @@
 """The record of each query: its pose, or why it has none, and how well it fits."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,13 @@ import pycolmap
 
 from ..utils.cli import InputError
 from ..utils.files import naming, replacing
-from . import mirrored
-from .confidence import Gate
+from . import gate as gates
+from .gate import Gate
 from .intrinsics import to_list
+from .measures import Measures
 from .references import Reference
 
-RECORDS = 22  # the version of the content of records, and of the gate
+RECORDS = 23  # the version of the content of records, and of the gate
 NUMBERS = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
 
 
@@ -23,6 +25,11 @@ def pose_of(record: dict) -> pycolmap.Rigid3d | None:
         return None
     w, x, y, z = record["qvec"]
     return pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(record["tvec"]))
+
+
+def measures_of(record: dict) -> Measures:
+    """Return the measures in a record."""
+    return Measures.from_dict(record["measures"])
 
 
 def camera_of(record: dict) -> pycolmap.Camera:
@@ -44,6 +51,7 @@ def read_records(path: Path) -> dict[str, dict]:
             for record in records.values():
                 record["localized"] = bool(record["localized"])
                 pose_of(record)
+                measures_of(record)
             return records
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         pass
@@ -66,9 +74,9 @@ def to_record(
         cam_from_world: the pose.
         info: as `query.localize` returns it, with `max_error`.
     """
-    localized = info["reason"] is None
+    localized, covariance = info["reason"] is None, info["covariance"]
     if not localized:
-        cam_from_world = reference.fallback(names) or cam_from_world
+        cam_from_world, covariance = reference.fallback(names) or cam_from_world, None
     return {
         "localized": localized,
         "reason": info["reason"],
@@ -79,7 +87,8 @@ def to_record(
         "max_error": info["max_error"],
         **{key: info[key] for key in NUMBERS},
         "db": info["db"] if localized else next(iter(names), None),
-        "mirror_image": None,
+        "covariance": None if covariance is None else covariance.tolist(),
+        "measures": info["measures"].to_dict(),
     }
 
 
@@ -106,12 +115,14 @@ def with_mirror_image(
         names: the retrieved images, best first.
         gate: what a pose must have for the query to be called localized.
     """
-    record = {**record, "mirror_image": other["confidence"]}
-    if not (reason := mirrored.refusal(record["confidence"], other["confidence"], gate)):
+    measures = replace(measures_of(record), mirror_image=other["confidence"])
+    record = {**record, "measures": measures.to_dict()}
+    if not (reason := gates.refusal(measures, gate)):
         return record
     fallback = reference.fallback(names) or pose_of(record)
     first = next(iter(names), None)
-    return record | _written(fallback) | {"localized": False, "reason": reason, "db": first}
+    refusal = {"localized": False, "reason": reason, "db": first, "covariance": None}
+    return record | _written(fallback) | refusal
 
 
 def refused(
@@ -119,6 +130,7 @@ def refused(
 ) -> dict:
     """Return the record of a query that is not to be localized."""
     info = {"reason": reason, "confidence": 0.0, "agreement": 0.0, "max_error": None}
+    info |= {"measures": Measures(), "covariance": None}
     return to_record(reference, names, None, info | dict.fromkeys(NUMBERS, 0) | {"camera": camera})
 
 

@@ -22,13 +22,14 @@ from ..utils.h5 import open_h5
 from ..utils.match_files import find_pair, get_matcher, get_matches, most_similar_first
 from ..utils.parsers import parse_query_lists, write_poses
 from ..utils.progress import progress
-from .confidence import DEFAULT_GATE, Gate
-from .mirrored import MirrorImages, is_doubtful, mirror, mirror_options
+from .gate import DEFAULT_GATE, Gate, may_be_mirrored
+from .mirrored import MirrorImages, mirror, mirror_options
 from .query import localize
 from .records import (
     RECORDS,
     Log,
     log_file,
+    measures_of,
     pose_of,
     refused,
     to_record,
@@ -85,8 +86,8 @@ def main(
         `confidence` and `agreement`; the written pose as `qvec` (w, x, y, z) and `tvec`, the
         fallback if the query is not localized, None if there is none; `camera`, the model, width,
         height and parameters in a list, None if not known; `max_error`, RANSAC's inlier threshold
-        in pixels, None for pycolmap's default; `mirror_image`, the confidence of its mirror image,
-        None if that was not tried; and the numbers and `db` of `localize`.
+        in pixels, None for pycolmap's default; `measures`, see `Measures`; and the numbers and `db`
+        of `localize`.
     """
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
     if mirror_images:
@@ -192,10 +193,8 @@ def _check_some_matched(
 
 def _may_be_mirrored(record: dict) -> bool:
     """Tell whether the mirror image of a query is yet to be tried."""
-    tried = record["mirror_image"] is not None
-    return (
-        record["localized"] and not tried and is_doubtful(record["agreement"], record["confidence"])
-    )
+    measures = measures_of(record)
+    return record["localized"] and measures.mirror_image is None and may_be_mirrored(measures)
 
 
 def _mirrored(

@@ -10,7 +10,7 @@ import pycolmap
 from .. import aggregate_features, match_features, pairs_from_retrieval
 from ..confs.matchers import confs as matchers_confs
 from ..localization import intrinsics, stage
-from ..localization.confidence import DEFAULT_GATE
+from ..localization.gate import DEFAULT_GATE
 from ..localization.mirrored import mirror
 from ..localization.query import merged, ransac_options
 from ..localization.references import SfmMap

@@ -1,13 +1,15 @@
 """Localize one photo at a time in a map that is held in memory."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from ..localization import gate as gates
 from ..localization import intrinsics, mirrored, query, stage, turned
-from ..localization.confidence import DEFAULT_GATE, Gate
+from ..localization.gate import DEFAULT_GATE, Gate
 from ..localization.query import merged, ransac_options
 from ..localize_sfm import RANSAC_THRESH
 from ..pairs_from_retrieval import rank
@@ -114,15 +116,14 @@ class Localizer:
         lap("matching")
         cam_from_world, info = self._estimate(features, matches, camera, refinement)
         lap("pose")
-        known = info["agreement"], info["confidence"]
-        if info["reason"] is None and mirrored.is_doubtful(*known):
+        if info["reason"] is None and gates.may_be_mirrored(info["measures"]):
             flipped = self._extract(image, flip=True)
             matches = self._match(flipped["descriptors"], retrieved)
             camera = mirrored.mirror(camera)
             refinement = mirrored.mirror_options(refinement)
             _, other = self._estimate(flipped, matches, camera, refinement, thorough=False)
-            confidences = info["confidence"], other["confidence"]
-            info["reason"] = mirrored.refusal(*confidences, self.gate)
+            measures = replace(info["measures"], mirror_image=other["confidence"])
+            info |= {"measures": measures, "reason": gates.refusal(measures, self.gate)}
             lap("mirror_image")
         info |= {
             "points2D": features["keypoints"][info["keypoints"]],

@@ -17,7 +17,7 @@ from .. import (
 )
 from ..confs import matchers as matchers_confs
 from ..localization import intrinsics
-from ..localization.confidence import DEFAULT_GATE
+from ..localization.gate import DEFAULT_GATE
 from ..localization.records import camera_of, pose_of
 from ..mapping import extension
 from ..mapping.checks import Inputs, contradictions, sizes

@@ -7,7 +7,7 @@ from typing import Annotated
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.detectors.dog import KEYPOINTS, KeypointSettings
-from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.utils.codes import STORAGES, Storage
 from hloc_reduce.utils.options import HIDDEN, POSITIVE, Checked, Option

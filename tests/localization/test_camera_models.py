@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 from hloc_reduce.localization import absolute_pose
-from hloc_reduce.localization.confidence import DEFAULT_GATE
+from hloc_reduce.localization.gate import DEFAULT_GATE
 
 POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04])), [0.3, 0.1, 8.0])
 GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)

@@ -9,19 +9,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from hloc_reduce.localization import absolute_pose, refusals
-from hloc_reduce.localization import confidence as confidence_module
-from hloc_reduce.localization.confidence import (
-    DEFAULT_GATE,
-    Gate,
+from hloc_reduce.localization import absolute_pose, measures
+from hloc_reduce.localization.gate import DEFAULT_GATE, Gate, refusal
+from hloc_reduce.localization.measures import (
+    Uncertainty,
     _log10_tail,
     agreement,
     confidence,
-    reprojection_errors,
+    covariance_of_pose,
     uncertainty,
 )
-from hloc_reduce.localization.pose import Matches
-from hloc_reduce.localization.refusals import imprecision
+from hloc_reduce.localization.projection import reprojection_errors
 from hloc_reduce.utils.cli import InputError
 
 CAMERA = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1600, height=1200, params=[1400, 800, 600])
@@ -82,8 +80,8 @@ def test_few_inliers_are_refused():
     found = solve(*matches(6, 0))
     assert found.refusal == "too few inliers: 6, at least 8 are needed"
     assert solve(*matches(6, 0), gate=Gate(0, 6)).refusal is None
-    refusal = solve(*matches(12, 20), gate=Gate(1000, 6)).refusal
-    assert refusal.startswith("12 inliers of 32 matches may be chance: confidence 3")
+    reason = solve(*matches(12, 20), gate=Gate(1000, 6)).refusal
+    assert reason.startswith("12 inliers of 32 matches may be chance: confidence 3")
     nothing = solve(np.zeros((0, 2)), np.zeros((0, 3)))
     assert nothing.cam_from_world is None and "too few inliers: 0" in nothing.refusal
 
@@ -146,11 +144,11 @@ def test_the_density_of_projections_is_that_of_the_nearest():
     points2D = generator.uniform(0, 1000, (200, 2))
     visible = np.unique(projected.round(), axis=0)
     distance = np.linalg.norm(points2D[:, None] - visible, axis=2)
-    ninth = np.sort(distance, axis=1)[:, confidence_module.NEIGHBORS]
-    expected = confidence_module.NEIGHBORS / 600 / (np.pi * np.maximum(ninth, 1) ** 2)
+    ninth = np.sort(distance, axis=1)[:, measures.NEIGHBORS]
+    expected = measures.NEIGHBORS / 600 / (np.pi * np.maximum(ninth, 1) ** 2)
     uniform = 1 / (CAMERA.width * CAMERA.height)
     assert 0.2 < (expected > uniform).mean() < 0.8
-    found = confidence_module._density(points2D, projected, CAMERA)
+    found = measures._density(points2D, projected, CAMERA)
     np.testing.assert_allclose(found, np.maximum(expected, uniform))
 
 
@@ -172,6 +170,21 @@ def test_uncertainty_is_the_spread_of_poses(free):
     assert 0.6 < expected / measured < 1.6
 
 
+def test_the_covariance_of_a_pose_is_that_of_the_estimator():
+    """COLMAP's own, up to its loss, in its parameters: half angles and the moved origin."""
+    keypoints, points = matches(200, 0, noise=0.3)
+    found = pycolmap.estimate_and_refine_absolute_pose(keypoints, points, CAMERA, {}, {}, True)
+    pose = found["cam_from_world"]
+    covariance = covariance_of_pose(keypoints, points, pose, CAMERA)
+    x, y, z = pose.translation
+    motion = np.eye(6)
+    motion[3:, :3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    motion[:3] /= 2
+    expected, measured = found["covariance"], motion @ covariance @ motion.T
+    scale = np.trace(measured) / np.trace(expected)
+    np.testing.assert_allclose(measured, scale * expected, atol=0.05 * measured.max())
+
+
 def test_inliers_that_do_not_fix_the_pose_are_refused():
     """All of them lie in a narrow band of the image, and nearly in a plane."""
     generator = np.random.default_rng(0)
@@ -181,21 +194,17 @@ def test_inliers_that_do_not_fix_the_pose_are_refused():
     found = solve(keypoints, points)
     assert "the inliers do not fix the pose" in found.refusal
     assert "known intrinsics would help" not in found.refusal
-    its_matches = Matches(keypoints, points, CAMERA, FREE)
-    assert "known intrinsics would help" in imprecision(its_matches, found, TRUE)
+    free = replace(found.measures, is_focal_length_free=True, focal_length=1400)
+    assert "known intrinsics would help" in refusal(free, DEFAULT_GATE)
     assert uncertainty(keypoints[:3], points[:3], TRUE, CAMERA) == (np.inf, np.inf, np.inf)
 
 
 @pytest.mark.parametrize(("uncertain", "is_refused"), [(0.029, False), (0.031, True)])
-def test_a_position_is_certain_to_3_percent(monkeypatch, uncertain, is_refused):
-    keypoints, points = matches(20, 0)
-    found = solve(keypoints, points)
-    monkeypatch.setattr(refusals, "uncertainty", lambda *_: (uncertain, 0.1, 0.0))
-    its_matches = Matches(keypoints, points, CAMERA, {})
-    reason = imprecision(its_matches, found, TRUE)
+def test_a_position_is_certain_to_3_percent(uncertain, is_refused):
+    found = solve(*matches(20, 0)).measures
+    reason = refusal(replace(found, uncertainty=Uncertainty(uncertain, 0.1, 0)), DEFAULT_GATE)
     assert ("% of the distance (at most 3 %)" in (reason or "")) == is_refused
-    monkeypatch.setattr(refusals, "uncertainty", lambda *_: (np.inf, np.inf, 0.0))
-    reason = imprecision(its_matches, found, TRUE)
+    reason = refusal(replace(found, uncertainty=measures.UNDETERMINED), DEFAULT_GATE)
     assert "by at least 100 % of" in reason and "by at least 180 degrees" in reason
 
 
@@ -270,13 +279,13 @@ def test_values_below_a_limit_are_not_printed_as_the_limit():
     """A photo was refused with 'agreement 0.86, at least 0.86 is needed'."""
     given = *matches(60, 20), [np.arange(80)]
     found = solve(*given)
-    for gate in (
-        Gate(min_agreement=((0, found.agreement + 1e-4),)),
+    for strict in (
+        Gate(min_agreement=((0, found.measures.agreement + 1e-4),)),
         Gate(min_confidence=found.confidence + 1e-4),
     ):
-        refusal = solve(*given, gate=gate).refusal
+        reason = solve(*given, gate=strict).refusal
         value, least = re.search(
-            r"(?:agreement|confidence) ([\d.]+), at least ([\d.]+)", refusal
+            r"(?:agreement|confidence) ([\d.]+), at least ([\d.]+)", reason
         ).groups()
         assert float(value) < float(least)
 
@@ -300,7 +309,7 @@ def test_doubtful_poses_must_agree_with_more_matches():
     assert mutual.of_photo(2.0).least_agreement(40) < mutual.least_agreement(40)
     keypoints, points = matches(60, 18)
     found = solve(keypoints, points, [np.arange(78)], gate=gate)
-    assert 50 < found.confidence < 300 and 0.7 < found.agreement < 0.86
+    assert 50 < found.confidence < 300 and 0.7 < found.measures.agreement < 0.86
     assert found.refusal.startswith("the matches of no image agree")
 
 
@@ -354,15 +363,15 @@ def test_a_rival_is_found_in_another_thread(replaced, workers, monkeypatch):
     first, second = matches(60, 0), matches(40, 0, pose=pose_of(0, (50, 0, 8)), seed=1)
     parts = (np.concatenate(part) for part in zip(first, second, strict=True))
     images = [np.arange(0, 100, 2), np.arange(1, 100, 2)]
-    calibrate = absolute_pose.calibrate
+    try_others = absolute_pose.with_other_intrinsics
 
-    def calibrated(its_matches, pose):
-        best, doubt = calibrate(its_matches, pose)
+    def tried(its_matches, pose):
+        best, others = try_others(its_matches, pose)
         # one whose rival has other matches
         kept = best.inliers & (np.arange(100) < 59)
-        return (replace(best, inliers=kept) if replaced else best), doubt
+        return (replace(best, inliers=kept) if replaced else best), others
 
-    monkeypatch.setattr(absolute_pose, "calibrate", calibrated)
+    monkeypatch.setattr(absolute_pose, "with_other_intrinsics", tried)
     found = absolute_pose.estimate(*parts, images, CAMERA, {}, DEFAULT_GATE, True, workers)
     number = 59 if replaced else 60
     assert found.refusal == f"ambiguous: another pose has 40 inliers, this one {number}"

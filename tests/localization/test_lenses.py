@@ -8,8 +8,7 @@ import pytest
 from test_intrinsics import write_photo
 
 from hloc_reduce.localization import intrinsics, lens_choice, mirrored
-from hloc_reduce.localization.calibration import TOLERANT
-from hloc_reduce.localization.confidence import DEFAULT_GATE, MAX_POSITION, MAX_ROTATION
+from hloc_reduce.localization.gate import DEFAULT_GATE, LISTS
 from hloc_reduce.localization.intrinsics import infer, of_cameras, refinement
 from hloc_reduce.localization.lenses import is_bent, split
 from hloc_reduce.localization.pose import Pose
@@ -111,7 +110,7 @@ def test_another_lens_of_the_size_is_not_localized_wrongly(of_map, camera):
     """Nor is a photo by a normal lens, which has the size by chance."""
     lens, other = camera_of(of_map, BENT[of_map]), camera_of(camera, {**MILD, **BENT}[camera])
     found, position, rotation = localize(other, of_cameras(3 * [lens]))
-    is_right = position < TOLERANT * MAX_POSITION and rotation < TOLERANT * MAX_ROTATION
+    is_right = position < LISTS.position and rotation < LISTS.rotation
     assert found.refusal is not None or is_right
 
 

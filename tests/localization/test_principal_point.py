@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 from hloc_reduce.localization import absolute_pose
-from hloc_reduce.localization.confidence import DEFAULT_GATE
+from hloc_reduce.localization.gate import DEFAULT_GATE
 from hloc_reduce.localization.pose import Pose
 from hloc_reduce.localization.projection import reprojection_errors
 

@@ -5,17 +5,12 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hloc_reduce.localization import absolute_pose, calibration, resection
-from hloc_reduce.localization.calibration import choose
-from hloc_reduce.localization.confidence import (
-    DEFAULT_GATE,
-    INDEPENDENT,
-    project,
-    reprojection_errors,
-    uncertainty,
-)
+from hloc_reduce.localization import absolute_pose, gate, hypotheses, resection
+from hloc_reduce.localization.gate import DEFAULT_GATE
 from hloc_reduce.localization.intrinsics import REFINEMENTS
+from hloc_reduce.localization.measures import INDEPENDENT, uncertainty
 from hloc_reduce.localization.pose import Matches, Pose
+from hloc_reduce.localization.projection import project, reprojection_errors
 from hloc_reduce.localization.resection import (
     ALL,
     RADIAL,
@@ -148,22 +143,22 @@ def test_few_matches_of_a_cropped_photo_are_refused_or_right(photo, number):
 
 
 @pytest.mark.parametrize(
-    ("unclear", "confidence", "is_trusted"),
+    ("kind", "confidence", "is_trusted"),
     [
-        (calibration.UNCLEAR, 103, True),
-        (calibration.UNCLEAR_CROPPED, 103, False),
-        (calibration.UNCLEAR_CROPPED, 90, False),  # 14 of 441 crops, 4 to 8 degrees off
-        (calibration.UNCLEAR_CROPPED, 75, True),
+        ("stretched", 103, True),
+        ("cropped", 103, False),
+        ("cropped", 90, False),  # 14 of 441 crops, 4 to 8 degrees off
+        ("cropped", 75, True),
     ],
 )
-def test_an_equal_fit_turns_a_photo_that_may_be_cropped(unclear, confidence, is_trusted):
+def test_an_equal_fit_turns_a_photo_that_may_be_cropped(kind, confidence, is_trusted):
     """7 of 98 accepted crops were turned by 5 to 16 degrees: the right pose had fitted better."""
     turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.1, 0])), np.zeros(3))
     inliers, points3D = np.ones(50, bool), matches(WHOLE, 50, wrong=0)[1]
     assumed = Pose(turn * POSE, guessed(1600, 1200), inliers, confidence=100, degrees_of_freedom=7)
     right = Pose(POSE, WHOLE, inliers, confidence=confidence, degrees_of_freedom=ALL)
-    found, doubt = choose(assumed, right, points3D, unclear)
-    assert found is assumed and (doubt is None) == is_trusted
+    other = hypotheses.alternative(assumed, right, points3D)
+    assert gate.is_doubtful(kind, other) == (not is_trusted)
 
 
 @pytest.mark.parametrize(
@@ -241,8 +236,7 @@ def test_a_negative_focal_length_is_not_refined():
     camera = camera_of(1600, 1200, [-1400, 800, 600, 0], "SIMPLE_RADIAL")
     pose = Pose(POSE, camera, np.ones(50, bool), confidence=50)
     given = Matches(*matches(WHOLE, 30), camera, REFINEMENTS["guess"])
-    found, doubt = absolute_pose.calibrate(given, pose)
-    assert found is pose and doubt is None
+    assert hypotheses.with_other_intrinsics(given, pose) == (pose, {})
 
 
 def test_derivatives_of_a_projection():

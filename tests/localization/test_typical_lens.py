@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 from hloc_reduce.localization import absolute_pose, intrinsics
-from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.localization.pose import Pose
 
 POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04])), [0.3, 0.1, 8.0])
@@ -55,7 +55,7 @@ def test_the_typical_lens_is_taken_where_it_fits():
     assert free.refusal is None and free.camera.mean_focal_length() != 900
     assert found.refusal is None and found.camera.params.tolist() == [900, 640, 480, -0.05]
     assert its_error < 0.005 < 0.02 < error
-    assert found.agreement == free.agreement
+    assert found.measures.agreement == free.measures.agreement
 
 
 @pytest.mark.parametrize("number, depth", [(30, 0.5), (300, 0.2)])
@@ -106,18 +106,9 @@ def test_the_typical_lens_does_not_make_up_for_a_flat_scene():
     assert solve(LENS, 30, 0.1)[0].refusal == free.refusal
 
 
-def test_a_pose_with_the_typical_lens_is_judged(monkeypatch):
-    """If it is refused, the one with the estimated lens stays."""
-    judge = absolute_pose.refusal
-    monkeypatch.setattr(
-        absolute_pose,
-        "refusal",
-        lambda matches, *others: None if matches.is_focal_length_free else judge(matches, *others),
-    )
-    strict = Gate(min_inliers=31, min_agreement=((0, 0.0),))
-    free, _ = solve(None, 30, 0.2)
-    found, _ = solve(LENS, 30, 0.2, gate=strict)
-    assert found.refusal is None and found.camera.params.tolist() == free.camera.params.tolist()
+def test_a_pose_with_the_typical_lens_is_judged():
+    found, _ = solve(LENS, 30, 0.2, gate=Gate(min_inliers=31, min_agreement=((0, 0.0),)))
+    assert found.refusal == "too few inliers: 30, at least 31 are needed"
 
 
 @pytest.mark.parametrize("lean", [0.055, 0.08])

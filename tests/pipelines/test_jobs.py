@@ -6,7 +6,7 @@ import pytest
 from command import write
 
 from hloc_reduce.evaluation import published
-from hloc_reduce.localization.confidence import Gate
+from hloc_reduce.localization.gate import Gate
 from hloc_reduce.utils.cli import InputError
 from pipelines.batch import jobs, tables
 from pipelines.batch.jobs import Job

@@ -5,10 +5,10 @@ import pytest
 from command import outcome, run
 
 from hloc_reduce import Localizer, extract_features
-from hloc_reduce.localization import confidence as confidence_module
-from hloc_reduce.localization import mirrored, refusals
-from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
-from hloc_reduce.localization.records import log_file, read_records
+from hloc_reduce.localization import gate as gates
+from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
+from hloc_reduce.localization.measures import Measures
+from hloc_reduce.localization.records import log_file, measures_of, read_records
 from hloc_reduce.utils.cli import InputError
 from pipelines import aachen, inloc, localize
 
@@ -24,7 +24,7 @@ def symmetric() -> float:
 @pytest.fixture
 def as_certain_as_right_ones(monkeypatch):
     """Without intrinsics the wrong pose is uncertain by 3.3 %, for which it would be refused."""
-    monkeypatch.setattr(refusals, "PRECISE", (1.0, 1.0))
+    monkeypatch.setattr(gates, "PRECISE", (1.0, 1.0))
 
 
 def mirror(path, of):
@@ -38,7 +38,7 @@ def mirror_images(outputs):
     path = log_file(outputs / summary["poses"])
     records = read_records(path)
     assert len(path.read_text().splitlines()) == 1 + len(rows)  # each query once
-    return {name: record["mirror_image"] for name, record in records.items()}
+    return {name: measures_of(record).mirror_image for name, record in records.items()}
 
 
 @pytest.mark.parametrize(
@@ -47,13 +47,14 @@ def mirror_images(outputs):
 )
 def test_poses_like_those_of_mirrored_photos_are_doubtful(agreement, confidence, expected):
     """The first two were of mirrored photos of a castle, and were not tried."""
-    assert mirrored.is_doubtful(agreement, confidence) == expected
+    measures = Measures(agreement=agreement, confidence=confidence)
+    assert gates.may_be_mirrored(measures) == expected
 
 
 @pytest.mark.usefixtures("as_certain_as_right_ones")
 def test_photos_of_ones_own(place, tmp_path, monkeypatch):
     """The mirrored photo is refused by the pipeline and in memory, and would not be otherwise."""
-    monkeypatch.setattr(mirrored, "DOUBTFUL", (0.9, 250.0))
+    monkeypatch.setattr(gates, "DOUBTFUL", (0.9, 250.0))
     build, images, outputs = place
     new = tmp_path / "new"
     new.mkdir()
@@ -75,10 +76,10 @@ def test_photos_of_ones_own(place, tmp_path, monkeypatch):
     run(monkeypatch, localize, *build, *MATCHER, "--query_images", new)
     assert outcome(outputs / "queries-new")[1] == rows
 
-    monkeypatch.setattr(mirrored, "DOUBTFUL", (0.0, 0.0))
+    monkeypatch.setattr(gates, "DOUBTFUL", (0.0, 0.0))
     pose, info = localizer.localize(new / "mirrored.png")
     assert pose is not None and info["num_inliers"] > 50
-    monkeypatch.setattr(mirrored, "DOUBTFUL", (1.0, 0.0))
+    monkeypatch.setattr(gates, "DOUBTFUL", (1.0, 0.0))
     pose, info = localizer.localize(new / "right.png")
     assert pose is not None and "mirror_image" in info["seconds"]
 
@@ -120,14 +121,15 @@ def test_a_run_that_stops_before_the_mirror_images_resumes(place, tmp_path, monk
 )
 def test_mirror_images_that_fit_nearly_as_well(matcher, confidence, of_mirror_image, expected):
     gate = DEFAULT_GATE.of_matches(matcher, 64)
-    assert bool(mirrored.refusal(confidence, of_mirror_image, gate)) == expected
+    measures = Measures(confidence=confidence, mirror_image=of_mirror_image)
+    assert bool(gates._mirrored(measures, gate)) == expected
 
 
 def test_the_gate_of_a_user_decides_on_mirror_images(place, tmp_path, monkeypatch):
     """In the pipeline and in memory; the mirror image has 0.7 times the confidence."""
     build, images, outputs = place
-    monkeypatch.setattr(mirrored, "DOUBTFUL", (1.0, 0.0))
-    monkeypatch.setattr(confidence_module, "MIRRORED", 0.5)
+    monkeypatch.setattr(gates, "DOUBTFUL", (1.0, 0.0))
+    monkeypatch.setattr(gates, "MIRRORED", 0.5)
     new = tmp_path / "new"
     new.mkdir()
     (new / "right.png").write_bytes((images / "query/day/a.png").read_bytes())

@@ -13,7 +13,7 @@ from small_map import MATCHER
 from hloc_reduce import localize_sfm, match_features
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import query, stage
-from hloc_reduce.localization.confidence import AGREEMENT, AGREEMENT_NOISY, AGREEMENT_RATIO
+from hloc_reduce.localization.gate import AGREEMENT, AGREEMENT_NOISY, AGREEMENT_RATIO
 from hloc_reduce.localization.records import log_file, pose_of, read_records
 from hloc_reduce.localization.references import SfmMap
 from hloc_reduce.utils import cli, colmap

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from ...localization import absolute_pose, intrinsics
-from ...localization.confidence import DEFAULT_GATE, MAX_POSITION, MAX_ROTATION
+from ...localization.gate import DEFAULT_GATE, MAX_POSITION, MAX_ROTATION, Tolerance
 from ...localization.pose import MAX_ERROR, Pose, differ
 from ...localization.projection import photo_scale, reprojection_errors
 from ...localization.query import merged, ransac_options
@@ -18,9 +18,8 @@ from ...utils.progress import progress
 from ..findings import Finding
 from .inputs import Inputs
 
-# a pose contradicts the others if they place the photo farther away, in multiples of the
-# uncertainty with which a query is localized
-ELSEWHERE = 2.0
+# a pose contradicts the others if they place the photo farther away
+ELSEWHERE = Tolerance(2 * MAX_POSITION, 2 * MAX_ROTATION)
 
 Read = Callable[[str, str], np.ndarray]  # the matches (M, 2) of two images
 
@@ -135,8 +134,7 @@ def _contradicts(
 
     def elsewhere(pose: Pose) -> bool:
         placed = Pose(image.cam_from_world(), image.camera, pose.inliers)
-        far, turned = ELSEWHERE * MAX_POSITION, ELSEWHERE * MAX_ROTATION
-        return differ(pose, placed, points3D, far, turned)
+        return differ(pose, placed, points3D, ELSEWHERE)
 
     config = ransac_options(MAX_ERROR, image.camera)
     pose = absolute_pose.estimate(*matches, image.camera, config, DEFAULT_GATE)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ...localization.confidence import DEFAULT_GATE
+from ...localization.gate import DEFAULT_GATE
 from ..findings import Finding
 from .inputs import Inputs
 

@@ -4,8 +4,8 @@ from collections import Counter
 
 import pycolmap
 
-from ...localization.confidence import focal_lengths
 from ...localization.exif import WELL_KNOWN
+from ...localization.gate import focal_lengths
 from ..findings import Finding
 from .inputs import Inputs
 

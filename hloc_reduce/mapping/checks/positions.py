@@ -6,8 +6,9 @@ from collections import Counter
 import pycolmap
 
 from ...localization import intrinsics
-from ...localization.confidence import MAX_POSITION, uncertainty
 from ...localization.exif import WELL_KNOWN
+from ...localization.gate import MAX_POSITION
+from ...localization.measures import uncertainty
 from ...localization.projection import FOCAL, POSE
 from ...utils import cli, colmap
 from ..adjustment import MOST_ADJUSTED, focal_length_deviations

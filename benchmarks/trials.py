@@ -1,20 +1,23 @@
-"""Count wrong poses that are accepted as localized, and true poses that are refused.
+"""Try maps with photos whose poses are known, and write what is measured of each pose found.
 
 Each map is tried with held-out photos of its place, with photos of all other places, and with
 blurred, mirrored, black and noisy versions of its own; all with their intrinsics and without, its
-own also with a wrong focal length. Cropped and squeezed versions of its own are tried without
-intrinsics. In a COLMAP model, every third photo is held out. Keypoints and maps are the same for
-all features, which have one base: those of colmap_sift_sv64, or of a network. Another --seed holds
-out other photos, builds other maps, and draws other photos of other places. Results go to
-trials.csv, and as a curve to false_accepts.svg; an interrupted run resumes with the next place.
+own also with a wrong focal length. Its own are also tried cropped, cropped and enlarged, squeezed,
+and warped as a photo of a print is, without intrinsics. In a COLMAP model, every third photo is
+held out. Keypoints and maps are the same for all features of one base. Another --seed holds out
+other photos, builds other maps, and draws other photos of other places. Each trial is a row of
+results/trials/FEATURE-SEED.csv, with its outcome (true, near, wrong, none) and all `Measures`,
+whatever the gate says; `benchmarks.fit_gate` and the tables of the documentation read these files.
+An interrupted run resumes with the next place.
 """
 
 import argparse
 import copy
 import csv
 import os
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -22,8 +25,8 @@ import h5py
 import numpy as np
 import pycolmap
 import torch
-from false_accepts_tables import RESHAPED, add_places, levels, own_table, plot, table
 
+from benchmarks.rows import RESULTS, how
 from hloc_reduce import extract_features, localize_inloc, maps, projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
@@ -32,14 +35,14 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import intrinsics, mirrored, query
-from hloc_reduce.localization.confidence import DEFAULT_GATE, Gate
+from hloc_reduce.localization.gate import ALTERNATIVES, DEFAULT_GATE, STRICT, Gate
+from hloc_reduce.localization.measures import Alternative, Measures, Uncertainty
 from hloc_reduce.localization.query import merged
 from hloc_reduce.localization.references import Reference, ScanMap, SfmMap
 from hloc_reduce.localize_sfm import RANSAC_THRESH
 from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
-from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import FLOATS, restore, store
 from hloc_reduce.utils.feature_files import (
     get_blur,
@@ -49,22 +52,74 @@ from hloc_reduce.utils.feature_files import (
 )
 from hloc_reduce.utils.files import replacing, write_csv
 from hloc_reduce.utils.h5 import open_file, open_h5
-from hloc_reduce.utils.images import read_image
+from hloc_reduce.utils.images import list_images, read_image
+from hloc_reduce.utils.progress import progress
 
+TRIALS = RESULTS / "trials"
 MAP_FEATURES = {"colmap_sift": "colmap_sift_sv64"}  # of a base; default: the base itself
 EVERY = 3
+LEAST = 5.0  # confidence of poses whose mirror images are tried
 ALTERED = ("blurred", "mirrored", "black", "noise")
+# whose intrinsics are not those of the place
+RESHAPED = ("cropped", "squeezed", "zoomed", "warped")
 BLUR = 6.0  # standard deviation in pixels
 CROPPED, SQUEEZED = 0.7, 0.75  # share of width and height, share of the height
+WARPED = 0.06  # share of the size by which corners move
 OFF = 1.15  # factor of a wrong focal length
 # a pose is true within metres, or a share of the extent of the cameras, and degrees
 TRUE_METRES, TRUE_EXTENT, TRUE_DEGREES = 0.25, 0.01, 2.0
 # a pose that is not true is near within this share of the scene's depth and these degrees
 NEAR, NEAR_DEGREES = 0.1, 5.0
-COLUMNS = (
-    *("feature", "map", "place", "photo", "kind", "intrinsics", "matches", "inliers", "confidence"),
-    *("agreement", "refusal", "position_error", "rotation_error_deg", "outcome"),
+LABELS = (
+    *("feature", "matcher", "dim", "blur", "map", "place", "photo", "kind", "intrinsics", "commit"),
+    *("outcome", "position_error", "rotation_error_deg"),
 )
+NUMBERS = (
+    *("num_matches", "num_inliers", "confidence", "agreement", "degrees_of_freedom"),
+    *("may_be_cropped", "longer_side", "is_focal_length_free", "focal_length"),
+    *("given_focal_length", "off_centre", "off_centre_swapped", "mirror_image"),
+)
+PRECISIONS = "uncertainty", "uncropped"
+COLUMNS = (
+    *LABELS,
+    *NUMBERS,
+    *("focal_range_min", "focal_range_max"),
+    *(f"{name}_{part}" for name in PRECISIONS for part in Uncertainty._fields),
+    *(f"{kind}_{part}" for kind in ALTERNATIVES for part in Alternative._fields),
+)
+DIGITS = 5
+
+
+def to_row(measures: Measures) -> dict:
+    """Return measures as columns; those that were not measured are absent."""
+    row = {name: getattr(measures, name) for name in NUMBERS}
+    row["focal_range_min"], row["focal_range_max"] = measures.focal_range
+    named = {name: getattr(measures, name) for name in PRECISIONS} | dict(measures.alternatives)
+    row |= {
+        f"{name}_{part}": value for name in named for part, value in named[name]._asdict().items()
+    }
+    return {
+        key: f"{value:.{DIGITS}g}" if isinstance(value, float) else value
+        for key, value in row.items()
+        if value is not None
+    }
+
+
+def of_row(row: dict[str, str]) -> Measures:
+    """Return the measures in the columns of a row of a CSV file."""
+    numbers = {name: float(row[name]) for name in NUMBERS if row[name] not in ("", "True", "False")}
+    flags = {name: row[name] == "True" for name in NUMBERS if row[name] in ("True", "False")}
+    precisions = {
+        name: Uncertainty(*(float(row[f"{name}_{part}"]) for part in Uncertainty._fields))
+        for name in PRECISIONS
+    }
+    alternatives = {
+        kind: Alternative(*(float(row[f"{kind}_{part}"]) for part in Alternative._fields))
+        for kind in ALTERNATIVES
+        if row[f"{kind}_ratio"]
+    }
+    range_ = float(row["focal_range_min"]), float(row["focal_range_max"])
+    return Measures(**numbers, **flags, **precisions, focal_range=range_, alternatives=alternatives)
 
 
 @dataclass
@@ -164,48 +219,55 @@ def _extract(images: Path, output: Path, names: list[str], base: str) -> Path:
     return extract_features.main(conf, images, output, image_list=sorted(set(names)))
 
 
+def altered(kind: str, photo: np.ndarray, seed: int) -> np.ndarray:
+    """Return an altered version of a photo (H, W, 3)."""
+    height, width = photo.shape[:2]
+    if kind == "blurred":
+        return cv2.GaussianBlur(photo, (0, 0), BLUR)
+    if kind == "mirrored":
+        return photo[:, ::-1]
+    if kind == "black":
+        return np.zeros_like(photo)
+    if kind == "noise":
+        return np.random.default_rng(seed).integers(0, 256, photo.shape, np.uint8)
+    if kind == "squeezed":
+        return cv2.resize(photo, None, fx=1, fy=SQUEEZED, interpolation=cv2.INTER_AREA)
+    if kind == "warped":  # as a print that is photographed aslant
+        corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
+        moved = corners + WARPED * np.float32(
+            [[width, height / 2], [0, 0], [-width / 3, 0], [width / 5, -height]]
+        )
+        homography = cv2.getPerspectiveTransform(corners, moved.astype(np.float32))
+        return cv2.warpPerspective(photo, homography, (width, height))
+    assert kind in ("cropped", "zoomed")
+    part = photo[int((1 - CROPPED) * height) :, : int(CROPPED * width)]
+    return part if kind == "cropped" else cv2.resize(part, (width, height))
+
+
 def alter(
     place: Place, output: Path, seed: int
 ) -> list[tuple[str, pycolmap.Camera | None, pycolmap.Rigid3d | None]]:
     """Write altered photos of a place's queries, and extract their features.
 
     Returns:
-        Names; intrinsics, None for cropped and squeezed photos; and true poses, None if unknown.
+        Names; intrinsics, None for photos of another shape; and true poses, None if unknown.
     """
-    noise = np.random.default_rng(seed)
-    altered = []
+    written = []
     for i, (name, camera, truth) in enumerate(place.queries):
-        kind = ALTERED[i % 2] if i > 1 else ALTERED[2 + i]
         photo = read_image(place.images / name)
-        height, width = photo.shape[:2]
-        cut, kept = int((1 - CROPPED) * height), int(CROPPED * width)
-        views = {
-            "blurred": lambda photo=photo: cv2.GaussianBlur(photo, (0, 0), BLUR),
-            "mirrored": lambda photo=photo: photo[:, ::-1],
-            "black": lambda photo=photo: np.zeros_like(photo),
-            "noise": lambda photo=photo: noise.integers(0, 256, photo.shape, np.uint8),
-            "cropped": lambda photo=photo, cut=cut, kept=kept: photo[cut:, :kept],
-            "squeezed": lambda photo=photo: cv2.resize(
-                photo, None, fx=1, fy=SQUEEZED, interpolation=cv2.INTER_AREA
-            ),
-        }
-        for view in (kind, *RESHAPED):
-            path = output / "altered" / view / Path(name).with_suffix(".png")
+        for kind in (ALTERED[i % 2] if i > 1 else ALTERED[2 + i], *RESHAPED):
+            path = output / "altered" / kind / Path(name).with_suffix(".png")
             if not path.exists():
+                encoded = cv2.imencode(".png", altered(kind, photo, seed + i)[..., ::-1])[1]
                 with replacing(path) as temporary:
-                    encoded = cv2.imencode(".png", views[view]()[..., ::-1])[1]
                     temporary.write_bytes(encoded.tobytes())
             named = path.relative_to(output / "altered").as_posix()
-            here = truth if view in ("blurred", *RESHAPED) else None
-            altered.append((named, None if view in RESHAPED else camera, here))
-    names = [name for name, _, _ in altered]
-    extract_features.main(
-        features_confs.confs[place.base],
-        output / "altered",
-        image_list=names,
-        feature_path=output / "altered.h5",
-    )
-    return altered
+            known = truth if kind in ("blurred", *RESHAPED) else None
+            written.append((named, None if kind in RESHAPED else camera, known))
+    names = [name for name, _, _ in written]
+    conf, features = features_confs.confs[place.base], output / "altered.h5"
+    extract_features.main(conf, output / "altered", image_list=names, feature_path=features)
+    return written
 
 
 class Described:
@@ -272,13 +334,17 @@ def run(
     for name, descriptors in described.items():
         ids, _ = place.reference.lift(name, np.arange(len(descriptors)))
         shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
-    gate = DEFAULT_GATE.of_matches(model, described[place.names[0]].shape[1])
+    dim = described[place.names[0]].shape[1]
+    gate = DEFAULT_GATE.of_matches(model, dim)
+    strict = (ratio_threshold or 1) <= STRICT
+    labels = {"feature": feature, "matcher": "ratio" if strict else "mutual", "dim": dim}
+    labels["commit"] = how()["commit"]
 
-    def match(path: Path, name: str) -> tuple[np.ndarray, dict, Gate]:
+    def match(path: Path, name: str) -> tuple[np.ndarray, dict, float]:
         with open_h5(path) as file:
             query = describe(file, name, is_query=True)
             keypoints = get_colmap_keypoints(file, name)[0]
-            its_gate = gate.of_photo(get_blur(file, name))
+            blur = get_blur(file, name)
         matches = {}
         for other in place.names:
             rows_of = shown[other]
@@ -286,28 +352,27 @@ def run(
             matched = torch.nonzero(found >= 0)[:, 0]
             matched = matched[cosine[matched].argsort(descending=True)]
             matches[other] = torch.stack([found[matched], rows_of[matched]], 1).numpy()
-        return keypoints, matches, its_gate
+        return keypoints, matches, blur
 
-    for source, name, camera, truth, path, kind in tried:
+    for source, name, camera, truth, path, kind in progress(tried, place.name, "photo"):
         images = source.images if path == source.features else output / "altered"
         with open_h5(path) as file:
             size = get_image_size(file, name)
-        matched, flipped = match(path, name), None
+        (*matched, blur), flipped = match(path, name), None
         known = ("given", "off", "guess") if kind == "own" else ("given", "guess")
         for given in known if camera else ("guess",):
             its_camera, refinement = intrinsics_of(camera, size, given, place.cameras)
-            row = localize(place, matched, its_camera, refinement)
-            found = row["agreement"], row["confidence"]
-            if not row["refusal"] and mirrored.is_doubtful(*found):
-                flipped = flipped or match(*mirror(images, output, name, place.base))
-                its_camera = mirrored.mirror(its_camera)
-                other_row = localize(place, flipped, its_camera, refinement, thorough=False)
-                values = row["confidence"], other_row["confidence"]
-                row["refusal"] = mirrored.refusal(*values, gate) or ""
-            cam_from_world = row.pop("cam_from_world")
-            row |= outcome(place, row, cam_from_world, truth)
-            first = {"feature": feature, "map": place.name, "place": source.name}
-            rows.append(first | {"photo": name, "kind": kind, "intrinsics": given} | row)
+            pose, info = localize(place, *matched, its_camera, refinement, gate)
+            measures = info["measures"]
+            if measures.num_inliers >= gate.min_inliers and measures.confidence >= LEAST:
+                flipped = flipped or match(*mirror(images, output, name, place.base))[:2]
+                refinement = mirrored.mirror_options(refinement)
+                other_camera = mirrored.mirror(its_camera)
+                _, other = localize(place, *flipped, other_camera, refinement, gate, False)
+                measures = replace(measures, mirror_image=other["confidence"])
+            row = labels | {"blur": blur, "map": place.name, "place": source.name, "photo": name}
+            row |= {"kind": kind, "intrinsics": given, **outcome(place, info, pose, truth)}
+            rows.append(row | to_row(measures))
     return rows
 
 
@@ -347,41 +412,33 @@ def intrinsics_of(
 
 def localize(
     place: Place,
-    matched: tuple[np.ndarray, dict, Gate],
+    keypoints: np.ndarray,
+    matches: dict,
     camera: pycolmap.Camera,
     refinement: dict,
+    gate: Gate,
     thorough: bool = True,
-) -> dict:
-    """Localize a query, given its keypoints, matches and gate; its intrinsics may be refined."""
-    keypoints, matches, gate = matched
+) -> tuple[pycolmap.Rigid3d | None, dict]:
+    """Localize a query, given its keypoints and matches; its intrinsics may be refined."""
     config = merged(query.ransac_options(RANSAC_THRESH, camera), refinement)
-    options = config, gate, thorough
-    cam_from_world, info = query.localize(place.reference, keypoints, camera, matches, *options)
-    depths = [np.nan]
-    if cam_from_world is not None and info["inliers"].any():
-        points = info["points3D"][info["inliers"]]
-        depths = (points @ cam_from_world.rotation.matrix().T + cam_from_world.translation)[:, 2]
-    return {
-        "matches": info["num_correspondences"],
-        "inliers": info["num_inliers"],
-        "confidence": info["confidence"],
-        "agreement": info["agreement"],
-        "refusal": info["reason"] or "",
-        "cam_from_world": cam_from_world,
-        "depth": float(np.median(depths)),
-    }
+    return query.localize(place.reference, keypoints, camera, matches, config, gate, thorough)
 
 
 def outcome(
-    place: Place, row: dict, cam_from_world: pycolmap.Rigid3d | None, truth: pycolmap.Rigid3d | None
+    place: Place,
+    info: dict,
+    cam_from_world: pycolmap.Rigid3d | None,
+    truth: pycolmap.Rigid3d | None,
 ) -> dict:
     """Return the errors of a pose, and whether it is true, near, wrong or none."""
-    depth = row.pop("depth")
     if cam_from_world is None:
-        return {"position_error": "", "rotation_error_deg": "", "outcome": "none"}
+        return {"outcome": "none"}
     if truth is None:
-        return {"position_error": "", "rotation_error_deg": "", "outcome": "wrong"}
+        return {"outcome": "wrong"}
     distance, degrees = pose_error(cam_from_world, truth)
+    points = info["points3D"][info["inliers"]]
+    depths = points @ cam_from_world.rotation.matrix().T[:, 2] + cam_from_world.translation[2]
+    depth = float(np.median(depths)) if len(depths) else np.nan
     limit = max(TRUE_EXTENT * place.extent, TRUE_METRES if place.metric else 0)
     if distance <= limit and degrees <= TRUE_DEGREES:
         found = "true"
@@ -389,7 +446,8 @@ def outcome(
         found = "near"
     else:
         found = "wrong"
-    return {"position_error": distance, "rotation_error_deg": degrees, "outcome": found}
+    errors = {"position_error": f"{distance / depth:.4g}", "rotation_error_deg": f"{degrees:.4g}"}
+    return {"outcome": found, **errors}
 
 
 def _main() -> None:
@@ -398,62 +456,79 @@ def _main() -> None:
         "--map scenes/fox/images:scenes/fox/sparse "
         "--map scenes/cyprus/images:scenes/cyprus/sparse --feature colmap_sift_sv64",
     )
-    add_places(parser)
+    parser.add_argument(
+        "--map", action="append", default=[], metavar="IMAGES:MODEL", help="may be repeated"
+    )
+    parser.add_argument(
+        "--same",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar="PLACE",
+        help="places that see each other, whose photos are not tried as wrong ones",
+    )
     parser.add_argument(
         "--dataset", type=Path, action="append", default=[], help="in Aachen's or InLoc's layout"
     )
     parser.add_argument(
-        "--feature",
-        nargs="+",
-        default=list(MAP_FEATURES.values()),
-        help="features of one base, NAME or NAME:STORAGE",
+        "--strangers",
+        type=Path,
+        action="append",
+        default=[],
+        help="folder of photos of other places, which are tried as wrong ones",
     )
+    parser.add_argument("--feature", default="colmap_sift_sv64", help="NAME or NAME:STORAGE")
     parser.add_argument(
         "--matcher",
-        help=f"one of {', '.join(matchers_confs.confs)} (default: the features')",
+        help=f"one of {', '.join(matchers_confs.confs)} (default: the feature's)",
     )
-    parser.add_argument("--trials", type=int, default=85, help="photos of other places, per map")
+    parser.add_argument("--trials", type=int, default=40, help="photos of other places, per map")
     parser.add_argument(
         "--seed", type=int, default=0, help="seed of the maps and of the drawn photos"
     )
-    parser.add_argument("--output", type=Path, default=Path("outputs/false_accepts"))
+    parser.add_argument("--output", type=Path, default=Path("outputs/trials"))
     args = parser.parse_args()
     torch.set_num_threads(1)
-    output = args.output / f"seed{args.seed}"
-    same = [set(names) for names in args.same]
-    rows = _trials_of_all(args, output)
-    write_csv(rows, output / "trials.csv", COLUMNS)
-    print(table(sorted(rows, key=lambda row: args.feature.index(row["feature"])), same))
-    print()
-    print(own_table(rows))
-    print()
-    print(levels(rows, same))
-    plot(rows, same, output / "false_accepts.svg")
+    rows = _trials_of_all(args)
+    file = TRIALS / f"{args.feature.replace(':', '-')}-{args.seed}.csv"
+    write_csv(rows, file, COLUMNS)
+    outcomes = Counter(row["outcome"] for row in rows)
+    print(f"{len(rows):,} trials: {dict(outcomes)}. They are in {file}.")
 
 
-def _trials_of_all(args: argparse.Namespace, output: Path) -> list[dict]:
-    """Try all maps with all features, and return the rows of trials.csv."""
-    bases = {base_name(feature.partition(":")[0]) for feature in args.feature}
-    if len(bases) > 1:
-        raise InputError(f"The features have several bases: {', '.join(sorted(bases))}.")
-    options = args.seed, *bases
-    conf = features_confs.get(args.feature[0].partition(":")[0])[1]
+def _trials_of_all(args: argparse.Namespace) -> list[dict]:
+    """Try all maps, and return the rows."""
+    base, output = base_name(args.feature.partition(":")[0]), args.output / f"seed{args.seed}"
+    conf = features_confs.get(args.feature.partition(":")[0])[1]
     matcher = args.matcher or features_confs.matcher_of(conf)
     sources = [(root.name, of_dataset, (root,)) for root in args.dataset]
     sources += [(name, split, (name, *both)) for name, both in parse_maps(args.map).items()]
-    places = {name: make(*given, output / name, *options) for name, make, given in sources}
+    places = {
+        name: make(*given, output / base / name, args.seed, base) for name, make, given in sources
+    }
+    strangers = [_strangers(folder, output / base, base) for folder in args.strangers]
     rows: list[dict] = []
     for name, place in places.items():
-        others = [other for other in places.values() if other is not place]
-        for feature in args.feature:
-            file = output / name / f"trials_{feature.replace(':', '-')}_{matcher}.csv"
-            if not file.exists():
-                options = feature, args.trials, matcher, args.seed
-                write_csv(run(place, others, output / name, *options), file, COLUMNS)
-            with file.open(newline="") as opened:
-                rows += csv.DictReader(opened)
+        same = {name, *(other for group in args.same if name in group for other in group)}
+        others = [other for key, other in places.items() if key not in same] + strangers
+        folder = output / base / name
+        file = folder / f"trials_{args.feature.replace(':', '-')}_{matcher}.csv"
+        if not file.exists():
+            options = args.feature, args.trials, matcher, args.seed
+            write_csv(run(place, others, folder, *options), file, COLUMNS)
+        with file.open(newline="") as opened:
+            rows += csv.DictReader(opened)
         print(f"{name}: {len(rows):,} trials", flush=True)
     return rows
+
+
+def _strangers(folder: Path, output: Path, base: str) -> Place:
+    """Return the photos of a folder as queries that no map shows; without intrinsics."""
+    names = list_images(folder)
+    features = _extract(folder, output / "strangers" / folder.name, names, base)
+    queries = [(name, None, None) for name in names]
+    nothing = intrinsics.MapCameras({}, set())
+    return Place(folder.name, folder, queries, None, [], features, False, base, 0.0, nothing)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,14 @@
-"""Tell right poses from chance, and precise poses from uncertain ones."""
+"""What a pose of a query measures: numbers without limits, by which `gate` decides."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from math import comb, log10
-from typing import Annotated, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
 
 from ..utils.arrays import distinct
-from ..utils.cli import InputError
-from ..utils.options import HIDDEN
 from .projection import FOCAL, POSE, photo_scale, project, reprojection_errors
 
 SOLUTIONS = 4  # poses that a minimal sample may have
@@ -20,29 +19,7 @@ SAME_PLACE = 2.0
 NEIGHBORS = 8  # projections from which the density around a keypoint is estimated
 LEAST_NOISE = 0.5  # pixels, the least standard deviation of a keypoint
 INDEPENDENT = 30  # inliers with independent errors: in a bent map neighbors err alike
-FOCAL_LENGTHS = (0.3, 5.0)  # range of estimated ones, in longer sides: 11 to 180 mm on 35 mm film
-REFINED = 2.0  # factor by which a focal length from EXIF data may change
-MAX_POSITION = 0.05  # standard deviation of the position, in median depths of the inliers
-MAX_ROTATION = 2.0  # standard deviation in degrees
 MIN_MATCHES = 6  # of an image whose matches may tell whether a pose is right
-RIVAL = 0.25  # a pose is ambiguous if another one has this share of its confidence
-# or if one by other images, such as those of another floor, has this share of its inliers
-RIVAL_BY_OTHERS = 0.8
-
-# The least agreement of a pose, from a confidence on. With a ratio test, wrong poses at copies of
-# repeated structures have confidences of 50 to 300. Below, there are few matches, so that the
-# agreement is less certain; above, there are many more right poses in noisy scans.
-Steps = tuple[tuple[float, float], ...]
-AGREEMENT: Steps = ((0, 0.3),)  # of matches without a strict ratio test
-AGREEMENT_NOISY: Steps = ((0, 0.17),)  # the same for photos whose noise was reduced
-STRICT = 0.8  # the largest ratio of a strict test
-AGREEMENT_RATIO: Steps = ((0, 0.76), (50, 0.86), (300, 0.76))  # with a strict ratio test
-FEW = 32  # dimensions
-AGREEMENT_FEW: Steps = ((0, 0.55), (50, 0.72), (300, 0.55))  # the same for fewer dimensions
-# The largest share of its confidence that the mirror image of a right pose may have. On symmetric
-# facades networks, which match without a ratio test, have up to 0.73; of mirrored photos of a
-# castle, localized 90 degrees off by matches with a strict one, seven have 0.47 to 0.97.
-MIRRORED, MIRRORED_RATIO = 0.8, 0.4
 
 
 def confidence(
@@ -153,16 +130,17 @@ class Uncertainty(NamedTuple):
     focal_length: float
 
 
-def uncertainty(
+UNDETERMINED = Uncertainty(np.inf, np.inf, np.inf)
+
+
+def covariance(
     points2D: np.ndarray,
     points3D: np.ndarray,
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
     degrees_of_freedom: int = POSE,
-) -> Uncertainty:
-    """Estimate how precisely inliers determine a pose, to first order from their errors.
-
-    More than INDEPENDENT inliers do not make the pose more precise.
+) -> np.ndarray | None:
+    """Return the covariance of a pose that inliers determine, to first order from their errors.
 
     Args:
         points2D: (M, 2) image points of the inliers, COLMAP's pixels.
@@ -170,11 +148,15 @@ def uncertainty(
         cam_from_world: the pose.
         camera: intrinsics.
         degrees_of_freedom: the number of unknown parameters, see `projection`.
+
+    Returns:
+        (F, F) float64 of the unknown parameters: the rotation about the camera's axes in radians,
+        the translation along them in units of the inliers' median depth, the focal length as its
+        logarithm, and so on. None if the inliers do not determine them.
     """
-    nothing = Uncertainty(np.inf, np.inf, np.inf)
     equations, unknowns = 2 * len(points2D), degrees_of_freedom
     if equations <= unknowns:
-        return nothing
+        return None
     local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
     _, derivatives = project(local / np.median(local[:, 2]))
     jacobian = camera.mean_focal_length() * np.concatenate(derivatives, axis=1)
@@ -183,30 +165,54 @@ def uncertainty(
     measured = (errors**2).sum() / (equations - unknowns)
     noise = max((LEAST_NOISE * photo_scale(camera)) ** 2, measured)
     try:
-        variance = noise * np.diag(np.linalg.inv(jacobian.T @ jacobian))
+        found = noise * np.linalg.inv(jacobian.T @ jacobian)
     except np.linalg.LinAlgError:
-        return nothing
-    if not (variance > 0).all():
-        return nothing
-    bent = max(1, len(points2D) / INDEPENDENT)
+        return None
+    return found if (np.diag(found) > 0).all() else None
+
+
+def covariance_of_pose(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    cam_from_world: pycolmap.Rigid3d,
+    camera: pycolmap.Camera,
+    degrees_of_freedom: int = POSE,
+) -> np.ndarray | None:
+    """Return the covariance (6, 6) of a pose, or None; arguments as of `covariance`.
+
+    It is that of a small motion of the camera: of the rotation about its axes in radians, then of
+    the translation along them, in the units of the map. Unknown intrinsics are allowed for. The
+    inliers are taken to be independent, and the map to be exact.
+    """
+    found = covariance(points2D, points3D, cam_from_world, camera, degrees_of_freedom)
+    if found is None:
+        return None
+    local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
+    unit = np.array([1, 1, 1, *3 * [np.median(local[:, 2])]])
+    return found[:POSE, :POSE] * np.outer(unit, unit)
+
+
+def uncertainty(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    cam_from_world: pycolmap.Rigid3d,
+    camera: pycolmap.Camera,
+    degrees_of_freedom: int = POSE,
+) -> Uncertainty:
+    """Estimate how precisely inliers determine a pose; arguments as of `covariance`.
+
+    More than INDEPENDENT inliers do not make the pose more precise.
+    """
+    found = covariance(points2D, points3D, cam_from_world, camera, degrees_of_freedom)
+    if found is None:
+        return UNDETERMINED
+    variance, bent = np.diag(found), max(1, len(points2D) / INDEPENDENT)
     rotation, position, focal_length = variance[:3], variance[3:POSE], variance[POSE:FOCAL]
     return Uncertainty(
         position=float(np.sqrt(bent * position.sum())),
         rotation=float(np.degrees(np.sqrt(bent * rotation.sum()))),
         focal_length=float(np.sqrt(focal_length.sum())),
     )
-
-
-def focal_lengths(camera: pycolmap.Camera, guessed: bool) -> tuple[float, float]:
-    """Return the range of plausible focal lengths in pixels.
-
-    Args:
-        camera: intrinsics before the estimation.
-        guessed: their focal length is unknown rather than approximate.
-    """
-    size, given = max(camera.width, camera.height), camera.mean_focal_length()
-    low, high = FOCAL_LENGTHS
-    return (low * size, high * size) if guessed else (given / REFINED, given * REFINED)
 
 
 def agreement(inliers: np.ndarray, images: list[np.ndarray]) -> float:
@@ -231,71 +237,85 @@ def agreement(inliers: np.ndarray, images: list[np.ndarray]) -> float:
     return float(max((rate + 0.5 / number - deviation) / (1 + 1 / number), default=0.0))
 
 
-@dataclass(frozen=True)
-class Gate:
-    """What a pose must have for the query to be called localized.
+class Alternative(NamedTuple):
+    """Another pose of the same query, as one that fits with other intrinsics, or other matches.
 
     Args:
-        min_confidence: minimum confidence of a localized query: -log10 of the number of poses with
-            as many inliers that are expected by chance.
-        min_inliers: minimum number of RANSAC's inliers of a localized query.
-        min_agreement: pairs, in ascending order, of a confidence and the minimum `agreement` of
-            poses with at least this confidence; default: by the matches, see `of_matches`.
-        min_agreement_noisy: the same for photos whose noise was reduced.
-        max_mirrored: the maximum confidence of the mirror image, as a share of its own; default: by
-            the matches.
-
-    Raises:
-        InputError: for a confidence that is not finite, or a negative number of inliers or share.
+        ratio: its confidence as a multiple of that of the pose; of a pose by other images, the
+            numbers of inliers instead.
+        position: how far both positions differ, in units of the inliers' median depth.
+        rotation: how far both rotations differ, in degrees.
+        detail: what messages name: its focal length in pixels, or its number of inliers.
     """
 
-    min_confidence: float = 8.0
-    min_inliers: int = 8
-    min_agreement: Steps | None = None
-    min_agreement_noisy: Steps | None = None
-    max_mirrored: Annotated[float, HIDDEN] | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.min_confidence < np.inf:
-            raise InputError(
-                f"min_confidence is {self.min_confidence}: it must be finite and at least 0."
-            )
-        if self.min_inliers < 0:
-            raise InputError(f"min_inliers is {self.min_inliers}: at least 0.")
-        if self.max_mirrored is not None and not self.max_mirrored >= 0:
-            raise InputError(f"max_mirrored is {self.max_mirrored}: at least 0.")
-
-    def of_matches(self, matcher: dict, dim: int) -> "Gate":
-        """Return the gate for a matcher and descriptors.
-
-        Args:
-            matcher: configuration of the matcher's model.
-            dim: dimension of the descriptors.
-        """
-        is_strict = (matcher.get("ratio_threshold") or 1) <= STRICT
-        gate = self
-        if self.max_mirrored is None:
-            gate = replace(gate, max_mirrored=MIRRORED_RATIO if is_strict else MIRRORED)
-        if self.min_agreement is not None:
-            return gate
-        if not is_strict:
-            return replace(gate, min_agreement=AGREEMENT, min_agreement_noisy=AGREEMENT_NOISY)
-        return replace(gate, min_agreement=AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO)
-
-    def of_photo(self, blur: float) -> "Gate":
-        """Return the gate for a photo whose noise was reduced by a blur in pixels, 0 for none."""
-        noisy = self.min_agreement_noisy
-        return replace(self, min_agreement=noisy) if blur > 0 and noisy else self
-
-    def is_mirrored(self, confidence: float, of_mirror_image: float) -> bool:
-        """Tell from the confidences of a pose and of its mirror image whether neither is sure."""
-        most = MIRRORED if self.max_mirrored is None else self.max_mirrored
-        return of_mirror_image > most * confidence
-
-    def least_agreement(self, confidence: float) -> float:
-        """Return the least agreement of a pose with a confidence."""
-        steps = self.min_agreement or AGREEMENT
-        return next((least for start, least in reversed(steps) if confidence >= start), 0.0)
+    ratio: float
+    position: float = 0.0
+    rotation: float = 0.0
+    detail: float = 0.0
 
 
-DEFAULT_GATE = Gate()
+@dataclass(frozen=True)
+class Measures:
+    """All that is measured of a pose, by which `gate` decides whether to trust it.
+
+    Args:
+        num_matches: number of different 2D-3D matches.
+        num_inliers: number of RANSAC's inliers.
+        confidence: see `confidence`; minus infinity without a pose.
+        agreement: see `agreement`.
+        uncertainty: see `uncertainty`, with the degrees of freedom of the estimation.
+        uncropped: the same with all intrinsics unknown, as those of a photo that was cropped.
+        degrees_of_freedom: of the estimation, see `projection`.
+        may_be_cropped: whether the photo may have been cropped.
+        longer_side: of the photo, in pixels.
+        is_focal_length_free: whether the focal length was estimated or refined.
+        focal_length: that of the pose, in pixels.
+        given_focal_length: that of the intrinsics before the estimation, in pixels.
+        focal_range: the least and the largest plausible one, in pixels.
+        off_centre: how far the principal point is from the centre, as a share of the size.
+        off_centre_swapped: the same if its coordinates are swapped.
+        alternatives: other poses by kind, a key of `gate.ALTERNATIVES`: of each kind the likeliest.
+        mirror_image: confidence of the pose of the mirror image, None if that was not tried.
+    """
+
+    num_matches: int = 0
+    num_inliers: int = 0
+    confidence: float = -np.inf
+    agreement: float = 0.0
+    uncertainty: Uncertainty = UNDETERMINED
+    uncropped: Uncertainty = UNDETERMINED
+    degrees_of_freedom: int = POSE
+    may_be_cropped: bool = False
+    longer_side: int = 1
+    is_focal_length_free: bool = False
+    focal_length: float = 0.0
+    given_focal_length: float = 0.0
+    focal_range: tuple[float, float] = (0.0, np.inf)
+    off_centre: float = 0.0
+    off_centre_swapped: float = 0.0
+    alternatives: Mapping[str, Alternative] = field(default_factory=dict)
+    mirror_image: float | None = None
+
+    def to_dict(self) -> dict:
+        """Return them as JSON values, with None for infinite numbers."""
+        return _finite(asdict(self))
+
+    @classmethod
+    def from_dict(cls, values: Mapping) -> "Measures":
+        """Return the measures of `to_dict`."""
+        known = dict(values)
+        for key in ("uncertainty", "uncropped"):
+            known[key] = Uncertainty(*(np.inf if one is None else one for one in known[key]))
+        known["confidence"] = -np.inf if known["confidence"] is None else known["confidence"]
+        known["focal_range"] = tuple(known["focal_range"])
+        others = known["alternatives"].items()
+        return cls(**{**known, "alternatives": {kind: Alternative(*one) for kind, one in others}})
+
+
+def _finite(value: Any) -> Any:
+    """Replace numbers that JSON does not have by None, and tuples by lists."""
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
