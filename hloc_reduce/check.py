@@ -4,12 +4,13 @@ The more is given, the more is checked: by the model alone how photos share poin
 its database how matches fit the poses; by the photos their sizes and EXIF data.
 """
 
-import json
 from collections.abc import Collection, Iterable
 from contextlib import suppress
 from functools import cache
+from json import dumps
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated
 
 import pycolmap
 
@@ -23,10 +24,11 @@ from .mapping.registration import Registration
 from .maps.by_others import ByOthers
 from .maps.map import RETRIEVAL
 from .reduce import Reduction
-from .utils import cli, colmap
+from .utils import cli, colmap, options
 from .utils.cli import InputError
 from .utils.colmap import StoredDatabase
 from .utils.files import replacing
+from .utils.options import Option
 from .utils.paths import strings_as_paths
 
 FEATURE = "colmap_sift"  # whose descriptors are in databases
@@ -43,14 +45,18 @@ TOLD_BY = {
 
 @strings_as_paths
 def main(
-    model: Path, database: Path | None = None, images: Path | None = None
+    model: Annotated[Path, Option(flags=("model",))],
+    database: Path | None = None,
+    images: Path | None = None,
+    json: Annotated[Path, Option(metavar="FILE")] | None = None,
 ) -> tuple[list[Finding], dict[str, set[str]]]:
     """Check a COLMAP model.
 
     Args:
-        model: folder of the model, with points.
+        model: folder of a COLMAP model, with points.
         database: COLMAP database that it was made from.
         images: folder of its photos.
+        json: file to write the findings to.
 
     Returns:
         What was found; and from the kinds of checks that were not possible to what these lack.
@@ -58,6 +64,24 @@ def main(
     Raises:
         InputError: if something is missing or broken, or the database is of another model.
     """
+    if json is not None:
+        cli.check_file(json, "a file for the findings")
+    found, lacking = _check(model, database, images)
+    if json is not None:
+        write(found, json)
+    return found, lacking
+
+
+def write(findings: Iterable[Finding], path: Path) -> None:
+    """Write findings into a JSON file."""
+    content = [one.to_json() | {"text": one.message} for one in findings]
+    with replacing(path) as temporary:
+        temporary.write_text(dumps(content, indent=2, allow_nan=False))
+
+
+def _check(
+    model: Path, database: Path | None, images: Path | None
+) -> tuple[list[Finding], dict[str, set[str]]]:
     reference = colmap.read_model(model)
     if not reference.num_points3D():
         raise InputError(f"The model {model} has no points: give one that COLMAP reconstructed.")
@@ -156,20 +180,8 @@ def report(findings: list[Finding], lacking: dict[str, set[str]]) -> str:
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "sparse/0 --database database.db --images photos")
-    parser.add_argument("model", type=Path, help="folder of a COLMAP model, with points")
-    parser.add_argument("--database", type=Path, help="COLMAP database that it was made from")
-    parser.add_argument("--images", type=Path, help="folder of its photos")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the findings, too")
-    args = parser.parse_args()
-    if args.json is not None:
-        cli.check_file(args.json, "a file for the findings")
-    findings, lacking = main(args.model, args.database, args.images)
-    if args.json is not None:
-        content = [one.to_json() | {"text": one.message} for one in findings]
-        with replacing(args.json) as temporary:
-            temporary.write_text(json.dumps(content, indent=2, allow_nan=False))
-    print(report(findings, lacking))
+    example = "sparse/0 --database database.db --images photos"
+    print(report(*options.call(main, __doc__, example)))
 
 
 if __name__ == "__main__":
