@@ -51,7 +51,6 @@ def read_records(path: Path) -> dict[str, dict]:
             for record in records.values():
                 record["localized"] = bool(record["localized"])
                 pose_of(record)
-                measures_of(record)
             return records
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         pass

@@ -39,7 +39,7 @@ class Command:
     """The options of the command line.
 
     Args:
-        descriptor: base descriptors.
+        descriptor: base descriptors, for PhotoTour of patches only.
         base: YAML file of a feature of any extractor, hloc's included, to project instead.
         scheme: schemes.
         dim: output dimensions; not for nested, raw.
@@ -52,7 +52,7 @@ class Command:
         seed: seed of everything random.
     """
 
-    descriptor: Annotated[Sequence[str], Option("descriptor", features_confs.BASES)] = ("sift",)
+    descriptor: Annotated[Sequence[str], Option(note=", ".join(features_confs.BASES))] = ("sift",)
     base: Annotated[Path, Option(metavar="FILE")] | None = None
     scheme: Annotated[
         Sequence[str],

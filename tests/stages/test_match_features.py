@@ -8,7 +8,8 @@ import torch
 from command import refused
 from small_map import MATCHER
 
-from hloc_reduce import match_features, matchers, pairs_from_retrieval
+from hloc_reduce import match_features, pairs_from_retrieval
+from hloc_reduce.matchers.base import Matcher
 from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
 from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.utils import best_two
@@ -180,7 +181,7 @@ def test_codes_stay_codes_in_memory(coded):
 
 
 def test_only_matchers_that_take_codes_get_them(coded):
-    class Nearest(matchers.Matcher):
+    class Nearest(Matcher):
         def _forward(self, data):
             assert all(data[f"descriptors{i}"].dtype == torch.float32 for i in (0, 1))
             number = data["descriptors0"].shape[2]
