@@ -16,7 +16,7 @@ STAGES = "stages"  # the modules at the top level of hloc_reduce
 # the lowest first
 ROOMS = (
     *("utils", "runtime", "detectors", "descriptors", "networks", "projections"),
-    *("extractors", "retrieval", "aggregators", "matchers", "confs", "datasets", "localization"),
+    *("extractors", "retrieval", "matchers", "confs", "datasets", "localization"),
     *(
         "mapping",
         STAGES,

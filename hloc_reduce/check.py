@@ -16,13 +16,13 @@ import pycolmap
 
 from . import aggregate_features, from_colmap
 from .confs import features as features_confs
+from .confs import retrieval as retrieval_confs
 from .mapping.checks import CHECKS, Inputs, Localize, run
 from .mapping.checks.focal_lengths import are_alike
 from .mapping.findings import Finding
 from .mapping.plausibility import focal_length_spread
 from .mapping.registration import Registration
 from .maps.by_others import ByOthers
-from .maps.map import RETRIEVAL
 from .reduce import Reduction
 from .utils import cli, colmap, options
 from .utils.cli import InputError
@@ -157,9 +157,11 @@ def _by_others(
     def prepared() -> ByOthers:
         features = folder / f"{conf['output']}.h5"
         from_colmap.write(database, features, reduction, names, {})
-        descriptors = aggregate_features.main(RETRIEVAL, features, names)
+        vlad = retrieval_confs.get(retrieval_confs.VLAD)
+        descriptors = aggregate_features.main(vlad, features, names)
         matcher = features_confs.matcher_of(conf)
-        return ByOthers(*(model, conf, matcher, images, features, descriptors, folder / "mirrored"))
+        mirrored = folder / "mirrored"
+        return ByOthers(model, conf, matcher, images, features, descriptors, mirrored, vlad)
 
     def localize(names: Collection[str], by: Collection[str], mirrored: bool) -> dict[str, dict]:
         return prepared()(names, by, mirrored)

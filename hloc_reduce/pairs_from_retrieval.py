@@ -3,20 +3,14 @@
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import numpy as np
-
 from . import logger
+from .retrieval.ranking import block, rank_file, read_global
 from .utils import cli, colmap, options
 from .utils.cli import InputError
-from .utils.h5 import get_array, list_h5_names, open_h5
+from .utils.h5 import list_h5_names
 from .utils.parsers import check_names, image_names, parse_retrieval, write_pairs
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
-
-# global descriptors of queries, and of database images, in memory at once: at most this many rows
-# and bytes
-BLOCK, BLOCK_BYTES = 2**14, 2**28
-QUERIES = 1024  # rows of the similarity matrix in memory at once
 
 
 @strings_as_paths
@@ -59,14 +53,14 @@ def main(
         db_list = [image.name for image in colmap.read_model(db_model).images.values()]
     query_names = _select(descriptors, query_prefix, query_list)
     db_names = _select(db_descriptors, db_prefix, db_list)
-    size = max(1, min(BLOCK, BLOCK_BYTES // read_global(descriptors, query_names[:1]).nbytes))
+    size = block(descriptors, query_names[0])
 
     def retrieve() -> Iterator[tuple[str, str]]:
         with progress(None, "Retrieving", "image", len(query_names)) as shown:
             for start in range(0, len(query_names), size):
                 names = query_names[start : start + size]
                 queries = read_global(descriptors, names)
-                ranking = _rank_file(queries, db_descriptors, db_names, num_matched + 1, size)
+                ranking = rank_file(queries, db_descriptors, db_names, num_matched + 1, size)
                 for name, row in zip(names, ranking, strict=True):
                     others = [db_names[j] for j in row if not same_file or db_names[j] != name]
                     yield from ((name, other) for other in others[:num_matched])
@@ -75,59 +69,6 @@ def main(
     number = write_pairs(retrieve(), output)
     logger.info("Retrieved %d pairs for %d images.", number, len(query_names))
     return output
-
-
-def similarity(queries: np.ndarray, database: np.ndarray) -> np.ndarray:
-    """Return the similarity of global descriptors.
-
-    Args:
-        queries: (Q, G) of unit norm.
-        database: (N, G) of unit norm, or zero for images without features.
-
-    Returns:
-        (Q, N) cosines, -inf for images without features.
-    """
-    found = queries @ database.T
-    found[:, ~database.any(axis=1)] = -np.inf
-    return found
-
-
-def rank(similarity: np.ndarray, num_matched: int) -> np.ndarray:
-    """Find the most similar images of a database.
-
-    Args:
-        similarity: (Q, N) of queries to the database.
-        num_matched: maximum number of images to find.
-
-    Returns:
-        (Q, num_matched) rows of the database, best first; ties keep their order.
-    """
-    return np.argsort(-similarity, axis=1, kind="stable")[:, :num_matched]
-
-
-def _rank_file(
-    queries: np.ndarray, path: Path, names: list[str], num_matched: int, size: int
-) -> np.ndarray:
-    """Rank as `rank` does, but read the database from a file, `size` images at once."""
-    rows = np.empty((len(queries), 0), np.int64)
-    cosines = np.empty((len(queries), 0), np.float32)
-    for start in range(0, len(names), size):
-        database = read_global(path, names[start : start + size])
-        if queries.shape[1] != database.shape[1]:
-            raise InputError(
-                f"Global descriptors of {queries.shape[1]} numbers cannot be compared with "
-                f"{database.shape[1]} numbers in {path}."
-            )
-        new = np.arange(start, start + len(database))
-        best = []
-        for i in range(0, len(queries), QUERIES):
-            part = slice(i, i + QUERIES)
-            values = np.hstack([cosines[part], similarity(queries[part], database)])
-            found = np.hstack([rows[part], np.broadcast_to(new, (len(values), len(new)))])
-            order = rank(values, num_matched)
-            best.append([np.take_along_axis(array, order, 1) for array in (found, values)])
-        rows, cosines = (np.concatenate(parts) for parts in zip(*best, strict=True))
-    return rows
 
 
 @strings_as_paths
@@ -188,19 +129,6 @@ def _select(
     if not selected:
         raise InputError(f"No image is selected from the global descriptors {path}.")
     return check_names(selected, path)
-
-
-def read_global(path: Path, names: list[str]) -> np.ndarray:
-    """Read the global descriptors of images (N, G) float32.
-
-    Raises:
-        InputError: when an image has none, or they differ in size.
-    """
-    with open_h5(path) as file:
-        rows = [get_array(file, name, "global_descriptor", (1,)) for name in names]
-    if len({row.shape for row in rows}) > 1:
-        raise InputError(f"The global descriptors in {path} differ in size.")
-    return np.stack(rows).astype(np.float32)
 
 
 def _main() -> None:

@@ -12,7 +12,7 @@ import pycolmap
 from . import logger
 from .mapping.checks.overlays import drop_overlays
 from .mapping.database import INFERRED_CAMERAS, import_images
-from .pairs_from_retrieval import rank, read_global, similarity
+from .retrieval.ranking import rank, read_global, similarity
 from .runtime import provenance
 from .triangulation import Pair, Verified, read_matches
 from .utils import cli, colmap, options

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 from hloc_reduce import compact, extract_features, localize_sfm, logger, maps
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINTS, KeypointSettings
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
@@ -27,9 +28,9 @@ from hloc_reduce.utils.options import Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
 from .common import changes, command
-from .common.options import Matcher, Positive
+from .common.options import Matcher, Positive, Retrieval
 from .common.queries import LISTED, Photos, Queries, identity, results_folder
-from .common.retrieval import retrieve_in_map
+from .common.retrieval import check_retrieval, retrieval_name, retrieve, retrieve_in_map
 from .common.run import Run, readable
 
 MADE_FROM = "made_from.json"  # the map and the photos of the queries
@@ -50,6 +51,7 @@ def open_map(
     accept_partial: bool = False,
     camera_mode: Annotated[str, colmap.CAMERA_MODE] | None = None,
     database: Path | None = None,
+    retrieval: Retrieval | None = None,
 ) -> Map:
     """Build a map, or open one that was built before.
 
@@ -76,6 +78,9 @@ def open_map(
         camera_mode: which photos share a camera; default: auto.
         database: COLMAP database that `map` was made from: its keypoints and descriptors make the
             map, without photos. Photos, if given, only tell more about the cameras.
+        retrieval: vlad, or netvlad, openibl, megaloc, eigenplaces or dir of an installed hloc; or,
+            for the queries only, hloc's text file of pairs or h5 file of global descriptors;
+            default: vlad.
 
     Raises:
         InputError: when an old map was built with other options, or something is missing or wrong.
@@ -83,6 +88,7 @@ def open_map(
     if camera_mode is not None and (map_images is None or model_or_map is not None):
         raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
     mode = colmap.camera_mode(camera_mode or "auto")
+    named = retrieval if retrieval in retrieval_confs.confs else None
     is_built = model_or_map and (maps.is_map(model_or_map) or maps.is_compact(model_or_map))
     if is_built and (database or map_images):
         option = "--database" if database else "--map_images"
@@ -97,6 +103,7 @@ def open_map(
         "overwrite": overwrite,
         "storage": storage or STORAGES[0],
         "keypoints": keypoints or KEYPOINTS[0],
+        "retrieval": named or retrieval_confs.VLAD,
     }
     folder = outputs / "map"
     if database is not None:
@@ -113,7 +120,7 @@ def open_map(
     built = _open(model_or_map, folder, overwrite)
     if feature or projection:
         built.check_feature(feature or features_confs.RECOMMENDED, projection)
-    given = {"storage": storage, "keypoints": keypoints, "matcher": matcher}
+    given = {"storage": storage, "keypoints": keypoints, "matcher": matcher, "retrieval": named}
     for option, value in given.items():
         if value not in (None, getattr(built, option)):
             raise InputError(
@@ -145,6 +152,7 @@ def main(
     overwrite: bool = False,
     strict: bool = False,
     gate: Gate = DEFAULT_GATE,
+    retrieval: Retrieval | None = None,
 ) -> dict:
     """Localize queries in a map and return the summary, as in summary.json.
 
@@ -159,6 +167,7 @@ def main(
         overwrite: recompute existing results.
         strict: fail at an unreadable query photo instead of recording it as not localized.
         gate: what a pose must have for the query to be called localized.
+        retrieval: hloc's text file of pairs or h5 file of global descriptors; default: the map's.
 
     Raises:
         InputError: when something is missing or wrong.
@@ -171,7 +180,14 @@ def main(
 
     photos = Photos(outputs / MADE_FROM, built, query_images, names)
     conf = {"map": built.place, **identity(outputs, query_images, queries), "num_loc": num_loc}
+    retrieval = built.retrieval if retrieval is None else retrieval
+    retrieved = f"{retrieval_name(retrieval)}{num_loc}"
+    loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
     inputs = [query_images, *([queries] if queries else [])]
+    if retrieval != built.retrieval:
+        check_retrieval(retrieval, loc_pairs, num_loc, names, map_names)
+        conf["retrieval"] = str(Path(retrieval).resolve())
+        inputs.append(Path(retrieval))
     remedy = (
         "Choose other --outputs, or replace the results, but not the map: "
         f"--map {built.folder} --overwrite."
@@ -191,12 +207,14 @@ def main(
                 queries=names,
             )
         photos.forget(failures(features))
-        loc_pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
         with run.stage("retrieval"):
-            queries_read = readable(features, names)
-            retrieve_in_map(built, features, loc_pairs, num_loc, queries_read, map_names)
+            wanted_pairs = loc_pairs, num_loc, readable(features, names), map_names, query_images
+            if retrieval == built.retrieval:
+                retrieve_in_map(built, features, *wanted_pairs)
+            else:
+                retrieve(retrieval, features, *wanted_pairs)
         matches = run.match("match_queries", loc_pairs, features, built.features)
-        poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_vlad{num_loc}.txt"
+        poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_{retrieved}.txt"
         with run.stage("localization"):
             records = localize_sfm.main(
                 built.sfm,
@@ -214,7 +232,7 @@ def main(
             )
         limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
         summary = {
-            "retrieval": "vlad",
+            "retrieval": retrieval,
             "num_loc": num_loc,
             "intrinsics": Counter(wanted.sources.values()),
             "map": str(built.folder),

@@ -20,7 +20,6 @@ from hloc_reduce.evaluation.summaries import map_bytes
 from hloc_reduce.hlm.reader import SUFFIX
 from hloc_reduce.localization.records import pose_of
 from hloc_reduce.localization.stage import read_queries
-from hloc_reduce.maps.map import RETRIEVAL
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, RunFolder
 from hloc_reduce.utils import cli, colmap
@@ -107,7 +106,7 @@ def main(
         with folder.stage("reduce"):
             reduce.main(features, small, feature, storage=storage)
         with folder.stage("compact"):
-            described = aggregate_features.main(RETRIEVAL, small, map_names)
+            described = aggregate_features.main(aggregate_features.confs["vlad"], small, map_names)
             compact.main(
                 packed,
                 sfm=sfm,

@@ -39,7 +39,7 @@ TIMEOUT = 120  # seconds
 
 context = multiprocessing.get_context("forkserver")
 # what runs import when they first need it
-MODELS = "extractors.reduced", "descriptors.sift", "matchers.nearest_neighbor", "aggregators.vlad"
+MODELS = "extractors.reduced", "descriptors.sift", "matchers.nearest_neighbor", "retrieval.vlad"
 
 
 def _start_server() -> None:

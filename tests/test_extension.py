@@ -1,4 +1,4 @@
-"""An extractor and a matcher of one file each work in the stages."""
+"""An extractor, a matcher and a retrieval of one file each work wherever those that ship do."""
 
 from pathlib import Path
 
@@ -7,20 +7,47 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from command import outcome
+from safetensors import safe_open
 
-from hloc_reduce import extract_features, extractors, match_features, matchers
+from hloc_reduce import (
+    Localizer,
+    aggregate_features,
+    compact,
+    extract_features,
+    extractors,
+    maps,
+    match_features,
+    matchers,
+    retrieval,
+)
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import retrieval as retrieval_confs
+from hloc_reduce.retrieval.ranking import read_global
+from hloc_reduce.utils import colmap
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.match_files import get_matches
 from hloc_reduce.utils.parsers import write_pairs
+from pipelines import aachen, localize
 
 TOYS = Path(__file__).parent / "toys"
+PIPELINE = localize
+
+
+THUMBNAIL = {
+    "output": "global-feats-thumbnail",
+    "model": {"name": "thumbnail"},
+    "preprocessing": {"resize_max": 256},
+}
 
 
 @pytest.fixture(autouse=True)
 def toys(monkeypatch):
     """As if their files were in the packages."""
-    for package, folder in ((extractors, "extractors"), (matchers, "matchers")):
-        monkeypatch.setattr(package, "__path__", [*package.__path__, str(TOYS / folder)])
+    for package in (extractors, matchers, retrieval):
+        folder = TOYS / package.__name__.rpartition(".")[2]
+        monkeypatch.setattr(package, "__path__", [*package.__path__, str(folder)])
+    monkeypatch.setitem(retrieval_confs.confs, "thumbnail", THUMBNAIL)
 
 
 def test_a_toy_extractor_and_a_toy_matcher(tmp_path):
@@ -79,3 +106,72 @@ def test_a_conf_of_hlocs_is_taken_word_for_word(tmp_path):
         "model": {"name": "nearest_neighbor", "do_mutual_check": True, "distance_threshold": 0.7},
     }
     assert matchers.load(conf["model"]).conf["distance_threshold"] == 0.7
+
+
+def test_a_toy_retrieval_in_a_map(place, tmp_path, run, refused):
+    """It sees images only: it needs no vocabulary, and no local descriptors."""
+    build, images, outputs = place
+    photos = images / "query/day"
+    given = (*build, "--feature", "colmap_sift_sv32", "--retrieval", "thumbnail")
+    run(*given, "--query_images", photos)
+    built = maps.Map(outputs / "map")
+    assert built.retrieval == "thumbnail" and built.vocabulary is None
+    assert built.descriptors.name == "global-feats-thumbnail_feats-dog-colmap_sift_sv32.h5"
+    assert not list(built.folder.glob("*vocabulary*"))
+    summary, rows = outcome(outputs / "queries-day")
+    assert summary["retrieval"] == "thumbnail" and summary["poses"].endswith("_thumbnail50.txt")
+    assert rows["a.png"]["status"] == "localized"
+    file = tmp_path / "place.hlm"
+    compact.main(file, outputs / "map")
+    with safe_open(file, "np") as opened:
+        assert '"retrieval": "thumbnail"' in opened.metadata()["map"]
+        assert "vocabulary" not in {*opened.keys()}
+    for path in (outputs / "map", file):
+        pose, info = Localizer(path).localize(photos / "a.png")
+        assert pose is not None and info["retrieved"][0] == rows["a.png"]["retrieved"]
+    run("--map", file, "--query_images", photos, "--outputs", tmp_path / "unpacked")
+    assert maps.Map(tmp_path / "unpacked/map").retrieval == "thumbnail"
+    _, of_file = outcome(tmp_path / "unpacked/queries-day")
+    assert of_file["a.png"]["status"] == "localized"
+    assert of_file["a.png"]["retrieved"] == rows["a.png"]["retrieved"]
+    other = ("--map", outputs / "map", "--outputs", tmp_path, "--retrieval", "vlad")
+    assert "was built with --retrieval thumbnail" in refused(*other)
+    assert "differs: retrieval" in refused(*build, "--feature", "colmap_sift_sv32")
+
+
+def test_a_map_with_a_toy_retrieval_grows(place, tmp_path, run):
+    (_, model, *_), images, outputs = place
+    names = [f"db/{i}.png" for i in range(4)]
+    part = colmap.write_part(model, set(names[:3]), tmp_path / "part")
+    run("--map", part, "--map_images", images, "--outputs", outputs, "--retrieval", "thumbnail")
+    (tmp_path / "new/db").mkdir(parents=True)
+    (tmp_path / "new" / names[3]).write_bytes((images / names[3]).read_bytes())
+    built = maps.add(maps.Map(outputs / "map"), tmp_path / "new", model)
+    assert built.names() == names and built.retrieval == "thumbnail"
+    rows = read_global(built.descriptors, names)
+    assert rows.shape == (4, 8 * 8 * 3)
+    np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, atol=1e-3)
+
+
+@pytest.mark.parametrize("is_compact", [False, True])
+def test_a_toy_retrieval_in_the_pipeline_of_aachen(aachen_layout, tmp_path, is_compact):
+    found = aachen.main(
+        *(aachen_layout, tmp_path / "outputs", "colmap_sift_sv32"),
+        retrieval="thumbnail",
+        compact=is_compact,
+    )
+    assert found["queries_localized"] == 2
+    results = tmp_path / "outputs/compact" if is_compact else tmp_path / "outputs"
+    lines = (results / "pairs-query-thumbnail50.txt").read_text().splitlines()
+    assert len(lines) == 3 * 4
+
+
+def test_a_retrieval_by_images_reads_no_local_descriptors(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+    with h5py.File(tmp_path / "features.h5", "w") as file:
+        file["a.png/keypoints"] = np.zeros((0, 2), np.float32)
+    features = tmp_path / "features.h5"
+    found = aggregate_features.main(THUMBNAIL, features, image_dir=tmp_path)
+    assert read_global(found, ["a.png"]).shape == (1, 192)
+    with pytest.raises(InputError, match="needs the images"):
+        aggregate_features.main(THUMBNAIL, features)

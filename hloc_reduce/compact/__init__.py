@@ -13,20 +13,21 @@ from typing import Annotated
 import numpy as np
 
 from .. import logger
-from ..aggregate_features import vocabulary_of
+from ..aggregate_features import output_of, vocabulary_if_any
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..confs import retrieval as retrieval_confs
 from ..hlm import points, writer
 from ..hlm.reader import SUFFIX
 from ..hlm.writer import Source
 from ..localization import intrinsics
-from ..maps.map import RETRIEVAL, Map
-from ..pairs_from_retrieval import read_global
+from ..maps.map import Map
+from ..retrieval.ranking import read_global
 from ..utils import cli, colmap
 from ..utils.cli import InputError
 from ..utils.codes import STORAGES, Storage
 from ..utils.files import MEGABYTE, replacing
-from ..utils.options import ABOVE_0
+from ..utils.options import ABOVE_0, Option
 from ..utils.paths import strings_as_paths
 
 TRIES = 12  # sizes that are tried to come close to a limit
@@ -47,6 +48,7 @@ def main(
     matcher: str | None = None,
     storage: Storage | None = None,
     max_mb: Annotated[float, ABOVE_0] | None = None,
+    retrieval: Annotated[str, Option("retrieval", retrieval_confs.confs)] | None = None,
 ) -> dict[str, int]:
     """Write a compact map.
 
@@ -55,8 +57,8 @@ def main(
         map: folder of a map of pipelines.localize; or else give the following four.
         sfm: COLMAP model, instead of `map`.
         features: feature file of its images.
-        global_descriptors: h5 file of their global descriptors, with the vocabulary beside it, from
-            aggregate_features; default: the one beside `features`.
+        global_descriptors: h5 file of their global descriptors, with the vocabulary beside it, if
+            any, from aggregate_features; default: the one beside `features`.
         feature: name of the feature of `features`, or its YAML file.
         matcher: matcher of queries; default: the map's, or the feature's, but NN-ratio90 instead of
             NN-ratio.
@@ -64,6 +66,7 @@ def main(
             uint4 for DoG features of up to 32 dimensions, uint2 for others, and float16 without
             levels.
         max_mb: size of the file in 1,000,000 bytes: points that images need least are left out.
+        retrieval: what computed `global_descriptors`; default: the map's, or vlad.
 
     Returns:
         The bytes of each part of the file.
@@ -80,11 +83,14 @@ def main(
         raise InputError("Give --map, or --sfm, --features and --feature, not both.")
     if map is not None:
         built = Map(map)
+        if retrieval not in (None, built.retrieval):
+            raise InputError(f"The map {map} was built with --retrieval {built.retrieval}.")
         features, source = built.features, _of_map(built)
     elif sfm is None or features is None or feature is None:
         raise InputError("Give --map, or --sfm, --features and --feature.")
     else:
-        source = _of_stages(sfm, features, global_descriptors, feature)
+        name = retrieval or retrieval_confs.VLAD
+        source = _of_stages(sfm, features, global_descriptors, feature, name)
     return write(output, source, features, matcher, storage, max_mb)
 
 
@@ -161,19 +167,22 @@ def _of_map(built: Map) -> Source:
         built.vocabulary,
         built.cameras,
         built.doubts,
+        built.retrieval,
     )
 
 
-def _of_stages(sfm: Path, features: Path, global_descriptors: Path | None, feature: str) -> Source:
+def _of_stages(
+    sfm: Path, features: Path, global_descriptors: Path | None, feature: str, retrieval: str
+) -> Source:
     """Return what the outputs of stages give, with the matcher of the feature."""
     name, conf = features_confs.get(feature)
-    beside = features.parent / f"{RETRIEVAL['output']}_{features.stem}.h5"
-    descriptors = global_descriptors or beside
-    vocabulary = vocabulary_of(descriptors)
+    described_by = retrieval_confs.get(retrieval)
+    descriptors = global_descriptors or output_of(described_by, features)
+    vocabulary = vocabulary_if_any(described_by, descriptors)
     model = colmap.read_model(sfm)
     cameras = intrinsics.of_cameras(image.camera for image in model.images.values())
     matcher = features_confs.matcher_of(conf)
-    return Source(model, name, conf, matcher, descriptors, vocabulary, cameras)
+    return Source(model, name, conf, matcher, descriptors, vocabulary, cameras, retrieval=retrieval)
 
 
 def _check_dim(source: Source, features: Path, dim: int) -> None:

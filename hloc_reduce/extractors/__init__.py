@@ -13,8 +13,9 @@ import torch
 
 from ..descriptors import DIM
 from ..networks.noise import reduce_noise
-from ..utils.base_model import BaseModel, dynamic_load
+from ..utils.base_model import BaseModel
 from ..utils.cli import InputError
+from ..utils.configured import dynamic_load
 from ..utils.hloc import is_installed
 from ..utils.images import in_original, resized
 

@@ -1,21 +1,15 @@
 """An extractor of an installed hloc as an extractor of this project."""
 
-import pkgutil
-
 import torch
 from torch.nn.functional import normalize
 
-from ..utils.cli import InputError, choose
-from ..utils.hloc import extractors_package
+from ..utils.cli import InputError
+from ..utils.hloc import make_extractor, reason
 from . import Extractor
 
 # keys of hloc's configurations that determine the descriptors
 DETERMINING = ("descriptor", "model_name", "weights")
 ROTATION_INVARIANT = {"dog"}
-
-
-def _reason(error: Exception) -> str:
-    return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error) else ''}"
 
 
 class HlocExtractor(Extractor):
@@ -27,24 +21,10 @@ class HlocExtractor(Extractor):
     default_conf = {"conf": {}}
 
     def _init(self, conf: dict) -> None:
-        package, load = extractors_package()
-        conf = dict(conf["conf"])
-        if "name" not in conf:
-            raise InputError(
-                "The extractor hloc needs the name of one of hloc's: conf: {name: ...}."
-            )
-        name = conf["name"] = str(conf["name"]).removeprefix("hloc.")
-        self.name = choose(
-            "extractor", name, [module.name for module in pkgutil.iter_modules(package.__path__)]
-        )
-        try:
-            self.model = load(package, name)(conf)
-        except Exception as error:  # whatever hloc and its third parties raise
-            raise InputError(
-                f"hloc's extractor {name} cannot be made ({_reason(error)})."
-            ) from None
+        self.model = make_extractor(conf["conf"])
+        self.name = str(conf["conf"]["name"]).removeprefix("hloc.")
         self.detection_noise = getattr(self.model, "detection_noise", 1.0)
-        self.rotation_invariant = self.is_rotation_invariant({"conf": conf})
+        self.rotation_invariant = self.is_rotation_invariant(conf)
 
     @classmethod
     def is_rotation_invariant(cls, conf: dict) -> bool:
@@ -65,7 +45,7 @@ class HlocExtractor(Extractor):
             raise
         except Exception as error:
             raise InputError(
-                f"hloc's extractor {self.name} fails ({_reason(error)}). "
+                f"hloc's extractor {self.name} fails ({reason(error)}). "
                 "Does it need other preprocessing, such as grayscale?"
             ) from error
         if "descriptors" not in features:

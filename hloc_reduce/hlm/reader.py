@@ -12,6 +12,7 @@ import pycolmap
 from .. import projections
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..confs import retrieval as retrieval_confs
 from ..localization import intrinsics
 from ..projections.layers import Layer
 from ..projections.layers import read as read_layers
@@ -24,7 +25,9 @@ from . import points as points_of_map
 from . import signs
 
 VERSION = 2
-VERSIONS = 1, VERSION  # that are read; in the first one, all coordinates have the same bits
+VERSION_RETRIEVAL = 3  # of files whose global descriptors are not VLAD's
+# that are read; in the first one, all coordinates have the same bits
+VERSIONS = 1, VERSION, VERSION_RETRIEVAL
 SUFFIX = ".hlm"
 # what a file may ask for
 MAX_DIM, MAX_GLOBAL, MAX_SIDE, LEAST_OCTAVE = 512, 2**14, 4096, -1
@@ -42,11 +45,12 @@ class CompactMap:
         conf: its configuration.
         storage: of the points' descriptors.
         matcher: a key of `confs.matchers`.
+        retrieval: a key of `confs.retrieval`.
         cameras: what the map tells about the intrinsics of other photos.
         camera_number, camera_of: the number of each image's camera, and its intrinsics.
         names: the images, sorted.
         points: the coordinates.
-        vocabulary: (W, D) float32, of the global descriptors.
+        vocabulary: (W, D) float32, of the global descriptors; None if they have none.
         dim: dimension of the descriptors.
         projection: content of the file of the projection, None without one.
 
@@ -64,7 +68,8 @@ class CompactMap:
                 metadata = json.loads((file.metadata() or {})["map"])
             if metadata["version"] not in VERSIONS:
                 raise InputError(
-                    f"{path} is a compact map of version {metadata['version']}, not {VERSION}."
+                    f"{path} is a compact map of version {metadata['version']}, not "
+                    f"{' or '.join(map(str, VERSIONS[1:]))}."
                 )
             if metadata["version"] == 1:
                 metadata["bits"] = 3 * [metadata["bits"]]
@@ -175,16 +180,22 @@ class CompactMap:
         self.projection = projections.find(projection).read_bytes()
 
     def _read_retrieval(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
-        self.vocabulary = read_vocabulary()
+        self.retrieval = str(metadata.get("retrieval", retrieval_confs.VLAD))
+        retrieval_confs.get(self.retrieval)
+        self.vocabulary: np.ndarray | None = None
         if "vocabulary" in tensors:
             found = _array(tensors, "vocabulary", np.float16, (None, self.dim))
             self.vocabulary = found.astype(np.float32)
-        elif metadata.get("vocabulary_sha256") not in (None, file_sha256(VOCABULARY)):
-            raise InputError(f"{self.path} needs another vocabulary than the one that ships.")
-        number, size = self.vocabulary.size, int(metadata["signs"])
-        if self.vocabulary.shape[1] != self.dim or not 0 < number <= MAX_GLOBAL:
-            raise ValueError(f"a vocabulary of shape {self.vocabulary.shape}")
-        if size != signs.count(number) or not np.isfinite(self.vocabulary).all():
+        elif self.retrieval == retrieval_confs.VLAD or "vocabulary_sha256" in metadata:
+            self.vocabulary = read_vocabulary()
+            if metadata.get("vocabulary_sha256") not in (None, file_sha256(VOCABULARY)):
+                raise InputError(f"{self.path} needs another vocabulary than the one that ships.")
+        number, size = int(metadata.get("global_dim", 0)), int(metadata["signs"])
+        if self.vocabulary is not None:
+            if self.vocabulary.shape[1] != self.dim or not np.isfinite(self.vocabulary).all():
+                raise ValueError(f"a vocabulary of shape {self.vocabulary.shape}, or not finite")
+            number = number or self.vocabulary.size
+        if not 0 < number <= MAX_GLOBAL or size != signs.count(number):
             raise ValueError(f"{size} signs of global descriptors of {number} numbers")
         packed = _array(tensors, "retrieval", np.uint8, (len(self.names), -(-size // 8)))
         self._retrieval = signs.Signs(packed, number)

@@ -10,14 +10,16 @@ import pycolmap
 
 from .. import projections
 from ..confs import features as features_confs
+from ..confs import retrieval as retrieval_confs
 from ..localization import intrinsics
 from ..retrieval.vlad import VOCABULARY, read_vocabulary
+from ..utils.cli import InputError
 from ..utils.codes import QUANTIZED, STORAGES, store
 from ..utils.files import file_sha256
 from . import points as points_of_map
 from . import signs
 from .points import Points
-from .reader import VERSION, check_model, rotation_of
+from .reader import MAX_GLOBAL, VERSION, VERSION_RETRIEVAL, check_model, rotation_of
 
 
 @dataclass(frozen=True)
@@ -30,9 +32,10 @@ class Source:
         conf: its configuration, whose storage is that of the points' descriptors.
         matcher: a key of `confs.matchers`.
         global_descriptors: h5 file of the images' global descriptors.
-        vocabulary: of these.
+        vocabulary: of these; None if they have none.
         cameras: what the map tells about the intrinsics of other photos.
         doubts: why the map may be wrong, see `Map.doubts`.
+        retrieval: of the global descriptors, a key of `confs.retrieval`.
     """
 
     model: pycolmap.Reconstruction
@@ -40,9 +43,10 @@ class Source:
     conf: dict
     matcher: str
     global_descriptors: Path
-    vocabulary: Path
+    vocabulary: Path | None
     cameras: intrinsics.MapCameras
     doubts: list[str] = field(default_factory=list)
+    retrieval: str = retrieval_confs.VLAD
 
 
 def encode(
@@ -79,9 +83,8 @@ def encode(
     _add_images(tensors, metadata, points, source.model)
     _add_points(tensors, metadata, points, source.model)
     _add_descriptors(tensors, metadata, points, source.conf)
-    _add_vocabulary(tensors, metadata, source.vocabulary)
     _add_projection(tensors, metadata, source.conf["model"])
-    tensors["retrieval"], metadata["signs"] = signs.pack(global_descriptors)
+    _add_retrieval(tensors, metadata, source, global_descriptors)
     content = save(tensors, {"map": json.dumps(metadata, sort_keys=True)})
     parts = {name: tensor.nbytes for name, tensor in tensors.items()}
     return content, parts | {"header": len(content) - sum(parts.values())}
@@ -130,10 +133,21 @@ def _add_descriptors(tensors: dict, metadata: dict, points: Points, conf: dict) 
     metadata |= {"storage": storage, "scale": scale}
 
 
-def _add_vocabulary(tensors: dict, metadata: dict, vocabulary: Path) -> None:
-    """Add the vocabulary, or name the one that ships."""
-    words, shipped = read_vocabulary(vocabulary), file_sha256(VOCABULARY)
-    if file_sha256(vocabulary) == shipped:
+def _add_retrieval(
+    tensors: dict, metadata: dict, source: Source, global_descriptors: np.ndarray
+) -> None:
+    """Add global descriptors and their vocabulary, if any, or name the one that ships."""
+    number = global_descriptors.shape[1]
+    if number > MAX_GLOBAL:
+        raise InputError(f"Global descriptors of {number} numbers, of at most {MAX_GLOBAL}.")
+    tensors["retrieval"], metadata["signs"] = signs.pack(global_descriptors)
+    if source.retrieval != retrieval_confs.VLAD:
+        metadata["version"] = VERSION_RETRIEVAL
+        metadata |= {"retrieval": source.retrieval, "global_dim": number}
+    if source.vocabulary is None:
+        return
+    words, shipped = read_vocabulary(source.vocabulary), file_sha256(VOCABULARY)
+    if file_sha256(source.vocabulary) == shipped:
         metadata["vocabulary_sha256"] = shipped
     else:
         tensors["vocabulary"] = words.astype(np.float16)

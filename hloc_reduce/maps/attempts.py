@@ -22,6 +22,7 @@ from .. import (
 )
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..confs import retrieval as retrieval_confs
 from ..extract_features import keep_readable
 from ..mapping import findings, mapper, plausibility, registration
 from ..mapping.checks import Inputs, another_size, intrinsics, mirrored
@@ -30,7 +31,7 @@ from ..runtime.outputs import RunFolder
 from ..utils import cli, colmap
 from ..utils.parsers import parse_pairs, parse_retrieval, write_pairs
 from .by_others import ByOthers
-from .map import RETRIEVAL, SFM, Map, models
+from .map import SFM, Map, models
 
 # suffixes of the models of later attempts
 MORE_KEYPOINTS = "-keypoints_colmap"  # also of its features
@@ -55,6 +56,7 @@ class Photos:
         exhaustive: pair photos without covisible ones with all others.
         accept_partial: do without photos that cannot be read.
         camera_mode: which photos share a camera, if their poses are reconstructed.
+        retrieval: a key of `confs.retrieval`.
         left_out: photos that are described and matched, but not reconstructed.
     """
 
@@ -66,6 +68,7 @@ class Photos:
     exhaustive: bool
     accept_partial: bool
     camera_mode: pycolmap.CameraMode
+    retrieval: str
     left_out: frozenset[str] = frozenset()
 
     @property
@@ -188,7 +191,8 @@ def _find_mirrored(best: Attempt) -> list[Finding]:
     photos, features, descriptors = _describe(best.photos, best.conf)
     folder = photos.folder.path / MIRROR_IMAGES
     by_others = ByOthers(
-        *(best.sfm, best.conf, photos.matcher, photos.image_dir, features, descriptors, folder)
+        *(best.sfm, best.conf, photos.matcher, photos.image_dir, features, descriptors, folder),
+        retrieval_confs.get(photos.retrieval),
     )
     known = registration.read(best.sfm_dir)
     with photos.folder.stage("mirror_images"):
@@ -296,7 +300,10 @@ def _describe(photos: Photos, conf: dict) -> Described:
         )
         names = keep_readable(features, photos.names, photos.accept_partial)
     with photos.folder.stage("retrieval"):
-        descriptors = aggregate_features.main(RETRIEVAL, features, names)
+        described_by = retrieval_confs.get(photos.retrieval)
+        descriptors = aggregate_features.main(
+            described_by, features, names, image_dir=photos.image_dir
+        )
     return Described(replace(photos, names=names), features, descriptors)
 
 
@@ -355,6 +362,9 @@ def drop_others(folder: RunFolder, built: Map) -> None:
     kept = built.features.stem
     plain = kept.removesuffix(MORE_KEYPOINTS)
     for name in {plain, f"{plain}{MORE_KEYPOINTS}"} - {kept}:
-        begins = f"{name}.h5", f"{name}_matches", f"{RETRIEVAL['output']}_{name}."
+        described = aggregate_features.output_of(
+            retrieval_confs.get(built.retrieval), built.features.with_stem(name)
+        )
+        begins = f"{name}.h5", f"{name}_matches", f"{described.stem}."
         folder.delete(other for other in folder.written if other.startswith(begins))
     folder.delete({MIRROR_IMAGES, *models(folder.written)} - {built.sfm.name})

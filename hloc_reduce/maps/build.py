@@ -10,12 +10,14 @@ import pycolmap
 from .. import extract_features, logger
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..confs import retrieval as retrieval_confs
 from ..detectors.dog import KEYPOINTS
 from ..extract_features import keep_present, without
 from ..localization import intrinsics
 from ..mapping import registration
 from ..mapping.checks import Inputs, judging, run, sizes
 from ..mapping.findings import Finding, check_accepted, names_in, staying
+from ..retrieval import load as load_retrieval
 from ..runtime import provenance
 from ..runtime.outputs import CONF, RunFolder
 from ..utils import colmap
@@ -45,6 +47,7 @@ def main(
     keypoints: str = KEYPOINTS[0],
     accept_partial: bool = False,
     camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
+    retrieval: str = retrieval_confs.VLAD,
 ) -> Map:
     """Build a map, or open the one that was made from the same.
 
@@ -67,6 +70,7 @@ def main(
             cameras in the model; without a model, build a map even if fewer than half of the images
             are in it, or its focal lengths, positions or matches show that it may be wrong.
         camera_mode: which images share a camera, without a model.
+        retrieval: a key of `confs.retrieval`.
 
     Returns:
         The map.
@@ -79,6 +83,7 @@ def main(
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher = matcher or features_confs.matcher_of(conf)
+    described_by = retrieval_confs.get(retrieval)
     reference, normalized = (None, False) if model is None else colmap.read_normalized(model)
     if reference is not None and not reference.images:
         raise InputError(f"The model {model} has no images.")
@@ -89,6 +94,7 @@ def main(
     exhaustive = len(names) <= MAX_EXHAUSTIVE
     if overwrite or not (map_dir / CONF).exists():
         extract_features.check_model(conf)
+        load_retrieval(described_by["model"])
     usable = names
     if reference is not None and (overwrite or not (map_dir / FINISHED).exists()):
         usable = _of_fitting_size(image_dir, names, reference, accept_partial)
@@ -106,13 +112,14 @@ def main(
     elif model is None:
         made_from |= {"pairs": f"retrieval, {PAIR_ROUNDS} rounds of verification"}
     made_from |= {"normalized": True} if normalized else {}
+    made_from |= retrieval_confs.provenance(retrieval)
     with claim(map_dir, made_from, overwrite, image_dir, model, projection) as folder:
         if not (map_dir / FINISHED).exists():
             begin(map_dir, fingerprints)
             logger.info("Building the map %s of %d images.", map_dir, len(usable))
             photos = Photos(
                 *(folder, image_dir, usable, matcher, num_covis, exhaustive),
-                *(accept_partial, camera_mode),
+                *(accept_partial, camera_mode, retrieval),
             )
             conf = keep_projection(conf, map_dir)
             if model is not None and reference is not None:
@@ -170,6 +177,7 @@ def _finish(
         *(photos.folder.path, attempt.conf, sfm, cameras),
         feature=feature,
         matcher=photos.matcher,
+        retrieval=photos.retrieval,
         image_dir=str(photos.image_dir.resolve()),
         keypoints=keypoints,
         sfm=attempt.sfm_dir.name,

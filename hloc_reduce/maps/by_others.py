@@ -19,7 +19,6 @@ from ..runtime.executors import SERIAL
 from ..utils import colmap
 from ..utils.parsers import parse_retrieval, write_pairs
 from . import mirror_images
-from .map import RETRIEVAL
 
 NUM_LOC = 20  # most similar images that a new photo is matched with
 
@@ -36,6 +35,7 @@ class ByOthers:
         features: feature file of the photos.
         descriptors: h5 file of their global descriptors.
         folder: for the features and the matches of mirror images.
+        retrieval: configuration of the global descriptors.
     """
 
     sfm: pycolmap.Reconstruction
@@ -45,6 +45,7 @@ class ByOthers:
     features: Path
     descriptors: Path
     folder: Path
+    retrieval: dict
 
     def __call__(
         self, names: Collection[str], by: Collection[str], mirrored: bool
@@ -101,5 +102,9 @@ class ByOthers:
         """Return the files of the features and of the global descriptors of mirror images."""
         features = self.folder / self.features.name
         mirror_images.extract(self.conf, self.image_dir, names, features)
-        vocabulary = aggregate_features.vocabulary_of(self.descriptors)
-        return features, aggregate_features.main(RETRIEVAL, features, vocabulary=vocabulary)
+        return features, aggregate_features.main(
+            mirror_images.of_mirror_images(self.retrieval),
+            features,
+            vocabulary=aggregate_features.vocabulary_of(self.descriptors),
+            image_dir=self.image_dir,
+        )

@@ -10,10 +10,12 @@ import numpy as np
 
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..confs import retrieval as retrieval_confs
 from ..hlm.reader import CompactMap, is_compact
 from ..localization import intrinsics
 from ..localization.references import Reference, SfmMap
-from ..pairs_from_retrieval import read_global, similarity
+from ..retrieval import load as load_retrieval
+from ..retrieval.ranking import read_global, similarity
 from ..retrieval.vlad import read_vocabulary
 from ..runtime import parallel
 from ..utils import colmap
@@ -35,9 +37,6 @@ class Engine(Protocol):
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
         """Extract the features of a photo, see `extractors.extract`."""
 
-    def aggregate(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the global descriptor (1, G) float32 of local ones (N, D) float32."""
-
     def prepare(self, descriptors: np.ndarray) -> Any:
         """Return descriptors (N, D) float32 as `match` takes them."""
 
@@ -52,7 +51,7 @@ class Contents:
     """A map in memory.
 
     Args:
-        engine: extracts, aggregates and matches features.
+        engine: extracts and matches features.
         preprocessing: of photos.
         storage: of its descriptors.
         dim: of its descriptors.
@@ -61,6 +60,8 @@ class Contents:
         doubts: why it may be wrong, see `Map.doubts`.
         reference: its points.
         names: its images.
+        describe: returns the global descriptor (G,) float32 of a photo, rounded as in files, given
+            its features and its file or pixels.
         similarity: returns the similarity (I,) of a global descriptor (G,) to those of its images.
         match: matches descriptors (N, D) float32 of a photo with images; returns for each of these
             names the rows (M, 2) int64 of the photo's descriptors and of the image's keypoints.
@@ -75,6 +76,7 @@ class Contents:
     doubts: list[str]
     reference: Reference
     names: list[str]
+    describe: Callable[[dict, Path | np.ndarray], np.ndarray]
     similarity: Callable[[np.ndarray], np.ndarray]
     match: Callable[[np.ndarray, list[str]], dict[str, np.ndarray]]
 
@@ -117,10 +119,7 @@ def _of_folder(path: Path) -> Contents:
     matcher = matchers_confs.confs[built.matcher]["model"]
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)
-    engine = TorchEngine(
-        *(extractors.load(built.conf["model"]), matcher),
-        *(read_vocabulary(built.vocabulary), built.storage),
-    )
+    engine = TorchEngine(extractors.load(built.conf["model"]), matcher, built.storage)
     levels, described = built.levels(), {}
     with open_h5(built.features) as file:
         for name in names:
@@ -129,6 +128,7 @@ def _of_folder(path: Path) -> Contents:
             described[name] = engine.prepare(stored.restore(unbiased=engine.takes_codes))
     shown = {name: np.flatnonzero(reference.point_rows(name) >= 0) for name in names}
     global_descriptors = read_global(built.descriptors, names)
+    vocabulary = None if built.vocabulary is None else read_vocabulary(built.vocabulary)
 
     def match(descriptors: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
         query = engine.prepare(descriptors)
@@ -148,6 +148,7 @@ def _of_folder(path: Path) -> Contents:
         doubts=built.doubts,
         reference=reference,
         names=names,
+        describe=_describe(built.retrieval, vocabulary),
         similarity=lambda descriptor: similarity(descriptor[None], global_descriptors)[0],
         match=match,
     )
@@ -155,6 +156,8 @@ def _of_folder(path: Path) -> Contents:
 
 def _of_file(path: Path, onnx: Path | None) -> Contents:
     compact = CompactMap(path)
+    if retrieval_confs.get(compact.retrieval)["model"]["name"] == "hloc":
+        _check_torch(path, f"a map with the retrieval {compact.retrieval}")
     matcher = matchers_confs.confs[compact.matcher]["model"]
     engine = _numpy_engine(compact, matcher, onnx) or _torch_engine(compact, matcher)
 
@@ -176,6 +179,7 @@ def _of_file(path: Path, onnx: Path | None) -> Contents:
         doubts=compact.doubts,
         reference=compact,
         names=compact.names,
+        describe=_describe(compact.retrieval, compact.vocabulary),
         similarity=compact.similarity,
         match=match,
     )
@@ -196,7 +200,7 @@ def _numpy_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engi
             extract = ColmapSift(base, compact.layers())
     else:
         return None
-    return NumpyEngine(extract, matcher, compact.vocabulary)
+    return NumpyEngine(extract, matcher)
 
 
 def _torch_engine(compact: CompactMap, matcher: dict) -> Engine:
@@ -208,4 +212,19 @@ def _torch_engine(compact: CompactMap, matcher: dict) -> Engine:
         model = compact.write_projection(Path(folder))["model"]
         with naming(compact.path):
             extractor = extractors.load(model)
-    return TorchEngine(extractor, matcher, compact.vocabulary, compact.storage)
+    return TorchEngine(extractor, matcher, compact.storage)
+
+
+def _describe(
+    retrieval: str, vocabulary: np.ndarray | None
+) -> Callable[[dict, Path | np.ndarray], np.ndarray]:
+    """Return `Contents.describe` of a key of `confs.retrieval` and its vocabulary, if any."""
+    conf = retrieval_confs.get(retrieval)
+    model, preprocessing = load_retrieval(conf["model"]), conf.get("preprocessing", {})
+    if vocabulary is not None:
+        model.vocabulary = vocabulary
+
+    def describe(features: dict, image: Path | np.ndarray) -> np.ndarray:
+        return model.describe_photo(features, image, preprocessing).astype(np.float32)
+
+    return describe

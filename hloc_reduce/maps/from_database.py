@@ -7,11 +7,13 @@ import pycolmap
 from .. import aggregate_features, extract_features, from_colmap, logger, triangulation
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..confs import retrieval as retrieval_confs
 from ..detectors.dog import KEYPOINTS
 from ..localization import intrinsics
 from ..mapping.checks import Inputs, judging, run
 from ..mapping.findings import staying
 from ..reduce import Reduction
+from ..retrieval import load as load_retrieval
 from ..runtime.outputs import RunFolder
 from ..utils import colmap
 from ..utils.cli import InputError, no_folder
@@ -20,7 +22,7 @@ from ..utils.colmap import StoredDatabase
 from ..utils.match_files import check_distinct
 from ..utils.paths import strings_as_paths
 from .build import begin, claim, digests
-from .map import FINISHED, RETRIEVAL, SFM, Map, keep_projection, write
+from .map import FINISHED, SFM, Map, keep_projection, write
 
 
 @strings_as_paths
@@ -35,6 +37,7 @@ def main(
     storage: str = STORAGES[0],
     keypoints: str = KEYPOINTS[0],
     image_dir: Path | None = None,
+    retrieval: str = retrieval_confs.VLAD,
 ) -> Map:
     """Build a map, or open the one that was made from the same.
 
@@ -50,6 +53,7 @@ def main(
         keypoints: settings of DoG for queries, as in `confs.features.get`.
         image_dir: folder of the images, whose EXIF data tell more about the cameras, and which the
             report shows; None if there are none.
+        retrieval: a key of `confs.retrieval`; those that see the images need `image_dir`.
 
     Returns:
         The map.
@@ -61,6 +65,9 @@ def main(
     reduction = Reduction(feature, projection, storage)
     name, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher = matcher or features_confs.matcher_of(conf)
+    described_by = retrieval_confs.get(retrieval)
+    if load_retrieval(described_by["model"]).needs_image and image_dir is None:
+        raise InputError(f"--retrieval {retrieval} needs the photos of the map: --map_images.")
     if image_dir is not None and not image_dir.is_dir():
         raise no_folder(image_dir)
     reference = colmap.read_model(model)
@@ -79,6 +86,7 @@ def main(
             "matcher": matchers_confs.confs[matcher]["model"],
             **found,
             "cameras": {"known": told["cameras"], "models": told["camera_models"]},
+            **retrieval_confs.provenance(retrieval),
         }
         inputs = database, model, projection, image_dir
         with claim(map_dir, made_from, overwrite, *inputs) as folder:
@@ -87,12 +95,16 @@ def main(
                 logger.info("Building the map %s of %d images.", map_dir, len(names))
                 conf = keep_projection(conf, map_dir)
                 _build(folder, opened, reduction, conf, names, reference, model, found)
+                with folder.stage("retrieval"):
+                    features = map_dir / f"{conf['output']}.h5"
+                    aggregate_features.main(described_by, features, names, image_dir=image_dir)
                 with folder.stage("judge_poses"):
                     judged = staying(run(Inputs(reference), judging(are_poses_estimated=False)))
                 write(
                     *(map_dir, conf, reference, cameras),
                     feature=name,
                     matcher=matcher,
+                    retrieval=retrieval,
                     image_dir=str((image_dir or map_dir / "images").resolve()),
                     model=str(model.resolve()),
                     database=str(database.resolve()),
@@ -132,12 +144,10 @@ def _build(
     model: Path,
     found: dict[str, dict[str, str]],
 ) -> None:
-    """Write the features, global descriptors and model of a map."""
+    """Write the features and the model of a map."""
     with folder.stage("extract_features"):
         features = folder.path / f"{conf['output']}.h5"
         from_colmap.write(database, features, reduction, names, found["database"])
-    with folder.stage("retrieval"):
-        aggregate_features.main(RETRIEVAL, features, names)
     with (
         folder.stage("triangulation"),
         triangulation.replacing_map(folder.path / SFM, found["model"], model) as written,

@@ -12,7 +12,7 @@ from ..localization import intrinsics, mirrored, query, stage, turned
 from ..localization.gate import DEFAULT_GATE, Gate
 from ..localization.query import merged, ransac_options
 from ..localize_sfm import RANSAC_THRESH
-from ..pairs_from_retrieval import rank
+from ..retrieval.ranking import rank
 from ..runtime import parallel
 from ..utils.cli import InputError
 from ..utils.codes import FLOATS
@@ -65,7 +65,8 @@ class Localizer:
         self.gate = gate.of_matches(contents.matcher, contents.dim)
         self.engine, self.reference = contents.engine, contents.reference
         self.names = contents.names
-        self._similarity, self._match = contents.similarity, contents.match
+        self._describe, self._similarity = contents.describe, contents.similarity
+        self._match = contents.match
 
     def localize(
         self, image: Path | str | np.ndarray, camera: pycolmap.Camera | None = None
@@ -110,7 +111,7 @@ class Localizer:
                 f"{width}x{height}."
             )
         lap("extraction")
-        retrieved = self._retrieve(features["descriptors"])
+        retrieved = self._retrieve(features, image)
         lap("retrieval")
         matches = self._match(features["descriptors"], retrieved)
         lap("matching")
@@ -162,8 +163,7 @@ class Localizer:
         )
 
     @parallel.one_thread()
-    def _retrieve(self, descriptors: np.ndarray) -> list[str]:
-        """Return the names of the map images most similar to local descriptors (N, D)."""
-        # rounded as in the map
-        query = self.engine.aggregate(descriptors)[0].astype(np.float16).astype(np.float32)
+    def _retrieve(self, features: dict, image: Path | np.ndarray) -> list[str]:
+        """Return the names of the map images that are most similar to a photo, best first."""
+        query = self._describe({**features, "descriptors": features["descriptors"].T}, image)
         return [self.names[j] for j in rank(self._similarity(query)[None], self.num_loc)[0]]

@@ -12,6 +12,7 @@ import pycolmap
 from .. import aggregate_features, extract_features, projections
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..confs import retrieval as retrieval_confs
 from ..detectors.dog import KEYPOINTS
 from ..localization import intrinsics
 from ..mapping.findings import Finding, warn
@@ -30,7 +31,6 @@ FINISHED = "map.json"  # is written last
 FINGERPRINTS = "fingerprints.json"
 SFM = "sfm"  # the folder of the COLMAP model
 PLACE = "place.txt"  # stays when the map is rebuilt
-RETRIEVAL = aggregate_features.confs["vlad"]
 
 
 class Map:
@@ -48,6 +48,7 @@ class Map:
             `conf` may have others, which found more keypoints.
         conf: configuration of the features, for more images.
         matcher: key of `confs.matchers`.
+        retrieval: key of `confs.retrieval`.
         images: folder of the photos.
         num_images: images with a pose.
         findings: what may be wrong with it, and which photos were left out.
@@ -57,7 +58,7 @@ class Map:
         sfm: folder of the COLMAP model.
         features: feature file of the map images.
         descriptors: h5 file of their global descriptors.
-        vocabulary: file of the vocabulary of the global descriptors.
+        vocabulary: file of the vocabulary of the global descriptors, None if they have none.
 
     Raises:
         InputError: if the folder is missing, or is not a finished map.
@@ -91,6 +92,8 @@ class Map:
         self.id = str(content["id"])
         self.feature = _file_name(content["feature"])
         self.matcher = choose("matcher", content["matcher"], matchers_confs.confs)
+        name = content.get("retrieval", retrieval_confs.VLAD)
+        retrieved_by, self.retrieval = retrieval_confs.get(name), str(name)
         self.images = Path(content["image_dir"])
         self.num_images = int(content["images_with_pose"])
         if "findings" in content:
@@ -122,15 +125,16 @@ class Map:
         self.conf = with_projection(conf, lambda name: str(self.folder / _file_name(name)))
         self.sfm = self.folder / _file_name(content.get("sfm", SFM))
         self.features = self.folder / f"{_file_name(conf['output'])}.h5"
-        self.descriptors = self.folder / f"{RETRIEVAL['output']}_{self.features.stem}.h5"
-        self.vocabulary = aggregate_features.vocabulary_of(self.descriptors)
+        self.descriptors = aggregate_features.output_of(retrieved_by, self.features)
+        self.vocabulary = aggregate_features.vocabulary_if_any(retrieved_by, self.descriptors)
 
     def _check(self) -> None:
         """Refuse a map that lacks a file, or has a broken one, before any work is done in it."""
         from ..retrieval.vlad import read_vocabulary
 
         projection = self.conf["model"].get("projection")
-        needed = [self.features, self.descriptors, self.vocabulary]
+        needed = [self.features, self.descriptors]
+        needed += [self.vocabulary] if self.vocabulary else []
         needed += [Path(projections.split_prefix(projection)[0])] if projection else []
         missing = [path for path in needed if not path.is_file()]
         for part in ("cameras", "images", "points3D"):
@@ -144,7 +148,8 @@ class Map:
                 with open_h5(path) as file:
                     file_provenance(file)
             self._check_levels()
-            read_vocabulary(self.vocabulary)
+            if self.vocabulary:
+                read_vocabulary(self.vocabulary)
             if projection:
                 projections.load(projection)
         except Unavailable:
@@ -194,6 +199,33 @@ class Map:
                 f"The map {self.folder} is of --feature {self.feature}{other}. "
                 "Leave it out to localize in this map."
             )
+
+    def aggregate(
+        self,
+        features: Path,
+        names: list[str],
+        image_dir: Path | None,
+        export_dir: Path | None = None,
+    ) -> Path:
+        """Compute global descriptors of other photos that compare with the map's.
+
+        Args:
+            features: feature file of the photos.
+            names: the photos.
+            image_dir: their folder, which only some retrievals need.
+            export_dir: folder of the h5 file of global descriptors; default: that of `features`.
+
+        Returns:
+            The h5 file.
+        """
+        return aggregate_features.main(
+            retrieval_confs.confs[self.retrieval],
+            features,
+            export_dir=export_dir,
+            vocabulary=self.vocabulary,
+            image_list=names,
+            image_dir=image_dir,
+        )
 
     @property
     def doubts(self) -> list[str]:

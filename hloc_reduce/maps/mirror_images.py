@@ -55,7 +55,7 @@ def extract(
         The feature file.
     """
     return extract_features.main(
-        {**conf, "preprocessing": {**conf["preprocessing"], "mirrored": True}},
+        of_mirror_images(conf),
         image_dir,
         feature_path=features,
         image_list=names,
@@ -63,3 +63,8 @@ def extract(
         strict=False,
         queries=names,
     )
+
+
+def of_mirror_images(conf: dict) -> dict:
+    """Return the configuration of features, or of global descriptors, of mirror images."""
+    return {**conf, "preprocessing": {**conf.get("preprocessing", {}), "mirrored": True}}

@@ -1,4 +1,4 @@
-"""Features, retrieval and matches of one photo at a time."""
+"""Features and matches of one photo at a time."""
 
 from pathlib import Path
 
@@ -7,7 +7,6 @@ import numpy as np
 from ..descriptors import COLMAP
 from ..detectors import dog
 from ..matchers import integers
-from ..retrieval import vlad
 from ..utils.codes import to_integers
 from ..utils.images import in_original, resized
 from .numpy_features import Extract
@@ -31,13 +30,12 @@ class NumpyEngine:
     Args:
         extract: of the map's feature.
         matcher: configuration of a matcher that `takes` accepts.
-        vocabulary: (W, D) float32, of global descriptors.
     """
 
     takes_codes = True  # as the matcher does, see `matchers.Matcher`
 
-    def __init__(self, extract: Extract, matcher: dict, vocabulary: np.ndarray):
-        self._extract, self._vocabulary = extract, vocabulary
+    def __init__(self, extract: Extract, matcher: dict):
+        self._extract = extract
         self.rotation_invariant = extract.rotation_invariant
         self._ratio_threshold = matcher.get("ratio_threshold")
         self._distance_threshold = matcher.get("distance_threshold")
@@ -51,10 +49,6 @@ class NumpyEngine:
         """
         pixels, size = resized(image, preprocessing)
         return in_original(self._extract(pixels), pixels.shape, size, dog.NOISE)
-
-    def aggregate(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the global descriptor (1, G) float32 of local ones (N, D) float32."""
-        return vlad.aggregate(descriptors, self._vocabulary)[None]
 
     def prepare(self, descriptors: np.ndarray) -> np.ndarray:
         """Return descriptors (N, D) float32 as `match` takes them: (N, D) int16."""

@@ -8,7 +8,6 @@ import numpy as np
 import pycolmap
 
 from .. import (
-    aggregate_features,
     extract_features,
     localize_sfm,
     logger,
@@ -34,7 +33,7 @@ from ..utils.h5 import open_h5
 from ..utils.match_files import check_distinct
 from ..utils.parsers import parse_pairs
 from .by_others import NUM_LOC
-from .map import FINGERPRINTS, RETRIEVAL, Map
+from .map import FINGERPRINTS, Map
 from .mirror_images import mirror_images
 
 GROWING = "growing"  # the folder of an addition, in that of the map
@@ -140,9 +139,7 @@ class Addition:
         self._leave_out("not readable", [name for name in names if name in broken])
         readable = [name for name in names if name not in broken]
         if readable:
-            descriptors = aggregate_features.main(
-                RETRIEVAL, features, vocabulary=self.built.vocabulary, image_list=readable
-            )
+            descriptors = self.built.aggregate(features, readable, self.image_dir)
             # photos that the map could not reconstruct have old features in its files
             merge(self.features, [self.built.features, features], names)
             merge(self.descriptors, [self.built.descriptors, descriptors], names)

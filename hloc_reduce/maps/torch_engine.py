@@ -5,37 +5,27 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .. import aggregators, extractors, matchers
+from .. import extractors, matchers
 from ..matchers.integers import match_images_of_points
 from ..runtime import parallel
 from ..utils.codes import FLOATS, to_integers
-from .map import RETRIEVAL
 from .numpy_engine import takes
 
 
 class TorchEngine:
-    """Features, retrieval and matches of one photo at a time, on a GPU if there is one.
+    """Features and matches of one photo at a time, on a GPU if there is one.
 
     Args:
         extractor: of the map's feature.
         matcher: configuration of the matcher.
-        vocabulary: (W, D) float32, of global descriptors.
         storage: of the map's descriptors.
     """
 
-    def __init__(
-        self,
-        extractor: extractors.Extractor,
-        matcher: dict,
-        vocabulary: np.ndarray,
-        storage: str,
-    ):
+    def __init__(self, extractor: extractors.Extractor, matcher: dict, storage: str):
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._extractor = extractor.eval().to(self._device)
         self.rotation_invariant = extractor.rotation_invariant
         self._matcher = matchers.load(matcher).eval()
-        self._vlad = aggregators.load(RETRIEVAL["model"])
-        self._vlad.vocabulary = vocabulary
         self.takes_codes = self._matcher.takes_codes
         coded = storage not in FLOATS and self.takes_codes
         # a code is rounded much more than integers are, and they are faster
@@ -44,11 +34,6 @@ class TorchEngine:
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
         """Extract the features of a photo, see `extractors.extract`."""
         return extractors.extract(self._extractor, image, preprocessing, self._device)
-
-    def aggregate(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the global descriptor (1, G) float32 of local ones (N, D) float32."""
-        local = torch.from_numpy(descriptors.T)[None]
-        return self._vlad({"descriptors": local})["global_descriptor"].numpy()
 
     def prepare(self, descriptors: np.ndarray) -> torch.Tensor:
         """Return descriptors (N, D) float32 as `match` takes them."""

@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from ..aggregate_features import output_of, vocabulary_of
 from ..confs import features as features_confs
+from ..confs import retrieval as retrieval_confs
 from ..hlm.reader import CompactMap
 from ..localization.projection import reprojection_errors
 from ..runtime import provenance
@@ -16,7 +18,7 @@ from ..utils.cli import InputError
 from ..utils.files import announce, file_sha256, replacing
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
-from .map import FINISHED, PLACE, RETRIEVAL, SFM, Map, write
+from .map import FINISHED, PLACE, SFM, Map, write
 
 COMPACT = "compact"  # in the configuration of a folder: the sha256 of the file
 
@@ -69,12 +71,13 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
     announce(folder / SFM)
     (folder / SFM).mkdir(exist_ok=True)
     model.write(folder / SFM)
-    descriptors = folder / f"{RETRIEVAL['output']}_{features.stem}.h5"
+    descriptors = output_of(retrieval_confs.get(compact.retrieval), features)
     with GroupWriter(descriptors, header, overwrite=True) as writer:
         for name, row in zip(compact.names, compact.global_descriptors(), strict=True):
             writer.add(name, {"global_descriptor": row})
-    with replacing(descriptors.with_suffix(".vocabulary.safetensors")) as temporary:
-        temporary.write_bytes(save({"vocabulary": compact.vocabulary}))
+    if compact.vocabulary is not None:
+        with replacing(vocabulary_of(descriptors)) as temporary:
+            temporary.write_bytes(save({"vocabulary": compact.vocabulary}))
     with replacing(folder / PLACE) as temporary:
         temporary.write_text(digest)
     write(
@@ -82,6 +85,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
         id=digest,
         feature=compact.feature,
         matcher=compact.matcher,
+        retrieval=compact.retrieval,
         image_dir=str(folder / "images"),  # there are none
         keypoints=features_confs.keypoints_of(conf["model"]) or "adaptive",
         doubts=compact.doubts,

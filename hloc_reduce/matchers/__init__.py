@@ -15,7 +15,7 @@ def load(conf: dict) -> "Matcher":
     Raises:
         InputError: when there is no such matcher, or its configuration is wrong.
     """
-    from ..utils.base_model import dynamic_load
+    from ..utils.configured import dynamic_load
     from .base import Matcher
 
     return dynamic_load(sys.modules[__name__], str(conf.get("name")), Matcher)(conf)

@@ -4,11 +4,45 @@ from pathlib import Path
 
 import numpy as np
 
+from ..runtime import parallel
 from ..utils.arrays import unit
 from ..utils.cli import InputError
+from . import Retrieval
 
 # 64 words of sift_sv64, learned by aggregate_features from south-building
 VOCABULARY = Path(__file__).parent / "vlad_sift_sv64.safetensors"
+
+
+class VLAD(Retrieval):
+    """Sums of the residuals of local descriptors to the words of a vocabulary."""
+
+    required_inputs = ("descriptors",)
+    learns = True
+    default_conf = {"num_words": 64, "max_samples": 200_000, "seed": 0}
+
+    def fit(self, descriptors: np.ndarray) -> None:
+        """Learn the words from local descriptors (N, D), N > 0."""
+        from sklearn.cluster import MiniBatchKMeans  # takes a second to import
+        from threadpoolctl import threadpool_limits
+
+        generator = np.random.default_rng(self.conf["seed"])
+        if len(descriptors) > self.conf["max_samples"]:
+            chosen = generator.choice(len(descriptors), self.conf["max_samples"], replace=False)
+            descriptors = descriptors[np.sort(chosen)]
+        kmeans = MiniBatchKMeans(
+            n_clusters=min(self.conf["num_words"], len(descriptors)),
+            batch_size=4096,
+            n_init=3,
+            random_state=self.conf["seed"],
+        )
+        # more threads wait for each other in such small batches
+        with parallel.one_thread(), threadpool_limits(1, "openmp"):
+            kmeans.fit(descriptors.astype(np.float32))
+        self.vocabulary = kmeans.cluster_centers_
+
+    def describe(self, data: dict[str, np.ndarray]) -> np.ndarray:
+        """Return the global descriptor (words * D,) of local `descriptors` (D, N)."""
+        return aggregate(data["descriptors"].T, self.vocabulary)
 
 
 def read_vocabulary(path: Path | str | None = None) -> np.ndarray:

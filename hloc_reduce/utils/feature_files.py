@@ -1,7 +1,7 @@
 """Feature files in hloc's format."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -202,3 +202,26 @@ def get_descriptors(file: h5py.File, name: str) -> np.ndarray:
         InputError: when they are missing or broken.
     """
     return read_descriptors(file, name).restore()
+
+
+def get_features(file: h5py.File, name: str, keys: Iterable[str]) -> dict[str, np.ndarray]:
+    """Read some of hloc's dictionary of the features of an image, as float32.
+
+    Args:
+        file: an open feature file.
+        name: of the image.
+        keys: such as `descriptors` (D, N), `keypoints` (N, 2), `scores`, `scales`, `oris` (N,) and
+            `image_size` (2,).
+
+    Raises:
+        InputError: when one is missing or broken.
+    """
+    found = {}
+    for key in keys:
+        if key == "descriptors":
+            found[key] = get_descriptors(file, name).T
+        elif key == "keypoints":
+            found[key] = get_keypoints(file, name)[0].astype(np.float32)
+        else:
+            found[key] = get_array(file, name, key, (0,)).astype(np.float32)
+    return found

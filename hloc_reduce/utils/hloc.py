@@ -1,13 +1,15 @@
 """The installed hloc, github.com/cvg/Hierarchical-Localization."""
 
 import importlib
+import pkgutil
 from collections.abc import Callable
 from importlib.util import find_spec
 from types import ModuleType
+from typing import Any
 
 from packaging.version import InvalidVersion, Version
 
-from .cli import InputError
+from .cli import InputError, choose
 
 SOURCE = "git+https://github.com/cvg/Hierarchical-Localization"
 # hloc has been 1.5 since 2023; its `min_version` tells whether its pycolmap is new enough
@@ -38,6 +40,34 @@ def extractors_package() -> tuple[ModuleType, Callable]:
             f"{MIN_PYCOLMAP}: pip install --upgrade {SOURCE}"
         )
     return import_module("extractors"), import_module("utils.base_model").dynamic_load
+
+
+def make_extractor(conf: dict) -> Any:
+    """Make an extractor of hloc.
+
+    Args:
+        conf: hloc's configuration of its model: `name`, with or without the prefix `hloc.`, and the
+            options of that extractor.
+
+    Raises:
+        InputError: when hloc is missing or too old, or the extractor is unknown or cannot be made,
+            for example as its weights cannot be downloaded.
+    """
+    package, load = extractors_package()
+    if "name" not in conf:
+        raise InputError("The extractor hloc needs the name of one of hloc's: conf: {name: ...}.")
+    name = str(conf["name"]).removeprefix("hloc.")
+    known = [module.name for module in pkgutil.iter_modules(package.__path__)]
+    model = choose("extractor", name, known)
+    try:
+        return load(package, model)({**conf, "name": name})
+    except Exception as error:  # whatever hloc and its third parties raise
+        raise InputError(f"hloc's extractor {name} cannot be made ({reason(error)}).") from None
+
+
+def reason(error: Exception) -> str:
+    """Return the type of an error and the first line of its message."""
+    return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error) else ''}"
 
 
 def parse_version(version: str) -> Version:

@@ -22,7 +22,7 @@ from hloc_reduce.utils.tables import aligned
 from ..common.options import Method
 from . import jobs, tables
 from .jobs import Job
-from .shared import Shared
+from .shared import Shared, is_shared
 
 # what --dry_run assumes: keypoints of an image of 1600 pixels, and bytes of a keypoint without its
 # descriptor in a feature file, in a pair of a match file, and in a map
@@ -148,8 +148,7 @@ def steps(shared: Shared, overwrite: bool) -> Iterator[tuple[str, str, int, str,
             todo |= missing
         names = ", ".join(path.stem.removeprefix("feats-dog-") for path in group)
         yield "extract_features", names, len(todo), "images", size
-    by_vlad = [Path(shared.retrieval(job)) for job in running if job.retrieval == "vlad"]
-    for path in dict.fromkeys(by_vlad):
+    for path in dict.fromkeys(Path(shared.retrieval(job)) for job in running if is_shared(job)):
         if overwrite or not path.exists():
             yield "retrieval", path.stem.removeprefix("pairs-query-"), queries, "queries", 0
     for job in running:

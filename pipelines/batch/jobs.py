@@ -41,7 +41,7 @@ class Job(Method):
 
     Args:
         dataset: data set folder.
-        retrieval: "vlad", with the first feature of the data set, or a file.
+        retrieval: a key of `confs.retrieval`, with the first feature of the data set, or a file.
         num_covis: other images that each map image is matched with; default: the pipeline's.
         num_loc: retrieved map images per query; default: the pipeline's.
     """

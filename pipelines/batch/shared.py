@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hloc_reduce import extract_features, logger
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs.retrieval import confs
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.layouts import layout_of
 from hloc_reduce.detectors.dog import KEYPOINTS
@@ -21,12 +22,17 @@ from hloc_reduce.utils.codes import STORAGES
 from hloc_reduce.utils.files import announce
 
 from ..common.dataset import SHARED_POINTS
-from ..common.retrieval import check_retrieval, retrieve
+from ..common.retrieval import check_model, check_retrieval, retrieve
 from ..common.run import readable
 from ..layouts import pipeline_of
 from .jobs import Job
 
-RECORD = "shared.json"  # the feature file that VLAD uses, in later runs too
+RECORD = "shared.json"  # the feature file that retrieval uses, in later runs too
+
+
+def is_shared(job: Job) -> bool:
+    """Tell whether a job retrieves by global descriptors, which jobs share, not by a file."""
+    return job.retrieval in confs
 
 
 class Shared:
@@ -69,9 +75,8 @@ class Shared:
 
         for name in job.numbers:
             cli.choose(f"option for {self.dataset.name}", name, self.pipeline.Options().numbers)
-        if job.retrieval != "vlad" and not Path(job.retrieval).is_file():
-            raise InputError(f"retrieval {job.retrieval}: neither vlad nor an existing file.")
         num_loc, names = self.numbers(job)["num_loc"], (self.query_names, self.map_names)
+        check_model(job.retrieval)
         used = check_retrieval(job.retrieval, self.folder, num_loc, *names)
         self._place.check(used)
         if job.ground_truth not in self._truths:
@@ -130,14 +135,14 @@ class Shared:
         return list(groups.values())
 
     def retrieval(self, job: Job) -> str:
-        """Return the retrieval file of a job, its own or by VLAD."""
-        if job.retrieval != "vlad":
+        """Return the retrieval file of a job, its own or a shared one."""
+        if not is_shared(job):
             return str(Path(job.retrieval).resolve())
-        name = f"pairs-query-vlad{self.numbers(job)['num_loc']}.txt"
-        return str(self.folder / f"vlad_{self._vlad_features().stem}" / name)
+        name = f"pairs-query-{job.retrieval}{self.numbers(job)['num_loc']}.txt"
+        return str(self.folder / f"{job.retrieval}_{self._features_of_retrieval().stem}" / name)
 
-    def _vlad_features(self) -> Path:
-        """Return the feature file that VLAD uses: the first one, or that of an earlier run."""
+    def _features_of_retrieval(self) -> Path:
+        """Return the feature file of retrieval: the first one, or that of an earlier run."""
         before = self.folder / provenance.read(self.folder / RECORD).get("vlad", "")
         return before if before in self.confs else self.features[next(iter(self.features))]
 
@@ -167,9 +172,11 @@ class Shared:
                 for group in self.groups():
                     with self.failing([j for j in self.running() if self.features[j] in group]):
                         self._extract(group, executor, strict)
-            by_vlad = [job for job in self.running() if job.retrieval == "vlad"]
-            with folder.stage("retrieval"), self.failing(by_vlad):
-                self._retrieve(by_vlad, not strict)
+            with folder.stage("retrieval"):
+                for name in {job.retrieval: None for job in self.running() if is_shared(job)}:
+                    jobs = [job for job in self.running() if job.retrieval == name]
+                    with self.failing(jobs):
+                        self._retrieve(name, jobs, not strict)
 
     def _extract(self, paths: list[Path], executor: Executor, strict: bool) -> None:
         """Extract features that have the same keypoints."""
@@ -183,17 +190,15 @@ class Shared:
                 features, self._place.images, self.images(), executor, strict, self.query_names
             )
 
-    def _retrieve(self, jobs: list[Job], accept_partial: bool) -> None:
-        """Retrieve by VLAD for jobs."""
-        if not jobs:
-            return
-        features = self._vlad_features()
+    def _retrieve(self, retrieval: str, jobs: list[Job], accept_partial: bool) -> None:
+        """Retrieve for the jobs with a key of `confs.retrieval`."""
+        features = self._features_of_retrieval()
         if features not in {self.features[job] for job in self.running()}:
-            raise InputError(f"Retrieval needs VLAD of {features.stem}, which failed.")
+            raise InputError(f"Retrieval needs the features {features.stem}, which failed.")
         provenance.write(self.folder / RECORD, {"vlad": features.name})
         names = (
             readable(features, self.query_names),
             extract_features.keep_readable(features, self.map_names, accept_partial),
         )
         for pairs, num_loc in {(self.retrieval(j), self.numbers(j)["num_loc"]) for j in jobs}:
-            retrieve("vlad", features, Path(pairs), num_loc, *names)
+            retrieve(retrieval, features, Path(pairs), num_loc, *names, self._place.images)

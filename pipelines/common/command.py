@@ -9,11 +9,11 @@ from hloc_reduce import logger
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.evaluation.summaries import recall_table
 from hloc_reduce.runtime import trace
-from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.options import Parser
 
 from . import compact_map
 from .options import DatasetOptions
+from .retrieval import check_name
 
 SUBMIT = "For recall, submit {} to https://www.visuallocalization.net."
 
@@ -57,9 +57,8 @@ def read(parser: Parser) -> dict[str, Any]:
         print(features_confs.table())
         print(f"\nDefault: {features_confs.RECOMMENDED}. Which to choose: docs/features.md")
         raise SystemExit(0)
-    retrieval = values.get("retrieval", "vlad")
-    if retrieval != "vlad" and not Path(retrieval).is_file():
-        raise InputError(f"--retrieval {retrieval}: neither vlad nor an existing file.")
+    if values.get("retrieval") is not None:
+        check_name(values["retrieval"])
     return values
 
 

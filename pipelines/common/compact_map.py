@@ -4,7 +4,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from hloc_reduce import compact, localize_sfm, logger, maps
-from hloc_reduce.aggregate_features import vocabulary_of
+from hloc_reduce.aggregate_features import vocabulary_if_any
+from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.datasets import ModelPlace
 from hloc_reduce.hlm.reader import SUFFIX
 from hloc_reduce.hlm.writer import Source
@@ -27,9 +28,10 @@ def check(is_compact: bool, max_mb: float | None, retrieval: str) -> None:
     """Raise an InputError for options that do not go together."""
     if max_mb is not None and not is_compact:
         raise InputError(f"--max_mb {max_mb:g} is the size of a compact map: give --compact, too.")
-    if is_compact and retrieval != "vlad":
+    if is_compact and retrieval not in retrieval_confs.confs:
         raise InputError(
-            "Images of a compact map are retrieved by what is in it: leave out --retrieval."
+            "Images of a compact map are retrieved by what is in it: leave out --retrieval, or "
+            f"choose one of {', '.join(retrieval_confs.confs)}."
         )
 
 
@@ -75,12 +77,13 @@ def main(
         provenance.write(outputs / MADE_FROM, made_from)
         built = _pack(run, part, place, sfm, max_mb)
         features, num_loc = run.features, run.options.num_loc
-        pairs = outputs / f"pairs-query-vlad{num_loc}.txt"
+        retrieved = f"{built.retrieval}{num_loc}"
+        pairs = outputs / f"pairs-query-{retrieved}.txt"
         with part.stage("retrieval"):
             queries = readable(features, run.query_names)
-            retrieve_in_map(built, features, pairs, num_loc, queries, built.names())
+            retrieve_in_map(built, features, pairs, num_loc, queries, built.names(), place.images)
         matches = part.match("match_queries", pairs, features, built.features)
-        poses = outputs / f"{place.results}_hloc_{run.feature}+{matcher}_vlad{num_loc}.txt"
+        poses = outputs / f"{place.results}_hloc_{run.feature}+{matcher}_{retrieved}.txt"
         query_files = pairs, features, built.features
         with part.stage("localization"):
             records = localize_sfm.main(
@@ -111,14 +114,16 @@ def _pack(run: DatasetRun, part: Run, place: ModelPlace, sfm: Path, max_mb: floa
     with part.stage("compact"):
         if not file.exists():
             model = colmap.read_model(sfm)
+            retrieval = run.options.retrieval
             source = Source(
                 model,
                 run.feature,
                 run.conf,
                 run.matcher,
                 run.global_descriptors,
-                vocabulary_of(run.global_descriptors),
+                vocabulary_if_any(retrieval_confs.get(retrieval), run.global_descriptors),
                 intrinsics.of_map(model, place.images),
+                retrieval=retrieval,
             )
             compact.write(file, source, run.features, max_mb=max_mb)
         return maps.unpack(file, part.folder.path / "map")

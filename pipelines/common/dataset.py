@@ -4,19 +4,20 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from hloc_reduce import extract_features
+from hloc_reduce.aggregate_features import output_of
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.datasets import Place, true_poses
 from hloc_reduce.evaluation.summaries import map_bytes
 from hloc_reduce.localization.mirrored import MirrorImages
-from hloc_reduce.maps.map import RETRIEVAL
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, RunFolder
 from hloc_reduce.utils.h5 import get_text, open_h5
 from hloc_reduce.utils.parsers import write_poses
 
 from .options import DatasetOptions
-from .retrieval import check_retrieval, retrieval_name, retrieve
+from .retrieval import check_model, check_retrieval, retrieval_name, retrieve
 from .run import Run, Thresholds, check_queries, readable, relative
 
 TRUTH = "ground_truth_poses.txt"  # written if the poses of the queries are those of a model
@@ -79,7 +80,8 @@ class DatasetRun(Run):
             "retrieval": options.retrieval,
             **options.numbers,
         }
-        inputs = [] if options.retrieval == "vlad" else [Path(options.retrieval)]
+        is_file = options.retrieval not in retrieval_confs.confs
+        inputs = [Path(options.retrieval)] if is_file else []
         if inputs and outputs.resolve().parent in inputs[0].resolve().parents:
             conf["retrieval"] = relative(inputs[0], outputs)  # both may be moved together
         overwrite = options.overwrite
@@ -91,6 +93,7 @@ class DatasetRun(Run):
             overwrite |= redone and {**before, "features": conf["features"]} == conf
         elif overwrite or not (outputs / CONF).exists():
             extract_features.check_model(self.conf)
+            check_model(options.retrieval)
         return RunFolder(outputs, conf, overwrite, inputs)
 
     def extract_features(self) -> Path:
@@ -115,8 +118,10 @@ class DatasetRun(Run):
 
     @property
     def global_descriptors(self) -> Path:
-        """The file of the global descriptors that `retrieve` computes for VLAD."""
-        return self.features.with_name(f"{RETRIEVAL['output']}_{self.features.stem}.h5")
+        """The file of the global descriptors that `retrieve` computes, unless they are given."""
+        confs = retrieval_confs.confs
+        conf = confs.get(self.options.retrieval, confs[retrieval_confs.VLAD])
+        return output_of(conf, self.features)
 
     def map_bytes(self, sfm: Path) -> int:
         """Measure the map that queries are localized in, see `summaries.map_bytes`."""
@@ -132,7 +137,8 @@ class DatasetRun(Run):
         with self.stage("retrieval"):
             queries = readable(self.features, self.query_names)
             source, num_loc = self.options.retrieval, self.options.num_loc
-            retrieve(source, self.features, self._pairs, num_loc, queries, self.map_names)
+            names = queries, self.map_names
+            retrieve(source, self.features, self._pairs, num_loc, *names, self.place.images)
         return self._pairs
 
     def finish_dataset(

@@ -15,7 +15,7 @@ from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.hlm.reader import CompactMap
 from hloc_reduce.mapping.checks import focal_lengths
 from hloc_reduce.maps.unpack import COMPACT
-from hloc_reduce.pairs_from_retrieval import read_global
+from hloc_reduce.retrieval.ranking import read_global
 from hloc_reduce.retrieval.vlad import VOCABULARY, read_vocabulary
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, DELETING

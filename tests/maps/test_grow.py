@@ -34,7 +34,7 @@ BASE, NEW = ["db/0.png", "db/1.png", "db/2.png"], "db/3.png"
 # where a change is killed
 STAGES = (
     "extract_features.main",
-    "aggregate_features.main",
+    "Map.aggregate",
     "match_features.main",
     "extension.extend",
     "contradictions.judge",

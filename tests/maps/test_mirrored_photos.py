@@ -9,6 +9,7 @@ import pytest
 from command import state
 
 from hloc_reduce import maps
+from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.mapping.checks import Inputs, contradictions, mirrored
 from hloc_reduce.mapping.findings import names_in
 from hloc_reduce.maps.by_others import ByOthers
@@ -131,7 +132,7 @@ def test_photos_that_share_little_are_not_judged(tmp_path):
         model.add_point3D(np.array([0, 0, 1.0 + row]), pycolmap.Track(elements))
     for i in seen:
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((100, 100), np.uint8))
-    by_others = ByOthers(model, {}, "", tmp_path, *3 * [tmp_path / "none"])
+    by_others = ByOthers(model, {}, "", tmp_path, *3 * [tmp_path / "none"], {})
     assert mirrored.find(Inputs(model, localize=by_others)) == []
 
 
@@ -150,5 +151,6 @@ def test_no_photo_is_mirrored(plane, symmetric, tmp_path, caplog, run):
         by_others = ByOthers(
             *(sfm, built.conf, built.matcher, built.images),
             *(built.features, built.descriptors, tmp_path / "mirrored"),
+            retrieval_confs.get(built.retrieval),
         )
         assert mirrored.find(Inputs(sfm, localize=by_others)) == []

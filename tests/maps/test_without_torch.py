@@ -149,8 +149,8 @@ def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
     np.testing.assert_array_equal(*rounded)
     query = rounded[0].astype(np.float32)
     both = light, heavy
-    np.testing.assert_array_equal(*(one.engine.aggregate(query) for one in both))
-    np.testing.assert_array_equal(*(one.similarity(one.engine.aggregate(query)[0]) for one in both))
+    described = light.describe({"descriptors": query.T}, photo)
+    np.testing.assert_array_equal(*(one.similarity(described) for one in both))
     matched = [one.match(query, one.names) for one in both]
     for name in light.names:
         np.testing.assert_array_equal(*(pairs[name] for pairs in matched))

@@ -129,7 +129,7 @@ def test_retrieval_that_fails_concerns_its_own_jobs(
     own = write(tmp_path / "pairs-query-own.txt", "query/day/a.png db/0.png\n")
     grid = {"dataset": str(aachen_layout), "feature": "sift_sv16", "retrieval": ["vlad", str(own)]}
 
-    def broken(*_):
+    def broken(*_, **__):
         raise InputError("no VLAD")
 
     monkeypatch.setattr(aggregate_features, "main", broken)

@@ -53,6 +53,17 @@ class Dots(BaseModel):
             "descriptors": [2 * torch.eye(256)[:, : self.number]],
         }
 """
+NETVLAD = """
+from ..utils.base_model import BaseModel
+
+class NetVLAD(BaseModel):
+    def _init(self, conf):
+        pass
+
+    def _forward(self, data):
+        assert data["image"].shape[1] == 3
+        return {"global_descriptor": 3 * data["image"].mean(dim=(2, 3))}
+"""
 EXTRACT_FEATURES = """
 import argparse
 
@@ -69,6 +80,7 @@ MODULES = {
     "utils/base_model.py": BASE_MODEL,
     "extractors/__init__.py": "",
     "extractors/dots.py": DOTS,
+    "extractors/netvlad.py": NETVLAD,
     "extract_features.py": EXTRACT_FEATURES,
     "match_features.py": 'confs = {"NN-ratio": {"output": "hlocs own"}}',
     "broken.py": "import not_there",

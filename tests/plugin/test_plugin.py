@@ -13,14 +13,16 @@ from command import refused, run
 from hloc_double import INIT
 
 import hloc_reduce
-from hloc_reduce import extractors, projections, training
+from hloc_reduce import extractors, projections, retrieval, training
 from hloc_reduce import hloc as plugin
 from hloc_reduce.confs import features
+from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.confs.matchers import confs as matchers
 from hloc_reduce.projections import network
 from hloc_reduce.training import tracks
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
+from pipelines import aachen
 
 
 @pytest.fixture
@@ -222,3 +224,29 @@ def test_a_base_of_hlocs_is_trained_on(double, tmp_path, monkeypatch, caplog):
     assert "mine descriptors are 256-D: --dim 300 is too large" in message
     message = refused(monkeypatch, caplog, training, *arguments, "--phototour", tmp_path)
     assert "not the patches of PhotoTour" in message
+
+
+def test_global_descriptors_of_hloc_serve_retrieval(double):
+    conf = retrieval_confs.confs["netvlad"]
+    assert conf["output"] == "global-feats-netvlad"  # as hloc's
+    model = retrieval.load(conf["model"])
+    assert model.needs_image and not model.learns
+    image = np.zeros((30, 40, 3), np.float32)
+    image[..., 1] = 0.5
+    np.testing.assert_allclose(model.describe({"image": image}), [0, 1, 0])
+    with pytest.raises(InputError, match="hloc's extractor netvlad fails .AssertionError"):
+        model.describe({"image": image[..., 0]})
+    with pytest.raises(
+        InputError, match="Unknown extractor 'eigenplaces'. There are: netvlad, dots"
+    ):
+        retrieval.load(retrieval_confs.confs["eigenplaces"]["model"])
+    local = retrieval.load({"name": "hloc", "conf": {"name": "dots"}})
+    with pytest.raises(InputError, match="dots gives no global descriptor"):
+        local.describe({"image": image})
+
+
+def test_retrieval_of_a_missing_hloc_fails_at_once(aachen_layout, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("hloc_reduce.utils.hloc.is_installed", lambda: False)
+    given = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--retrieval", "megaloc")
+    assert "hloc is not installed: pip" in refused(monkeypatch, caplog, aachen, *given)
+    assert not (tmp_path / "o").exists()

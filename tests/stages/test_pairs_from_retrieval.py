@@ -5,14 +5,15 @@ import numpy as np
 import pytest
 
 from hloc_reduce import pairs_from_retrieval
+from hloc_reduce.retrieval import ranking
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.parsers import parse_retrieval
 
 
 @pytest.mark.parametrize("block", [1, 2, 2**26])
 def test_retrieval_ranks_by_similarity(tmp_path, monkeypatch, block):
-    monkeypatch.setattr(pairs_from_retrieval, "BLOCK_BYTES", block * 3 * 4)
-    monkeypatch.setattr(pairs_from_retrieval, "QUERIES", 1)
+    monkeypatch.setattr(ranking, "BLOCK_BYTES", block * 3 * 4)
+    monkeypatch.setattr(ranking, "QUERIES", 1)
     path = tmp_path / "global.h5"
     vectors = {
         "q/0": [1, 0, 0],

@@ -1,10 +1,10 @@
 """hloc's extractor `vlad`: global descriptors aggregated from local ones, for retrieval."""
 
+import torch
 from hloc.utils.base_model import BaseModel
 
-from hloc_reduce.aggregators.vlad import VLAD as Aggregation
 from hloc_reduce.extractors import load
-from hloc_reduce.retrieval.vlad import read_vocabulary
+from hloc_reduce.retrieval.vlad import aggregate, read_vocabulary
 
 
 class VLAD(BaseModel):
@@ -26,8 +26,9 @@ class VLAD(BaseModel):
 
     def _init(self, conf: dict) -> None:
         self.extract = load(conf["features"])
-        self.aggregate = Aggregation({})
-        self.aggregate.vocabulary = read_vocabulary(conf["vocabulary"])
+        self.vocabulary = read_vocabulary(conf["vocabulary"])
 
     def _forward(self, data: dict) -> dict:
-        return self.aggregate(self.extract(data))
+        descriptors = self.extract(data)["descriptors"][0].T
+        found = aggregate(descriptors.float().cpu().numpy(), self.vocabulary)
+        return {"global_descriptor": torch.from_numpy(found)[None].to(descriptors.device)}
