@@ -85,6 +85,8 @@ def encode(
     _add_descriptors(tensors, metadata, points, source.conf)
     _add_projection(tensors, metadata, source.conf["model"])
     _add_retrieval(tensors, metadata, source, global_descriptors)
+    # safetensors writes the memory of an array, whatever its order
+    tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     content = save(tensors, {"map": json.dumps(metadata, sort_keys=True)})
     parts = {name: tensor.nbytes for name, tensor in tensors.items()}
     return content, parts | {"header": len(content) - sum(parts.values())}

@@ -12,6 +12,7 @@ from safetensors.numpy import load_file, save_file
 from hloc_reduce import Localizer, aggregate_features, compact, maps, projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.hlm import points
 from hloc_reduce.hlm.reader import CompactMap
 from hloc_reduce.mapping.checks import focal_lengths
 from hloc_reduce.maps.unpack import COMPACT
@@ -19,7 +20,7 @@ from hloc_reduce.retrieval.ranking import read_global
 from hloc_reduce.retrieval.vlad import VOCABULARY, read_vocabulary
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, DELETING
-from hloc_reduce.utils import parsers
+from hloc_reduce.utils import colmap, parsers
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.files import file_sha256
 from pipelines import localize
@@ -70,6 +71,19 @@ def test_a_file_localizes_as_its_map(built, tmp_path, run):
     again = (outputs / "map/map.json").stat().st_mtime_ns
     run(*new)
     assert (outputs / "map/map.json").stat().st_mtime_ns == again
+
+
+@pytest.mark.parametrize("storage", ["float16", "float32", "uint8"])
+def test_descriptors_that_are_not_coded_are_those_of_the_points(storage, built, tmp_path):
+    folder, _ = built
+    known = maps.Map(folder)
+    compact.main(tmp_path / "place.hlm", folder, storage=storage)
+    found = CompactMap(tmp_path / "place.hlm")
+    expected = points.collect(colmap.read_model(known.sfm), known.features).sorted().descriptors
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    described = found.descriptors(np.arange(len(expected)))
+    described /= np.linalg.norm(described, axis=1, keepdims=True)
+    assert (described * expected).sum(axis=1).min() > 0.999
 
 
 def test_doubts_of_a_map_go_into_its_file(built, tmp_path, run, caplog):
