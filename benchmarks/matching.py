@@ -28,7 +28,7 @@ DIMS = (128, 64, 32, 24, 16)
 # share of the matches that rounding to codes may change; uint4 changes what is matched
 ROUNDED = {"uint8": 0.02, "uint4": np.inf}
 
-Pair = tuple[torch.Tensor, torch.Tensor]
+Pair = tuple[torch.Tensor, torch.Tensor]  # descriptors (N, D) and (M, D)
 Stored = tuple[dict[str, np.ndarray], dict[str, dict]]  # as `codes.store` returns it
 
 
@@ -88,17 +88,20 @@ def methods(data: list[Pair], device: str) -> dict[str, Callable[[list[Pair]], l
     ours = NearestNeighbor({"ratio_threshold": RATIO})
     batches = 1 if device == "cpu" else 64
 
+    def match_pairs(pairs: list[Pair]) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        return ours.match([tuple({"descriptors": part.T} for part in pair) for pair in pairs])
+
     def run(pairs: list[Pair]) -> list:
         parts = [pairs[i : i + batches] for i in range(0, len(pairs), batches)]
         workers = None if device == "cpu" else 1
-        found = parallel.ordered("match", ours.match, parts, workers)
+        found = parallel.ordered("match", match_pairs, parts, workers)
         return [matches for part in found for matches, _ in part]
 
     def match_codes(pair: list[Stored]) -> torch.Tensor:
         first, second = (
             torch.from_numpy(to_integers(restore(*part, unbiased=True))) for part in pair
         )
-        return ours.match([(first, second)])[0][0]
+        return match_pairs([(first, second)])[0][0]
 
     def run_codes(storage: str) -> Callable[[list[Pair]], list]:
         stored = [[coded(part, storage) for part in pair] for pair in data]

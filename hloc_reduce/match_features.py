@@ -20,7 +20,13 @@ from .runtime.group_writer import Arrays, Group, GroupWriter, fill
 from .utils import cli, options
 from .utils.cli import InputError
 from .utils.codes import to_integers
-from .utils.feature_files import Levels, StoredDescriptors, coded_by, read_descriptors
+from .utils.feature_files import (
+    Levels,
+    StoredDescriptors,
+    coded_by,
+    get_features,
+    read_descriptors,
+)
 from .utils.h5 import file_provenance, open_h5
 from .utils.match_files import check_distinct, names_to_pair
 from .utils.options import HIDDEN, Option
@@ -32,12 +38,13 @@ if TYPE_CHECKING:
     from .matchers.base import Matcher
 
 confs = matchers_confs.confs
-CACHE_BYTES = 2**30  # descriptors in memory: 500 images of 8,000 x 64
+CACHE_BYTES = 2**30  # features in memory: 500 images of 8,000 x 64
 CHUNK = 64  # pairs
 PAIRS_ON_GPU = 16  # given to a matcher at once, which batches as many as its memory allows
 
-Described = np.ndarray | StoredDescriptors  # (N, D) float32, or codes
-DescribedPair = tuple[str, Described, Described]  # name of its group, descriptors
+# hloc's dictionary of the features of an image, see `matchers.base.Matcher`; codes stay codes
+Features = dict[str, np.ndarray | StoredDescriptors]
+FeaturesOfPair = tuple[str, Features, Features]  # the first is the name of its group
 
 
 @strings_as_paths
@@ -171,53 +178,64 @@ def _match(
     matcher = matchers.load(conf["model"]).eval().to(device)
     match = partial(_match_batch, matcher, device, gpu_bytes or GPU_BYTES)
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
-        described = map(partial(_describe, DescriptorCache(CACHE_BYTES), file0, file1), pairs)
-        batches = iter(lambda: list(islice(described, size)), [])
+        cache = FeatureCache(CACHE_BYTES, matcher.feature_keys)
+        read = map(partial(_read, cache, file0, file1), pairs)
+        batches = iter(lambda: list(islice(read, size)), [])
         with closing(parallel.ordered("match", match, batches, workers)) as matched:
             for groups in matched:
                 yield from groups
 
 
-def _describe(
-    read: "DescriptorCache", file0: h5py.File, file1: h5py.File, pair: tuple[str, str]
-) -> DescribedPair:
-    """Read the descriptors of a pair."""
-    descriptors0, descriptors1 = read(file0, pair[0]), read(file1, pair[1])
-    dim0, dim1 = (
-        one.shape[1] if isinstance(one, np.ndarray) else one.dim
-        for one in (descriptors0, descriptors1)
-    )
+def _read(
+    read: "FeatureCache", file0: h5py.File, file1: h5py.File, pair: tuple[str, str]
+) -> FeaturesOfPair:
+    """Read the features of a pair."""
+    features0, features1 = read(file0, pair[0]), read(file1, pair[1])
+    dim0, dim1 = map(_dim, (features0, features1))
     if dim0 != dim1:
         raise InputError(
             f"{file1.filename}: the descriptors of {pair[1]} are {dim1}-D, those of {pair[0]} are "
             f"{dim0}-D."
         )
-    return names_to_pair(*pair), descriptors0, descriptors1
+    return names_to_pair(*pair), features0, features1
+
+
+def _dim(features: Features) -> int | None:
+    """Return the dimension of descriptors, None without any."""
+    stored = features.get("descriptors")
+    if isinstance(stored, StoredDescriptors):
+        return stored.dim
+    return None if stored is None else len(stored)
 
 
 def _match_batch(
-    matcher: "Matcher", device: str, gpu_bytes: int, batch: list[DescribedPair]
+    matcher: "Matcher", device: str, gpu_bytes: int, batch: list[FeaturesOfPair]
 ) -> list[tuple[None, Group]]:
     """Match pairs and return their groups."""
     import torch
 
-    moved: dict[tuple[int, bool], torch.Tensor] = {}  # pairs share images
+    moved: dict[tuple[int, bool], dict[str, torch.Tensor]] = {}  # pairs share images
 
-    def move(descriptors: Described, as_integers: bool) -> torch.Tensor:
-        key = id(descriptors), as_integers
+    def move(features: Features, as_integers: bool) -> dict[str, torch.Tensor]:
+        key = id(features), as_integers
         if key not in moved:
-            array = (
-                descriptors
-                if isinstance(descriptors, np.ndarray)
-                else descriptors.restore(unbiased=matcher.takes_codes)
-            )
-            moved[key] = torch.from_numpy(to_integers(array) if as_integers else array).to(device)
+            arrays = {
+                name: value
+                if isinstance(value, np.ndarray)
+                else value.restore(unbiased=matcher.takes_codes).T
+                for name, value in features.items()
+            }
+            if as_integers:
+                arrays["descriptors"] = to_integers(arrays["descriptors"].T).T
+            moved[key] = {
+                name: torch.from_numpy(array).to(device) for name, array in arrays.items()
+            }
         return moved[key]
 
     pairs = []
     for _, *pair in batch:
         # a code is rounded much more than integers are, and they are faster
-        coded = any(isinstance(one, StoredDescriptors) for one in pair)
+        coded = any(isinstance(one.get("descriptors"), StoredDescriptors) for one in pair)
         as_integers = coded and matcher.takes_codes and device == "cpu"
         pairs.append((move(pair[0], as_integers), move(pair[1], as_integers)))
     found = matcher.match(pairs, gpu_bytes)
@@ -231,20 +249,21 @@ def _match_batch(
     return groups
 
 
-class DescriptorCache:
-    """Reads descriptors and keeps the last used ones in memory, codes as codes.
+class FeatureCache:
+    """Reads features and keeps the last used ones in memory, codes as codes.
 
     Args:
-        max_bytes: maximum size of the descriptors in memory.
+        max_bytes: maximum size of the features in memory.
+        keys: what is read, see `matchers.base.Matcher`.
     """
 
-    def __init__(self, max_bytes: int):
-        self.max_bytes, self.bytes = max_bytes, 0
-        self.kept: OrderedDict[tuple[str, str], Described] = OrderedDict()
+    def __init__(self, max_bytes: int, keys: Iterable[str]):
+        self.max_bytes, self.bytes, self.keys = max_bytes, 0, tuple(keys)
+        self.kept: OrderedDict[tuple[str, str], Features] = OrderedDict()
         self.levels = Levels()
 
-    def __call__(self, file: h5py.File, name: str) -> Described:
-        """Return the descriptors of an image in an open feature file.
+    def __call__(self, file: h5py.File, name: str) -> Features:
+        """Return the features of an image in an open feature file.
 
         Raises:
             InputError: when they are broken, or are codes with other levels than those before.
@@ -253,19 +272,25 @@ class DescriptorCache:
         if key in self.kept:
             self.kept.move_to_end(key)
             return self.kept[key]
-        stored = read_descriptors(file, name)
-        restored = stored.restore()  # which checks them
-        self.levels.check(stored)
-        descriptors = restored if stored.is_float else stored
-        self.kept[key] = descriptors
-        self.bytes += _nbytes(descriptors)
+        others = [key for key in self.keys if key != "descriptors"]
+        features: Features = {**get_features(file, name, others)}
+        if "descriptors" in self.keys:
+            stored = read_descriptors(file, name)
+            restored = stored.restore()  # which checks them
+            self.levels.check(stored)
+            features["descriptors"] = restored.T if stored.is_float else stored
+        self.kept[key] = features
+        self.bytes += _nbytes(features)
         while self.bytes > self.max_bytes and len(self.kept) > 1:
             self.bytes -= _nbytes(self.kept.popitem(last=False)[1])
-        return descriptors
+        return features
 
 
-def _nbytes(descriptors: Described) -> int:
-    return (descriptors if isinstance(descriptors, np.ndarray) else descriptors.array).nbytes
+def _nbytes(features: Features) -> int:
+    return sum(
+        (value if isinstance(value, np.ndarray) else value.array).nbytes
+        for value in features.values()
+    )
 
 
 def _main() -> None:

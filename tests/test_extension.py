@@ -22,7 +22,9 @@ from hloc_reduce import (
     retrieval,
 )
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.confs import retrieval as retrieval_confs
+from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.retrieval.ranking import read_global
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
@@ -34,6 +36,7 @@ TOYS = Path(__file__).parent / "toys"
 PIPELINE = localize
 
 
+IN_PLANE = {"output": "matches-in-plane", "model": {"name": "in_plane"}}
 THUMBNAIL = {
     "output": "global-feats-thumbnail",
     "model": {"name": "thumbnail"},
@@ -48,6 +51,7 @@ def toys(monkeypatch):
         folder = TOYS / package.__name__.rpartition(".")[2]
         monkeypatch.setattr(package, "__path__", [*package.__path__, str(folder)])
     monkeypatch.setitem(retrieval_confs.confs, "thumbnail", THUMBNAIL)
+    monkeypatch.setitem(matchers_confs.confs, "in_plane", IN_PLANE)
 
 
 def test_a_toy_extractor_and_a_toy_matcher(tmp_path):
@@ -82,8 +86,8 @@ def test_a_toy_extractor_is_listed(monkeypatch):
 
 def test_a_toy_matcher_matches_some_rows():
     matcher = matchers.load({"name": "in_order", "number": 3})
-    descriptors = torch.eye(5)
-    matches = matcher.match_rows(descriptors, descriptors, torch.tensor([0, 2, 4]))
+    features = {"descriptors": torch.eye(5)}
+    matches = matcher.match_rows(features, features, torch.tensor([0, 2, 4]))
     assert matches.tolist() == [[0, 0], [2, 2]]
 
 
@@ -93,10 +97,11 @@ def test_nearest_neighbors_of_some_rows(do_mutual_check):
     descriptors = torch.nn.functional.normalize(torch.randn(2, 60, 4), dim=2)
     conf = {"name": "nearest_neighbor", "do_mutual_check": do_mutual_check, "ratio_threshold": 0.95}
     matcher = matchers.load(conf)
-    matches0 = matcher.match([tuple(descriptors)])[0][0]
+    pair = [{"descriptors": one.T} for one in descriptors]
+    matches0 = matcher.match([pair])[0][0]
     rows = torch.arange(0, 60, 2)
     expected = {(i, int(j)) for i, j in enumerate(matches0) if j >= 0 and j % 2 == 0}
-    found = {tuple(pair) for pair in matcher.match_rows(*descriptors, rows).tolist()}
+    found = {tuple(pair) for pair in matcher.match_rows(*pair, rows).tolist()}
     assert found == expected and len(found) > 5
 
 
@@ -175,3 +180,55 @@ def test_a_retrieval_by_images_reads_no_local_descriptors(tmp_path):
     assert read_global(found, ["a.png"]).shape == (1, 192)
     with pytest.raises(InputError, match="needs the images"):
         aggregate_features.main(THUMBNAIL, features)
+
+
+@pytest.mark.parametrize("storage", ["float16", "uint4"])
+def test_a_toy_matcher_of_keypoints_in_a_map(storage, place, tmp_path, run):
+    """In files, in memory, and with the keypoints of a compact map: projections of its points."""
+    build, images, outputs = place
+    photos = images / "query/day"
+    given = ("--feature", "colmap_sift_sv32", "--matcher", "in_plane", "--storage", storage)
+    run(*build, *given, "--query_images", photos)
+    _, rows = outcome(outputs / "queries-day")
+    row = rows["a.png"]
+    assert row["status"] == "localized" and int(row["num_inliers"]) > 100
+    file = tmp_path / "place.hlm"
+    compact.main(file, outputs / "map", storage=storage)
+    pose, info = Localizer(outputs / "map").localize(photos / "a.png")
+    assert info["num_matches"] == int(row["num_matches"])
+    pose_in_file, info = Localizer(file).localize(photos / "a.png")
+    assert max(pose_error(pose, pose_in_file)) < 0.1 and info["num_inliers"] > 100
+    run("--map", file, "--query_images", photos, "--outputs", tmp_path / "unpacked")
+    _, of_file = outcome(tmp_path / "unpacked/queries-day")
+    assert of_file["a.png"]["status"] == "localized"
+    assert int(of_file["a.png"]["num_matches"]) == info["num_matches"]
+
+
+def test_only_what_a_matcher_needs_is_read(tmp_path):
+    with h5py.File(tmp_path / "features.h5", "w") as file:
+        for name in "ab":
+            file[f"{name}/descriptors"] = np.eye(4, dtype=np.float16)
+            file[f"{name}/keypoints"] = np.eye(4, 2, dtype=np.float32)
+    write_pairs([("a", "b")], tmp_path / "pairs.txt")
+    given = tmp_path / "pairs.txt", tmp_path / "features.h5"
+    conf = matchers_confs.confs["NN-mutual"]
+    match_features.main(conf, *given, matches=tmp_path / "m.h5")
+    with pytest.raises(InputError, match="not a file of image_size"):
+        match_features.main(IN_PLANE, *given, matches=tmp_path / "n.h5")
+
+
+def test_compact_maps_have_no_scores(place, tmp_path, run, monkeypatch):
+    build, *_, outputs = place
+    run(*build, "--feature", "colmap_sift_sv32", "--matcher", "in_plane")
+    compact.main(tmp_path / "place.hlm", outputs / "map")
+    needed = ("scores0", "scores1")
+    loaded = matchers.load
+
+    def demanding(conf):
+        model = loaded(conf)
+        model.required_inputs = needed
+        return model
+
+    monkeypatch.setattr(matchers, "load", demanding)
+    with pytest.raises(InputError, match="in_plane, which needs scores of keypoints"):
+        Localizer(tmp_path / "place.hlm")

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -14,6 +14,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..localization import intrinsics
+from ..localization.projection import reprojection_errors
 from ..projections.layers import Layer
 from ..projections.layers import read as read_layers
 from ..retrieval.vlad import VOCABULARY, read_vocabulary
@@ -274,6 +275,30 @@ class CompactMap:
     def num_keypoints(self, name: str) -> int:
         """Return the number of points that an image shows: these are its keypoints."""
         return int(self._visible.counts[self._rows[name]])
+
+    def features(self, name: str, keys: Iterable[str]) -> dict[str, np.ndarray]:
+        """Return some features of an image, float32, see `matchers.base.Matcher`.
+
+        Args:
+            name: of the image.
+            keys: `keypoints` (M, 2), the `projections` with hloc's pixel origin, and `image_size`
+                (2,).
+        """
+        found = {}
+        for key in keys:
+            if key == "keypoints":
+                found[key] = (self.projections(name) - 0.5).astype(np.float32)
+            else:
+                camera = self.camera_of[name]
+                found[key] = np.array([camera.width, camera.height], np.float32)
+        return found
+
+    def projections(self, name: str) -> np.ndarray:
+        """Return the projections (M, 2) of the points that an image shows, COLMAP's pixels."""
+        points = self.points[self.visible(name)]
+        given = np.zeros((len(points), 2))
+        _, found = reprojection_errors(given, points, self.pose(name), self.camera_of[name])
+        return np.nan_to_num(found, posinf=0.0, neginf=0.0)
 
     def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the ids and the coordinates of points that an image shows."""

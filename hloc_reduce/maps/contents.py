@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -21,29 +21,22 @@ from ..runtime import parallel
 from ..utils import colmap
 from ..utils.arrays import distinct
 from ..utils.cli import InputError, naming
-from ..utils.feature_files import dimension, read_descriptors
+from ..utils.feature_files import dimension, get_features, read_descriptors
 from ..utils.h5 import open_h5
 from .map import Map
-from .numpy_engine import NumpyEngine, is_colmap_sift, takes
+from .matching import Features, Matching, is_integer_matcher
+from .numpy_engine import NumpyEngine, is_colmap_sift
 from .numpy_features import ColmapSift, Extract, OnnxNetwork
 
 
 class Engine(Protocol):
     """Computes for a map, see `numpy_engine.NumpyEngine` and `torch_engine.TorchEngine`."""
 
-    takes_codes: bool  # of its matcher, see `matchers.Matcher`
+    matching: Matching
     rotation_invariant: bool  # of its extractor, see `extractors.Extractor`
 
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
         """Extract the features of a photo, see `extractors.extract`."""
-
-    def prepare(self, descriptors: np.ndarray) -> Any:
-        """Return descriptors (N, D) float32 as `match` takes them."""
-
-    def match_points(
-        self, query: Any, described: Any, images: list[np.ndarray]
-    ) -> list[np.ndarray]:
-        """Match the descriptors of a photo with the rows that each image has of those of points."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +56,9 @@ class Contents:
         describe: returns the global descriptor (G,) float32 of a photo, rounded as in files, given
             its features and its file or pixels.
         similarity: returns the similarity (I,) of a global descriptor (G,) to those of its images.
-        match: matches descriptors (N, D) float32 of a photo with images; returns for each of these
-            names the rows (M, 2) int64 of the photo's descriptors and of the image's keypoints.
+        match: matches the features of a photo, at least those that the matcher needs, with images;
+            returns for each of these names the rows (M, 2) int64 of the photo's and of the image's
+            keypoints.
     """
 
     engine: Engine
@@ -78,7 +72,7 @@ class Contents:
     names: list[str]
     describe: Callable[[dict, Path | np.ndarray], np.ndarray]
     similarity: Callable[[np.ndarray], np.ndarray]
-    match: Callable[[np.ndarray, list[str]], dict[str, np.ndarray]]
+    match: Callable[[Features, list[str]], dict[str, np.ndarray]]
 
 
 def read(path: Path, onnx: Path | None = None) -> Contents:
@@ -120,21 +114,25 @@ def _of_folder(path: Path) -> Contents:
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)
     engine = TorchEngine(extractors.load(built.conf["model"]), matcher, built.storage)
-    levels, described = built.levels(), {}
+    matching, levels, prepared = engine.matching, built.levels(), {}
+    others = [key for key in matching.feature_keys if key != "descriptors"]
     with open_h5(built.features) as file:
         for name in names:
-            stored = read_descriptors(file, name)
-            levels.check(stored)
-            described[name] = engine.prepare(stored.restore(unbiased=engine.takes_codes))
+            features = get_features(file, name, others)
+            if "descriptors" in matching.feature_keys:
+                stored = read_descriptors(file, name)
+                levels.check(stored)
+                features["descriptors"] = stored.restore(unbiased=matching.takes_codes).T
+            prepared[name] = matching.prepare(features)
     shown = {name: np.flatnonzero(reference.point_rows(name) >= 0) for name in names}
     global_descriptors = read_global(built.descriptors, names)
     vocabulary = None if built.vocabulary is None else read_vocabulary(built.vocabulary)
 
-    def match(descriptors: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
-        query = engine.prepare(descriptors)
+    def match(features: Features, names: list[str]) -> dict[str, np.ndarray]:
+        query = matching.prepare(features)
 
         def match_image(name: str) -> np.ndarray:
-            return engine.match(query, described[name], shown[name])
+            return matching.match(query, prepared[name], shown[name])
 
         return dict(zip(names, parallel.ordered("match", match_image, names), strict=True))
 
@@ -160,14 +158,24 @@ def _of_file(path: Path, onnx: Path | None) -> Contents:
         _check_torch(path, f"a map with the retrieval {compact.retrieval}")
     matcher = matchers_confs.confs[compact.matcher]["model"]
     engine = _numpy_engine(compact, matcher, onnx) or _torch_engine(compact, matcher)
+    matching = engine.matching
+    others = [key for key in matching.feature_keys if key != "descriptors"]
+    if missing := [key for key in others if key not in ("keypoints", "image_size")]:
+        raise InputError(
+            f"{path} has the matcher {compact.matcher}, which needs {', '.join(missing)} of "
+            "keypoints; compact maps do not have these."
+        )
 
-    def match(descriptors: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
+    def match(features: Features, names: list[str]) -> dict[str, np.ndarray]:
         visible = [compact.visible(name) for name in names]
         points = distinct(np.concatenate([np.zeros(0, np.int64), *visible]))
-        described = compact.descriptors(points, unbiased=engine.takes_codes)
-        images = [np.searchsorted(points, part) for part in visible]
-        prepared = engine.prepare(descriptors), engine.prepare(described)
-        return dict(zip(names, engine.match_points(*prepared, images), strict=True))
+        described = compact.descriptors(points, unbiased=matching.takes_codes)
+        images = [
+            (np.searchsorted(points, part), compact.features(name, others))
+            for name, part in zip(names, visible, strict=True)
+        ]
+        found = matching.match_points(matching.prepare(features), described, images)
+        return dict(zip(names, found, strict=True))
 
     return Contents(
         engine=engine,
@@ -189,9 +197,9 @@ def _numpy_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engi
     """Return an engine without torch, None if the map's feature or matcher needs torch."""
     base = features_confs.base_of(compact.conf["model"])
     extract: Extract
-    if onnx is not None and not takes(matcher):
+    if onnx is not None and not is_integer_matcher(matcher):
         raise InputError(f"{compact.path} has the matcher {compact.matcher}, which needs torch.")
-    if not takes(matcher):
+    if not is_integer_matcher(matcher):
         return None
     if onnx is not None:
         extract = OnnxNetwork(onnx, compact.feature, base.get("denoise", True))

@@ -15,7 +15,7 @@ from ..localize_sfm import RANSAC_THRESH
 from ..retrieval.ranking import rank
 from ..runtime import parallel
 from ..utils.cli import InputError
-from ..utils.codes import FLOATS
+from ..utils.codes import FLOATS, restore, store
 from ..utils.feature_files import to_colmap
 from .contents import read
 
@@ -113,13 +113,13 @@ class Localizer:
         lap("extraction")
         retrieved = self._retrieve(features, image)
         lap("retrieval")
-        matches = self._match(features["descriptors"], retrieved)
+        matches = self._match(features, retrieved)
         lap("matching")
         cam_from_world, info = self._estimate(features, matches, camera, refinement)
         lap("pose")
         if info["reason"] is None and gates.may_be_mirrored(info["measures"]):
             flipped = self._extract(image, flip=True)
-            matches = self._match(flipped["descriptors"], retrieved)
+            matches = self._match(flipped, retrieved)
             camera = mirrored.mirror(camera)
             refinement = mirrored.mirror_options(refinement)
             _, other = self._estimate(flipped, matches, camera, refinement, thorough=False)
@@ -127,7 +127,7 @@ class Localizer:
             info |= {"measures": measures, "reason": gates.refusal(measures, self.gate)}
             lap("mirror_image")
         info |= {
-            "points2D": features["keypoints"][info["keypoints"]],
+            "points2D": to_colmap(features["keypoints"][info["keypoints"]]),
             "retrieved": retrieved,
             "intrinsics": source,
             "map_doubts": self.doubts,
@@ -136,13 +136,12 @@ class Localizer:
         return cam_from_world if info["reason"] is None else None, info
 
     def _extract(self, image: Path | np.ndarray, flip: bool = False) -> dict:
-        """Extract features as a feature file has them: keypoints (N, 2), descriptors (N, D)."""
+        """Extract features, float32 and rounded as in a feature file, see `matchers.Matcher`."""
         preprocessing = {**self.preprocessing, "mirrored": flip}
         features = self.engine.extract(image, preprocessing)
-        rounded = features["descriptors"].T.astype(self.dtype)
-        descriptors = rounded.astype(np.float32, order="C")
-        keypoints = to_colmap(features["keypoints"])
-        return {**features, "descriptors": descriptors, "keypoints": keypoints}
+        stored, _ = store({key: np.asarray(part) for key, part in features.items()}, self.dtype)
+        rounded = {key: part.astype(np.float32) for key, part in stored.items()}
+        return {**rounded, "descriptors": restore(stored, {}).T}
 
     @parallel.one_thread()
     def _estimate(
@@ -155,7 +154,7 @@ class Localizer:
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Estimate the pose of a photo from its matches, see `localization.query.localize`."""
         return query.localize(
-            *(self.reference, features["keypoints"], camera, matches),
+            *(self.reference, to_colmap(features["keypoints"]), camera, matches),
             merged(ransac_options(self.ransac_thresh, camera), refinement),
             self.gate.of_photo(float(features["blur"])),
             thorough,
@@ -165,5 +164,5 @@ class Localizer:
     @parallel.one_thread()
     def _retrieve(self, features: dict, image: Path | np.ndarray) -> list[str]:
         """Return the names of the map images that are most similar to a photo, best first."""
-        query = self._describe({**features, "descriptors": features["descriptors"].T}, image)
+        query = self._describe(features, image)
         return [self.names[j] for j in rank(self._similarity(query)[None], self.num_loc)[0]]

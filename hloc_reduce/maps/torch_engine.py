@@ -1,19 +1,22 @@
-"""The torch engine of a map in memory."""
+"""The engine of a map in memory that uses torch, on a GPU if there is one."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from .. import extractors, matchers
-from ..matchers.integers import match_images_of_points
+from ..matchers.base import Matcher
 from ..runtime import parallel
-from ..utils.codes import FLOATS, to_integers
-from .numpy_engine import takes
+from ..utils.codes import FLOATS
+from .matching import Features, IntegerMatching, Matching, is_integer_matcher
+
+Tensors = dict[str, torch.Tensor]
 
 
 class TorchEngine:
-    """Features and matches of one photo at a time, on a GPU if there is one.
+    """Extracts with torch, and matches with torch or as integers.
 
     Args:
         extractor: of the map's feature.
@@ -25,41 +28,52 @@ class TorchEngine:
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._extractor = extractor.eval().to(self._device)
         self.rotation_invariant = extractor.rotation_invariant
-        self._matcher = matchers.load(matcher).eval()
-        self.takes_codes = self._matcher.takes_codes
-        coded = storage not in FLOATS and self.takes_codes
         # a code is rounded much more than integers are, and they are faster
-        self._as_integers = coded and self._device == "cpu"
+        by_integers = storage not in FLOATS and self._device == "cpu"
+        self.matching: Matching = (
+            IntegerMatching(matcher)
+            if by_integers and is_integer_matcher(matcher)
+            else TorchMatching(matchers.load(matcher), self._device)
+        )
 
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
         """Extract the features of a photo, see `extractors.extract`."""
         return extractors.extract(self._extractor, image, preprocessing, self._device)
 
-    def prepare(self, descriptors: np.ndarray) -> torch.Tensor:
-        """Return descriptors (N, D) float32 as `match` takes them."""
-        matched = to_integers(descriptors) if self._as_integers else descriptors
-        return torch.from_numpy(matched).to(self._device)
 
-    def match(self, query: torch.Tensor, described: torch.Tensor, rows: np.ndarray) -> np.ndarray:
-        """Match the descriptors of a photo with some of a map image, see `Matcher.match_rows`.
+class TorchMatching:
+    """Matches by a matcher of torch.
 
-        Args:
-            query: (N, D) from `prepare`.
-            described: (M, D) from `prepare`.
-            rows: (K,) int64, ascending rows of these.
-        """
-        chosen = torch.from_numpy(rows).to(self._device)
-        return self._matcher.match_rows(query, described, chosen).cpu().numpy()
+    Args:
+        matcher: the matcher.
+        device: where it computes.
+    """
+
+    def __init__(self, matcher: Matcher, device: str):
+        self._matcher, self._device = matcher.eval().to(device), device
+        self.feature_keys, self.takes_codes = matcher.feature_keys, matcher.takes_codes
+
+    def prepare(self, features: Features) -> Tensors:
+        """Return what the matcher needs of the features of an image."""
+        return {key: self._tensor(features[key]) for key in self.feature_keys}
+
+    def match(self, query: Tensors, image: Tensors, rows: np.ndarray) -> np.ndarray:
+        """Match a photo with some keypoints of a map image, see `Matching.match`."""
+        return self._matcher.match_rows(query, image, self._tensor(rows)).cpu().numpy()
 
     def match_points(
-        self, query: torch.Tensor, described: torch.Tensor, images: list[np.ndarray]
+        self, query: Tensors, descriptors: np.ndarray, images: Sequence[tuple[np.ndarray, Features]]
     ) -> list[np.ndarray]:
-        """Match the descriptors of a photo with images, see `NumpyEngine.match_points`."""
-        if self._as_integers and takes(self._matcher.conf):
-            limits = self._matcher.conf["ratio_threshold"], self._matcher.conf["distance_threshold"]
-            return match_images_of_points(described.numpy(), query.numpy(), images, *limits)
+        """Match a photo with images that share descriptors, see `Matching.match_points`."""
+        described = self._tensor(descriptors)
 
-        def match(rows: np.ndarray) -> np.ndarray:
-            return self.match(query, described[rows], np.arange(len(rows)))
+        def match(image: tuple[np.ndarray, Features]) -> np.ndarray:
+            rows, others = image
+            features = {key: self._tensor(value) for key, value in others.items()}
+            features["descriptors"] = described[self._tensor(rows)].T
+            return self.match(query, features, np.arange(len(rows)))
 
         return list(parallel.ordered("match", match, images))
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(array).to(self._device)

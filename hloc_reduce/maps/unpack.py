@@ -9,7 +9,6 @@ from ..aggregate_features import output_of, vocabulary_of
 from ..confs import features as features_confs
 from ..confs import retrieval as retrieval_confs
 from ..hlm.reader import CompactMap
-from ..localization.projection import reprojection_errors
 from ..runtime import provenance
 from ..runtime.group_writer import GroupWriter
 from ..runtime.outputs import CONF, DELETING, RunFolder
@@ -95,10 +94,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
 def _add_image(model: pycolmap.Reconstruction, compact: CompactMap, number: int) -> np.ndarray:
     """Add an image; return the projections of its points (M, 2), COLMAP's pixels."""
     name = compact.names[number]
-    points = compact.points[compact.visible(name)]
-    camera, pose = compact.camera_of[name], compact.pose(name)
-    _, projected = reprojection_errors(np.zeros((len(points), 2)), points, pose, camera)
-    projected = np.nan_to_num(projected, posinf=0.0, neginf=0.0)
+    camera, pose, projected = compact.camera_of[name], compact.pose(name), compact.projections(name)
     camera.camera_id = compact.camera_number[name] + 1
     image = pycolmap.Image(
         name=name, keypoints=projected, camera_id=camera.camera_id, image_id=number + 1

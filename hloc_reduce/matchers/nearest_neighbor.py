@@ -6,7 +6,7 @@ import torch
 from torch.nn.utils.rnn import pad_sequence
 
 from . import integers
-from .base import GPU_BYTES, Matcher, Tensors
+from .base import GPU_BYTES, Features, Matcher, Tensors
 
 PART_BYTES = 2**19  # of descriptors1 at once: they stay in the cache of a core
 TILE = 2**20  # similarities at once
@@ -238,21 +238,24 @@ class NearestNeighbor(Matcher):
     }
 
     @torch.no_grad()
-    def match(self, pairs: list[Tensors], gpu_bytes: int = GPU_BYTES) -> list[Tensors]:
+    def match(
+        self, pairs: Sequence[tuple[Features, Features]], gpu_bytes: int = GPU_BYTES
+    ) -> list[Tensors]:
         """Match pairs, see `Matcher.match`; on a GPU several small ones at once."""
+        described = [(a["descriptors"].T, b["descriptors"].T) for a, b in pairs]
         options = {
             "ratio_threshold": self.conf["ratio_threshold"],
             "distance_threshold": self.conf["distance_threshold"],
             "mutual": self.conf["do_mutual_check"],
         }
-        on_cpu = all(descriptors.is_cpu for pair in pairs for descriptors in pair)
+        on_cpu = all(descriptors.is_cpu for pair in described for descriptors in pair)
         max_bytes = 0 if on_cpu else gpu_bytes
         found: dict[int, Tensors] = {}
-        for batch in _batches([(len(a), len(b)) for a, b in pairs], max_bytes):
+        for batch in _batches([(len(a), len(b)) for a, b in described], max_bytes):
             if len(batch) == 1:
-                matched = [mutual_nearest(*pairs[batch[0]], gpu_bytes=gpu_bytes, **options)]
+                matched = [mutual_nearest(*described[batch[0]], gpu_bytes=gpu_bytes, **options)]
             else:
-                descriptors0, descriptors1 = zip(*(pairs[i] for i in batch), strict=True)
+                descriptors0, descriptors1 = zip(*(described[i] for i in batch), strict=True)
                 matched = mutual_nearest_padded(descriptors0, descriptors1, **options)
             found.update(zip(batch, matched, strict=True))
         results = (found[i] for i in range(len(pairs)))
@@ -260,14 +263,14 @@ class NearestNeighbor(Matcher):
 
     @torch.no_grad()
     def match_rows(
-        self, descriptors0: torch.Tensor, descriptors1: torch.Tensor, rows1: torch.Tensor
+        self, features0: Features, features1: Features, rows1: torch.Tensor
     ) -> torch.Tensor:
         """Match only some descriptors1, see `Matcher.match_rows`."""
         if not self.conf["do_mutual_check"]:
-            return super().match_rows(descriptors0, descriptors1, rows1)
+            return super().match_rows(features0, features1, rows1)
         matches1, cosine = mutual_nearest(
-            descriptors1,
-            descriptors0,
+            features1["descriptors"].T,
+            features0["descriptors"].T,
             self.conf["ratio_threshold"],
             rows1,
             distance_threshold=self.conf["distance_threshold"],
@@ -278,8 +281,11 @@ class NearestNeighbor(Matcher):
         return torch.from_numpy(ordered).to(matches1.device)
 
     def _forward(self, data: dict) -> dict:
-        pair = (data["descriptors0"][0].T.contiguous(), data["descriptors1"][0].T.contiguous())
-        ((matches, scores),) = self.match([pair])
+        # `match` wants the numbers of a descriptor beside each other in memory
+        first, second = (
+            {"descriptors": data[key][0].T.contiguous().T} for key in self.required_inputs
+        )
+        ((matches, scores),) = self.match([(first, second)])
         return {"matches0": matches[None], "matching_scores0": scores[None]}
 
 

@@ -15,8 +15,7 @@ from hloc_reduce import Localizer, compact, maps, projections
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import query
 from hloc_reduce.localization.records import read_records
-from hloc_reduce.maps import contents
-from hloc_reduce.maps.torch_engine import TorchEngine
+from hloc_reduce.maps import contents, torch_engine
 from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
 from hloc_reduce.utils import cli, parsers
 from hloc_reduce.utils.cli import InputError
@@ -85,7 +84,8 @@ def test_queries_called_as_map_photos(place, tmp_path, run):
     assert len({tuple(row.values())[2:] for row in rows.values()}) == 1
     localizer = Localizer(outputs / "map")
     if not torch.cuda.is_available():
-        assert localizer.engine.prepare(np.zeros((3, 64), np.float32)).dtype == torch.int16
+        features = {"descriptors": np.zeros((64, 3), np.float32)}
+        assert localizer.engine.matching.prepare(features).dtype == np.int16
     pose, info = localizer.localize(new / "1.png")
     assert (
         info["num_matches"] == int(rows["db/1.png"]["num_matches"]) and len(info["retrieved"]) == 4
@@ -225,14 +225,15 @@ def test_only_matchers_that_take_codes_get_them(takes_codes, place, run, monkeyp
     run(*build, "--feature", "colmap_sift_sv32", "--storage", "uint2")
     compact.main(outputs / "place.hlm", outputs / "map")
     monkeypatch.setattr(NearestNeighbor, "takes_codes", takes_codes)
-    monkeypatch.setattr(contents, "takes", lambda _: False)  # the engine without torch
-    longest, prepare = [], TorchEngine.prepare
+    for module in (contents, torch_engine):
+        monkeypatch.setattr(module, "is_integer_matcher", lambda _: False)
+    longest, match_rows = [], NearestNeighbor.match_rows
 
-    def measured(engine, descriptors):
-        longest.append(np.linalg.norm(descriptors, axis=1).max())
-        return prepare(engine, descriptors)
+    def measured(matcher, query, image, rows):
+        longest.append(image["descriptors"].norm(dim=0).max())
+        return match_rows(matcher, query, image, rows)
 
-    monkeypatch.setattr(TorchEngine, "prepare", measured)
+    monkeypatch.setattr(NearestNeighbor, "match_rows", measured)
     for path in (outputs / "map", outputs / "place.hlm"):
         longest.clear()
         pose, _ = Localizer(path).localize(images / "query/day/a.png")

@@ -90,7 +90,7 @@ def test_localization_without_torch(file, monkeypatch):
     path, photo = file
     *values, inliers, confidence = map(float, without_torch(path, photo).split())
 
-    monkeypatch.setattr(contents, "takes", lambda matcher: False)
+    monkeypatch.setattr(contents, "is_integer_matcher", lambda matcher: False)
     localizer = Localizer(path)
     assert type(localizer.engine).__name__ == "TorchEngine"
     pose, info = localizer.localize(photo)
@@ -140,7 +140,7 @@ def test_one_and_two_threads_give_the_same_pose(file):
 def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
     path, photo = file
     light = contents.read(path)
-    monkeypatch.setattr(contents, "takes", lambda matcher: False)
+    monkeypatch.setattr(contents, "is_integer_matcher", lambda matcher: False)
     heavy = contents.read(path)
     found = [one.engine.extract(photo, one.preprocessing) for one in (light, heavy)]
     for key in ("keypoints", "image_size", "uncertainty", "blur"):
@@ -151,7 +151,7 @@ def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
     both = light, heavy
     described = light.describe({"descriptors": query.T}, photo)
     np.testing.assert_array_equal(*(one.similarity(described) for one in both))
-    matched = [one.match(query, one.names) for one in both]
+    matched = [one.match({"descriptors": query.T}, one.names) for one in both]
     for name in light.names:
         np.testing.assert_array_equal(*(pairs[name] for pairs in matched))
     assert any(len(pairs) > 50 for pairs in matched[0].values())

@@ -84,6 +84,11 @@ def test_tiles_of_any_size_give_the_same(part, tile, ratio_threshold, monkeypatc
     assert (matches >= 0).sum() >= 30
 
 
+def features(*described):
+    """As a matcher takes images with descriptors (N, D)."""
+    return tuple({"descriptors": descriptors.T} for descriptors in described)
+
+
 def integers(descriptors):
     return torch.from_numpy(to_integers(descriptors.numpy()))
 
@@ -106,13 +111,13 @@ def test_integers_match_as_floats(sizes, ratio_threshold, options, arithmetic):
     matcher = NearestNeighbor({"ratio_threshold": ratio_threshold, **options})
     assert matcher.takes_codes
     rounded = tuple(integers(one) for one in pair)
-    ((matches, scores),) = matcher.match([rounded])
-    ((expected, expected_scores),) = matcher.match([pair])
+    ((matches, scores),) = matcher.match([features(*rounded)])
+    ((expected, expected_scores),) = matcher.match([features(*pair)])
     assert matches.tolist() == expected.tolist()
     torch.testing.assert_close(scores, expected_scores, atol=1e-3, rtol=0)
     rows1 = torch.arange(0, sizes[1], 2)
-    found = matcher.match_rows(*rounded, rows1)
-    assert sorted(found.tolist()) == sorted(matcher.match_rows(*pair, rows1).tolist())
+    found = matcher.match_rows(*features(*rounded), rows1)
+    assert sorted(found.tolist()) == sorted(matcher.match_rows(*features(*pair), rows1).tolist())
 
 
 def test_codes_pass_the_ratio_test(arithmetic):
@@ -124,10 +129,10 @@ def test_codes_pass_the_ratio_test(arithmetic):
     right = {}
     for unbiased in (False, True):
         coded = torch.from_numpy(to_integers(restore(*stored, unbiased=unbiased)))
-        ((matches, scores),) = matcher.match([(integers(base), coded)])
+        ((matches, scores),) = matcher.match([features(integers(base), coded)])
         right[unbiased] = int((matches == torch.arange(1000)).sum())
         assert scores.max() <= 1
-    ((matches, _),) = matcher.match([(base, other)])
+    ((matches, _),) = matcher.match([features(base, other)])
     floats = int((matches == torch.arange(1000)).sum())
     assert right[False] < 0.75 * floats and right[True] > 0.8 * floats
 
@@ -135,8 +140,8 @@ def test_codes_pass_the_ratio_test(arithmetic):
 def test_integers_match_the_same_in_either_order(arithmetic):
     pair = integers(unit(400, 8, 0)), integers(unit(300, 8, 1))  # random: near ties abound
     matcher = NearestNeighbor({"ratio_threshold": 0.95})
-    ((forward, _),) = matcher.match([pair])
-    ((backward, _),) = matcher.match([pair[::-1]])
+    ((forward, _),) = matcher.match([features(*pair)])
+    ((backward, _),) = matcher.match([features(*pair[::-1])])
     found = {(i, j) for i, j in enumerate(forward.tolist()) if j >= 0}
     assert found and found == {(i, j) for j, i in enumerate(backward.tolist()) if i >= 0}
 

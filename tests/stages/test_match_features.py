@@ -20,6 +20,8 @@ from hloc_reduce.utils.h5 import list_h5_names
 from hloc_reduce.utils.match_files import get_matches
 from hloc_reduce.utils.parsers import parse_pairs, write_pairs
 
+KEYS = ("descriptors",)
+
 
 @pytest.fixture
 def built(scene):
@@ -109,17 +111,19 @@ def test_descriptors_in_memory_are_bounded(tmp_path):
         for name in "abcd":
             writer.add(name, {"descriptors": np.full((4, 10), ord(name), np.float16)})
     with h5py.File(path) as file:
-        read = match_features.DescriptorCache(max_bytes=2 * 4 * 10 * 4)
+        read = match_features.FeatureCache(2 * 4 * 10 * 4, KEYS)
         first = read(file, "a")
-        assert first.shape == (10, 4) and first.flags["C_CONTIGUOUS"]
+        assert first.keys() == {"descriptors"} and first["descriptors"].shape == (4, 10)
+        assert first["descriptors"].T.flags["C_CONTIGUOUS"]
         read(file, "b")
         assert read(file, "a") is first  # and is the last one used now
         read(file, "c")
         assert read(file, "a") is first
         assert {name for _, name in read.kept} == {"a", "c"} and read.bytes == 320
-        assert read(file, "d")[0, 0] == ord("d")
-        small = match_features.DescriptorCache(max_bytes=1)
-        assert small(file, "a")[0, 0] == ord("a") and small(file, "b")[0, 0] == ord("b")
+        assert read(file, "d")["descriptors"][0, 0] == ord("d")
+        small = match_features.FeatureCache(1, KEYS)
+        for name in "ab":
+            assert small(file, name)["descriptors"][0, 0] == ord(name)
         assert len(small.kept) == 1
 
 
@@ -174,7 +178,7 @@ def test_codes_match_as_the_floats_they_stand_for(storage, name, coded, tmp_path
 
 
 def test_codes_stay_codes_in_memory(coded):
-    read = match_features.DescriptorCache(max_bytes=10**9)
+    read = match_features.FeatureCache(10**9, KEYS)
     with h5py.File(coded) as file:
         sizes = [read.bytes, *(read(file, f"{name}.jpg") and read.bytes for name in CODED)]
     assert np.diff(sizes).tolist() == [200 * 32 * bits // 8 for bits in CODED.values()]
@@ -188,8 +192,8 @@ def test_only_matchers_that_take_codes_get_them(coded):
             return {"matches0": torch.zeros(1, number), "matching_scores0": torch.ones(1, number)}
 
     with h5py.File(coded) as file:
-        read = match_features.DescriptorCache(10**9)
-        pair = match_features._describe(read, file, file, ("query.jpg", "uint4.jpg"))
+        read = match_features.FeatureCache(10**9, KEYS)
+        pair = match_features._read(read, file, file, ("query.jpg", "uint4.jpg"))
     ((_, (name, arrays, _)),) = match_features._match_batch(Nearest({}), "cpu", 1, [pair])
     assert name == "query.jpg/uint4.jpg" and len(arrays["matches0"]) == 200
 
