@@ -214,6 +214,8 @@ def _match_batch(
     """Match pairs and return their groups."""
     import torch
 
+    from .matchers import integers
+
     moved: dict[tuple[int, bool], dict[str, torch.Tensor]] = {}  # pairs share images
 
     def move(features: Features, as_integers: bool) -> dict[str, torch.Tensor]:
@@ -234,9 +236,8 @@ def _match_batch(
 
     pairs = []
     for _, *pair in batch:
-        # a code is rounded much more than integers are, and they are faster
         coded = any(isinstance(one.get("descriptors"), StoredDescriptors) for one in pair)
-        as_integers = coded and matcher.takes_codes and device == "cpu"
+        as_integers = matcher.takes_codes and device == "cpu" and integers.is_worthwhile(coded)
         pairs.append((move(pair[0], as_integers), move(pair[1], as_integers)))
     found = matcher.match(pairs, gpu_bytes)
     groups: list[tuple[None, Group]] = []

@@ -8,6 +8,7 @@ import torch
 
 from .. import extractors, matchers
 from ..matchers.base import Matcher
+from ..matchers.integers import is_worthwhile
 from ..runtime import parallel
 from ..utils.codes import FLOATS
 from .matching import Features, IntegerMatching, Matching, is_integer_matcher
@@ -28,8 +29,7 @@ class TorchEngine:
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._extractor = extractor.eval().to(self._device)
         self.rotation_invariant = extractor.rotation_invariant
-        # a code is rounded much more than integers are, and they are faster
-        by_integers = storage not in FLOATS and self._device == "cpu"
+        by_integers = self._device == "cpu" and is_worthwhile(coded=storage not in FLOATS)
         self.matching: Matching = (
             IntegerMatching(matcher)
             if by_integers and is_integer_matcher(matcher)

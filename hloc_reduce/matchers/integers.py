@@ -11,6 +11,15 @@ TILE = 2**19  # products at once
 ROWS = 2048  # descriptors that a thread matches at once
 
 
+def is_worthwhile(coded: bool) -> bool:
+    """Tell whether descriptors are matched as integers on a CPU.
+
+    Codes are: they are rounded much more than integers. Floats are where the code of `best_two` was
+    compiled, which is up to three times as fast as their products.
+    """
+    return coded or bool(best_two.instructions())
+
+
 def nearest(
     descriptors0: np.ndarray,
     descriptors1: np.ndarray,
@@ -47,16 +56,16 @@ def best_two_of_blocks(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the best two products as `best_two.best_two` does, where nothing was compiled.
 
-    The products are whole numbers that float32 represents exactly.
+    The products are whole numbers that float64 represents exactly, but not float32.
     """
     number = len(descriptors0)
     index = np.empty(number, np.int32)
-    best, second = np.empty((2, number), np.float32)
-    others = descriptors1.astype(np.float32).T
+    best, second = np.empty((2, number))
+    others = descriptors1.astype(np.float64).T
     rows = max(1, TILE // len(descriptors1))
     for start in range(0, number, rows):
         chosen = slice(start, start + rows)
-        products = descriptors0[chosen].astype(np.float32) @ others
+        products = descriptors0[chosen].astype(np.float64) @ others
         of_block = np.arange(len(products))
         index[chosen] = winner = products.argmax(axis=1)
         best[chosen] = products[of_block, winner]

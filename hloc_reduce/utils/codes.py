@@ -24,9 +24,9 @@ STORAGE = Option(
 Storage = Annotated[str, STORAGE]
 STEPS = 255
 # The integer that stands for 1, and the least mean norm of what codes stand for. Products of
-# restored vectors are at most (UNIT / LEAST_NORM)**2 < 2**24, so a float32 represents them exactly;
-# 99.9 % of the matches of real descriptors that pass a ratio test stay the same.
-UNIT, LEAST_NORM = 3000, 0.75
+# restored vectors are at most (UNIT / LEAST_NORM)**2 < 2**30, which `best_two` needs. At least
+# 99.9 % of the matches of real descriptors stay the same, with a ratio test or without.
+UNIT, LEAST_NORM = 20_000, 0.75
 
 
 def descriptor_bytes(dim: int, storage: str) -> int:

@@ -5,7 +5,7 @@ import pytest
 
 from hloc_reduce.matchers import integers
 from hloc_reduce.utils import best_two
-from hloc_reduce.utils.codes import UNIT, to_integers
+from hloc_reduce.utils.codes import LEAST_NORM, UNIT, to_integers
 
 LOWEST = np.iinfo(np.int32).min
 compiled = pytest.mark.skipif(
@@ -24,9 +24,9 @@ def by_definition(rows0, rows1):
 def draw(number, dim, kind, seed):
     """Rows that are random; of few values, so that many products tie; all equal; or extreme."""
     generator = np.random.default_rng(seed)
-    if kind == "extreme":  # the longest rows that there are: products of 2**24
+    if kind == "extreme":  # the longest rows that there are
         rows = np.zeros((number, dim), np.int16)
-        rows[np.arange(number), generator.integers(0, dim, number)] = UNIT
+        rows[np.arange(number), generator.integers(0, dim, number)] = UNIT / LEAST_NORM
         return rows * generator.choice([-1, 1], (number, 1)).astype(np.int16)
     if kind == "equal":
         return np.full((number, dim), -3, np.int16)
@@ -75,7 +75,7 @@ def test_rows_that_are_not_contiguous():
         np.testing.assert_array_equal(values, right)
 
 
-def test_products_of_unit_vectors_are_exact_in_float32():
+def test_integers_are_close_and_their_products_fit():
     for dim in (1, 16, 128):
         vectors = np.random.default_rng(dim).standard_normal((1000, dim)).astype(np.float32)
         vectors[0] = 1  # the worst: each number is rounded in the same direction
@@ -83,4 +83,4 @@ def test_products_of_unit_vectors_are_exact_in_float32():
         integers = to_integers(vectors)
         assert integers.dtype == np.int16
         np.testing.assert_allclose(integers / UNIT, vectors, atol=0.51 / UNIT)
-        assert (integers.astype(np.int64) ** 2).sum(axis=1).max() < 2**24
+        assert (integers.astype(np.int64) ** 2).sum(axis=1).max() < LEAST_NORM**2 * 2**30
