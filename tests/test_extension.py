@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import command
 import cv2
 import h5py
 import numpy as np
@@ -232,3 +233,38 @@ def test_compact_maps_have_no_scores(place, tmp_path, run, monkeypatch):
     monkeypatch.setattr(matchers, "load", demanding)
     with pytest.raises(InputError, match="in_plane, which needs scores of keypoints"):
         Localizer(tmp_path / "place.hlm")
+
+
+def test_a_toy_retrieval_in_a_batch(aachen_layout, run_batch):
+    """Jobs share what each retrieval finds."""
+    features = ["colmap_sift_sv32", "colmap_sift_sv16"]
+    grid = {"dataset": str(aachen_layout), "feature": features, "retrieval": ["vlad", "thumbnail"]}
+    outputs = run_batch(grid)
+    rows = command.table(outputs / "jobs.csv")
+    assert not any(row["error"] for row in rows)
+    assert {row["job"] for row in rows} == {*features, *(f"{name}+thumbnail" for name in features)}
+    shared = outputs / aachen_layout.name / "shared"
+    pairs = {str(path.relative_to(shared)) for path in shared.rglob("pairs-query-*.txt")}
+    stem = "feats-dog-colmap_sift_sv32"
+    assert pairs == {f"{name}_{stem}/pairs-query-{name}50.txt" for name in ("vlad", "thumbnail")}
+
+
+def test_a_map_of_a_database_without_photos_needs_local_descriptors(tmp_path, refused):
+    given = ("--map", tmp_path, "--database", tmp_path / "database.db", "--outputs", tmp_path / "o")
+    message = refused(*given, "--retrieval", "thumbnail")
+    assert "--retrieval thumbnail needs the photos of the map: --map_images" in message
+
+
+def test_a_file_of_pairs_for_queries_in_a_map(place, tmp_path, run, refused):
+    """As hloc's lists of the data sets; the map keeps its own retrieval."""
+    build, images, outputs = place
+    photos = images / "query/day"
+    pairs = command.write(tmp_path / "pairs-query-mine50.txt", "a.png db/2.png\na.png db/1.png\n")
+    given = (*build, "--feature", "colmap_sift_sv32", "--query_images", photos)
+    run(*given, "--retrieval", pairs)
+    summary, rows = outcome(outputs / "queries-day")
+    assert rows["a.png"]["status"] == "localized" and rows["a.png"]["retrieved"] == "db/2.png"
+    assert summary["retrieval"] == str(pairs) and summary["poses"].endswith("_mine50.txt")
+    assert maps.Map(outputs / "map").retrieval == "vlad"
+    assert "differs: retrieval" in refused(*given)
+    assert "neither vlad nor an existing file" in refused(*given, "--retrieval", "vald")
