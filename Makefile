@@ -19,13 +19,14 @@ STAGES_OF_COLMAP := from_colmap localize_sfm more_pairs pairs_from_covisibility 
 # keep two cores busy, because some tests wait.
 WORKERS := -n 3 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test types suite test-long results results-quick docs lint clean
+.PHONY: demo test types suite check test-long results results-quick docs lint clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed
 	$(BIN)/python -m pipelines.aachen --feature colmap_sift_sv64 --demo
 
-test: $(VENV)/installed $(OLD)/installed
+# what a developer runs after each change
+test: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(MAKE) --jobs 2 types suite
@@ -33,15 +34,19 @@ test: $(VENV)/installed $(OLD)/installed
 types: $(VENV)/installed
 	$(BIN)/mypy
 
-suite: $(VENV)/installed $(OLD)/installed
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(WORKERS)
+suite: $(VENV)/installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(WORKERS) -m 'not long and not check'
+
+# what CI runs after `make test`: clusters, browsers, kills, installations, the oldest pycolmap
+check: $(VENV)/installed $(OLD)/installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(WORKERS) -m 'check and not long'
 	PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -c 'import pycolmap; assert pycolmap.__version__ == "$(OLDEST)"'
 	OMP_NUM_THREADS=1 PYTHONPATH=$(abspath $(OLD)) $(BIN)/python -m pytest $(WORKERS) \
 		tests/models/test_dog.py tests/mapping tests/localization/test_intrinsics.py \
 		$(STAGES_OF_COLMAP:%=tests/stages/test_%.py) \
 		tests/maps/test_localizer.py \
-		tests/maps/test_compact.py::test_a_file_localizes_as_its_map \
-		tests/maps/test_compact.py::test_files_of_stages \
+		tests/hlm/test_compact.py::test_a_file_localizes_as_its_map \
+		tests/hlm/test_compact.py::test_files_of_stages \
 		tests/maps/test_photos_alone.py::test_photos_alone \
 		tests/pipelines/test_aachen.py::test_plane tests/pipelines/test_inloc.py::test_plane
 

@@ -7,10 +7,13 @@ import subprocess
 import sys
 import zipfile
 
+import pytest
 from package_copy import FOLDERS, ROOT, copy_package
 
 from hloc_reduce import projections
 from hloc_reduce.networks import MINI
+
+pytestmark = pytest.mark.check
 
 
 def has_compiler() -> bool:

@@ -241,6 +241,7 @@ def test_a_converted_model_is_kept_until_the_file_changes(nvm_layout, tmp_path):
     assert (folder / "made_from.json").stat().st_mtime_ns != before[folder / "made_from.json"]
 
 
+@pytest.mark.check
 def test_a_batch_and_a_comparison_take_them(
     cambridge_layout, sevenscenes_layout, run_batch, tmp_path
 ):

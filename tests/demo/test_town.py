@@ -16,6 +16,8 @@ from hloc_reduce.demo.render import rasterize
 from hloc_reduce.demo.surface import View
 from hloc_reduce.utils.cli import InputError
 
+pytestmark = pytest.mark.check
+
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):

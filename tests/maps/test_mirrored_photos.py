@@ -17,6 +17,8 @@ from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize
 
+pytestmark = pytest.mark.check
+
 PIPELINE = localize
 OTHERS = [f"{i}.png" for i in (0, 2, 3, 4)]
 

@@ -27,6 +27,8 @@ from hloc_reduce.utils.codes import to_integers
 from hloc_reduce.utils.images import read_image
 from pipelines import localize
 
+pytestmark = pytest.mark.check
+
 PIPELINE = localize
 REQUIREMENTS = ROOT / "requirements-light.txt"  # what docs/robot.md installs
 BLOCK = """

@@ -166,6 +166,7 @@ def test_herz_jesus(herz_jesus, tmp_path, run):
     assert day["median_position_error_m"] < 0.01 and day["mean_inliers"] > 1000
 
 
+@pytest.mark.check
 @pytest.mark.parametrize(
     "width, step, least", [(512, 2, 80), pytest.param(1024, 1, 90, marks=pytest.mark.long)]
 )

@@ -19,6 +19,8 @@ from hloc_reduce import aggregate_features, extract_features
 from hloc_reduce.utils.cli import InputError
 from pipelines import aachen
 
+pytestmark = pytest.mark.check
+
 
 def refuse_tfeat(name):
     if name == "tfeat":

@@ -9,6 +9,8 @@ from conftest import PLANE
 from hloc_reduce.evaluation import published
 from pipelines import compare, inloc
 
+pytestmark = pytest.mark.check
+
 
 def test_compare(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
     outputs = tmp_path / "outputs"

@@ -231,6 +231,7 @@ def test_wrong_input(inloc_layout, tmp_path, run, refused):
     assert "would be overwritten" in message
 
 
+@pytest.mark.check
 @pytest.mark.skipif(not (SHARED / "scripts").is_dir(), reason="no real place on this machine")
 def test_redkitchen(tmp_path, run):
     """The whole job on a real place, recorded by a depth camera."""

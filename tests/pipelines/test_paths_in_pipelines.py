@@ -1,7 +1,11 @@
 """Maps and pipelines take strings for paths, as hloc does."""
 
+import pytest
+
 from hloc_reduce import Localizer, localize_inloc, maps, report
 from pipelines import aachen, batch, compare, inloc, localize
+
+pytestmark = pytest.mark.check
 
 FEATURE = "colmap_sift_sv16"
 

@@ -15,6 +15,8 @@ from hloc_reduce.report import pictures, runs
 from hloc_reduce.utils.h5 import iterate_h5_names
 from pipelines import aachen, compare, inloc, localize
 
+pytestmark = pytest.mark.check
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 

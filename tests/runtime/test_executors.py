@@ -16,6 +16,8 @@ from hloc_reduce.runtime.group_writer import GroupWriter, fill
 from hloc_reduce.utils.cli import InputError
 from pipelines import aachen, inloc
 
+pytestmark = pytest.mark.check
+
 
 @pytest.fixture(scope="module")
 def pool():

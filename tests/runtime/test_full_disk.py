@@ -14,6 +14,8 @@ import survival
 from hloc_reduce.utils.h5 import write_h5
 from pipelines import aachen
 
+pytestmark = pytest.mark.check
+
 
 @pytest.fixture
 def disk(tmp_path):

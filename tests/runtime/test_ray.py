@@ -20,6 +20,8 @@ from hloc_reduce.utils import interrupts
 from hloc_reduce.utils.cli import InputError
 from pipelines import aachen, batch
 
+pytestmark = pytest.mark.check
+
 ray = pytest.importorskip("ray")
 
 

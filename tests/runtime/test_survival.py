@@ -19,6 +19,8 @@ from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.utils import files, h5, interrupts
 from hloc_reduce.utils.h5 import write_h5
 
+pytestmark = pytest.mark.check
+
 SEED = 0
 KILL, STOP = (signal.SIGKILL,), (signal.SIGINT, signal.SIGTERM)
 BOTH = (None, 2)  # the serial executor, and one of two processes

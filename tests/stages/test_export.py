@@ -14,6 +14,8 @@ from hloc_reduce.confs import features
 from hloc_reduce.projections import network
 from hloc_reduce.utils.cli import InputError
 
+pytestmark = pytest.mark.check
+
 PIPELINE = export
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
