@@ -7,18 +7,16 @@ places, in five folds of places; by the rules on intrinsics and precision they a
 are. Prints what the gate accepts, what a probability would accept instead, and the weights.
 """
 
-import csv
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from benchmarks.trials import TRIALS, of_row
+from benchmarks.trial_rows import TRIALS, read
 from hloc_reduce.localization import gate
-from hloc_reduce.localization.gate import BY_MATCHES, DEFAULT_GATE, RULES, STRICT
+from hloc_reduce.localization.gate import BY_MATCHES, DEFAULT_GATE, RULES
 from hloc_reduce.localization.measures import Measures
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.tables import aligned
@@ -30,30 +28,6 @@ FOLDS = 5
 PENALTY = 1e-4  # of squared weights of standardized evidence
 OUTCOMES = "true", "near", "wrong"
 PROBABILITIES = 0.5, 0.7, 0.8, 0.9, 0.95, 0.99
-
-
-def read(files: Iterable[Path]) -> list[dict]:
-    """Read trials, those that have a pose with their `measures`, and whether they are accepted."""
-    rows: list[dict] = []
-    for file in files:
-        with file.open(newline="") as opened:
-            rows += csv.DictReader(opened)
-    for row in rows:
-        row["accepted"] = False
-        if row["outcome"] != "none":
-            row["measures"] = of_row(row)
-            row["accepted"] = is_accepted(row)
-    return rows
-
-
-def is_accepted(row: dict) -> bool:
-    """Return whether the gate trusts the pose of a trial."""
-    matcher = {"ratio_threshold": STRICT} if row["matcher"] == "ratio" else {}
-    its_gate = DEFAULT_GATE.of_matches(matcher, int(row["dim"])).of_photo(float(row["blur"]))
-    measures = row["measures"]
-    if not gate.may_be_mirrored(measures):
-        measures = replace(measures, mirror_image=None)
-    return gate.refusal(measures, its_gate) is None
 
 
 def evidence_of(measures: Measures) -> np.ndarray:

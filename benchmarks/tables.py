@@ -1,10 +1,16 @@
 """Tables of the documentation, made from the rows of results/."""
 
+from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 
 from benchmarks.rows import Row, read, select
+from benchmarks.trial_rows import RESHAPED, TRIALS
+from benchmarks.trial_rows import read as read_trials
 from hloc_reduce.utils.cli import InputError
 
+STRANGERS = "other", "mirrored", "black", "noise"  # kinds of trials whose poses are all wrong
+INTRINSICS = "off", "given", "guess"  # of trials
 Table = list[list[str]]  # the header and the rows
 Choice = tuple[str, str]  # feature, storage
 
@@ -187,23 +193,24 @@ def maps_table() -> Table:
 
 
 def false_accepts_table() -> Table:
-    """Count wrong poses that were accepted, and own photos that were localized."""
-    table = [["feature", "storage", "photos that do not belong", "wrong focal length"]]
-    table[0] += ["own, with intrinsics", "own, without"]
-    rows = read("false_accepts")
-    keys = ("feature", "storage", "variant")
-    for chosen in sorted({tuple(row[key] for key in keys) for row in rows}):
-        trials = {row["list"]: row for row in select(rows, **dict(zip(keys, chosen, strict=True)))}
-        label = f"`{chosen[0]}`" + (f", {chosen[2]}" if chosen[2] else "")
-        cells = [label, f"`{chosen[1]}`"]
-        for kind in ("other places, black, noise, mirrored", "own, focal length 15 % too long"):
-            row = trials.get(kind)
-            cells.append(f"{row['wrong']} of {thousands(row['trials'])}" if row else "")
-        for kind in ("own, with intrinsics", "own, without intrinsics"):
-            row = trials.get(kind)
-            counts = " / ".join(row[key] for key in ("right", "near", "wrong")) if row else ""
-            cells.append(f"{counts} of {row['trials']}" if row else "")
-        table.append(cells)
+    """Count the poses of labelled trials that the gate accepts, by feature and kind of photo."""
+    heads = ["photos that do not belong", "wrong focal length", "own, with intrinsics"]
+    table = [["feature", *heads, "own, without", "own, altered"]]
+    files: dict[str, list[Path]] = {}
+    for file in sorted(TRIALS.glob("*.csv")):
+        files.setdefault(file.stem.rpartition("-")[0], []).append(file)
+    for feature, of_feature in files.items():
+        trials = read_trials(of_feature)
+        own = [row for row in trials if row["kind"] in ("own", "blurred")]
+        cells = [[row for row in trials if row["kind"] in STRANGERS]]
+        cells += [[row for row in own if row["intrinsics"] == given] for given in INTRINSICS]
+        cells += [[row for row in trials if row["kind"] in RESHAPED]]
+        counts = [f"{sum(row['accepted'] for row in cells[0])} of {len(cells[0]):,}"]
+        for rows in cells[1:]:
+            accepted = Counter(row["outcome"] for row in rows if row["accepted"])
+            found = " / ".join(str(accepted[outcome]) for outcome in ("true", "near", "wrong"))
+            counts.append(f"{found} of {len(rows):,}")
+        table.append([f"`{feature}`", *counts])
     return table
 
 

@@ -26,7 +26,8 @@ import numpy as np
 import pycolmap
 import torch
 
-from benchmarks.rows import RESULTS, how
+from benchmarks.rows import how
+from benchmarks.trial_rows import COLUMNS, RESHAPED, TRIALS, to_row
 from hloc_reduce import extract_features, localize_inloc, maps, projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
@@ -35,8 +36,7 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import intrinsics, mirrored, query
-from hloc_reduce.localization.gate import ALTERNATIVES, DEFAULT_GATE, STRICT, Gate
-from hloc_reduce.localization.measures import Alternative, Measures, Uncertainty
+from hloc_reduce.localization.gate import DEFAULT_GATE, STRICT, Gate
 from hloc_reduce.localization.query import merged
 from hloc_reduce.localization.references import Reference, ScanMap, SfmMap
 from hloc_reduce.localize_sfm import RANSAC_THRESH
@@ -55,13 +55,10 @@ from hloc_reduce.utils.h5 import open_file, open_h5
 from hloc_reduce.utils.images import list_images, read_image
 from hloc_reduce.utils.progress import progress
 
-TRIALS = RESULTS / "trials"
 MAP_FEATURES = {"colmap_sift": "colmap_sift_sv64"}  # of a base; default: the base itself
 EVERY = 3
 LEAST = 5.0  # confidence of poses whose mirror images are tried
 ALTERED = ("blurred", "mirrored", "black", "noise")
-# whose intrinsics are not those of the place
-RESHAPED = ("cropped", "squeezed", "zoomed", "warped")
 BLUR = 6.0  # standard deviation in pixels
 CROPPED, SQUEEZED = 0.7, 0.75  # share of width and height, share of the height
 WARPED = 0.06  # share of the size by which corners move
@@ -70,56 +67,6 @@ OFF = 1.15  # factor of a wrong focal length
 TRUE_METRES, TRUE_EXTENT, TRUE_DEGREES = 0.25, 0.01, 2.0
 # a pose that is not true is near within this share of the scene's depth and these degrees
 NEAR, NEAR_DEGREES = 0.1, 5.0
-LABELS = (
-    *("feature", "matcher", "dim", "blur", "map", "place", "photo", "kind", "intrinsics", "commit"),
-    *("outcome", "position_error", "rotation_error_deg"),
-)
-NUMBERS = (
-    *("num_matches", "num_inliers", "confidence", "agreement", "degrees_of_freedom"),
-    *("may_be_cropped", "longer_side", "is_focal_length_free", "focal_length"),
-    *("given_focal_length", "off_centre", "off_centre_swapped", "mirror_image"),
-)
-PRECISIONS = "uncertainty", "uncropped"
-COLUMNS = (
-    *LABELS,
-    *NUMBERS,
-    *("focal_range_min", "focal_range_max"),
-    *(f"{name}_{part}" for name in PRECISIONS for part in Uncertainty._fields),
-    *(f"{kind}_{part}" for kind in ALTERNATIVES for part in Alternative._fields),
-)
-DIGITS = 5
-
-
-def to_row(measures: Measures) -> dict:
-    """Return measures as columns; those that were not measured are absent."""
-    row = {name: getattr(measures, name) for name in NUMBERS}
-    row["focal_range_min"], row["focal_range_max"] = measures.focal_range
-    named = {name: getattr(measures, name) for name in PRECISIONS} | dict(measures.alternatives)
-    row |= {
-        f"{name}_{part}": value for name in named for part, value in named[name]._asdict().items()
-    }
-    return {
-        key: f"{value:.{DIGITS}g}" if isinstance(value, float) else value
-        for key, value in row.items()
-        if value is not None
-    }
-
-
-def of_row(row: dict[str, str]) -> Measures:
-    """Return the measures in the columns of a row of a CSV file."""
-    numbers = {name: float(row[name]) for name in NUMBERS if row[name] not in ("", "True", "False")}
-    flags = {name: row[name] == "True" for name in NUMBERS if row[name] in ("True", "False")}
-    precisions = {
-        name: Uncertainty(*(float(row[f"{name}_{part}"]) for part in Uncertainty._fields))
-        for name in PRECISIONS
-    }
-    alternatives = {
-        kind: Alternative(*(float(row[f"{kind}_{part}"]) for part in Alternative._fields))
-        for kind in ALTERNATIVES
-        if row[f"{kind}_ratio"]
-    }
-    range_ = float(row["focal_range_min"]), float(row["focal_range_max"])
-    return Measures(**numbers, **flags, **precisions, focal_range=range_, alternatives=alternatives)
 
 
 @dataclass
