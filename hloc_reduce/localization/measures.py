@@ -142,6 +142,9 @@ def covariance(
 ) -> np.ndarray | None:
     """Return the covariance of a pose that inliers determine, to first order from their errors.
 
+    It is that of a small motion of the camera, and of its unknown intrinsics. The inliers are taken
+    to be independent, and the map to be exact.
+
     Args:
         points2D: (M, 2) image points of the inliers, COLMAP's pixels.
         points3D: (M, 3) their world points.
@@ -151,14 +154,15 @@ def covariance(
 
     Returns:
         (F, F) float64 of the unknown parameters: the rotation about the camera's axes in radians,
-        the translation along them in units of the inliers' median depth, the focal length as its
-        logarithm, and so on. None if the inliers do not determine them.
+        the translation along them in the units of the map, the focal length as its logarithm, and
+        so on. None if the inliers do not determine them.
     """
     equations, unknowns = 2 * len(points2D), degrees_of_freedom
     if equations <= unknowns:
         return None
     local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
-    _, derivatives = project(local / np.median(local[:, 2]))
+    depth = np.median(local[:, 2])
+    _, derivatives = project(local / depth)
     jacobian = camera.mean_focal_length() * np.concatenate(derivatives, axis=1)
     jacobian = jacobian[:degrees_of_freedom].T
     errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
@@ -168,28 +172,11 @@ def covariance(
         found = noise * np.linalg.inv(jacobian.T @ jacobian)
     except np.linalg.LinAlgError:
         return None
-    return found if (np.diag(found) > 0).all() else None
-
-
-def covariance_of_pose(
-    points2D: np.ndarray,
-    points3D: np.ndarray,
-    cam_from_world: pycolmap.Rigid3d,
-    camera: pycolmap.Camera,
-    degrees_of_freedom: int = POSE,
-) -> np.ndarray | None:
-    """Return the covariance (6, 6) of a pose, or None; arguments as of `covariance`.
-
-    It is that of a small motion of the camera: of the rotation about its axes in radians, then of
-    the translation along them, in the units of the map. Unknown intrinsics are allowed for. The
-    inliers are taken to be independent, and the map to be exact.
-    """
-    found = covariance(points2D, points3D, cam_from_world, camera, degrees_of_freedom)
-    if found is None:
+    if not (np.diag(found) > 0).all():
         return None
-    local = points3D @ cam_from_world.rotation.matrix().T + cam_from_world.translation
-    unit = np.array([1, 1, 1, *3 * [np.median(local[:, 2])]])
-    return found[:POSE, :POSE] * np.outer(unit, unit)
+    unit = np.ones(degrees_of_freedom)
+    unit[3:POSE] = depth
+    return found * np.outer(unit, unit)
 
 
 def uncertainty(
@@ -199,17 +186,25 @@ def uncertainty(
     camera: pycolmap.Camera,
     degrees_of_freedom: int = POSE,
 ) -> Uncertainty:
-    """Estimate how precisely inliers determine a pose; arguments as of `covariance`.
+    """Estimate how precisely inliers determine a pose, from its `covariance`.
 
     More than INDEPENDENT inliers do not make the pose more precise.
+
+    Args:
+        points2D: (M, 2) image points of the inliers, COLMAP's pixels.
+        points3D: (M, 3) their world points.
+        cam_from_world: the pose.
+        camera: intrinsics.
+        degrees_of_freedom: the number of unknown parameters, see `projection`.
     """
     found = covariance(points2D, points3D, cam_from_world, camera, degrees_of_freedom)
     if found is None:
         return UNDETERMINED
     variance, bent = np.diag(found), max(1, len(points2D) / INDEPENDENT)
     rotation, position, focal_length = variance[:3], variance[3:POSE], variance[POSE:FOCAL]
+    depths = points3D @ cam_from_world.rotation.matrix()[2] + cam_from_world.translation[2]
     return Uncertainty(
-        position=float(np.sqrt(bent * position.sum())),
+        position=float(np.sqrt(bent * position.sum()) / abs(np.median(depths))),
         rotation=float(np.degrees(np.sqrt(bent * rotation.sum()))),
         focal_length=float(np.sqrt(focal_length.sum())),
     )

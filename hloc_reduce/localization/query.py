@@ -9,9 +9,9 @@ import pycolmap
 from . import gate as gates
 from . import lens_choice
 from .gate import DEFAULT_GATE, Gate
-from .measures import Alternative, covariance_of_pose
+from .measures import Alternative, covariance
 from .pose import Pose, apart
-from .projection import photo_scale
+from .projection import POSE, photo_scale
 from .references import Reference
 
 
@@ -48,7 +48,7 @@ def localize(
         matches; `camera`, the intrinsics of the pose; `db`, the best retrieved image; `keypoints`
         (M,), indices of the query's; `point3D_ids` (M,); `points3D` (M, 3); `inliers` (M,) bool;
         `covariance` (6, 6) of the pose, None if the inliers do not determine it, see
-        `measures.covariance_of_pose`.
+        `measures.covariance`.
     """
     solved = []
     for names in reference.clusters(list(matches)) if matches else [[]]:
@@ -89,7 +89,8 @@ def _covariance(points2D: np.ndarray, points3D: np.ndarray, pose: Pose) -> np.nd
     if pose.cam_from_world is None:
         return None
     view = pose.cam_from_world, pose.camera, pose.degrees_of_freedom
-    return covariance_of_pose(points2D[pose.inliers], points3D[pose.inliers], *view)
+    found = covariance(points2D[pose.inliers], points3D[pose.inliers], *view)
+    return None if found is None else found[:POSE, :POSE]
 
 
 def _quality(info: dict) -> tuple[bool, float, int]:

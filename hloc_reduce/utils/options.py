@@ -238,7 +238,7 @@ class Parser(cli.Parser):
 
 
 def call(main: Callable, description: str | None, example: str = "", **settings: Any) -> Any:
-    """Call a function with the options of its command line, as of `Parser.add`."""
+    """Parse a command line by the parameters of a function, and call it; see `Parser.add`."""
     parser = Parser(description, example)
     parser.add(main, **settings)
     return main(**taken(main, parser.read()))

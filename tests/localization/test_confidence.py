@@ -16,7 +16,7 @@ from hloc_reduce.localization.measures import (
     _log10_tail,
     agreement,
     confidence,
-    covariance_of_pose,
+    covariance,
     uncertainty,
 )
 from hloc_reduce.localization.projection import reprojection_errors
@@ -175,12 +175,12 @@ def test_the_covariance_of_a_pose_is_that_of_the_estimator():
     keypoints, points = matches(200, 0, noise=0.3)
     found = pycolmap.estimate_and_refine_absolute_pose(keypoints, points, CAMERA, {}, {}, True)
     pose = found["cam_from_world"]
-    covariance = covariance_of_pose(keypoints, points, pose, CAMERA)
+    found_here = covariance(keypoints, points, pose, CAMERA)
     x, y, z = pose.translation
     motion = np.eye(6)
     motion[3:, :3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     motion[:3] /= 2
-    expected, measured = found["covariance"], motion @ covariance @ motion.T
+    expected, measured = found["covariance"], motion @ found_here @ motion.T
     scale = np.trace(measured) / np.trace(expected)
     np.testing.assert_allclose(measured, scale * expected, atol=0.05 * measured.max())
 
