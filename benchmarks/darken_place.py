@@ -2,8 +2,7 @@
 
 Every third photo of the map becomes a query; the others stay in the map. Each query is multiplied
 by a gain, blurred, made noisy and rounded to 8 bits again, with parameters that are drawn from a
-seed. With --as_they_are, queries are not altered. Run pipelines.aachen on the data set;
-benchmarks/summaries.py then prints the table.
+seed. With --as_they_are, queries are not altered. `pipelines.aachen --dataset` runs on it.
 """
 
 import shutil

@@ -1,8 +1,8 @@
 """Try maps with photos whose poses are known, and write what is measured of each pose found.
 
 Each map is tried with held-out photos of its place, with photos of all other places, and with
-blurred, mirrored, black and noisy versions of its own; all with their intrinsics and without, its
-own also with a wrong focal length. Its own are also tried cropped, cropped and enlarged, squeezed,
+darkened, blurred, mirrored, black and noisy versions of its own; all with their intrinsics and
+without, its own also with a wrong focal length. Its own are also tried cropped, cropped and enlarged, squeezed,
 and warped as a photo of a print is, without intrinsics. In a COLMAP model, every third photo is
 held out. Keypoints and maps are the same for all features of one base. Another --seed holds out
 other photos, builds other maps, and draws other photos of other places. Each trial is a row of
@@ -26,6 +26,7 @@ import numpy as np
 import pycolmap
 import torch
 
+from benchmarks.darken_place import darken
 from benchmarks.rows import how
 from benchmarks.trial_rows import COLUMNS, RESHAPED, TRIALS, to_row
 from hloc_reduce import extract_features, localize_inloc, maps, projections
@@ -177,6 +178,8 @@ def altered(kind: str, photo: np.ndarray, seed: int) -> np.ndarray:
         return np.zeros_like(photo)
     if kind == "noise":
         return np.random.default_rng(seed).integers(0, 256, photo.shape, np.uint8)
+    if kind == "dark":
+        return darken(photo, np.random.default_rng(seed))
     if kind == "squeezed":
         return cv2.resize(photo, None, fx=1, fy=SQUEEZED, interpolation=cv2.INTER_AREA)
     if kind == "warped":  # as a print that is photographed aslant
@@ -202,14 +205,14 @@ def alter(
     written = []
     for i, (name, camera, truth) in enumerate(place.queries):
         photo = read_image(place.images / name)
-        for kind in (ALTERED[i % 2] if i > 1 else ALTERED[2 + i], *RESHAPED):
+        for kind in (ALTERED[i % 2] if i > 1 else ALTERED[2 + i], "dark", *RESHAPED):
             path = output / "altered" / kind / Path(name).with_suffix(".png")
             if not path.exists():
                 encoded = cv2.imencode(".png", altered(kind, photo, seed + i)[..., ::-1])[1]
                 with replacing(path) as temporary:
                     temporary.write_bytes(encoded.tobytes())
             named = path.relative_to(output / "altered").as_posix()
-            known = truth if kind in ("blurred", *RESHAPED) else None
+            known = truth if kind in ("blurred", "dark", *RESHAPED) else None
             written.append((named, None if kind in RESHAPED else camera, known))
     names = [name for name, _, _ in written]
     conf, features = features_confs.confs[place.base], output / "altered.h5"
