@@ -25,6 +25,7 @@ import h5py
 import numpy as np
 import pycolmap
 import torch
+from scipy.linalg import rq
 
 from benchmarks.darken_place import darken
 from benchmarks.rows import how
@@ -182,16 +183,30 @@ def altered(kind: str, photo: np.ndarray, seed: int) -> np.ndarray:
         return darken(photo, np.random.default_rng(seed))
     if kind == "squeezed":
         return cv2.resize(photo, None, fx=1, fy=SQUEEZED, interpolation=cv2.INTER_AREA)
-    if kind == "warped":  # as a print that is photographed aslant
-        corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
-        moved = corners + WARPED * np.float32(
-            [[width, height / 2], [0, 0], [-width / 3, 0], [width / 5, -height]]
-        )
-        homography = cv2.getPerspectiveTransform(corners, moved.astype(np.float32))
-        return cv2.warpPerspective(photo, homography, (width, height))
+    if kind == "warped":
+        return cv2.warpPerspective(photo, warping(width, height), (width, height))
     assert kind in ("cropped", "zoomed")
     part = photo[int((1 - CROPPED) * height) :, : int(CROPPED * width)]
     return part if kind == "cropped" else cv2.resize(part, (width, height))
+
+
+def warping(width: int, height: int) -> np.ndarray:
+    """Return the homography (3, 3) of a print that is photographed aslant."""
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    moved = [[width, height / 2], [0, 0], [-width / 3, 0], [width / 5, -height]]
+    return cv2.getPerspectiveTransform(corners, corners + WARPED * np.array(moved, np.float32))
+
+
+def warped_pose(camera: pycolmap.Camera, truth: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
+    """Return the pose, camera from world, of the camera that takes a warped photo.
+
+    It is at the same position, but turned, and its pixels are not rectangular: with H for the
+    homography, HK = K'R.
+    """
+    homography = warping(camera.width, camera.height) @ camera.calibration_matrix()
+    calibration, turn = rq(homography * np.sign(np.linalg.det(homography)))
+    turn = np.sign(np.diag(calibration))[:, None] * turn
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3)) * truth
 
 
 def alter(
@@ -213,6 +228,7 @@ def alter(
                     temporary.write_bytes(encoded.tobytes())
             named = path.relative_to(output / "altered").as_posix()
             known = truth if kind in ("blurred", "dark", *RESHAPED) else None
+            known = warped_pose(camera, truth) if kind == "warped" else known
             written.append((named, None if kind in RESHAPED else camera, known))
     names = [name for name, _, _ in written]
     conf, features = features_confs.confs[place.base], output / "altered.h5"
