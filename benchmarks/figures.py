@@ -4,10 +4,13 @@ import re
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
+
 from benchmarks.rows import CENTIMETRES, Row, read, select
 from benchmarks.tables import (
     FAMILIES,
     FEATURES,
+    KINDS_OF_TRIALS,
     MAPS,
     ONE_CORE,
     SIZES,
@@ -16,7 +19,11 @@ from benchmarks.tables import (
     percent,
     total,
 )
+from benchmarks.trial_rows import OUTCOMES, TRIALS, label
+from benchmarks.trial_rows import read as read_trials
 from hloc_reduce.evaluation import plots
+
+OUTCOME_COLOURS = plots.COLOURS[2], plots.COLOURS[4], plots.COLOURS[1]
 
 
 def draw_features() -> list[Callable]:
@@ -114,9 +121,43 @@ def draw_runs() -> list[Callable]:
     return [panel]
 
 
+def draw_errors() -> list[Callable]:
+    """Draw what becomes of photos of each kind, and the probabilities of right and wrong poses."""
+    trials = read_trials(sorted(TRIALS.glob("*.csv")))
+
+    def kinds(axis) -> None:
+        found = {
+            name: [row for row in trials if is_of(row)] for name, is_of in KINDS_OF_TRIALS.items()
+        }
+        names, left = list(found)[::-1], np.zeros(len(found))
+        for colour, outcome in zip(OUTCOME_COLOURS, OUTCOMES, strict=True):
+            shares = np.array(
+                [
+                    sum(row["accepted"] and row["outcome"] == outcome for row in found[name])
+                    / len(found[name])
+                    for name in names
+                ]
+            )
+            axis.barh(names, 100 * shares, left=left, color=colour, label=outcome)
+            left = left + 100 * shares
+        axis.set(xlabel="localized [%]", xlim=(0, 100))
+
+    def probabilities(axis) -> None:
+        poses = [row for row in trials if "measures" in row]
+        for is_right, name in ((True, "right"), (False, "of photos that do not belong")):
+            found = np.sort([row["probability"] for row in poses if label(row) == is_right])
+            share = 100 * np.arange(1, len(found) + 1) / len(found)
+            colour = OUTCOME_COLOURS[0 if is_right else -1]
+            axis.plot(found, share, color=colour, label=name)
+        axis.set(xlabel="probability", ylabel="poses with at most this [%]")
+
+    return [kinds, probabilities]
+
+
 FIGURES: dict[str, Callable[[], list[Callable]]] = {
     "docs/features.svg": draw_features,
     "docs/rate.svg": draw_bytes,
     "docs/maps.svg": draw_maps,
+    "docs/errors.svg": draw_errors,
     "docs/runs.svg": draw_runs,
 }

@@ -13,14 +13,24 @@ from hloc_reduce.evaluation import plots
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.files import replacing
 
-PAGES = ("README.md", "docs/results.md", "docs/features.md", "docs/performance.md")
+PAGES = (
+    "README.md",
+    "docs/results.md",
+    "docs/features.md",
+    "docs/localize.md",
+    "docs/performance.md",
+)
+LONGEST_NUMBER = 30  # characters of a cell, with units
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def markdown(table: Table) -> str:
     """Format a table; columns of numbers are aligned to the right."""
     columns = list(zip(*table[1:], strict=True))
-    numeric = [any(cell[:1].isdigit() for cell in column) for column in columns]
+    numeric = [
+        any(cell[:1].isdigit() for cell in column) and max(map(len, column)) < LONGEST_NUMBER
+        for column in columns
+    ]
     header = [table[0], ["---:" if right else "---" for right in numeric], *table[1:]]
     return "".join(f"| {' | '.join(cells)} |\n" for cells in header)
 

@@ -5,12 +5,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.rows import Row, read, select
-from benchmarks.trial_rows import RESHAPED, TRIALS
+from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
+from hloc_reduce.localization.gate import RULES
 from hloc_reduce.utils.cli import InputError
 
-STRANGERS = "other", "mirrored", "black", "noise"  # kinds of trials whose poses are all wrong
-INTRINSICS = "off", "given", "guess"  # of trials
+# kinds of trials, by what they are called in tables
+OWN = "own", "blurred", "dark"
+KINDS_OF_TRIALS: dict[str, Callable[[dict], bool]] = {
+    "own, with intrinsics": lambda row: row["kind"] in OWN and row["intrinsics"] == "given",
+    "own, without": lambda row: row["kind"] in OWN and row["intrinsics"] == "guess",
+    "own, altered": lambda row: row["kind"] in RESHAPED,
+    "own, wrong focal length": lambda row: row["intrinsics"] == "off",
+    "not of the place": lambda row: row["kind"] in STRANGERS,
+}
 Table = list[list[str]]  # the header and the rows
 Choice = tuple[str, str]  # feature, storage
 
@@ -194,23 +202,18 @@ def maps_table() -> Table:
 
 def false_accepts_table() -> Table:
     """Count the poses of labelled trials that the gate accepts, by feature and kind of photo."""
-    heads = ["photos that do not belong", "wrong focal length", "own, with intrinsics"]
-    table = [["feature", *heads, "own, without", "own, altered"]]
+    table = [["feature", *KINDS_OF_TRIALS]]
     files: dict[str, list[Path]] = {}
     for file in sorted(TRIALS.glob("*.csv")):
         files.setdefault(file.stem.rpartition("-")[0], []).append(file)
     for feature, of_feature in files.items():
-        trials = read_trials(of_feature)
-        own = [row for row in trials if row["kind"] in ("own", "blurred")]
-        cells = [[row for row in trials if row["kind"] in STRANGERS]]
-        cells += [[row for row in own if row["intrinsics"] == given] for given in INTRINSICS]
-        cells += [[row for row in trials if row["kind"] in RESHAPED]]
-        counts = [f"{sum(row['accepted'] for row in cells[0])} of {len(cells[0]):,}"]
-        for rows in cells[1:]:
+        trials, cells = read_trials(of_feature), []
+        for is_of in KINDS_OF_TRIALS.values():
+            rows = [row for row in trials if is_of(row)]
             accepted = Counter(row["outcome"] for row in rows if row["accepted"])
-            found = " / ".join(str(accepted[outcome]) for outcome in ("true", "near", "wrong"))
-            counts.append(f"{found} of {len(rows):,}")
-        table.append([f"`{feature}`", *counts])
+            found = " / ".join(str(accepted[outcome]) for outcome in OUTCOMES)
+            cells.append(f"{found} of {len(rows):,}")
+        table.append([f"`{feature}`", *cells])
     return table
 
 
@@ -292,6 +295,11 @@ def thousands(number: str) -> str:
     return f"{float(number):,.0f}"
 
 
+def limits_table() -> Table:
+    """List what a pose must have to be localized."""
+    return [["a pose must", "limit"], *([rule.text, rule.limit] for rule in RULES)]
+
+
 TABLES: dict[str, Callable[[], Table]] = {
     "features": features_table,
     "readme": readme_table,
@@ -299,6 +307,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "schemes": schemes_table,
     "maps": maps_table,
     "false_accepts": false_accepts_table,
+    "limits": limits_table,
     "runs": runs_table,
     "extraction": extraction_table,
     "gpu": gpu_table,

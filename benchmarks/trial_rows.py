@@ -7,20 +7,22 @@ from pathlib import Path
 
 from benchmarks.rows import RESULTS
 from hloc_reduce.localization import gate
-from hloc_reduce.localization.gate import ALTERNATIVES, DEFAULT_GATE, STRICT
+from hloc_reduce.localization.gate import ALTERNATIVES, Gate
 from hloc_reduce.localization.measures import Alternative, Measures, Uncertainty
 
 TRIALS = RESULTS / "trials"
 # kinds of altered photos whose intrinsics are not those of the place
 RESHAPED = ("cropped", "squeezed", "zoomed", "warped")
+STRANGERS = "other", "mirrored", "black", "noise"  # kinds of photos whose poses are all wrong
+OUTCOMES = "true", "near", "wrong"  # of poses
 LABELS = (
     *("feature", "matcher", "dim", "blur", "map", "place", "photo", "kind", "intrinsics", "commit"),
     *("outcome", "position_error", "rotation_error_deg"),
 )
 NUMBERS = (
     *("num_matches", "num_inliers", "confidence", "agreement", "degrees_of_freedom"),
-    *("may_be_cropped", "longer_side", "is_focal_length_free", "focal_length"),
-    *("given_focal_length", "off_centre", "off_centre_swapped", "mirror_image"),
+    *("may_be_cropped", "longer_side", "is_camera_given", "is_focal_length_free"),
+    *("focal_length", "given_focal_length", "off_centre", "off_centre_swapped", "mirror_image"),
 )
 PRECISIONS = "uncertainty", "uncropped"
 COLUMNS = (
@@ -66,7 +68,7 @@ def of_row(row: dict[str, str]) -> Measures:
 
 
 def read(files: Iterable[Path]) -> list[dict]:
-    """Read trials, those that have a pose with their `measures`, and whether they are accepted."""
+    """Read trials: whether the gate accepts them; of poses, the `measures` and probability."""
     rows: list[dict] = []
     for file in files:
         with file.open(newline="") as opened:
@@ -75,15 +77,16 @@ def read(files: Iterable[Path]) -> list[dict]:
         row["accepted"] = False
         if row["outcome"] != "none":
             row["measures"] = of_row(row)
-            row["accepted"] = is_accepted(row)
+            its_gate = Gate(matches=row["matcher"])
+            if not gate.may_be_mirrored(row["measures"], its_gate):
+                row["measures"] = replace(row["measures"], mirror_image=None)
+            found = gate.verdict(row["measures"], its_gate)
+            row |= {"accepted": not found["reason"], "probability": found["probability"]}
     return rows
 
 
-def is_accepted(row: dict) -> bool:
-    """Return whether the gate trusts the pose of a trial."""
-    matcher = {"ratio_threshold": STRICT} if row["matcher"] == "ratio" else {}
-    its_gate = DEFAULT_GATE.of_matches(matcher, int(row["dim"])).of_photo(float(row["blur"]))
-    measures = row["measures"]
-    if not gate.may_be_mirrored(measures):
-        measures = replace(measures, mirror_image=None)
-    return gate.refusal(measures, its_gate) is None
+def label(row: dict) -> bool | None:
+    """Return whether the matches of a trial's pose are right, None if that is not known."""
+    if row["outcome"] == "true":
+        return True
+    return False if row["kind"] in STRANGERS else None

@@ -38,7 +38,7 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import intrinsics, mirrored, query
-from hloc_reduce.localization.gate import DEFAULT_GATE, STRICT, Gate
+from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.localization.query import merged
 from hloc_reduce.localization.references import Reference, ScanMap, SfmMap
 from hloc_reduce.localize_sfm import RANSAC_THRESH
@@ -65,6 +65,8 @@ BLUR = 6.0  # standard deviation in pixels
 CROPPED, SQUEEZED = 0.7, 0.75  # share of width and height, share of the height
 WARPED = 0.06  # share of the size by which corners move
 OFF = 1.15  # factor of a wrong focal length
+# which intrinsics photos are tried with; photos of a calibrated camera are not mirrored
+KNOWN = {"own": ("given", "off", "guess"), "mirrored": ("guess",)}
 # a pose is true within metres, or a share of the extent of the cameras, and degrees
 TRUE_METRES, TRUE_EXTENT, TRUE_DEGREES = 0.25, 0.01, 2.0
 # a pose that is not true is near within this share of the scene's depth and these degrees
@@ -291,7 +293,7 @@ def run(
 ) -> list[dict]:
     """Try a map with all photos, and return the rows of trials.csv."""
     model = matchers_confs.confs[matcher]["model"]
-    ratio_threshold = model.get("ratio_threshold")
+    ratio_threshold, gate = model.get("ratio_threshold"), DEFAULT_GATE.of_matches(model)
     tried = list(trials(place, others, output, number, seed))
     describe = Described(feature)
     shown, rows = {}, []
@@ -301,9 +303,7 @@ def run(
         ids, _ = place.reference.lift(name, np.arange(len(descriptors)))
         shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
     dim = described[place.names[0]].shape[1]
-    gate = DEFAULT_GATE.of_matches(model, dim)
-    strict = (ratio_threshold or 1) <= STRICT
-    labels = {"feature": feature, "matcher": "ratio" if strict else "mutual", "dim": dim}
+    labels = {"feature": feature, "matcher": gate.matches, "dim": dim}
     labels["commit"] = how()["commit"]
 
     def match(path: Path, name: str) -> tuple[np.ndarray, dict, float]:
@@ -325,12 +325,12 @@ def run(
         with open_h5(path) as file:
             size = get_image_size(file, name)
         (*matched, blur), flipped = match(path, name), None
-        known = ("given", "off", "guess") if kind == "own" else ("given", "guess")
-        for given in known if camera else ("guess",):
+        for given in KNOWN.get(kind, ("given", "guess")) if camera else ("guess",):
             its_camera, refinement = intrinsics_of(camera, size, given, place.cameras)
             pose, info = localize(place, *matched, its_camera, refinement, gate)
             measures = info["measures"]
-            if measures.num_inliers >= gate.min_inliers and measures.confidence >= LEAST:
+            sure = measures.num_inliers >= gate.min_inliers and measures.confidence >= LEAST
+            if sure and not measures.is_camera_given:
                 flipped = flipped or match(*mirror(images, output, name, place.base))[:2]
                 refinement = mirrored.mirror_options(refinement)
                 other_camera = mirrored.mirror(its_camera)

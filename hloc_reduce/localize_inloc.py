@@ -16,7 +16,6 @@ from .datasets.inloc import RANSAC_SIZE, RANSAC_THRESH, by_iphone7
 from .localization import stage
 from .localization.gate import DEFAULT_GATE, Gate
 from .localization.intrinsics import to_lists
-from .localization.mirrored import MirrorImages
 from .localization.references import ScanMap, point_group
 from .runtime import provenance
 from .runtime.executors import SERIAL, Executor
@@ -47,7 +46,6 @@ def main(
     executor: Executor = SERIAL,
     points: Annotated[Path, HIDDEN] | None = None,
     gate: Gate = DEFAULT_GATE,
-    mirror_images: MirrorImages | None = None,
 ) -> dict[str, dict]:
     """Localize queries in a data set of InLoc's layout.
 
@@ -71,7 +69,6 @@ def main(
         points: file of the points that keypoints of cutouts show, for later runs and for other
             features with the same keypoints; default: `points_file(features)`.
         gate: what a pose must have for the query to be called localized.
-        mirror_images: extracts and matches mirror images of queries, see `localization.stage.main`.
 
     Returns:
         A record for each query, as `localization.stage.main` returns it. A query that is not
@@ -113,7 +110,6 @@ def main(
         skip_matches=skip_matches or 0,
         executor=executor,
         gate=gate,
-        mirror_images=mirror_images,
     )
 
 

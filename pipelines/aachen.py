@@ -89,7 +89,6 @@ def main(
                 full_names=place.full_names,
                 executor=given.executor,
                 gate=given.gate,
-                mirror_images=run.mirror_images_of_dataset(),
             )
         sizes = {"map_points3D": reconstruction.num_points3D(), "map_bytes": run.map_bytes(sfm)}
         return run.finish_dataset(lists, limits, records, poses, loc_matches, sfm, **sizes)

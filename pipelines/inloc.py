@@ -70,7 +70,6 @@ def main(
                 executor=given.executor,
                 points=points,
                 gate=given.gate,
-                mirror_images=run.mirror_images_of_dataset(),
             )
         source = "list" if place.query_list.is_file() else "iphone7"
         limits = dict.fromkeys(lists, INLOC_THRESHOLDS)

@@ -55,6 +55,7 @@ def _query_row(
         "inlier_ratio": round(inliers / correspondences, 4) if correspondences else 0.0,
         "confidence": record["confidence"],
         "agreement": record["agreement"],
+        "probability": record["probability"],
         **dict(zip(ERRORS, (None, None) if true is None else pose_error(pose, true), strict=True)),
         "retrieved": record["db"],
         "reason": record["reason"],

@@ -96,6 +96,7 @@ def _measures(
         degrees_of_freedom=pose.degrees_of_freedom,
         may_be_cropped=matches.may_be_cropped(pose),
         longer_side=max(camera.width, camera.height),
+        is_camera_given=matches.is_camera_given,
         is_focal_length_free=matches.is_focal_length_free,
         focal_length=pose.camera.mean_focal_length(),
         given_focal_length=camera.mean_focal_length(),
@@ -154,11 +155,11 @@ def _with_typical_lens(matches: Matches, pose: Pose) -> Pose:
 
 def _of_outliers(matches: Matches, pose: Pose) -> list[Pose]:
     """Return the pose that the outliers of a pose give, none if they are few."""
-    others, share = np.flatnonzero(~pose.inliers), ALTERNATIVES["rival"].ratio
-    if not len(others) >= share * pose.num_inliers > 0:
+    others = np.flatnonzero(~pose.inliers)
+    if not len(others) >= ALTERNATIVES["rival"].ratio * pose.num_inliers > 0:
         return []
     # half as many inliers as a rival of this confidence is expected to have
-    least = share / 2 * pose.num_inliers / len(others)
+    least = ALTERNATIVES["rival"].ratio / 2 * pose.num_inliers / len(others)
     sample = np.random.default_rng(SEED).permutation(others)[:RIVAL_SAMPLE]
     return [_estimate(matches, sample, max(LEAST_RATIO, least))]
 

@@ -9,44 +9,18 @@ import pycolmap
 
 from ..utils.cli import InputError
 from ..utils.options import HIDDEN
-from .measures import Alternative, Measures, Uncertainty
-from .projection import ALL
+from .measures import INDEPENDENT, Alternative, Measures, Uncertainty
 
-FOCAL_LENGTHS = (0.3, 5.0)  # range of estimated ones, in longer sides: 11 to 180 mm on 35 mm film
+FOCAL_LENGTHS = 0.3, 5.0  # range of estimated ones, in longer sides: 11 to 180 mm on 35 mm film
 REFINED = 2.0  # factor by which a focal length from EXIF data may change
 LISTED = 0.1, 50.0  # range of listed focal lengths, in longer sides
 # distances of the principal point from the centre, as shares of the size
 OFF_CENTRE, CENTRED = 0.15, 0.02
 ZOOMED = 1.05  # times the map's focal lengths: beyond, a photo may be cropped and enlarged
 
-MAX_POSITION = 0.05  # standard deviation of the position, in median depths of the inliers
-MAX_ROTATION = 2.0  # standard deviation in degrees
-# multiples of MAX_POSITION and MAX_ROTATION
-PRECISE = 0.6, 1.0  # uncertainty of a pose; one error in ten is more than 1.9 times as large
-ESTIMATED = 0.4, 1.0  # the same, with all intrinsics estimated
-CROPPED = 3.0, 1.0  # uncertainty with unknown intrinsics, of a photo that may be cropped
-
-# The least agreement of a pose, from a confidence on. With a ratio test, wrong poses at copies of
-# repeated structures have confidences of 50 to 300. Below, there are few matches, so that the
-# agreement is less certain; above, there are many more right poses in noisy scans.
-Steps = tuple[tuple[float, float], ...]
-AGREEMENT: Steps = ((0, 0.3),)  # of matches without a strict ratio test
-AGREEMENT_NOISY: Steps = ((0, 0.17),)  # the same for photos whose noise was reduced
-STRICT = 0.8  # the largest ratio of a strict test
-AGREEMENT_RATIO: Steps = ((0, 0.76), (50, 0.86), (300, 0.76))  # with a strict ratio test
-FEW = 32  # dimensions
-AGREEMENT_FEW: Steps = ((0, 0.55), (50, 0.72), (300, 0.55))  # the same for fewer dimensions
-# The largest share of its confidence that the mirror image of a right pose may have. On symmetric
-# facades networks, which match without a ratio test, have up to 0.73; of mirrored photos of a
-# castle, localized 90 degrees off by matches with a strict one, seven have 0.47 to 0.97.
-MIRRORED, MIRRORED_RATIO = 0.8, 0.4
-# agreement and confidence below which mirror images are tried. Poses of most mirrored photos have
-# an agreement of at most 0.85 or a confidence of at most 125; two of a castle 0.92 and 432.
-DOUBTFUL = 0.9, 500.0
-
 
 class Tolerance(NamedTuple):
-    """How far apart two poses may be that count as one.
+    """How far apart two poses may be that count as one, or how uncertain one may be.
 
     Args:
         position: in units of the inliers' median depth.
@@ -57,18 +31,21 @@ class Tolerance(NamedTuple):
     rotation: float
 
 
-ALIKE = Tolerance(MAX_POSITION, MAX_ROTATION)
-LISTS = Tolerance(0.06, 2.4)  # with listed and other focal lengths: many lists are 5 % off
-RIVALS = Tolerance(0.25, 10.0)
+ALIKE = Tolerance(0.06, 2.4)  # many listed focal lengths are 5 % off
+RIVALS = Tolerance(0.25, 10.0)  # of poses by other matches
+# standard deviations of a pose; one error in ten is more than 1.9 times as large
+PRECISE = Tolerance(0.03, 2.0)
+CROPPED = Tolerance(0.15, 2.0)  # with unknown intrinsics, of a photo that may be cropped
 # standard deviations between poses with the intrinsics of a map's own lens and with another focal
 # length: photos of a flat scene hardly tell one, and errors of the map decide which fits better
 UNCERTAIN = 1.5
 
+# ratios of the confidences of two poses; above BETTER, other intrinsics replace guessed ones
+AS_LIKELY, LIKELIER, BETTER = 0.8, 1.0, 1.1
 STRETCHED = (
     "it may be cropped or stretched: another principal point and aspect ratio fit about as well, "
     "and the pose differs; known intrinsics would help"
 )
-CONTRADICTED = "its intrinsics contradict the map: {} fit much better, and the pose differs"
 
 
 class Limit(NamedTuple):
@@ -76,58 +53,100 @@ class Limit(NamedTuple):
 
     Args:
         ratio: of both confidences, above which it is.
-        tolerance: beyond it, the poses differ.
         reason: the message; {detail:.0f} is that of the `Alternative`, {inliers} of the pose.
+        tolerance: beyond it, the poses differ.
     """
 
     ratio: float
-    tolerance: Tolerance
     reason: str
+    tolerance: Tolerance = ALIKE
 
 
 ALTERNATIVES = {
     # with a skew, which no lens has
-    "skew": Limit(1.1, ALIKE, "it may be warped, or a photo of a picture: a skew fits much better"),
-    # for given intrinsics: with other ones
+    "skew": Limit(LIKELIER, "it may be warped, or a photo of a picture: a skew fits better"),
+    # for given intrinsics
     "focal_length": Limit(
-        1.0,
-        LISTS,
-        "its intrinsics contradict the map: a focal length of {detail:.0f} pixels fits better, and "
-        "the pose differs",
+        LIKELIER,
+        "its intrinsics contradict the map: other ones, as a focal length of {detail:.0f} pixels, "
+        "fit better, and the pose differs",
     ),
     "principal_point": Limit(
-        1.1, LISTS, CONTRADICTED.format("another principal point and aspect ratio")
+        BETTER,
+        "its intrinsics contradict the map: another principal point and aspect ratio fit much "
+        "better, and the pose differs",
     ),
-    "parameters": Limit(1.1, LISTS, CONTRADICTED.format("other parameters of its camera model")),
     # for those of a lens of the map's photos that may have taken it
     "lens_by_size": Limit(
-        0.8,
-        LISTS,
+        AS_LIKELY,
         "another lens than that of the map's photos of its size may have taken it: other "
         "parameters fit about as well, and the pose differs; known intrinsics would help",
     ),
     "lens": Limit(
-        0.8,
-        ALIKE,
+        AS_LIKELY,
         "another lens of the map's photos of its size fits about as well, and the pose differs; "
         "known intrinsics would help",
     ),
-    # for estimated ones: with another principal point and aspect ratio, whose parameters cost
-    # confidence, of a photo that may be cropped and of another one; and with the map's lens
-    "cropped": Limit(0.8, ALIKE, STRETCHED),
-    "stretched": Limit(1.05, ALIKE, STRETCHED),
-    "typical_lens": Limit(0.8, ALIKE, STRETCHED),
+    # for estimated ones: with another principal point and aspect ratio, of a photo that may be
+    # cropped and of another one; and with the map's lens
+    "cropped": Limit(AS_LIKELY, STRETCHED),
+    "stretched": Limit(LIKELIER, STRETCHED),
+    "typical_lens": Limit(AS_LIKELY, STRETCHED),
     # by other matches
     "rival": Limit(
-        0.25, RIVALS, "ambiguous: another pose has {detail:.0f} inliers, this one {inliers}"
+        0.25, "ambiguous: another pose has {detail:.0f} inliers, this one {inliers}", RIVALS
     ),
+    # by other images that do not see those of the pose, as on another floor; of their inliers
     "other_images": Limit(
-        0.8,
-        RIVALS,
+        AS_LIKELY,
         "ambiguous: a pose by other images has {detail:.0f} inliers, this one {inliers}",
+        RIVALS,
     ),
 }
-BETTER = 1.1  # ratio of confidences above which other intrinsics replace the assumed ones
+
+
+class Evidence(NamedTuple):
+    """What speaks for the matches of a pose: the larger, the better.
+
+    Args:
+        confidence: its decimal logarithm, of at most MOST_TELLING.
+        agreement: see `measures.agreement`.
+    """
+
+    confidence: float
+    agreement: float
+
+
+class OfMatches(NamedTuple):
+    """What depends on the kind of the matches.
+
+    Args:
+        weights: of the evidence. With the bias, the weighted sum is the log odds of a right pose.
+        bias: of right poses and of those of photos that do not belong, if half of all are right.
+        min_probability: the least of a pose that is trusted. With a strict ratio test, copies of
+            repeated structures have up to 0.8. Without, mostly mirrored photos are probable, which
+            `max_mirrored` refutes.
+        max_mirrored: the largest confidence of the mirror image, as a share of its own. On
+            symmetric facades networks, which match without a ratio test, have up to 0.73 for right
+            poses; of mirrored photos of a castle, localized 90 degrees off by matches with a strict
+            one, seven have 0.47 to 0.97.
+    """
+
+    weights: Evidence
+    bias: float
+    min_probability: float
+    max_mirrored: float
+
+
+MOST_TELLING = 300.0  # confidence: more does not count
+BEST = Evidence(float(np.log10(MOST_TELLING)), 1.0)
+STRICT = 0.8  # the largest ratio of a strict ratio test
+# with a strict ratio test and without; weights and biases by `python -m benchmarks.fit_gate`
+OF_MATCHES = {
+    "ratio": OfMatches(Evidence(2.24, 17.55), -17.19, 0.8, 0.4),
+    "mutual": OfMatches(Evidence(1.7, 10.18), -7.1, 0.3, 0.8),
+}
+SURE = 0.99  # probability from which on mirror images are not tried
 
 
 @dataclass(frozen=True)
@@ -138,21 +157,19 @@ class Gate:
         min_confidence: minimum confidence of a localized query: -log10 of the number of poses with
             as many inliers that are expected by chance.
         min_inliers: minimum number of RANSAC's inliers of a localized query.
-        min_agreement: pairs, in ascending order, of a confidence and the minimum `agreement` of
-            poses with at least this confidence; default: by the matches, see `of_matches`.
-        min_agreement_noisy: the same for photos whose noise was reduced.
-        max_mirrored: the maximum confidence of the mirror image, as a share of its own; default: by
-            the matches.
+        min_probability: minimum probability of a localized query, see `probability`; default: 0.8
+            with a strict ratio test, else 0.3.
+        matches: "ratio" for those with a strict ratio test, else "mutual", see `of_matches`.
 
     Raises:
-        InputError: for a confidence that is not finite, or a negative number of inliers or share.
+        InputError: for a confidence that is not finite, a negative number of inliers, or a
+            probability that is none.
     """
 
     min_confidence: float = 8.0
     min_inliers: int = 8
-    min_agreement: Steps | None = None
-    min_agreement_noisy: Steps | None = None
-    max_mirrored: Annotated[float, HIDDEN] | None = None
+    min_probability: float | None = None
+    matches: Annotated[str, HIDDEN] = "mutual"
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
@@ -161,43 +178,57 @@ class Gate:
             )
         if self.min_inliers < 0:
             raise InputError(f"min_inliers is {self.min_inliers}: at least 0.")
-        if self.max_mirrored is not None and not self.max_mirrored >= 0:
-            raise InputError(f"max_mirrored is {self.max_mirrored}: at least 0.")
+        if self.min_probability is not None and not 0 <= self.min_probability <= 1:
+            raise InputError(f"min_probability is {self.min_probability}: from 0 to 1.")
 
-    def of_matches(self, matcher: dict, dim: int) -> "Gate":
-        """Return the gate for a matcher and descriptors.
-
-        Args:
-            matcher: configuration of the matcher's model.
-            dim: dimension of the descriptors.
-        """
+    def of_matches(self, matcher: dict) -> "Gate":
+        """Return the gate for a matcher, given the configuration of its model."""
         is_strict = (matcher.get("ratio_threshold") or 1) <= STRICT
-        gate = self
-        if self.max_mirrored is None:
-            gate = replace(gate, max_mirrored=MIRRORED_RATIO if is_strict else MIRRORED)
-        if self.min_agreement is not None:
-            return gate
-        if not is_strict:
-            return replace(gate, min_agreement=AGREEMENT, min_agreement_noisy=AGREEMENT_NOISY)
-        return replace(gate, min_agreement=AGREEMENT_FEW if dim < FEW else AGREEMENT_RATIO)
+        return replace(self, matches="ratio" if is_strict else "mutual")
 
-    def of_photo(self, blur: float) -> "Gate":
-        """Return the gate for a photo whose noise was reduced by a blur in pixels, 0 for none."""
-        noisy = self.min_agreement_noisy
-        return replace(self, min_agreement=noisy) if blur > 0 and noisy else self
-
-    def least_agreement(self, confidence: float) -> float:
-        """Return the least agreement of a pose with a confidence."""
-        steps = self.min_agreement or AGREEMENT
-        return next((least for start, least in reversed(steps) if confidence >= start), 0.0)
+    @property
+    def least_probability(self) -> float:
+        """The minimum probability of a localized query."""
+        given = self.min_probability
+        return OF_MATCHES[self.matches].min_probability if given is None else given
 
 
 DEFAULT_GATE = Gate()
 
 
+def evidence(measures: Measures) -> Evidence:
+    """Return what speaks for the matches of a pose."""
+    telling = min(max(1.0, measures.confidence), MOST_TELLING)
+    return Evidence(float(np.log10(telling)), measures.agreement)
+
+
+def probability(measures: Measures, gate: Gate) -> float:
+    """Return the probability that the matches of a pose are right, if half of all poses' are.
+
+    It does not tell whether the intrinsics are right, nor how precise the pose is: other rules do.
+    """
+    of_matches = OF_MATCHES[gate.matches]
+    log_odds = np.dot(of_matches.weights, evidence(measures)) + of_matches.bias
+    return float(1 / (1 + np.exp(-log_odds)))
+
+
 def refusal(measures: Measures, gate: Gate) -> str | None:
     """Return why a pose is not trusted, None if it is."""
-    return next((reason for rule in RULES if (reason := rule(measures, gate))), None)
+    return next((reason for rule in RULES if (reason := rule.refusal(measures, gate))), None)
+
+
+def verdict(measures: Measures, gate: Gate) -> dict:
+    """Return the `reason` why a pose is not trusted, its `probability`, and its `measures`."""
+    found = round(probability(measures, gate), 3)
+    return {"reason": refusal(measures, gate), "probability": found, "measures": measures}
+
+
+def may_be_mirrored(measures: Measures, gate: Gate) -> bool:
+    """Return whether the mirror image of a photo, whose pose is trusted, is to be tried.
+
+    Photos of a calibrated camera are not mirrored.
+    """
+    return not measures.is_camera_given and probability(measures, gate) < SURE
 
 
 def _no_lens(measures: Measures, _: Gate) -> str | None:
@@ -238,52 +269,51 @@ def _swapped(measures: Measures, _: Gate) -> str | None:
     return None
 
 
-def _other_intrinsics(measures: Measures, _: Gate) -> str | None:
-    return _doubtful(measures, lambda kind: kind not in BY_MATCHES)
+def _another_pose(measures: Measures, _: Gate) -> str | None:
+    for kind, limit in ALTERNATIVES.items():
+        other = measures.alternatives.get(kind)
+        if other and is_doubtful(kind, other):
+            return limit.reason.format(detail=other.detail, inliers=measures.num_inliers)
+    return None
 
 
 def _imprecise(measures: Measures, _: Gate) -> str | None:
-    limits = [
-        (
-            measures.uncertainty,
-            ESTIMATED if measures.degrees_of_freedom == ALL else PRECISE,
-            "the inliers do not fix the pose: its",
-        )
-    ]
+    limits = [(measures.uncertainty, PRECISE, "the inliers do not fix the pose: its")]
     if measures.may_be_cropped:
         reason = "it may be cropped, and without its intrinsics its"
         limits.append((measures.uncropped, CROPPED, reason))
     elif measures.off_centre > OFF_CENTRE:
         reason = "its principal point is far from the centre, and without its intrinsics its"
         limits.append((measures.uncropped, CROPPED, reason))
-    for found, (far, turned), reason in limits:
+    for found, most, reason in limits:
         hint = "; known intrinsics would help" if measures.is_focal_length_free else ""
-        if found.position > far * MAX_POSITION or found.rotation > turned * MAX_ROTATION:
+        if found.position > most.position or found.rotation > most.rotation:
             return (
                 f"{reason} position is uncertain by {_up_to(100, 100 * found.position)} % of the "
-                f"distance (at most {100 * far * MAX_POSITION:.0f} %), its rotation by "
-                f"{_up_to(180, found.rotation)} degrees (at most {turned * MAX_ROTATION:.0f}){hint}"
+                f"distance (at most {100 * most.position:.0f} %), its rotation by "
+                f"{_up_to(180, found.rotation)} degrees (at most {most.rotation:.0f}){hint}"
             )
     return None
 
 
-def _no_agreement(measures: Measures, gate: Gate) -> str | None:
-    least = gate.least_agreement(measures.confidence)
-    if measures.agreement >= least:
+def _improbable(measures: Measures, gate: Gate) -> str | None:
+    found = probability(measures, gate)
+    if found >= gate.least_probability:
         return None
-    return (
-        "the matches of no image agree with the pose: agreement "
-        f"{_down(measures.agreement, 2)}, at least {least:g} is needed"
+    lacking = np.subtract(BEST, evidence(measures)) * OF_MATCHES[gate.matches].weights
+    confidence, agreement = _down(measures.confidence, 1), _down(measures.agreement, 2)
+    reason = (
+        f"its confidence of {confidence} is low"
+        if lacking[0] > lacking[1]
+        else f"the matches of no image agree with the pose: agreement {agreement}"
     )
-
-
-def _ambiguous(measures: Measures, _: Gate) -> str | None:
-    return _doubtful(measures, lambda kind: kind in BY_MATCHES)
+    least = f"at least {gate.least_probability:g} is needed"
+    return f"{reason} (probability {_down(found, 2)}, {least})"
 
 
 def _mirrored(measures: Measures, gate: Gate) -> str | None:
-    most = MIRRORED if gate.max_mirrored is None else gate.max_mirrored
-    if measures.mirror_image is None or measures.mirror_image <= most * measures.confidence:
+    most = OF_MATCHES[gate.matches].max_mirrored * measures.confidence
+    if measures.mirror_image is None or measures.mirror_image <= most:
         return None
     return (
         f"it may be mirrored: the confidence is {measures.confidence:.1f}, that of its mirror "
@@ -291,10 +321,81 @@ def _mirrored(measures: Measures, gate: Gate) -> str | None:
     )
 
 
-BY_MATCHES = "rival", "other_images"  # alternatives by other matches
-RULES: tuple[Callable[[Measures, Gate], str | None], ...] = (
-    *(_no_lens, _few_inliers, _chance, _implausible_focal_length, _swapped, _other_intrinsics),
-    *(_imprecise, _no_agreement, _ambiguous, _mirrored),
+class Rule(NamedTuple):
+    """What a pose must have.
+
+    Args:
+        refusal: returns why a pose does not have it, None if it does.
+        text: completes "a pose must".
+        limit: in words.
+    """
+
+    refusal: Callable[[Measures, Gate], str | None]
+    text: str
+    limit: str
+
+
+def _words(most: Tolerance) -> str:
+    return f"{100 * most.position:g} % of the distance to the scene, {most.rotation:g}°"
+
+
+RULES = (
+    Rule(
+        _no_lens,
+        "have a focal length that lenses have, if it is listed",
+        f"{LISTED[0]:g} to {LISTED[1]:g} longer sides",
+    ),
+    Rule(_few_inliers, "have inliers", f"{DEFAULT_GATE.min_inliers} (`--min_inliers`)"),
+    Rule(
+        _chance,
+        "be unlikely by chance: `confidence`, -log10 of the number of equally good poses expected "
+        "if all matches are wrong",
+        f"{DEFAULT_GATE.min_confidence:g} (`--min_confidence`)",
+    ),
+    Rule(
+        _implausible_focal_length,
+        "have a plausible focal length, if it is estimated",
+        f"{FOCAL_LENGTHS[0]:g} to {FOCAL_LENGTHS[1]:g} longer sides, or within a factor of "
+        f"{REFINED:g} of EXIF data",
+    ),
+    Rule(
+        _swapped,
+        "have a listed principal point in the order x, y",
+        f"off the centre by less than {200 * CENTRED:g} % of the size, or by more than "
+        f"{100 * CENTRED:g} % if swapped",
+    ),
+    Rule(
+        _another_pose,
+        "not be contradicted by another pose: with another focal length, or a skew, that fits "
+        "better; with another principal point, aspect ratio or lens of the map that fits about as "
+        "well; by other matches; or, in InLoc, on another floor",
+        f"confidence of the other one: {100 * LIKELIER:g} %, {100 * AS_LIKELY:g} %, "
+        f"{100 * ALTERNATIVES['rival'].ratio:g} % and {100 * AS_LIKELY:g} % (of the inliers); "
+        f"farther away than {_words(ALIKE)}; by other matches {_words(RIVALS)}",
+    ),
+    Rule(
+        _imprecise,
+        "be determined by its inliers: standard deviations, where more than "
+        f"{INDEPENDENT} inliers count as {INDEPENDENT}",
+        f"{_words(PRECISE)}; with all intrinsics free, if the photo may be cropped or its listed "
+        f"principal point is more than {100 * OFF_CENTRE:g} % of the size off the centre: "
+        f"{_words(CROPPED)}",
+    ),
+    Rule(
+        _improbable,
+        "be by the right matches: `probability`, by its confidence and its `agreement`, the "
+        "largest share of a map image's matches that are inliers, less a standard deviation",
+        " and ".join(f"{kind.min_probability:g}" for kind in OF_MATCHES.values())
+        + " with and without a strict ratio test (`--min_probability`)",
+    ),
+    Rule(
+        _mirrored,
+        f"fit better than its mirror image, below a probability of {SURE:g}, unless the intrinsics "
+        "are given",
+        "confidence of the mirror image: "
+        + " and ".join(f"{100 * kind.max_mirrored:g} %" for kind in OF_MATCHES.values())
+        + " with and without a strict ratio test",
+    ),
 )
 
 
@@ -317,17 +418,7 @@ def is_within(other: Alternative, uncertainty: Uncertainty) -> bool:
 
 def is_determined(uncropped: Uncertainty) -> bool:
     """Return whether inliers determine a pose although all intrinsics are unknown."""
-    position, rotation = CROPPED[0] * MAX_POSITION, CROPPED[1] * MAX_ROTATION
-    return uncropped.position <= position and uncropped.rotation <= rotation
-
-
-def _doubtful(measures: Measures, of: Callable[[str], bool]) -> str | None:
-    """Return the reason of the first alternative of some kinds that makes a pose doubtful."""
-    for kind, other in measures.alternatives.items():
-        if of(kind) and is_doubtful(kind, other):
-            reason = ALTERNATIVES[kind].reason
-            return reason.format(detail=other.detail, inliers=measures.num_inliers)
-    return None
+    return uncropped.position <= CROPPED.position and uncropped.rotation <= CROPPED.rotation
 
 
 def _up_to(most: float, value: float) -> str:
@@ -338,11 +429,6 @@ def _up_to(most: float, value: float) -> str:
 def _down(value: float, digits: int) -> str:
     """Round down: what is below a limit is not to be printed as the limit."""
     return f"{np.floor(value * 10**digits) / 10**digits:.{digits}f}"
-
-
-def may_be_mirrored(measures: Measures) -> bool:
-    """Return whether a pose is so uncertain that that of the mirror image may be the right one."""
-    return measures.agreement < DOUBTFUL[0] or measures.confidence < DOUBTFUL[1]
 
 
 def focal_lengths(camera: pycolmap.Camera, guessed: bool) -> tuple[float, float]:

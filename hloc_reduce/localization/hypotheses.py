@@ -7,7 +7,7 @@ import numpy as np
 from ..utils import colmap
 from . import gate, resection
 from .lenses import is_bent
-from .measures import Alternative, confidence, uncertainty
+from .measures import INDEPENDENT_IF_BENT, Alternative, confidence, uncertainty
 from .pose import Matches, Pose, apart, quality
 from .projection import ALL, FOCAL, RADIAL, SKEW, reprojection_errors
 from .resection import Resection, View
@@ -27,8 +27,8 @@ def with_other_intrinsics(matches: Matches, pose: Pose) -> tuple[Pose, Alternati
     """Try whether other intrinsics than those of a pose fit the matches better.
 
     If the focal length is unknown, they replace them: a distortion, or the aspect ratio and the
-    principal point, too, of a photo that was cropped or stretched. If it is known, another one
-    contradicts it. A skew, which no lens has, reveals a photo of a picture.
+    principal point, too, of a photo that was cropped or stretched; and a skew, which no lens has,
+    reveals a photo of a picture. If it is known, another one contradicts it.
 
     Returns:
         The likelier pose, and those with other intrinsics.
@@ -39,22 +39,20 @@ def with_other_intrinsics(matches: Matches, pose: Pose) -> tuple[Pose, Alternati
         return pose, {}
     image, pinhole = resection.undistort(matches.points2D, pose.camera)
     start = pose.cam_from_world, pinhole
-    free = matches.is_focal_length_free and not resection.is_distorted(pose.camera)
+    if not matches.is_focal_length_free or resection.is_distorted(pose.camera):
+        return pose, _contradicting(matches, pose, image, start)
     points3D, assumed = matches.points3D, pose
-    if free:
-        radial = _resect(matches, image, start, RADIAL) or pose
-        if radial.confidence > DISTORTED * pose.confidence:
-            assumed = radial
+    radial = _resect(matches, image, start, RADIAL) or pose
+    if radial.confidence > DISTORTED * pose.confidence:
+        assumed = radial
     found = resection.resect_anew(image, points3D, *start, matches.max_error)
     other = _judged(matches, found, ALL)
     likelier = max(assumed, other or assumed, key=quality)
     others: Alternatives = {}
     if skewed := _resect(matches, image, found[:2] if found else start, SKEW):
         others["skew"] = alternative(likelier, skewed, points3D)
-        if free and gate.is_doubtful("skew", others["skew"]):
+        if gate.is_doubtful("skew", others["skew"]):
             return likelier, others
-    if not free:
-        return pose, others | _contradicting(matches, pose, other, image, start)
     if other is None:
         return assumed, others
     if other.confidence > gate.BETTER * assumed.confidence:
@@ -71,7 +69,8 @@ def _is_determined(matches: Matches, pose: Pose) -> bool:
     """Tell whether the inliers of a pose determine it although all intrinsics are free."""
     assert pose.cam_from_world is not None
     inliers = matches.inliers(pose)
-    return gate.is_determined(uncertainty(*inliers, pose.cam_from_world, pose.camera, ALL))
+    view = pose.cam_from_world, pose.camera
+    return gate.is_determined(uncertainty(*inliers, *view, ALL, INDEPENDENT_IF_BENT))
 
 
 def _resect(matches: Matches, points2D: np.ndarray, start: View, freedom: int) -> Pose | None:
@@ -89,40 +88,35 @@ def _judged(matches: Matches, found: Resection | None, freedom: int) -> Pose | N
     return Pose(*found[:3], confidence=value, degrees_of_freedom=freedom)
 
 
-def _contradicting(
-    matches: Matches, pose: Pose, anew: Pose | None, image: np.ndarray, start: View
-) -> Alternatives:
+def _contradicting(matches: Matches, pose: Pose, image: np.ndarray, start: View) -> Alternatives:
     """Return the poses with other intrinsics than known ones, by kind.
 
     Args:
         matches: of the query.
         pose: with the known intrinsics.
-        anew: with intrinsics that do not depend on them, all of them estimated.
         image: (M, 2) image points without the distortion.
         start: the pose, and its PINHOLE intrinsics.
     """
     assert pose.cam_from_world is not None
-    points3D = matches.points3D
     others: Alternatives = {}
     centred = resection.centred(pose.cam_from_world, pose.camera)
     for points2D, begin in ((image, start), (matches.points2D, centred)):
         other = _resect(matches, points2D, begin, FOCAL)
         if other is None or other.confidence <= pose.confidence:
             continue
-        found = alternative(pose, other, points3D, other.camera.mean_focal_length())
+        found = alternative(pose, other, matches.points3D, other.camera.mean_focal_length())
         if matches.is_lens_of_map:
             # photos of a flat scene hardly tell a focal length: errors of the map decide which fits
             view = pose.cam_from_world, pose.camera
-            if gate.is_within(found, uncertainty(*matches.inliers(pose), *view, FOCAL)):
+            inliers = matches.inliers(pose)
+            if gate.is_within(found, uncertainty(*inliers, *view, FOCAL, INDEPENDENT_IF_BENT)):
                 continue
         if "focal_length" not in others or found.position > others["focal_length"].position:
             others["focal_length"] = found
-    if anew is not None:
-        others["principal_point"] = alternative(pose, anew, points3D)
-    if (refined := _refined(matches, pose)) is not None:
-        others["parameters"] = alternative(pose, refined, points3D)
-        if matches.is_lens_by_size:
-            others["lens_by_size"] = others["parameters"]
+    if other := _resect(matches, image, start, ALL):
+        others["principal_point"] = alternative(pose, other, matches.points3D)
+    if matches.is_lens_by_size and (refined := _refined(matches, pose)):
+        others["lens_by_size"] = alternative(pose, refined, matches.points3D)
     return others
 
 

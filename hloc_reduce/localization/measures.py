@@ -18,7 +18,9 @@ FINEST = 1.0  # pixel
 SAME_PLACE = 2.0
 NEIGHBORS = 8  # projections from which the density around a keypoint is estimated
 LEAST_NOISE = 0.5  # pixels, the least standard deviation of a keypoint
-INDEPENDENT = 30  # inliers with independent errors: in a bent map neighbors err alike
+INDEPENDENT = 100  # inliers with independent errors: neighbors err alike
+# the same where other intrinsics may make up for errors of the map, which are alike in a bent one
+INDEPENDENT_IF_BENT = 30
 MIN_MATCHES = 6  # of an image whose matches may tell whether a pose is right
 
 
@@ -185,10 +187,9 @@ def uncertainty(
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
     degrees_of_freedom: int = POSE,
+    independent: int = INDEPENDENT,
 ) -> Uncertainty:
     """Estimate how precisely inliers determine a pose, from its `covariance`.
-
-    More than INDEPENDENT inliers do not make the pose more precise.
 
     Args:
         points2D: (M, 2) image points of the inliers, COLMAP's pixels.
@@ -196,11 +197,12 @@ def uncertainty(
         cam_from_world: the pose.
         camera: intrinsics.
         degrees_of_freedom: the number of unknown parameters, see `projection`.
+        independent: more inliers do not make the pose more precise.
     """
     found = covariance(points2D, points3D, cam_from_world, camera, degrees_of_freedom)
     if found is None:
         return UNDETERMINED
-    variance, bent = np.diag(found), max(1, len(points2D) / INDEPENDENT)
+    variance, bent = np.diag(found), max(1, len(points2D) / independent)
     rotation, position, focal_length = variance[:3], variance[3:POSE], variance[POSE:FOCAL]
     depths = points3D @ cam_from_world.rotation.matrix()[2] + cam_from_world.translation[2]
     return Uncertainty(
@@ -263,13 +265,15 @@ class Measures:
         degrees_of_freedom: of the estimation, see `projection`.
         may_be_cropped: whether the photo may have been cropped.
         longer_side: of the photo, in pixels.
+        is_camera_given: whether the intrinsics are known, not those of the map's photos.
         is_focal_length_free: whether the focal length was estimated or refined.
         focal_length: that of the pose, in pixels.
         given_focal_length: that of the intrinsics before the estimation, in pixels.
         focal_range: the least and the largest plausible one, in pixels.
         off_centre: how far the principal point is from the centre, as a share of the size.
         off_centre_swapped: the same if its coordinates are swapped.
-        alternatives: other poses by kind, a key of `gate.ALTERNATIVES`: of each kind the likeliest.
+        alternatives: other poses by kind, those of `gate.ALTERNATIVES` and `gate.BY_MATCHES`: of
+            each kind the likeliest.
         mirror_image: confidence of the pose of the mirror image, None if that was not tried.
     """
 
@@ -282,6 +286,7 @@ class Measures:
     degrees_of_freedom: int = POSE
     may_be_cropped: bool = False
     longer_side: int = 1
+    is_camera_given: bool = False
     is_focal_length_free: bool = False
     focal_length: float = 0.0
     given_focal_length: float = 0.0

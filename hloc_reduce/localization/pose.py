@@ -99,6 +99,11 @@ class Matches:
         return replace(self, camera=camera, config=config)
 
     @property
+    def is_camera_given(self) -> bool:
+        """Whether the intrinsics are known, not those of photos of the map."""
+        return not self.is_focal_length_free and not self.is_lens_of_map
+
+    @property
     def is_lens_of_map(self) -> bool:
         """Whether the intrinsics are those of photos of the map that the same lens took."""
         return bool(self.config.get("photo", {}).get("of_map"))

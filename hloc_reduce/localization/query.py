@@ -41,9 +41,9 @@ def localize(
 
     Returns:
         The pose (camera from world) or None, and info on the cluster of map images with the best
-        pose: `reason`, why the pose is not trusted, None if it is; `measures`, see `Measures`, and
-        of these `confidence`, at least 0, and `agreement`; `num_inliers`; `num_matches`, matches
-        with a 3D point, and
+        pose: `reason`, why the pose is not trusted, None if it is; `probability`, see
+        `gate.probability`; `measures`, see `Measures`, and of these `confidence`, at least 0, and
+        `agreement`; `num_inliers`; `num_matches`, matches with a 3D point, and
         `num_correspondences`, the different ones of these (M); `num_without_point`, the other
         matches; `camera`, the intrinsics of the pose; `db`, the best retrieved image; `keypoints`
         (M,), indices of the query's; `point3D_ids` (M,); `points3D` (M, 3); `inliers` (M,) bool;
@@ -56,8 +56,8 @@ def localize(
         points = keypoints[info["keypoints"]], info["points3D"]
         found = lens_choice.estimate(*points, images, camera, config, gate, thorough, workers)
         info |= {
+            **gates.verdict(found.measures, gate),
             "reason": _reason(len(keypoints), names, info) or found.refusal,
-            "measures": found.measures,
             "camera": found.camera,
             "num_inliers": found.num_inliers,
             "inliers": found.inliers,
@@ -75,8 +75,7 @@ def localize(
                 rivals.append(Alternative(ratio, *distance, detail=other.num_inliers))
         if rivals := [one for one in rivals if gates.differ(one, gates.RIVALS)]:
             others = {**best.measures.alternatives, "other_images": max(rivals)}
-            info["measures"] = replace(best.measures, alternatives=others)
-            info["reason"] = gates.refusal(info["measures"], gate)
+            info |= gates.verdict(replace(best.measures, alternatives=others), gate)
     if info["reason"] and len(keypoints) and (turned := config.get("photo", {}).get("turned")):
         info["reason"] += f"; {turned}"
     info["confidence"] = round(max(0.0, info["measures"].confidence), 2)

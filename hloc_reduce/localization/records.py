@@ -15,7 +15,7 @@ from .intrinsics import to_list
 from .measures import Measures
 from .references import Reference
 
-RECORDS = 23  # the version of the content of records, and of the gate
+RECORDS = 24  # the version of the content of records, and of the gate
 NUMBERS = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
 
 
@@ -81,6 +81,7 @@ def to_record(
         "reason": info["reason"],
         "confidence": info["confidence"],
         "agreement": info["agreement"],
+        "probability": info["probability"],
         **_written(cam_from_world),
         "camera": info["camera"] and to_list(info["camera"]),
         "max_error": info["max_error"],
@@ -115,20 +116,21 @@ def with_mirror_image(
         gate: what a pose must have for the query to be called localized.
     """
     measures = replace(measures_of(record), mirror_image=other["confidence"])
-    record = {**record, "measures": measures.to_dict()}
-    if not (reason := gates.refusal(measures, gate)):
+    found = gates.verdict(measures, gate)
+    record = {**record, **found, "measures": measures.to_dict()}
+    if not found["reason"]:
         return record
     fallback = reference.fallback(names) or pose_of(record)
     first = next(iter(names), None)
-    refusal = {"localized": False, "reason": reason, "db": first, "covariance": None}
-    return record | _written(fallback) | refusal
+    return record | _written(fallback) | {"localized": False, "db": first, "covariance": None}
 
 
 def refused(
     reference: Reference, names: list[str], camera: pycolmap.Camera | None, reason: str
 ) -> dict:
     """Return the record of a query that is not to be localized."""
-    info = {"reason": reason, "confidence": 0.0, "agreement": 0.0, "max_error": None}
+    info = {"reason": reason, "confidence": 0.0, "agreement": 0.0, "probability": 0.0}
+    info["max_error"] = None
     info |= {"measures": Measures(), "covariance": None}
     return to_record(reference, names, None, info | dict.fromkeys(NUMBERS, 0) | {"camera": camera})
 

@@ -17,7 +17,7 @@ from ..runtime.executors import SERIAL, Executor
 from ..runtime.group_writer import failure_of, failures
 from ..utils import cli
 from ..utils.cli import InputError
-from ..utils.feature_files import dimension, get_blur, get_colmap_keypoints, get_image_size
+from ..utils.feature_files import get_colmap_keypoints, get_image_size
 from ..utils.h5 import open_h5
 from ..utils.match_files import find_pair, get_matcher, get_matches, most_similar_first
 from ..utils.parsers import parse_query_lists, write_poses
@@ -78,8 +78,9 @@ def main(
         executor: does the work; `load_reference` and `config` are pickled for other processes.
         gate: what a pose must have for the query to be called localized; what is not given is that
             for the matcher and the dimension in the files.
-        mirror_images: extracts and matches mirror images of queries, whose own poses are refused
-            if those of the mirror images are nearly as likely; default: no query is tested.
+        mirror_images: extracts and matches mirror images of queries whose intrinsics are not
+            given: if the poses of these are nearly as likely, their own are refused; default: no
+            query is tested.
 
     Returns:
         A record for each query: `localized`; `reason`, why it is not localized, None if it is;
@@ -106,14 +107,14 @@ def main(
             _check_some_matched(matches, [name for name, _ in queries], retrieved)
             for name, record in solve(features, matches, tasks, True, "Localizing"):
                 log.add(name, record)
+        gate = _of_matches(gate, matches)
         tasks = [
             (name, mirror(camera), retrieved.get(name, []))
             for name, camera in queries
-            if camera and _may_be_mirrored(log.records[name])
+            if camera and _may_be_mirrored(log.records[name], gate)
         ]
         if mirror_images and tasks:
             files, reference = mirror_images([name for name, _, _ in tasks]), load_reference()
-            gate = _of_matches(gate, *files)
             config = partial(_mirrored, config)
             solve = partial(localize_all, load_reference, config, skip_matches, gate, executor)
             for name, record in solve(*files, tasks, False, "Trying mirror images"):
@@ -191,10 +192,11 @@ def _check_some_matched(
             )
 
 
-def _may_be_mirrored(record: dict) -> bool:
+def _may_be_mirrored(record: dict, gate: Gate) -> bool:
     """Tell whether the mirror image of a query is yet to be tried."""
     measures = measures_of(record)
-    return record["localized"] and measures.mirror_image is None and may_be_mirrored(measures)
+    untried = record["localized"] and measures.mirror_image is None
+    return untried and may_be_mirrored(measures, gate)
 
 
 def _mirrored(
@@ -231,7 +233,7 @@ def localize_all(
         said: what the progress bar says.
     """
     files = features, matches
-    gate = _of_matches(gate, *files)
+    gate = _of_matches(gate, matches)
     work = partial(_localize_chunk, load_reference, *files, config, skip_matches, gate, thorough)
     with closing(executor.map(work, tasks, CHUNK)) as found:
         yield from progress(found, said, "query", len(tasks))
@@ -243,10 +245,10 @@ def check_threshold(ransac_thresh: float) -> None:
         raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
 
 
-def _of_matches(gate: Gate, features: Path, matches: Path) -> Gate:
-    """Return the gate for the matcher of a match file and descriptors like those of a file."""
+def _of_matches(gate: Gate, matches: Path) -> Gate:
+    """Return the gate for the matcher of a match file."""
     with open_h5(matches) as file:
-        return gate.of_matches(get_matcher(file) or _by_name(matches), dimension(features))
+        return gate.of_matches(get_matcher(file) or _by_name(matches))
 
 
 def _by_name(matches: Path) -> dict:
@@ -269,20 +271,17 @@ def _localize_chunk(
     reference = load_reference()
 
     def solve(task: tuple) -> tuple[str, dict]:
-        name, camera, its_gate, keypoints, found = task
+        name, camera, keypoints, found = task
         used = {other: pairs for other, pairs in found.items() if len(pairs) >= skip_matches}
         options = config(name, camera)
-        query = keypoints, camera, used, options, its_gate
+        query = keypoints, camera, used, options, gate
         cam_from_world, info = localize(reference, *query, thorough)
         info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
         return name, to_record(reference, list(found), cam_from_world, info)
 
     with open_h5(features) as feature_file, open_h5(matches) as match_file:
         tasks = (
-            (
-                *(name, camera, gate.of_photo(get_blur(feature_file, name))),
-                *_read(feature_file, match_file, name, retrieved, reference),
-            )
+            (name, camera, *_read(feature_file, match_file, name, retrieved, reference))
             for name, camera, retrieved in queries
         )
         with closing(parallel.ordered("localize", solve, tasks)) as solved:

@@ -62,7 +62,7 @@ class Localizer:
         self.doubts = contents.doubts
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
-        self.gate = gate.of_matches(contents.matcher, contents.dim)
+        self.gate = gate.of_matches(contents.matcher)
         self.engine, self.reference = contents.engine, contents.reference
         self.names = contents.names
         self._describe, self._similarity = contents.describe, contents.similarity
@@ -117,14 +117,14 @@ class Localizer:
         lap("matching")
         cam_from_world, info = self._estimate(features, matches, camera, refinement)
         lap("pose")
-        if info["reason"] is None and gates.may_be_mirrored(info["measures"]):
+        if info["reason"] is None and gates.may_be_mirrored(info["measures"], self.gate):
             flipped = self._extract(image, flip=True)
             matches = self._match(flipped, retrieved)
             camera = mirrored.mirror(camera)
             refinement = mirrored.mirror_options(refinement)
             _, other = self._estimate(flipped, matches, camera, refinement, thorough=False)
             measures = replace(info["measures"], mirror_image=other["confidence"])
-            info |= {"measures": measures, "reason": gates.refusal(measures, self.gate)}
+            info |= gates.verdict(measures, self.gate)
             lap("mirror_image")
         info |= {
             "points2D": to_colmap(features["keypoints"][info["keypoints"]]),
@@ -154,9 +154,12 @@ class Localizer:
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Estimate the pose of a photo from its matches, see `localization.query.localize`."""
         return query.localize(
-            *(self.reference, to_colmap(features["keypoints"]), camera, matches),
+            self.reference,
+            to_colmap(features["keypoints"]),
+            camera,
+            matches,
             merged(ransac_options(self.ransac_thresh, camera), refinement),
-            self.gate.of_photo(float(features["blur"])),
+            self.gate,
             thorough,
             self.workers,
         )

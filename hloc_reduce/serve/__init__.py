@@ -179,6 +179,7 @@ def answer(
         "reason": info["reason"],
         "confidence": info["confidence"],
         "agreement": info["agreement"],
+        "probability": info["probability"],
         "num_inliers": info["num_inliers"],
         "camera": to_list(info["camera"]),
         "intrinsics": info["intrinsics"],
@@ -189,6 +190,7 @@ def answer(
     if pose is not None:
         x, y, z, w = pose.rotation.quat.tolist()
         found |= {"qvec": [w, x, y, z], "tvec": pose.translation.tolist()}
+        found["covariance"] = None if info["covariance"] is None else info["covariance"].tolist()
     if inliers:
         chosen = info["inliers"]
         found["points2D"] = info["points2D"][chosen].tolist()

@@ -84,7 +84,6 @@ def main(
             retrieve_in_map(built, features, pairs, num_loc, queries, built.names(), place.images)
         matches = part.match("match_queries", pairs, features, built.features)
         poses = outputs / f"{place.results}_hloc_{run.feature}+{matcher}_{retrieved}.txt"
-        query_files = pairs, features, built.features
         with part.stage("localization"):
             records = localize_sfm.main(
                 built.sfm,
@@ -96,7 +95,6 @@ def main(
                 full_names=place.full_names,
                 executor=run.executor,
                 gate=run.options.gate,
-                mirror_images=part.mirror_images(run.conf, place.images, *query_files),
             )
         files = run.files(built.features, built.sfm, pairs, matches)
         summary = run.summary(

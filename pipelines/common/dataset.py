@@ -10,7 +10,6 @@ from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.datasets import Place, true_poses
 from hloc_reduce.evaluation.summaries import map_bytes
-from hloc_reduce.localization.mirrored import MirrorImages
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, RunFolder
 from hloc_reduce.utils.h5 import get_text, open_h5
@@ -126,11 +125,6 @@ class DatasetRun(Run):
     def map_bytes(self, sfm: Path) -> int:
         """Measure the map that queries are localized in, see `summaries.map_bytes`."""
         return map_bytes(sfm, self.map_names, [self.features, self.global_descriptors])
-
-    def mirror_images_of_dataset(self) -> MirrorImages:
-        """Return what extracts and matches mirror images of queries, for a localization stage."""
-        images = self.place.images
-        return self.mirror_images(self.conf, images, self._pairs, self.features, self.features)
 
     def retrieve(self) -> Path:
         """Write the pairs of the readable queries and map images."""

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from hloc_reduce.localization import absolute_pose, measures
-from hloc_reduce.localization.gate import DEFAULT_GATE, Gate, refusal
+from hloc_reduce.localization.gate import DEFAULT_GATE, OF_MATCHES, Gate, probability, refusal
 from hloc_reduce.localization.measures import (
+    Measures,
     Uncertainty,
     _log10_tail,
     agreement,
@@ -251,20 +252,46 @@ def test_a_gate_is_of_numbers():
         Gate(float("nan"))
     with pytest.raises(InputError, match="min_inliers is -1"):
         Gate(min_inliers=-1)
+    with pytest.raises(InputError, match="min_probability is 30"):
+        Gate(min_probability=30)
+
+
+@pytest.mark.parametrize("kind", OF_MATCHES)
+def test_each_piece_of_evidence_speaks_for_a_pose(kind):
+    gate = Gate(matches=kind)
+    doubtful = Measures(confidence=20, agreement=0.5)
+    better = [
+        replace(doubtful, confidence=200),
+        replace(doubtful, agreement=0.6),
+    ]
+    assert all(probability(one, gate) > probability(doubtful, gate) for one in better)
+    assert probability(Measures(), gate) < 0.01
+    sure = Measures(confidence=500, agreement=1)
+    assert probability(sure, gate) > 0.99
+    assert probability(replace(sure, confidence=5000), gate) == probability(sure, gate)
+
+
+def test_a_user_may_ask_for_another_probability():
+    given = *matches(60, 5), [np.arange(65)]
+    gate = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8})
+    found = solve(*given, gate=gate)
+    assert found.refusal is None
+    least = probability(found.measures, gate) + 0.001
+    refused = solve(*given, gate=replace(gate, min_probability=least))
+    assert f"at least {least:g} is needed" in refused.refusal
 
 
 def test_a_pose_that_no_image_agrees_with_is_refused():
     """As that of a mirrored photo of a symmetric facade: a third of the matches of each image."""
     keypoints, points = matches(60, 120)
     images = np.split(np.random.default_rng(0).permutation(180), 3)
-    gate = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
-    assert gate.min_agreement > DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 16).min_agreement
+    gate = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8})
     found = solve(keypoints, points, images, gate=gate)
     assert found.confidence > 100
     assert found.refusal.startswith("the matches of no image agree with the pose: agreement 0.")
     # without a strict ratio test most matches of any image are wrong
     for matcher in ({}, {"ratio_threshold": 0.95}):
-        lenient = DEFAULT_GATE.of_matches(matcher, 64)
+        lenient = DEFAULT_GATE.of_matches(matcher)
         assert solve(keypoints, points, images, gate=lenient).refusal is None
     one = [np.arange(60), np.arange(60, 180)]
     assert solve(keypoints, points, one, gate=gate).refusal is None
@@ -280,37 +307,14 @@ def test_values_below_a_limit_are_not_printed_as_the_limit():
     given = *matches(60, 20), [np.arange(80)]
     found = solve(*given)
     for strict in (
-        Gate(min_agreement=((0, found.measures.agreement + 1e-4),)),
+        Gate(min_probability=probability(found.measures, DEFAULT_GATE) + 1e-4),
         Gate(min_confidence=found.confidence + 1e-4),
     ):
         reason = solve(*given, gate=strict).refusal
         value, least = re.search(
-            r"(?:agreement|confidence) ([\d.]+), at least ([\d.]+)", reason
+            r"(?:probability|confidence) ([\d.]+), at least ([\d.]+)", reason
         ).groups()
         assert float(value) < float(least)
-
-
-def test_in_noisy_photos_fewer_matches_must_agree():
-    gate = DEFAULT_GATE.of_matches({}, 64)
-    assert gate.of_photo(2.0).min_agreement < gate.of_photo(0.0).min_agreement
-    for other in (
-        DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64),
-        Gate(min_agreement=gate.min_agreement),
-    ):
-        assert other.of_photo(2.0) == other
-
-
-def test_doubtful_poses_must_agree_with_more_matches():
-    """As those at another copy of a repeated pattern, of confidences of 50 to 300."""
-    gate = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
-    assert gate.least_agreement(40) == gate.least_agreement(300) < gate.least_agreement(120)
-    mutual = DEFAULT_GATE.of_matches({}, 64)
-    assert mutual.least_agreement(40) == mutual.least_agreement(5000) < gate.least_agreement(40)
-    assert mutual.of_photo(2.0).least_agreement(40) < mutual.least_agreement(40)
-    keypoints, points = matches(60, 18)
-    found = solve(keypoints, points, [np.arange(78)], gate=gate)
-    assert 50 < found.confidence < 300 and 0.7 < found.measures.agreement < 0.86
-    assert found.refusal.startswith("the matches of no image agree")
 
 
 @pytest.mark.parametrize(("number", "repeated"), [(3, 8), (3, 12), (5, 3), (8, 4)])
@@ -375,11 +379,6 @@ def test_a_rival_is_found_in_another_thread(replaced, workers, monkeypatch):
     found = absolute_pose.estimate(*parts, images, CAMERA, {}, DEFAULT_GATE, True, workers)
     number = 59 if replaced else 60
     assert found.refusal == f"ambiguous: another pose has 40 inliers, this one {number}"
-
-
-def test_a_gate_of_ones_own_is_kept():
-    own = Gate(min_agreement=((0, 0.3), (50, 0.4)))
-    assert own.of_matches({"ratio_threshold": 0.8}, 64).min_agreement == own.min_agreement
 
 
 def test_the_size_of_a_photo_changes_nothing():

@@ -9,7 +9,7 @@ from hloc_reduce.localization.gate import DEFAULT_GATE
 
 pytestmark = pytest.mark.fault(6)
 POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04])), [0.3, 0.1, 8.0])
-GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
+GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8})
 
 
 def solve(source: str, zoom: float, depth: float, bend: float) -> tuple[str | None, float]:
@@ -41,7 +41,7 @@ def test_a_focal_length_that_the_scene_hardly_tells_does_not_contradict_the_map(
     refusal, error = solve("map", 1, depth, bend)
     assert refusal is None and error < 0.005
     refusal, _ = solve("list", 1, depth, bend)  # a list may be wrong
-    assert "contradict the map: a focal length" in refusal
+    assert "contradict the map" in refusal
 
 
 @pytest.mark.parametrize("zoom", [1.08, 1.15, 1.3])
@@ -49,7 +49,7 @@ def test_a_focal_length_that_the_scene_hardly_tells_does_not_contradict_the_map(
 def test_a_photo_that_was_enlarged_contradicts_the_lens_of_the_map(zoom, depth):
     """Although its EXIF data and its size are the same."""
     refusal, error = solve("map", zoom, depth, 0)
-    assert error > 0.06 and "contradict the map: a focal length" in refusal
+    assert error > 0.06 and "contradict the map" in refusal
 
 
 def test_a_scene_that_tells_no_principal_point_does_not_make_a_photo_cropped():

@@ -8,7 +8,7 @@ import pytest
 from test_intrinsics import write_photo
 
 from hloc_reduce.localization import intrinsics, lens_choice, mirrored
-from hloc_reduce.localization.gate import DEFAULT_GATE, LISTS
+from hloc_reduce.localization.gate import ALIKE, DEFAULT_GATE
 from hloc_reduce.localization.intrinsics import infer, of_cameras, refinement
 from hloc_reduce.localization.lenses import is_bent, split
 from hloc_reduce.localization.pose import Pose
@@ -76,7 +76,7 @@ def localize(
     points = np.concatenate([points, generator.permutation(points)[: number // 6]])
     assumed, source = infer(photo, of_map)
     options = refinement(assumed, source, of_map)
-    gate = DEFAULT_GATE.of_matches({}, 64)
+    gate = DEFAULT_GATE.of_matches({})
     found = lens_choice.estimate(pixels, points, [np.arange(len(pixels))], assumed, options, gate)
     if found.cam_from_world is None:
         return found, np.inf, np.inf
@@ -110,7 +110,7 @@ def test_another_lens_of_the_size_is_not_localized_wrongly(of_map, camera):
     """Nor is a photo by a normal lens, which has the size by chance."""
     lens, other = camera_of(of_map, BENT[of_map]), camera_of(camera, {**MILD, **BENT}[camera])
     found, position, rotation = localize(other, of_cameras(3 * [lens]))
-    is_right = position < LISTS.position and rotation < LISTS.rotation
+    is_right = position < ALIKE.position and rotation < ALIKE.rotation
     assert found.refusal is not None or is_right
 
 

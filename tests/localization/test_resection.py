@@ -23,7 +23,7 @@ from hloc_reduce.localization.resection import (
 
 TURN = pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04]))  # axis and angle
 POSE = pycolmap.Rigid3d(TURN, [0.3, 0.1, 8.0])
-GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
+GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8})
 
 
 def camera_of(width: int, height: int, params: list[float], model: str) -> pycolmap.Camera:
@@ -145,7 +145,8 @@ def test_few_matches_of_a_cropped_photo_are_refused_or_right(photo, number):
 @pytest.mark.parametrize(
     ("kind", "confidence", "is_trusted"),
     [
-        ("stretched", 103, True),
+        ("stretched", 99, True),
+        ("stretched", 103, False),
         ("cropped", 103, False),
         ("cropped", 90, False),  # 14 of 441 crops, 4 to 8 degrees off
         ("cropped", 75, True),
@@ -198,7 +199,8 @@ WRONG = {
 def test_intrinsics_that_contradict_the_map_are_refused(params):
     """Lists with a wrong focal length put cameras 15 % nearer or farther, called localized."""
     found = solve(*matches(WHOLE, 300), camera_of(1600, 1200, params, "SIMPLE_RADIAL"), "list")
-    assert found.refusal is not None
+    position, rotation = error(found)
+    assert found.refusal is not None or (position < 0.05 and rotation < 1)
     assert solve(*matches(WHOLE, 300), WHOLE, "list").refusal is None
 
 
@@ -216,7 +218,7 @@ def test_a_centred_principal_point_of_a_cropped_photo_is_refused():
     right = camera_of(1600, 1000, [1400, 1400, 800, 400], "PINHOLE")  # the upper sixth is cut off
     listed = camera_of(1600, 1000, [1400, 1400, 800, 500], "PINHOLE")
     given = matches(right, 300)
-    assert "another principal point" in solve(*given, listed, "list").refusal
+    assert "its intrinsics contradict the map" in solve(*given, listed, "list").refusal
     assert solve(*given, right, "list").refusal is None
 
 
@@ -305,7 +307,8 @@ def test_photos_of_pictures_are_refused(source, amount):
     image, points3D = matches(WHOLE, 300, depth=0.5)
     warped = cv2.perspectiveTransform(image[None], homography(WHOLE, amount))[0]
     camera = guessed(1600, 1200) if source == "guess" else WHOLE
-    assert "photo of a picture" in solve(warped, points3D, camera, source).refusal
+    reason = "photo of a picture" if source == "guess" else "its intrinsics contradict the map"
+    assert reason in solve(warped, points3D, camera, source).refusal
     assert solve(image, points3D, camera, source).refusal is None
 
 

@@ -13,7 +13,6 @@ from small_map import MATCHER
 from hloc_reduce import localize_sfm, match_features
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import query, stage
-from hloc_reduce.localization.gate import AGREEMENT, AGREEMENT_NOISY, AGREEMENT_RATIO
 from hloc_reduce.localization.records import log_file, pose_of, read_records
 from hloc_reduce.localization.references import SfmMap
 from hloc_reduce.utils import cli, colmap
@@ -221,16 +220,16 @@ def test_the_command_line_of_localization(built, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("conf", "name", "agreement"),
+    ("conf", "name", "kind"),
     [
-        ("NN-ratio", None, AGREEMENT_RATIO),
-        ("NN-mutual", None, AGREEMENT),
-        (None, "feats-sift_matches-NN-mutual-ratio.8_pairs-query-netvlad20.h5", AGREEMENT_RATIO),
-        (None, "feats-sift_matches-NN-mutual_pairs-query-netvlad20.h5", AGREEMENT),
-        (None, "feats-sift_matches-superglue_pairs-query-netvlad20.h5", AGREEMENT),
+        ("NN-ratio", None, "ratio"),
+        ("NN-mutual", None, "mutual"),
+        (None, "feats-sift_matches-NN-mutual-ratio.8_pairs-query-netvlad20.h5", "ratio"),
+        (None, "feats-sift_matches-NN-mutual_pairs-query-netvlad20.h5", "mutual"),
+        (None, "feats-sift_matches-superglue_pairs-query-netvlad20.h5", "mutual"),
     ],
 )
-def test_the_gate_knows_the_matcher_by_its_file(built, conf, name, agreement, monkeypatch):
+def test_the_gate_knows_the_matcher_by_its_file(built, conf, name, kind, monkeypatch):
     """Match files of hloc say only by their names which matcher made them."""
     if conf is None:
         with h5py.File(built.loc_matches, "r+") as file:
@@ -244,26 +243,10 @@ def test_the_gate_knows_the_matcher_by_its_file(built, conf, name, agreement, mo
     gates, localize = [], query.localize
     monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[5]) or localize(*a))
     assert built.localize()["query/6.jpg"]["localized"]
-    assert {gate.min_agreement for gate in gates} == {agreement}
+    assert {gate.matches for gate in gates} == {kind}
 
 
-@pytest.mark.parametrize(
-    ("blur", "agreement"), [(2.0, AGREEMENT_NOISY), (0.0, AGREEMENT), ("much", AGREEMENT)]
-)
-def test_the_gate_knows_noisy_photos_by_their_features(built, blur, agreement, monkeypatch):
-    conf = match_features.confs["NN-mutual"]
-    match_features.main(
-        conf, built.loc_pairs, built.features, matches=built.loc_matches, overwrite=True
-    )
-    with h5py.File(built.features, "r+") as file:
-        file["query/6.jpg/keypoints"].attrs["blur"] = blur
-    gates, localize = [], query.localize
-    monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[5]) or localize(*a))
-    assert built.localize()["query/6.jpg"]["localized"]
-    assert gates[0].min_agreement == agreement
-
-
-def test_the_gate_skips_images_without_descriptors(built, monkeypatch):
+def test_images_without_descriptors_are_skipped(built):
     """As those that could not be read, or those of features that are matched otherwise."""
     with h5py.File(built.features, "r+") as file:
         del file["db/0.jpg/descriptors"]

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from ...localization import absolute_pose, intrinsics
-from ...localization.gate import DEFAULT_GATE, MAX_POSITION, MAX_ROTATION, Tolerance
+from ...localization.gate import DEFAULT_GATE, Tolerance
 from ...localization.pose import MAX_ERROR, Pose, differ
 from ...localization.projection import photo_scale, reprojection_errors
 from ...localization.query import merged, ransac_options
@@ -19,7 +19,7 @@ from ..findings import Finding
 from .inputs import Inputs
 
 # a pose contradicts the others if they place the photo farther away
-ELSEWHERE = Tolerance(2 * MAX_POSITION, 2 * MAX_ROTATION)
+ELSEWHERE = Tolerance(0.1, 4.0)
 
 Read = Callable[[str, str], np.ndarray]  # the matches (M, 2) of two images
 

@@ -7,8 +7,7 @@ import pycolmap
 
 from ...localization import intrinsics
 from ...localization.exif import WELL_KNOWN
-from ...localization.gate import MAX_POSITION
-from ...localization.measures import uncertainty
+from ...localization.measures import INDEPENDENT_IF_BENT, uncertainty
 from ...localization.projection import FOCAL, POSE
 from ...utils import cli, colmap
 from ..adjustment import MOST_ADJUSTED, focal_length_deviations
@@ -18,6 +17,7 @@ from .inputs import Inputs
 # Photos whose focal lengths a map determines to 2 to 7 % were 5 to 37 % off: the points of a bent
 # map err together, so that its photos are off by a multiple of what independent errors explain.
 BENT_TOGETHER = 2.5
+MAX_DEVIATION = 0.05  # of a position, as a share of the distance
 VAGUE = 0.1  # share of the focal length: photos whose points tell it less are not tried with others
 # Share of the photos: a map with at least as many uncertain ones is refused. Of 28 photos localized
 # in maps of tourists' photos with a fifth of them 8 were wrong, of 24 in those with a tenth 1, and
@@ -55,7 +55,7 @@ def find(inputs: Inputs) -> list[Finding]:
 def finding(uncertain: dict[str, float]) -> Finding:
     """Return the finding for photos, and the shares by which their positions are uncertain."""
     text = (
-        f"The positions of these photos are uncertain by more than {100 * MAX_POSITION:.0f} % of "
+        f"The positions of these photos are uncertain by more than {100 * MAX_DEVIATION:.0f} % of "
         f"their distance: {_named(uncertain)}. Queries near them may be localized as far off. "
         f"{HELP}"
     )
@@ -68,8 +68,8 @@ _DOUBT = "photos whose positions are uncertain"
 def _many(uncertain: dict[str, float], counted: dict[str, float], number: int) -> Finding:
     text = (
         f"The map may be wrong: the positions of {len(counted)} of its {number} photos are "
-        f"uncertain by more than {100 * MAX_POSITION:.0f} % of their distance: {_named(counted)}. "
-        f"{HELP}"
+        f"uncertain by more than {100 * MAX_DEVIATION:.0f} % of their distance: "
+        f"{_named(counted)}. {HELP}"
     )
     return Finding("positions", text, tuple(uncertain), uncertain, "refuse", _DOUBT)
 
@@ -83,7 +83,7 @@ def _named(uncertain: dict[str, float]) -> str:
 
 
 def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
-    """Find photos whose positions are less certain than `MAX_POSITION`.
+    """Find photos whose positions are less certain than `MAX_DEVIATION`.
 
     A distant photo of a nearly flat scene hardly tells a longer focal length from a larger
     distance; and neither do all photos of such a scene together, if each has its own camera. So a
@@ -104,7 +104,7 @@ def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
     for image in images:
         view = image.cam_from_world(), sfm.cameras[image.camera_id]
         freedom = POSE if image.camera_id in several else FOCAL
-        own = uncertainty(*colmap.observed(sfm, image), *view, freedom)
+        own = uncertainty(*colmap.observed(sfm, image), *view, freedom, INDEPENDENT_IF_BENT)
         found[image.name] = own.position
         if not (own.position < 1 and own.focal_length < VAGUE):
             vague.append(image.name)
@@ -114,7 +114,7 @@ def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
             if image.camera_id in deviations and image.camera_id not in several:
                 together = BENT_TOGETHER * deviations[image.camera_id]
                 found[image.name] = max(found[image.name], together)
-    uncertain = {name: min(share, 1.0) for name, share in found.items() if share > MAX_POSITION}
+    uncertain = {name: min(share, 1.0) for name, share in found.items() if share > MAX_DEVIATION}
     return dict(sorted(uncertain.items(), key=lambda item: -item[1]))
 
 
