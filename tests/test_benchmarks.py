@@ -8,10 +8,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import yaml
 
-from benchmarks import accuracy, against_hloc, render, rows
+from benchmarks import accuracy, against_hloc, fit_gate, render, rows, tables, trial_rows
+from benchmarks import trials as benchmark_trials
+from hloc_reduce.localization import gate
 from hloc_reduce.utils.cli import InputError
 from pipelines.batch import jobs
 from pipelines.batch.jobs import Job
@@ -129,3 +132,72 @@ def test_jobs_without_rows_are_written_as_they_were_read(tmp_path):
     path = tmp_path / "missing.yaml"
     path.write_text(yaml.safe_dump({"jobs": [accuracy._options(job) for job in read]}))
     assert jobs.read(path)[1] == read
+
+
+@pytest.fixture(scope="module")
+def trials():
+    found = trial_rows.read(sorted(trial_rows.TRIALS.glob("*.csv")))
+    assert len(found) > 1000
+    return found
+
+
+@pytest.mark.parametrize("kind", gate.OF_MATCHES)
+def test_the_weights_of_the_gate_are_those_of_the_trials(trials, kind):
+    poses = [row for row in trials if row["matcher"] == kind and "measures" in row]
+    weights, bias, *_ = gate.OF_MATCHES[kind]
+    assert fit_gate.fit_rows(poses).round(2) == pytest.approx([*weights, bias], abs=0.02)
+
+
+def test_how_often_the_gate_errs_in_the_trials(trials):
+    """Those of the seeds of results/trials; as many errors as today, at most."""
+
+    def share(rows):
+        return sum(row["accepted"] for row in rows) / len(rows)
+
+    own = [row for row in trials if row["kind"] in tables.OWN and row["outcome"] == "true"]
+    assert 1 - share(own) <= 0.015
+    wrong = [row for row in trials if row["outcome"] == "wrong"]
+    assert share([row for row in wrong if row["kind"] in trial_rows.STRANGERS]) == 0
+    assert share([row for row in wrong if row["intrinsics"] == "off"]) <= 0.03
+    assert share([row for row in wrong if row["kind"] in trial_rows.RESHAPED]) <= 0.1
+
+
+def test_labels_of_trials():
+    """Poses that are wrong although the photo belongs are not by wrong matches."""
+    for outcome, kind, expected in (
+        ("true", "own", True),
+        ("true", "cropped", True),
+        ("wrong", "other", False),
+        ("wrong", "mirrored", False),
+        ("wrong", "own", None),
+        ("near", "own", None),
+    ):
+        assert trial_rows.label({"outcome": outcome, "kind": kind}) is expected
+
+
+def test_measures_are_the_same_in_rows(trials):
+    row = next(row for row in trials if "measures" in row and row["measures"].alternatives)
+    again = trial_rows.to_row(row["measures"])
+    text = {name: str(again.get(name, "")) for name in trial_rows.COLUMNS}
+    assert trial_rows.of_row(text) == row["measures"]
+
+
+def test_a_warped_photo_is_taken_by_a_turned_camera():
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=1200, height=900, params=[1000, 600, 450]
+    )
+    truth = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.3])), [1.0, 2, 3])
+    found = benchmark_trials.warped_pose(camera, truth)
+    assert found.inverse().translation == pytest.approx(truth.inverse().translation)
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + [0, 0, 8]
+    warped = project(truth, points) @ camera.calibration_matrix().T
+    warped = warped @ benchmark_trials.warping(1200, 900).T
+    # rays of the turned camera are those of the warped photo, by some upper triangular matrix
+    rays = project(found, points)
+    calibration = np.linalg.lstsq(rays / rays[:, 2:], warped / warped[:, 2:], rcond=None)[0].T
+    assert np.abs(np.tril(calibration, -1)).max() < 1e-9
+    assert (np.diag(calibration) > 0).all()
+
+
+def project(cam_from_world, points):
+    return points @ cam_from_world.rotation.matrix().T + cam_from_world.translation

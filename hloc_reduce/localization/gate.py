@@ -157,9 +157,9 @@ class Gate:
         min_confidence: minimum confidence of a localized query: -log10 of the number of poses with
             as many inliers that are expected by chance.
         min_inliers: minimum number of RANSAC's inliers of a localized query.
-        min_probability: minimum probability of a localized query, see `probability`; default: 0.8
-            with a strict ratio test, else 0.3.
-        matches: "ratio" for those with a strict ratio test, else "mutual", see `of_matches`.
+        min_probability: minimum probability of a localized query, see `gate.probability`; default:
+            0.8 with a strict ratio test, else 0.3.
+        matches: a key of `OF_MATCHES`; default: "mutual". See `of_matches`.
 
     Raises:
         InputError: for a confidence that is not finite, a negative number of inliers, or a
@@ -169,7 +169,7 @@ class Gate:
     min_confidence: float = 8.0
     min_inliers: int = 8
     min_probability: float | None = None
-    matches: Annotated[str, HIDDEN] = "mutual"
+    matches: Annotated[str | None, HIDDEN] = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
@@ -187,10 +187,15 @@ class Gate:
         return replace(self, matches="ratio" if is_strict else "mutual")
 
     @property
+    def kind(self) -> OfMatches:
+        """What depends on the kind of the matches."""
+        return OF_MATCHES[self.matches or "mutual"]
+
+    @property
     def least_probability(self) -> float:
         """The minimum probability of a localized query."""
         given = self.min_probability
-        return OF_MATCHES[self.matches].min_probability if given is None else given
+        return self.kind.min_probability if given is None else given
 
 
 DEFAULT_GATE = Gate()
@@ -207,8 +212,7 @@ def probability(measures: Measures, gate: Gate) -> float:
 
     It does not tell whether the intrinsics are right, nor how precise the pose is: other rules do.
     """
-    of_matches = OF_MATCHES[gate.matches]
-    log_odds = np.dot(of_matches.weights, evidence(measures)) + of_matches.bias
+    log_odds = np.dot(gate.kind.weights, evidence(measures)) + gate.kind.bias
     return float(1 / (1 + np.exp(-log_odds)))
 
 
@@ -300,7 +304,7 @@ def _improbable(measures: Measures, gate: Gate) -> str | None:
     found = probability(measures, gate)
     if found >= gate.least_probability:
         return None
-    lacking = np.subtract(BEST, evidence(measures)) * OF_MATCHES[gate.matches].weights
+    lacking = np.subtract(BEST, evidence(measures)) * gate.kind.weights
     confidence, agreement = _down(measures.confidence, 1), _down(measures.agreement, 2)
     reason = (
         f"its confidence of {confidence} is low"
@@ -312,7 +316,7 @@ def _improbable(measures: Measures, gate: Gate) -> str | None:
 
 
 def _mirrored(measures: Measures, gate: Gate) -> str | None:
-    most = OF_MATCHES[gate.matches].max_mirrored * measures.confidence
+    most = gate.kind.max_mirrored * measures.confidence
     if measures.mirror_image is None or measures.mirror_image <= most:
         return None
     return (
