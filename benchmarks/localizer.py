@@ -31,21 +31,26 @@ def _main() -> None:
         help="map folder of pipelines.localize, or file of hloc_reduce.compact",
     )
     parser.add_argument("--query_images", type=Path, required=True, help="folder of photos")
+    parser.add_argument("--queries", type=Path, help="their lists with intrinsics, a glob")
     parser.add_argument("--onnx", type=Path, help="the map's feature, from hloc_reduce.export")
     args = parser.parse_args()
-    photos = [args.query_images / name for name in list_images(args.query_images)]
     from hloc_reduce import Localizer
+    from hloc_reduce.utils.parsers import parse_query_lists
 
+    if args.queries:
+        photos = [query for part in parse_query_lists(args.queries).values() for query in part]
+    else:
+        photos = [(name, None) for name in list_images(args.query_images)]
     localizer = Localizer(args.map, onnx=args.onnx)
     opened = time.perf_counter() - START
-    localizer.localize(photos[0])
+    localizer.localize(args.query_images / photos[0][0], photos[0][1])
     print(
         f"Map of {len(localizer.names)} images. Opened {opened:.2f} s after the start of Python, "
         f"first photo localized after {time.perf_counter() - START:.2f} s, {megabytes():.0f} MB."
     )
     rows, inliers = [], []
-    for photo in progress(photos, "Localizing", "photo"):
-        pose, info = localizer.localize(photo)
+    for name, camera in progress(photos, "Localizing", "photo"):
+        pose, info = localizer.localize(args.query_images / name, camera)
         seconds = [info["seconds"].get(stage, 0.0) for stage in STAGES]
         rows.append([*seconds, sum(seconds), sum(seconds[1:])])
         inliers += [info["num_inliers"]] if pose is not None else []
