@@ -7,7 +7,7 @@ resumes the change.
 
 import json
 import uuid
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import pycolmap
@@ -27,9 +27,9 @@ from ..utils.files import announce, delete
 from ..utils.h5 import list_h5_names
 from ..utils.images import list_images
 from ..utils.paths import strings_as_paths
-from . import older
+from . import older, placing
 from .map import FINGERPRINTS, FINISHED, PLACE, SFM, Map, models
-from .placing import GROWING, PHOTO_KEYS, Addition, photo_of
+from .placing import GROWING, PHOTO_KEYS, Addition, Extended, photo_of
 
 
 @strings_as_paths
@@ -69,19 +69,13 @@ def add(
             raise InputError(f"{model} has a pose of no photo in {image_dir}.")
     with _opened(built) as folder, folder.stage("add_images"):
         built = Map(built.folder)  # another run may have changed it before it was locked
-        addition = Addition(built, colmap.read_model(built.sfm), image_dir, refine_map)
-        new = addition.begin(names, posed=reference is not None)
-        if not new:
-            addition.report()
-            _drop_left(folder, built)
-            return built
-        new = addition.describe(new)
-        if reference is not None and new:
-            addition.place(reference, new)
-        elif new:
-            addition.localize(new)
-        addition.report()
-        _commit_addition(addition)
+        addition, sfm = Addition(built, image_dir, refine_map), colmap.read_model(built.sfm)
+        new = placing.begin(addition, sfm, names, posed=reference is not None)
+        extended = placing.place(addition, sfm, new.names, reference)
+        left_out = new.left_out | extended.left_out
+        _report(built, extended.added, left_out)
+        if extended.added:
+            _commit_addition(addition, extended, left_out, new.fingerprints)
         _drop_left(folder, Map(built.folder))
     return Map(built.folder)
 
@@ -139,23 +133,36 @@ def _opened(built: Map) -> RunFolder:
     return RunFolder(built.folder, conf, overwrite=False, kept=(PLACE, FINGERPRINTS))
 
 
-def _commit_addition(addition: Addition) -> None:
+def _report(built: Map, added: Collection[str], left_out: Mapping[str, str]) -> None:
+    """Say which photos are not added, and why; raise an InputError if that is all."""
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in left_out.items():
+        by_reason.setdefault(reason, []).append(name)
+    found = "; ".join(f"{reason}: {cli.some(names)}" for reason, names in by_reason.items())
+    if found and not added:
+        raise InputError(f"No photo was added to {built.folder}: {found}.")
+    if found:
+        logger.warning("Not added: %s.", found)
+
+
+def _commit_addition(
+    addition: Addition,
+    extended: Extended,
+    left_out: Collection[str],
+    fingerprints: Mapping[str, list],
+) -> None:
     """Make the map have the new photos."""
-    built = addition.built
-    left_out = {name for part in addition.left_out.values() for name in part}
+    built, added = addition.built, extended.added
     merge(built.features, [addition.features], left_out)
     merge(built.descriptors, [addition.descriptors], left_out)
     known = provenance.read(built.folder / FINGERPRINTS)
-    new = {
-        f"{PHOTO_KEYS}{name}": addition.fingerprints[f"{PHOTO_KEYS}{name}"]
-        for name in addition.added
-    }
+    new = {key: fingerprints[key] for key in (f"{PHOTO_KEYS}{name}" for name in added)}
     provenance.write(built.folder / FINGERPRINTS, known | new)
-    alike = {*addition.added} - names_in(built.findings, "another_size")
-    cameras = intrinsics.of_map(addition.sfm, addition.image_dir, alike)
+    alike = {*added} - names_in(built.findings, "another_size")
+    cameras = intrinsics.of_map(extended.sfm, addition.image_dir, alike)
     more = len(new.keys() - known.keys())
-    _commit(built, addition.sfm, more, addition.added, cameras=cameras)
-    logger.info("Photos added to the map %s: %d.", built.folder, len(addition.added))
+    _commit(built, extended.sfm, more, added, cameras=cameras)
+    logger.info("Photos added to the map %s: %d.", built.folder, len(added))
 
 
 def _commit(
