@@ -45,7 +45,7 @@ def build(scene):
     match_features.main(MATCHER, scene.pairs, scene.features, matches=scene.matches)
     scene.sfm = scene.root / "sfm"
     scene.triangulate = lambda sfm=scene.sfm, **options: triangulation.main(
-        *(sfm, scene.model, scene.images, scene.pairs, scene.features, scene.matches), **options
+        sfm, scene.model, scene.images, scene.pairs, scene.features, scene.matches, **options
     )
     scene.map = scene.triangulate()
     scene.loc_pairs = all_pairs(scene.root / "pairs-loc.txt", ["query/6.jpg", "query/7.jpg"])

@@ -162,7 +162,9 @@ def test_a_map_with_a_toy_retrieval_grows(place, tmp_path, run):
 @pytest.mark.parametrize("is_compact", [False, True])
 def test_a_toy_retrieval_in_the_pipeline_of_aachen(aachen_layout, tmp_path, is_compact):
     found = aachen.main(
-        *(aachen_layout, tmp_path / "outputs", "colmap_sift_sv32"),
+        aachen_layout,
+        tmp_path / "outputs",
+        "colmap_sift_sv32",
         retrieval="thumbnail",
         compact=is_compact,
     )

@@ -55,11 +55,12 @@ class Finding:
         if verdict not in get_args(Verdict):
             raise ValueError(f"{verdict!r} is no verdict")
         return cls(
-            *(str(content["kind"]), str(content["text"])),
-            tuple(str(name) for name in content["names"]),
-            {str(name): float(value) for name, value in dict(content["values"]).items()},
-            verdict,
-            str(content["doubt"]),
+            kind=str(content["kind"]),
+            text=str(content["text"]),
+            names=tuple(str(name) for name in content["names"]),
+            values={str(name): float(value) for name, value in dict(content["values"]).items()},
+            verdict=verdict,
+            doubt=str(content["doubt"]),
         )
 
 

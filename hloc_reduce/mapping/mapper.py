@@ -202,7 +202,10 @@ class Mapper:
             registered = _size(best[0])[0]
             logger.info(
                 "Attempt %d of up to %d: %d of %d images reconstructed.",
-                *(len(tried), len(attempts), registered, number),
+                len(tried),
+                len(attempts),
+                registered,
+                number,
             )
             if registered >= enough:
                 break
@@ -228,7 +231,9 @@ class Mapper:
                 self.left_out += number - first
                 logger.warning(
                     "%d of %d attempts are left out, as further ones took %.0f s.",
-                    *(number - first, number, self.seconds),
+                    number - first,
+                    number,
+                    self.seconds,
                 )
                 return
             batch = attempts[first : first + cores] if first else attempts[:1]

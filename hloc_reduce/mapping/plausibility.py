@@ -44,7 +44,8 @@ def keep_plausible(models: list[Inputs]) -> Models:
             continue
         logger.info(
             "A model of %d photos is not used: %d viewpoints do not determine focal lengths.",
-            *(model.num_reg_images(), number),
+            model.num_reg_images(),
+            number,
         )
     return sorted(whole, key=size, reverse=True), merged(dropped)
 

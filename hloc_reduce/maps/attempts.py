@@ -189,10 +189,15 @@ def _log(registered: int, photos: Photos) -> None:
 def _find_mirrored(best: Attempt) -> list[Finding]:
     """Find mirrored photos, with a pose or without."""
     photos, features, descriptors = _describe(best.photos, best.conf)
-    folder = photos.folder.path / MIRROR_IMAGES
     by_others = ByOthers(
-        *(best.sfm, best.conf, photos.matcher, photos.image_dir, features, descriptors, folder),
-        retrieval_confs.get(photos.retrieval),
+        best.sfm,
+        conf=best.conf,
+        matcher=photos.matcher,
+        image_dir=photos.image_dir,
+        features=features,
+        descriptors=descriptors,
+        folder=photos.folder.path / MIRROR_IMAGES,
+        retrieval=retrieval_confs.get(photos.retrieval),
     )
     known = registration.read(best.sfm_dir)
     with photos.folder.stage("mirror_images"):
@@ -269,9 +274,16 @@ def _reconstruct(
         before, pairs = pairs, folder.path / f"pairs-db-{photos.num_covis}-{number}.txt"
         with folder.stage("verification"):
             pairs_from_verification.main(
-                *(pairs, photos.image_dir, before, features, matches, descriptors),
-                *(photos.num_covis, photos.num_covis if number == 1 else 0),
-                *(photos.camera_mode, photos.names),
+                pairs,
+                photos.image_dir,
+                before,
+                features,
+                matches,
+                descriptors,
+                num_matched=photos.num_covis,
+                num_covis=photos.num_covis if number == 1 else 0,
+                camera_mode=photos.camera_mode,
+                image_list=photos.names,
             )
         _match(photos, pairs, features, matches)
     kept = photos.kept
@@ -281,7 +293,11 @@ def _reconstruct(
         write_pairs(listed, pairs)
     with folder.stage("reconstruction"):
         sfm = reconstruction.main(
-            *(folder.path / name, photos.image_dir, pairs, features, matches),
+            folder.path / name,
+            photos.image_dir,
+            pairs,
+            features,
+            matches,
             camera_mode=camera_mode or photos.camera_mode,
             image_list=kept,
             once=once,
@@ -294,7 +310,9 @@ def _describe(photos: Photos, conf: dict) -> Described:
     """Extract features and global descriptors."""
     with photos.folder.stage("extract_features"):
         features = extract_features.main(
-            *(conf, photos.image_dir, photos.folder.path),
+            conf,
+            photos.image_dir,
+            photos.folder.path,
             image_list=photos.names,
             strict=not photos.accept_partial,
         )
@@ -319,7 +337,8 @@ def _pairs_of_model(photos: Photos, reference: pycolmap.Reconstruction, descript
             logger.info(
                 "%d of %d photos share no point of the model with others, so they are paired "
                 "with %s: %s.",
-                *(len(alone), len(others)),
+                len(alone),
+                len(others),
                 "all others" if photos.exhaustive else "the most similar ones",
                 cli.some(alone),
             )
@@ -327,7 +346,7 @@ def _pairs_of_model(photos: Photos, reference: pycolmap.Reconstruction, descript
             others |= {name: [other for other in others if other != name] for name in alone}
         elif alone:
             pairs_from_retrieval.main(
-                *(descriptors, pairs, photos.num_covis), query_list=alone, db_list=[*others]
+                descriptors, pairs, photos.num_covis, query_list=alone, db_list=[*others]
             )
             others |= parse_retrieval(pairs)
         number = write_pairs(((a, b) for a in others for b in others[a]), pairs)

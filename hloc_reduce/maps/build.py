@@ -118,8 +118,15 @@ def main(
             begin(map_dir, fingerprints)
             logger.info("Building the map %s of %d images.", map_dir, len(usable))
             photos = Photos(
-                *(folder, image_dir, usable, matcher, num_covis, exhaustive),
-                *(accept_partial, camera_mode, retrieval),
+                folder,
+                image_dir,
+                usable,
+                matcher=matcher,
+                num_covis=num_covis,
+                exhaustive=exhaustive,
+                accept_partial=accept_partial,
+                camera_mode=camera_mode,
+                retrieval=retrieval,
             )
             conf = keep_projection(conf, map_dir)
             if model is not None and reference is not None:
@@ -174,7 +181,10 @@ def _finish(
         found = [*staying(run(inputs, judging(not are_poses_given))), *found]
     check_accepted(found, photos.accept_partial)
     written = write(
-        *(photos.folder.path, attempt.conf, sfm, cameras),
+        photos.folder.path,
+        attempt.conf,
+        sfm,
+        cameras,
         feature=feature,
         matcher=photos.matcher,
         retrieval=photos.retrieval,

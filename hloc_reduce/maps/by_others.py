@@ -64,7 +64,9 @@ class ByOthers:
             what = "mirrored"
         pairs = self.folder / f"pairs-{what}.txt"
         pairs_from_retrieval.main(
-            *(descriptors, pairs, NUM_LOC + 1),
+            descriptors,
+            pairs,
+            NUM_LOC + 1,
             query_list=[*inferred],
             db_list=sorted(by),
             db_descriptors=self.descriptors,
@@ -75,7 +77,9 @@ class ByOthers:
         }
         write_pairs([(name, other) for name in retrieved for other in retrieved[name]], pairs)
         matches = match_features.main(
-            *(matchers_confs[self.matcher], pairs, features),
+            matchers_confs[self.matcher],
+            pairs,
+            features,
             matches=self.folder / f"matches-{what}.h5",
             features_ref=self.features,
         )
@@ -91,8 +95,14 @@ class ByOthers:
         ]
         return dict(
             stage.localize_all(
-                *(lambda: reference, lambda name, _: options[name], 0, DEFAULT_GATE, SERIAL),
-                *(features, matches, tasks),
+                load_reference=lambda: reference,
+                config=lambda name, _: options[name],
+                skip_matches=0,
+                gate=DEFAULT_GATE,
+                executor=SERIAL,
+                features=features,
+                matches=matches,
+                tasks=tasks,
                 thorough=False,
                 said="Looking for mirrored photos",
             )

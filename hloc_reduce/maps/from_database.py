@@ -101,7 +101,10 @@ def main(
                 with folder.stage("judge_poses"):
                     judged = staying(run(Inputs(reference), judging(are_poses_estimated=False)))
                 write(
-                    *(map_dir, conf, reference, cameras),
+                    map_dir,
+                    conf,
+                    reference,
+                    cameras,
                     feature=name,
                     matcher=matcher,
                     retrieval=retrieval,

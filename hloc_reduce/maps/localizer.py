@@ -158,10 +158,10 @@ class Localizer:
             to_colmap(features["keypoints"]),
             camera,
             matches,
-            merged(ransac_options(self.ransac_thresh, camera), refinement),
-            self.gate,
-            thorough,
-            self.workers,
+            config=merged(ransac_options(self.ransac_thresh, camera), refinement),
+            gate=self.gate,
+            thorough=thorough,
+            workers=self.workers,
         )
 
     @parallel.one_thread()

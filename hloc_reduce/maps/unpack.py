@@ -80,7 +80,10 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
     with replacing(folder / PLACE) as temporary:
         temporary.write_text(digest)
     write(
-        *(folder, conf, model, compact.cameras),
+        folder,
+        conf,
+        model,
+        compact.cameras,
         id=digest,
         feature=compact.feature,
         matcher=compact.matcher,

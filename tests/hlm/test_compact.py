@@ -199,7 +199,8 @@ def test_the_vocabulary_that_ships_is_named(place, tmp_path, run):
     run(*build, "--feature", "colmap_sift_sv64")
     known = maps.Map(outputs / "map")
     descriptors = aggregate_features.main(
-        *(aggregate_features.confs["vlad"], known.features),
+        aggregate_features.confs["vlad"],
+        known.features,
         export_dir=tmp_path / "elsewhere",
         vocabulary=VOCABULARY,
     )
@@ -275,8 +276,12 @@ def test_files_of_the_first_version_are_read(file):
     packed = np.packbits(whole[..., None] >> np.arange(bits) & 1, bitorder="little")
     change(
         file,
-        *("coordinates", lambda array: packed),
-        **{"version": 1, "bits": bits, "step": step, "least": least.tolist()},
+        "coordinates",
+        lambda array: packed,
+        version=1,
+        bits=bits,
+        step=step,
+        least=least.tolist(),
     )
     np.testing.assert_allclose(CompactMap(file).points.all(), expected, atol=0.51 * step)
 

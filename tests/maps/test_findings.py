@@ -13,8 +13,12 @@ from pipelines import localize
 
 PIPELINE = localize
 DIM = Finding(
-    *("dim", "These photos are dim: {names}. Take them again by day.", ("3.png", "1.png")),
-    *({"3.png": 0.1, "1.png": 0.2}, "warn", "photos that are dim"),
+    "dim",
+    "These photos are dim: {names}. Take them again by day.",
+    names=("3.png", "1.png"),
+    values={"3.png": 0.1, "1.png": 0.2},
+    verdict="warn",
+    doubt="photos that are dim",
 )
 
 

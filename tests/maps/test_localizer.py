@@ -169,9 +169,9 @@ def test_large_photos_have_larger_limits_in_files_and_in_memory(place, tmp_path,
 
     used, estimate = [], query.localize
 
-    def spy(reference, keypoints, camera, matches, config, *options):
+    def spy(*given, config, **options):
         used.append(config["estimation"]["ransac"]["max_error"])
-        return estimate(reference, keypoints, camera, matches, config, *options)
+        return estimate(*given, config=config, **options)
 
     monkeypatch.setattr(query, "localize", spy)
     _, info = Localizer(outputs / "map").localize(large)

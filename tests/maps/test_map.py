@@ -44,12 +44,9 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
     moved = outputs.parent / "moved"
     (outputs / "map").rename(moved)
     shutil.move(images / "db", outputs.parent / "db")
-    run(
-        *("--map", moved, "--query_images", images / "query/day", "--outputs", outputs),
-        *("--feature", "colmap_sift_sv64"),
-    )
-    assert outcome(outputs / "queries-day")[0]["map"] == str(moved)
     given = ("--map", moved, "--outputs", outputs)
+    run(*given, "--query_images", images / "query/day", "--feature", "colmap_sift_sv64")
+    assert outcome(outputs / "queries-day")[0]["map"] == str(moved)
     message = refused(*given, "--feature", "sift_sv32")
     assert "is of --feature colmap_sift_sv64." in message
     message = refused(*given, "--matcher", "NN-mutual")
@@ -299,11 +296,9 @@ def test_a_projection_is_kept_with_the_map(place, tmp_path, run):
     mine.unlink()
     pose, info = Localizer(outputs / "map").localize(images / "query/day/a.png")
     assert pose is not None and info["intrinsics"] == "guess"
-    run(
-        *("--map", outputs / "map", "--query_images", images / "query/day"),
-        *("--outputs", tmp_path / "other"),
-    )
-    assert outcome(tmp_path / "other/queries-day")[0]["bytes_per_keypoint"]["descriptor"] == 48
+    folder, other = outputs / "map", tmp_path / "other"
+    run("--map", folder, "--query_images", images / "query/day", "--outputs", other)
+    assert outcome(other / "queries-day")[0]["bytes_per_keypoint"]["descriptor"] == 48
 
 
 @pytest.mark.parametrize("exhaustive", [4, 3])

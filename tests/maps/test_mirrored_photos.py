@@ -151,8 +151,13 @@ def test_no_photo_is_mirrored(plane, symmetric, tmp_path, caplog, run):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mirrored, "largest_group", lambda _: {*names[1:]})
         by_others = ByOthers(
-            *(sfm, built.conf, built.matcher, built.images),
-            *(built.features, built.descriptors, tmp_path / "mirrored"),
-            retrieval_confs.get(built.retrieval),
+            sfm,
+            conf=built.conf,
+            matcher=built.matcher,
+            image_dir=built.images,
+            features=built.features,
+            descriptors=built.descriptors,
+            folder=tmp_path / "mirrored",
+            retrieval=retrieval_confs.get(built.retrieval),
         )
         assert mirrored.find(Inputs(sfm, localize=by_others)) == []

@@ -141,9 +141,7 @@ def test_retrieval_by_hlocs_pairs(inloc_layout, tmp_path, run):
     (inloc_layout / "ground_truth_poses.txt").unlink()
     (inloc_layout / "database/cutouts/PLA2/003/PLA_cutout_003_0_0.jpg").write_bytes(b"no image")
     (inloc_layout / "database/alignments/PLA2/transformations/PLA_trans_003.txt").unlink()
-    run(
-        *("--dataset", inloc_layout, "--outputs", outputs, "--retrieval", pairs), *("--num_loc", 30)
-    )
+    run("--dataset", inloc_layout, "--outputs", outputs, "--retrieval", pairs, "--num_loc", 30)
     summary, rows = outcome(outputs)
     assert summary["poses"] == "InLoc_hloc_colmap_sift_sv64+NN-ratio_netvlad30.txt"
     assert summary["map_images"] == 2 and list(summary["lists"]) == ["PLA1"]

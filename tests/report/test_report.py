@@ -121,11 +121,9 @@ def test_runs_of_scans_and_of_a_map_of_ones_own(
     command.run(monkeypatch, inloc, "--dataset", inloc_layout, *given)
     model = aachen_layout / "3D-models/aachen_v_1_1"
     photos = aachen_layout / "images_upright"
-    command.run(
-        monkeypatch,
-        *(localize, "--map", model, "--map_images", photos, "--outputs", tmp_path / "l"),
-        *("--query_images", photos / "query/day", "--feature", "colmap_sift_sv32"),
-    )
+    given = ("--outputs", tmp_path / "l", "--feature", "colmap_sift_sv32")
+    given += ("--map", model, "--map_images", photos, "--query_images", photos / "query/day")
+    command.run(monkeypatch, localize, *given)
     folders = [tmp_path / "i", tmp_path / "l/queries-day"]
     page = show(*folders, "--num_queries", 9)
     # one feature, twice

@@ -124,7 +124,12 @@ def stages(scene, tmp_path_factory):
             conf, every, features, matches=root / "m.h5", overwrite=True
         ),
         "map": lambda features, matches, **options: triangulation.main(
-            *(root / "other", scene.model, scene.images, pairs, features, matches),
+            root / "other",
+            scene.model,
+            scene.images,
+            pairs,
+            features,
+            matches,
             overwrite=True,
             **options,
         ),

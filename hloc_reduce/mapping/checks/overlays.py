@@ -43,7 +43,8 @@ def drop_overlays(
         logger.info(
             "Matches of what is at the same place in many photos, such as a logo or a time stamp, "
             "are left out in %d photos: %s.",
-            *(len(having), cli.some(having, PHOTOS_NAMED)),
+            len(having),
+            cli.some(having, PHOTOS_NAMED),
         )
     return {
         (a, b): indices[~(inside[a][indices[:, 0]] | inside[b][indices[:, 1]])]
