@@ -125,7 +125,9 @@ def features_table() -> Table:
         )
         table.append(
             [
-                *(f"`{feature}`", f"`{storage}`", day["bytes"]),
+                f"`{feature}`",
+                f"`{storage}`",
+                day["bytes"],
                 f"{total(rows, 'localized'):.0f} of {total(rows, 'queries'):.0f}",
                 *(f"{percent(rows, f'within_{limit}cm'):.0f}" for limit in (1, 5)),
                 f"{float(day['median_cm']):.2f}" if day["median_cm"] else "",
@@ -145,7 +147,9 @@ def readme_table() -> Table:
         town = select(rows, place="demo_town", list="night")[0]
         table.append(
             [
-                *(rows[0]["bytes"], f"`{feature}`", f"`{storage}`"),
+                rows[0]["bytes"],
+                f"`{feature}`",
+                f"`{storage}`",
                 *(inliers(rows, "herz-jesus", part) for part in ("day", "night")),
                 f"{total(rows, 'within_5cm'):.0f} of {total(rows, 'queries'):.0f}",
                 f"{town['localized']} of {town['queries']}",

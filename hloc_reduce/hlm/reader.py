@@ -81,8 +81,16 @@ class CompactMap:
         except InputError:
             raise
         except (
-            *(OSError, SafetensorError, KeyError, ValueError, TypeError, IndexError),
-            *(RecursionError, OverflowError, AttributeError, RuntimeError),
+            OSError,
+            SafetensorError,
+            KeyError,
+            ValueError,
+            TypeError,
+            IndexError,
+            RecursionError,
+            OverflowError,
+            AttributeError,
+            RuntimeError,
         ) as error:
             said = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
             raise InputError(f"{path} is not a compact map, or broken ({said}).") from None

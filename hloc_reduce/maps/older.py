@@ -22,8 +22,10 @@ PHOTOS_OF = {  # the fields that list photos
 }
 FIELDS = (
     *PHOTOS_OF,
-    *("doubtful_focal_lengths", "images_of_uncertain_position"),
-    *("gain_of_free_principal_points", "images_altered"),
+    "doubtful_focal_lengths",
+    "images_of_uncertain_position",
+    "gain_of_free_principal_points",
+    "images_altered",
 )
 
 

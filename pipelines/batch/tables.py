@@ -14,10 +14,26 @@ from .shared import Shared
 HEADINGS = ("bytes/descriptor", "bytes/keypoint", "seconds", "localized")
 LIMITS = "thresholds_m_deg"  # of a list in summary.json
 COLUMNS = (
-    *("dataset", "job", "feature", "matcher", "storage", "keypoints", "retrieval"),
-    *("num_covis", "num_loc", "error"),
-    *("descriptor_bytes", "bytes_per_keypoint", "seconds", "shared_seconds"),
-    *("list", "queries", "localized", "threshold_m", "threshold_deg", "recall_percent"),
+    "dataset",
+    "job",
+    "feature",
+    "matcher",
+    "storage",
+    "keypoints",
+    "retrieval",
+    "num_covis",
+    "num_loc",
+    "error",
+    "descriptor_bytes",
+    "bytes_per_keypoint",
+    "seconds",
+    "shared_seconds",
+    "list",
+    "queries",
+    "localized",
+    "threshold_m",
+    "threshold_deg",
+    "recall_percent",
 )
 
 

@@ -6,15 +6,13 @@ import pytest
 
 from hloc_reduce.localization.mirrored import mirror
 
+FULL_OPENCV = [500, 510, 310, 250, 0.1, -0.02, 0.01, -0.03, 0.01, 0.02, 0.01, -0.01]
 PARAMS = {
     "SIMPLE_RADIAL": [500, 310, 250, 0.1],
-    "OPENCV": [500, 510, 310, 250, 0.1, -0.02, 0.01, -0.03],
-    "FULL_OPENCV": [500, 510, 310, 250, 0.1, -0.02, 0.01, -0.03, 0.01, 0.02, 0.01, -0.01],
-    "THIN_PRISM_FISHEYE": [500, 510, 310, 250, 0.1, -0.02, 0.01, -0.03, 0.01, 0.02, 0.01, -0.01],
-    "RAD_TAN_THIN_PRISM_FISHEYE": [
-        *(500, 510, 310, 250, 0.1, -0.02, 0.01, -0.03, 0.01, 0.02),
-        *(0.01, -0.01, 0.02, -0.01, 0.01, 0.03),
-    ],
+    "OPENCV": FULL_OPENCV[:8],
+    "FULL_OPENCV": FULL_OPENCV,
+    "THIN_PRISM_FISHEYE": FULL_OPENCV,
+    "RAD_TAN_THIN_PRISM_FISHEYE": [*FULL_OPENCV, 0.02, -0.01, 0.01, 0.03],
 }
 
 

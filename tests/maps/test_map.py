@@ -220,8 +220,13 @@ def test_a_map_with_a_broken_file_is_refused_before_any_work(place, tmp_path, ru
     given = ("--map", folder, "--outputs", tmp_path / "x", "--query_images", images / "query/day")
     stem = "global-feats-vlad_feats-dog-sift_sv16"
     for name in (
-        *("sfm/cameras.bin", "sfm/images.bin", "sfm/points3D.bin", "feats-dog-sift_sv16.h5"),
-        *(f"{stem}.h5", f"{stem}.vocabulary.safetensors", "sift_sv16.safetensors"),
+        "sfm/cameras.bin",
+        "sfm/images.bin",
+        "sfm/points3D.bin",
+        "feats-dog-sift_sv16.h5",
+        f"{stem}.h5",
+        f"{stem}.vocabulary.safetensors",
+        "sift_sv16.safetensors",
     ):
         file = folder / name
         content = file.read_bytes()

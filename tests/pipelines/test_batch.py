@@ -56,7 +56,9 @@ def test_what_jobs_have_in_common_is_done_once(aachen_layout, run_batch, tmp_pat
     assert list(rows[0]) == list(tables.COLUMNS)
     assert [(row["job"], row["list"][:3], row["threshold_m"]) for row in rows[:4]] == [
         ("sift_sv64", "day", "0.25"),
-        *(("sift_sv64", "day", "0.5"), ("sift_sv64", "day", "5.0"), ("sift_sv64", "nig", "0.5")),
+        ("sift_sv64", "day", "0.5"),
+        ("sift_sv64", "day", "5.0"),
+        ("sift_sv64", "nig", "0.5"),
     ]
     assert len(rows) == len(features) * 2 * 3 and not any(row["error"] for row in rows)
     assert {row["descriptor_bytes"] for row in rows if row["job"] == "sift_sv16"} == {"32"}
@@ -143,17 +145,19 @@ def test_a_dry_run_shows_the_steps_and_writes_nothing(aachen_layout, run_batch, 
     # 7 images of 5000 keypoints with 14 bytes and 128, 16 and 128 numbers of 2 bytes
     size = f"{7 * 5000 * (3 * 14 + 2 * 272) / 1e6:.1f}"
     assert lines[1] == [
-        *(
-            aachen_layout.name,
-            "extract_features",
-            "sift, sift_sv16, colmap_sift",
-            "7",
-            "images",
-            size,
-        )
+        aachen_layout.name,
+        "extract_features",
+        "sift, sift_sv16, colmap_sift",
+        "7",
+        "images",
+        size,
     ]
     assert [line[1] for line in lines[2:7]] == [
-        *("retrieval", "match_map", "triangulation", "match_queries", "localization")
+        "retrieval",
+        "match_map",
+        "triangulation",
+        "match_queries",
+        "localization",
     ]
     assert lines[3][3:5] == ["12", "pairs"] and lines[5][3:5] == ["12", "pairs"]
 

@@ -32,8 +32,15 @@ def test_a_grid_with_exclusions(tmp_path):
     outputs, found = jobs.read(file)
     assert outputs == Path("outputs/some")
     assert names(found) == [
-        *("a/sift", "a/sift_sv64", "a/sift_sv16", "a/mkd_sv64", "a/mkd_sv16", "b/sift"),
-        *("b/mkd_sv64", "a/sift+num_loc3", "a/sift+NN-mutual+num_loc3"),
+        "a/sift",
+        "a/sift_sv64",
+        "a/sift_sv16",
+        "a/mkd_sv64",
+        "a/mkd_sv16",
+        "b/sift",
+        "b/mkd_sv64",
+        "a/sift+num_loc3",
+        "a/sift+NN-mutual+num_loc3",
     ]
     assert found[-1].numbers == {"num_loc": 3} and found[0].numbers == {}
     assert list(jobs.by_dataset(found)) == [Path("data/a").absolute(), Path("data/b").absolute()]

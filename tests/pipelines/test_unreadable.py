@@ -174,7 +174,9 @@ def test_a_map_photo_that_cannot_be_read(kind, aachen_layout, tmp_path, monkeypa
     assert summary["queries_unreadable"] == 0
     (sfm,) = outputs.glob("sfm_sift*")
     assert {image.name for image in colmap.read_model(sfm).images.values()} == {
-        *("db/0.png", "db/2.png", "db/3.png")
+        "db/0.png",
+        "db/2.png",
+        "db/3.png",
     }
     assert "db/1.png" not in (outputs / "pairs-db-covis20.txt").read_text()
     before = h5_files(outputs) | {path: path.stat().st_mtime_ns for path in sfm.iterdir()}

@@ -162,7 +162,9 @@ def test_further_attempts_begin_while_there_is_time(scene, matched, tmp_path, mo
         assert attempts == [(6, 30), (6, 15), (1, 30)]
         running = [text for text in caplog.messages if text.startswith("COLMAP's mapper makes")]
         assert [text.partition("makes ")[2] for text in running] == [
-            *("attempt 1 of up to 8...", "attempt 2 of up to 8...", "attempt 1 of up to 8...")
+            "attempt 1 of up to 8...",
+            "attempt 2 of up to 8...",
+            "attempt 1 of up to 8...",
         ]
         assert "run again with --overwrite" in caplog.text
         assert "attempts were left out for lack of time: 13" in caplog.text

@@ -218,7 +218,8 @@ def test_all_that_cannot_be_read_are_named(picture, tmp_path):
     for name in ("cut.png", "web0.jpg", "web1.jpg"):
         (tmp_path / name).unlink()
     assert list_h5_names(extract_features.main(conf, tmp_path, tmp_path / "out")) == [
-        *("good0.png", "good1.png")
+        "good0.png",
+        "good1.png",
     ]
 
 
