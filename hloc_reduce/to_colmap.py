@@ -63,8 +63,15 @@ def main(
         listed, of_pycolmap = Path(folder, "pairs.txt"), Path(folder, "colmap.db")
         write_pairs(pairs, listed)
         keypoints, _, found = read_matches(names, listed, features, matches, None)
-        arguments = image_dir, keypoints, found, listed, camera_mode
-        databases.write(of_pycolmap, *arguments, verbose=verbose)
+        databases.write(
+            of_pycolmap,
+            image_dir,
+            keypoints,
+            found,
+            unverified=listed,
+            camera_mode=camera_mode,
+            verbose=verbose,
+        )
         verified = colmap.count_verified(of_pycolmap)
         colmap.write_for_all(of_pycolmap, temporary)
         for left in ("-wal", "-shm", "-journal"):  # of the old database: they would change the new

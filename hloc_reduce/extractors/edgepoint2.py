@@ -58,8 +58,9 @@ class EdgePoint2(NetworkExtractor):
     def _compute(self, image: torch.Tensor, select: Callable[..., Keypoints]) -> dict:
         """Return the features of an image whose sides are multiples of `stride`."""
         dense, score_map = self.network(image)
-        limits = RADIUS, MIN_SCORE, BORDER, self.conf["max_keypoints"]
-        keypoints, scores = select(score_map[0, 0], *limits)
+        keypoints, scores = select(
+            score_map[0, 0], RADIUS, MIN_SCORE, BORDER, self.conf["max_keypoints"]
+        )
         size = torch.tensor(image.shape[:1:-1], dtype=image.dtype, device=image.device)
         grid = (keypoints + 0.5) / size * 2 - 1
         descriptors = grid_sample(dense, grid[None, None], align_corners=False)[0, :, 0]

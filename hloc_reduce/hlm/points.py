@@ -51,8 +51,7 @@ class Points:
             order = np.argsort(number[points][kept])
             visible.append(number[points][kept][order])
             cells.append(its_cells[kept][order])
-        parts = self.xyz[chosen], self.descriptors[chosen]
-        return Points(*parts, self.names, visible, cells)
+        return Points(self.xyz[chosen], self.descriptors[chosen], self.names, visible, cells)
 
     def sorted(self) -> "Points":
         """Return the points in the order of the images that show them, the first ones first."""

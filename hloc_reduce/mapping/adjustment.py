@@ -103,8 +103,9 @@ def focal_length_deviations(sfm: pycolmap.Reconstruction) -> dict[int, float]:
 
 def _errors(sfm: pycolmap.Reconstruction, image: pycolmap.Image) -> np.ndarray:
     """Return the reprojection errors (M,) of the points that an image sees, in pixels."""
-    view = image.cam_from_world(), sfm.cameras[image.camera_id]
-    return reprojection_errors(*colmap.observed(sfm, image), *view)[0]
+    points2D, points3D = colmap.observed(sfm, image)
+    camera = sfm.cameras[image.camera_id]
+    return reprojection_errors(points2D, points3D, image.cam_from_world(), camera)[0]
 
 
 def _adjuster(

@@ -61,8 +61,8 @@ def errors_of_pairs(
     for (name0, name1), indices in matches.items():
         if {name0, name1} <= poses.keys():
             relative = poses[name1] * poses[name0].inverse()
-            points = rays[name0][indices[:, 0]], rays[name1][indices[:, 1]]
-            yield (name0, name1), *epipolar_errors(relative, *points)
+            rays0, rays1 = rays[name0][indices[:, 0]], rays[name1][indices[:, 1]]
+            yield (name0, name1), *epipolar_errors(relative, rays0, rays1)
 
 
 @np.errstate(invalid="ignore")  # points that no camera sees are infinite

@@ -158,8 +158,16 @@ class Mapper:
     def write_database(self, mode: pycolmap.CameraMode) -> Path:
         """Write a database of the images and their verified matches."""
         path = self.folder / f"database-{mode.name}.db"
-        arguments = self.image_dir, self.keypoints, self.matches, self.unverified, mode
-        databases.write(path, *arguments, self.image_options, self.verbose)
+        databases.write(
+            path,
+            self.image_dir,
+            self.keypoints,
+            self.matches,
+            unverified=self.unverified,
+            camera_mode=mode,
+            image_options=self.image_options,
+            verbose=self.verbose,
+        )
         return path
 
     def run(self, database: Path, once: bool) -> Models:

@@ -88,8 +88,7 @@ def main(
             "cameras": {"known": told["cameras"], "models": told["camera_models"]},
             **retrieval_confs.provenance(retrieval),
         }
-        inputs = database, model, projection, image_dir
-        with claim(map_dir, made_from, overwrite, *inputs) as folder:
+        with claim(map_dir, made_from, overwrite, database, model, projection, image_dir) as folder:
             if not (map_dir / FINISHED).exists():
                 begin(map_dir, fingerprints)
                 logger.info("Building the map %s of %d images.", map_dir, len(names))

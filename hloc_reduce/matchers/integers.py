@@ -178,8 +178,9 @@ def match_images_of_points(
             similar = cosine[rows]
             matches = _confirmed(forward[rows], own, points[rows], query, limits)
         else:  # no ratio test
-            options = ratio_threshold, None, distance_threshold
-            matches, similar = mutual_nearest(points[rows], query, *options)
+            matches, similar = mutual_nearest(
+                points[rows], query, ratio_threshold, distance_threshold=distance_threshold
+            )
         matched = matches >= 0
         return most_similar_first(matches[matched], own[matched], similar[matched])
 

@@ -127,10 +127,10 @@ class Run:
         points, features = self.files["map"], self.files["map_features"]
         if points.is_dir():
             return SfmMap(colmap.read_model(points))
-        files = open_file(points), open_file(features)
+        of_points, of_features = open_file(points), open_file(features)
         names = sorted({name for names in self.retrieved.values() for name in names})
         poses = {name: scans.read_pose(self.files["map_images"], name) for name in names}
-        return ScanMap(*files, poses)
+        return ScanMap(of_points, of_features, poses)
 
     @cached_property
     def retrieved(self) -> dict[str, list[str]]:

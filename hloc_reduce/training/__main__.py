@@ -263,8 +263,18 @@ def _main() -> None:
     for descriptor in args.descriptor:
         paths = []
         for scheme in args.scheme:
-            arguments = maps, args.phototour, descriptor, scheme, args.dim, args.output, args.cache
-            paths += main(*arguments, args.recipe, args.seed, conf)
+            paths += main(
+                maps,
+                args.phototour,
+                descriptor,
+                scheme,
+                args.dim,
+                output=args.output,
+                cache=args.cache,
+                recipe=args.recipe,
+                seed=args.seed,
+                conf=conf,
+            )
         if args.validate:
             folder = args.cache / args.validate.resolve().name
             validate(args.validate, folder, descriptor, paths)

@@ -131,7 +131,8 @@ def weighted_mean(trained: MLP, axes: MLP, share: float) -> MLP:
     """
     mean = copy.deepcopy(axes)
     norm, norm_of_axes = (next(mlp.parameters()).norm() for mlp in (trained, axes))
-    parts = mean.parameters(), trained.parameters(), axes.parameters()
-    for into, one, other in zip(*parts, strict=True):
+    for into, one, other in zip(
+        mean.parameters(), trained.parameters(), axes.parameters(), strict=True
+    ):
         into.data = ((1 - share) * one / norm + share * other / norm_of_axes).detach()
     return mean.eval()

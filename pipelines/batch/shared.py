@@ -75,9 +75,11 @@ class Shared:
 
         for name in job.numbers:
             cli.choose(f"option for {self.dataset.name}", name, self.pipeline.Options().numbers)
-        num_loc, names = self.numbers(job)["num_loc"], (self.query_names, self.map_names)
+        num_loc = self.numbers(job)["num_loc"]
         check_model(job.retrieval)
-        used = check_retrieval(job.retrieval, self.folder, num_loc, *names)
+        used = check_retrieval(
+            job.retrieval, self.folder, num_loc, self.query_names, self.map_names
+        )
         self._place.check(used)
         if job.ground_truth not in self._truths:
             if job.ground_truth is None:
@@ -196,9 +198,7 @@ class Shared:
         if features not in {self.features[job] for job in self.running()}:
             raise InputError(f"Retrieval needs the features {features.stem}, which failed.")
         provenance.write(self.folder / RECORD, {"vlad": features.name})
-        names = (
-            readable(features, self.query_names),
-            extract_features.keep_readable(features, self.map_names, accept_partial),
-        )
+        queries = readable(features, self.query_names)
+        mapped = extract_features.keep_readable(features, self.map_names, accept_partial)
         for pairs, num_loc in {(self.retrieval(j), self.numbers(j)["num_loc"]) for j in jobs}:
-            retrieve(retrieval, features, Path(pairs), num_loc, *names, self._place.images)
+            retrieve(retrieval, features, Path(pairs), num_loc, queries, mapped, self._place.images)

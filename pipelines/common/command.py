@@ -66,8 +66,7 @@ def run_on_dataset(
     main: Callable[..., dict], dataset: Path, command: DatasetCommand, options: DatasetOptions
 ) -> None:
     """Run the pipeline of a data set as its command line says; print the result."""
-    method = options.feature, options.projection, options.storage, options.keypoints
-    outputs = command.outputs or Path("outputs") / dataset.name / features_confs.get(*method)[0]
+    outputs = command.outputs or Path("outputs") / dataset.name / options.configured_feature()[0]
     with trace.recording(outputs / "trace.json" if command.profile else None):
         summary = main(dataset, outputs, **vars(options))
     given = vars(options)

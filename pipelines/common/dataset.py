@@ -43,8 +43,7 @@ class DatasetRun(Run):
     """
 
     def __init__(self, place: Place, outputs: Path, options: DatasetOptions):
-        method = options.feature, options.projection, options.storage, options.keypoints
-        feature, self.conf = features_confs.get(*method)
+        feature, self.conf = options.configured_feature()
         matcher = options.matcher or features_confs.matcher_of(self.conf)
         self.place, self.options = place, options
         retrieved = f"{retrieval_name(options.retrieval)}{options.num_loc}"
@@ -130,9 +129,15 @@ class DatasetRun(Run):
         """Write the pairs of the readable queries and map images."""
         with self.stage("retrieval"):
             queries = readable(self.features, self.query_names)
-            source, num_loc = self.options.retrieval, self.options.num_loc
-            names = queries, self.map_names
-            retrieve(source, self.features, self._pairs, num_loc, *names, self.place.images)
+            retrieve(
+                self.options.retrieval,
+                self.features,
+                self._pairs,
+                self.options.num_loc,
+                queries,
+                self.map_names,
+                self.place.images,
+            )
         return self._pairs
 
     def finish_dataset(

@@ -65,6 +65,10 @@ class DatasetOptions(Method):
     overwrite: bool = False
     executor: Executor = SERIAL
 
+    def configured_feature(self) -> tuple[str, dict]:
+        """Return the name and the configuration of the feature."""
+        return features_confs.get(self.feature, self.projection, self.storage, self.keypoints)
+
     @property
     def numbers(self) -> dict[str, int]:
         """The options that begin with num_."""

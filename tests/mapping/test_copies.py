@@ -127,8 +127,8 @@ def test_sides_that_are_not_joined_directly():
     found = groups.contradicting(shared, expected, copies.JOINED_SHARE, enough, copies.APART_SHARE)
     assert found in ([4, 5], [6, 7])
     shared[shared == 0] = 80  # as photos of another season
-    arguments = copies.JOINED_SHARE, enough, copies.APART_SHARE
-    assert groups.contradicting(shared, expected, *arguments) == []
+    found = groups.contradicting(shared, expected, copies.JOINED_SHARE, enough, copies.APART_SHARE)
+    assert found == []
 
 
 def test_few_photos_have_no_sides():

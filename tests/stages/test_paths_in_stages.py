@@ -140,8 +140,8 @@ def test_names_of_any_kind_of_letters_and_dots_are_localized(plane):
     parsers.write_pairs(of_map + [(query, name) for name in renamed], every)
     matches = match_features.main(MATCHER, every, features, matches=plane / "m.h5")
     images, model = plane / "images", plane / "model"
-    inputs = (plane / "map_pairs.txt", features, matches)
-    triangulation.main(plane / "sfm", model, images, *inputs)
+    map_pairs = plane / "map_pairs.txt"
+    triangulation.main(plane / "sfm", model, images, map_pairs, features, matches)
     results = plane / "poses.txt"
     found = localize_sfm.main(plane / "sfm", queries, pairs, features, matches, results)
     assert found[query]["localized"]

@@ -183,9 +183,10 @@ def test_without_three_connected_images_nothing_is_tried(
     names, pairs, matches = matched
     parsers.write_pairs([(names[i], names[j]) for i, j in kept], pairs)
     monkeypatch.setattr(colmap, "incremental_mapping", None)
-    arguments = (scene.images, pairs, scene.features, matches)
     with pytest.raises(InputError, match="could not reconstruct"):
-        reconstruction.main(tmp_path / "sfm", *arguments, image_list=names)
+        reconstruction.main(
+            tmp_path / "sfm", scene.images, pairs, scene.features, matches, image_list=names
+        )
 
 
 @pytest.mark.fault(12)
@@ -193,9 +194,10 @@ def test_two_images_are_too_few(scene, matched, tmp_path, monkeypatch):
     """Two viewpoints do not determine focal lengths."""
     names, pairs, matches = matched
     monkeypatch.setattr(colmap, "incremental_mapping", None)
-    arguments = (scene.images, pairs, scene.features, matches)
     with pytest.raises(InputError, match="needs 3 or more, .*: 2 images are given of "):
-        reconstruction.main(tmp_path / "sfm", *arguments, image_list=names[:2])
+        reconstruction.main(
+            tmp_path / "sfm", scene.images, pairs, scene.features, matches, image_list=names[:2]
+        )
 
 
 def test_attempts_at_once_find_the_same(scene, matched, tmp_path, monkeypatch, caplog):
@@ -255,8 +257,15 @@ def test_a_photo_with_an_implausible_lens_does_not_bend_the_others(
         return models
 
     monkeypatch.setattr(colmap, "incremental_mapping", bent)
-    arguments = (tmp_path / "sfm", scene.images, pairs, scene.features, matches)
-    model = reconstruction.main(*arguments, image_list=names, once=True)
+    model = reconstruction.main(
+        tmp_path / "sfm",
+        scene.images,
+        pairs,
+        scene.features,
+        matches,
+        image_list=names,
+        once=True,
+    )
     assert not tried[0] and {*tried[1]} == {*names} - {names[2]}
     assert {*settings} == {(0, 1, 3)}  # those of the attempt that it replaces
     assert model.num_reg_images() == 5
@@ -268,9 +277,16 @@ def test_why_no_model_is_plausible_is_said(scene, matched, tmp_path, monkeypatch
     names, pairs, matches = matched
     dropped = Finding("lenses", "No lens has these: {names}.", tuple(names), verdict="drop")
     monkeypatch.setitem(CHECKS, "lenses", Check(lambda inputs: [dropped] if inputs.names else []))
-    arguments = (tmp_path / "sfm", scene.images, pairs, scene.features, matches)
     with pytest.raises(NoModelError, match=f"No lens has these: {names[0]}"):
-        reconstruction.main(*arguments, image_list=names, once=True)
+        reconstruction.main(
+            tmp_path / "sfm",
+            scene.images,
+            pairs,
+            scene.features,
+            matches,
+            image_list=names,
+            once=True,
+        )
 
 
 @pytest.mark.parametrize("is_poor", [True, False])

@@ -192,8 +192,8 @@ def test_other_formats_are_named_whatever_the_file_is_called(kind, suffix, pictu
     message = f"Cannot read image {path}: it is {kind}, not JPEG or PNG{how}."
 
     def import_images(path):
-        given = tmp_path / "new.db", tmp_path, [path.name], pycolmap.CameraMode.AUTO
-        colmap.import_images(*given, {})
+        mode = pycolmap.CameraMode.AUTO
+        colmap.import_images(tmp_path / "new.db", tmp_path, [path.name], mode, {})
 
     for read in (read_image, colmap.infer_camera, check_format, import_images):
         with pytest.raises(UnreadableImage) as error:

@@ -130,19 +130,18 @@ def _contradicts(
     errors, _ = reprojection_errors(points2D, points3D, image.cam_from_world(), image.camera)
     if 2 * (errors <= MAX_ERROR * photo_scale(image.camera)).sum() >= len(errors):
         return False
-    matches = points2D, points3D, images
 
     def elsewhere(pose: Pose) -> bool:
         placed = Pose(image.cam_from_world(), image.camera, pose.inliers)
         return differ(pose, placed, points3D, ELSEWHERE)
 
     config = ransac_options(MAX_ERROR, image.camera)
-    pose = absolute_pose.estimate(*matches, image.camera, config, DEFAULT_GATE)
+    pose = absolute_pose.estimate(points2D, points3D, images, image.camera, config, DEFAULT_GATE)
     enough = pose.num_inliers >= DEFAULT_GATE.min_inliers
     if enough and pose.confidence >= DEFAULT_GATE.min_confidence and elsewhere(pose):
         return True
     size = np.empty((image.camera.height, image.camera.width), np.uint8)
     guess, source = intrinsics.infer(size, intrinsics.MapCameras({}, set()))
     config = merged(config, intrinsics.REFINEMENTS[source])
-    pose = absolute_pose.estimate(*matches, guess, config, DEFAULT_GATE)
+    pose = absolute_pose.estimate(points2D, points3D, images, guess, config, DEFAULT_GATE)
     return pose.refusal is None and elsewhere(pose)

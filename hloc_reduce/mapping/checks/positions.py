@@ -102,9 +102,12 @@ def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
     several = {camera_id for camera_id, number in taken.items() if number >= WELL_KNOWN}
     found, vague = {}, []
     for image in images:
-        view = image.cam_from_world(), sfm.cameras[image.camera_id]
+        points2D, points3D = colmap.observed(sfm, image)
+        camera = sfm.cameras[image.camera_id]
         freedom = POSE if image.camera_id in several else FOCAL
-        own = uncertainty(*colmap.observed(sfm, image), *view, freedom, INDEPENDENT_IF_BENT)
+        own = uncertainty(
+            points2D, points3D, image.cam_from_world(), camera, freedom, INDEPENDENT_IF_BENT
+        )
         found[image.name] = own.position
         if not (own.position < 1 and own.focal_length < VAGUE):
             vague.append(image.name)

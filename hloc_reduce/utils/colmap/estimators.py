@@ -109,8 +109,14 @@ def triangulate_points(
     options.ba_refine_sensor_from_rig = False  # else only the poses of reference sensors stay
     with _log(verbose), full_disk(output):
         with near_origin(reference):
-            inputs = reference, database, image_dir, output
-            interruptible(pycolmap.triangulate_points, *inputs, options=options)
+            interruptible(
+                pycolmap.triangulate_points,
+                reference,
+                database,
+                image_dir,
+                output,
+                options=options,
+            )
         reference.write_binary(output)
     return reference
 
@@ -126,8 +132,9 @@ def incremental_mapping(
     output.mkdir()
     # the mapper warns at every failed attempt
     with _log(verbose, pycolmap.logging.Level.FATAL), full_disk(output):
-        inputs = database, image_dir, output
-        models = interruptible(pycolmap.incremental_mapping, *inputs, options=options)
+        models = interruptible(
+            pycolmap.incremental_mapping, database, image_dir, output, options=options
+        )
     return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
 
