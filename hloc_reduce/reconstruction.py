@@ -9,7 +9,7 @@ import pycolmap
 from . import logger
 from .mapping import checks, findings, registration
 from .mapping.checks.overlays import drop_overlays
-from .mapping.mapper import RULES, Mapper, attempts_for
+from .mapping.mapper import MODEL_CHOICE, Mapper, attempts_for
 from .runtime import provenance
 from .triangulation import MADE_FROM, read_matches, replacing_map
 from .utils import cli, colmap, options
@@ -102,7 +102,7 @@ def main(
         "min_match_score": min_match_score,
         "overlays": "dropped",
         "attempts": attempts[:1] if once else attempts,
-        **RULES,
+        **MODEL_CHOICE,
         "once": once,
     }
     made_from = provenance.of_inputs({**options, **chosen}, [pairs, features, matches])

@@ -15,7 +15,7 @@ Model = pycolmap.CameraModelId
 # of cameras whose intrinsics the mapper estimates
 ESTIMATED_MODELS = {Model.SIMPLE_PINHOLE, Model.PINHOLE, Model.SIMPLE_RADIAL, Model.RADIAL}
 
-MOST_ADJUSTED = 200  # images: adjusting more takes minutes, and more photos bend a map less
+MAX_ADJUSTED_IMAGES = 200  # adjusting more takes minutes, and more photos bend a map less
 # cropped photos, and others with wrong focal lengths, gain 18 % and more, those of sound maps at
 # most 10 % (docs/maps.md)
 GAIN_OF_FREE = 0.12

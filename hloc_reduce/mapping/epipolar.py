@@ -8,7 +8,7 @@ import pycolmap
 from ..utils import colmap
 
 EPIPOLAR_ERROR = 4.0  # pixels, times the uncertainty of the keypoints, as in hloc
-EVIDENCE = 15  # verified matches: fewer tell nothing of a pair
+MIN_VERIFIED_MATCHES = 15  # fewer tell nothing of a pair
 
 Pair = tuple[str, str]
 

@@ -21,10 +21,10 @@ from .adjustment import adjusted_error, with_one_camera
 from .checks import Inputs, copies, lenses
 from .checks.focal_lengths import FEW_IMAGES, SPREAD, SPREAD_OF_FEW, are_alike, of_spread
 from .checks.partial import ENOUGH_REGISTERED
-from .epipolar import EVIDENCE
+from .epipolar import MIN_VERIFIED_MATCHES
 from .findings import names_in, without
 from .plausibility import Models, focal_length_spread, keep_plausible, size
-from .registration import VIEWPOINTS, NoModelError, Registration, nothing
+from .registration import MIN_VIEWPOINTS, NoModelError, Registration, nothing
 
 # half of COLMAP's thresholds, for missing images; a quarter of them gave wrong poses
 RELAXED = {
@@ -44,26 +44,26 @@ MORE_IMAGES = 1.5  # times as many images show that one camera took all
 # Images that one camera took fit up to 10 % better with cameras of their own, in nine of twelve
 # models whose focal lengths differ by more than SPREAD_OF_FEW. Where one of them was enlarged by
 # 8 %, they fit at least 11 % better, in most models over 30 %.
-MISFIT = 0.1
-ALMOST = 0.9  # times as many points with one camera as with several
+MAX_MISFIT = 0.1
+ALMOST_AS_MANY = 0.9  # times as many points with one camera as with several
 # Focal length in longer sides from which photos hardly tell a distortion: it may make up for wrong
 # poses by a coefficient that no lens has. Without one, true distortions move points little.
-NARROW = 2.5
+NARROW_FOCAL_LENGTH = 2.5
 UNDISTORTED = {"ba_refine_extra_params": False}
 # what the provenance of a model says of how it was chosen
-RULES = {
+MODEL_CHOICE = {
     "inferred": databases.INFERRED_CAMERAS,
     "cameras": f"plausible, distortion {lenses.MAX_DISTORTION}, one for {MORE_IMAGES} times as "
     "many images",
     "points": f"{MORE_IMAGES} times as many where focal lengths differ",
-    "doubtful": f"from {SPREAD_OF_FEW}, misfit {MISFIT}, {ALMOST} times as many points",
+    "doubtful": f"from {SPREAD_OF_FEW}, misfit {MAX_MISFIT}, {ALMOST_AS_MANY} times as many points",
     "lenses": "others without the implausible ones, by the best attempt",
-    "narrow": f"no distortion from {NARROW} longer sides if it is implausible",
+    "narrow": f"no distortion from {NARROW_FOCAL_LENGTH} longer sides if it is implausible",
     "spread": SPREAD,
-    "viewpoints": VIEWPOINTS,
-    "misplaced": f"0.5 of {EVIDENCE} matches or more, 8 points",
+    "viewpoints": MIN_VIEWPOINTS,
+    "misplaced": f"0.5 of {MIN_VERIFIED_MATCHES} matches or more, 8 points",
     "copies": f"sharing less than {copies.JOINED_SHARE} of the points expected in "
-    f"{copies.TELLING}, any less than {copies.APART_SHARE}",
+    f"{copies.MIN_TELLING_POINTS}, any less than {copies.APART_SHARE}",
     "dropped": "findings",
 }
 
@@ -149,7 +149,9 @@ class Mapper:
         found = self.run(shared, self.once and not fits)
         images, more = _size(found[0])
         enough = (
-            more >= MORE_IMAGES * points if spread > SPREAD else fits and more >= ALMOST * points
+            more >= MORE_IMAGES * points
+            if spread > SPREAD
+            else fits and more >= ALMOST_AS_MANY * points
         )
         if found[0] and (images >= MORE_IMAGES * registered or (images >= registered and enough)):
             return found, shared
@@ -172,8 +174,8 @@ class Mapper:
 
     def run(self, database: Path, once: bool) -> Models:
         """Return the plausible models of the best attempt; stop when enough images are in one."""
-        if _largest_group(database) < VIEWPOINTS:
-            logger.info("No %d images have verified matches that connect them.", VIEWPOINTS)
+        if _largest_group(database) < MIN_VIEWPOINTS:
+            logger.info("No %d images have verified matches that connect them.", MIN_VIEWPOINTS)
             return [], []
         known = partial(
             Inputs,
@@ -261,7 +263,7 @@ def _cameras(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
 
 def _is_narrow(camera: pycolmap.Camera) -> bool:
     """Tell whether a camera has a narrow view."""
-    return camera.mean_focal_length() > NARROW * max(camera.width, camera.height)
+    return camera.mean_focal_length() > NARROW_FOCAL_LENGTH * max(camera.width, camera.height)
 
 
 def _matched(database: Path) -> set[str]:
@@ -289,7 +291,7 @@ def _fits_one_camera(model: pycolmap.Reconstruction) -> bool:
     if model.num_reg_images() > FEW_IMAGES:
         return False
     own = adjusted_error(copy.deepcopy(model))
-    return own >= (1 - MISFIT) * adjusted_error(with_one_camera(model))
+    return own >= (1 - MAX_MISFIT) * adjusted_error(with_one_camera(model))
 
 
 def _size(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:

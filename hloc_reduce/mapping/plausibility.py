@@ -9,7 +9,7 @@ from .. import logger
 from ..utils import colmap
 from .checks import CHECKS, Inputs
 from .findings import Finding, merged, names_in
-from .registration import VIEWPOINTS
+from .registration import MIN_VIEWPOINTS
 
 SAME_VIEWPOINT = 0.03  # of the distance to the scene, between images of one viewpoint
 DROPPING = "lenses", "misplaced", "copies", "few_points"  # checks, in this order
@@ -39,7 +39,7 @@ def keep_plausible(models: list[Inputs]) -> Models:
     for model in (one.model for one in models):
         if min(size(model)) < 2:
             continue
-        if (number := count_viewpoints(model)) >= VIEWPOINTS:
+        if (number := count_viewpoints(model)) >= MIN_VIEWPOINTS:
             whole.append(model)
             continue
         logger.info(

@@ -9,7 +9,7 @@ from ..utils.cli import InputError
 from .findings import Finding
 
 REGISTRATION = "registration.json"  # in the folder of a model
-VIEWPOINTS = 3  # at least, of a model: two do not determine the focal lengths
+MIN_VIEWPOINTS = 3  # of a model: two do not determine the focal lengths
 
 
 @dataclass(frozen=True)
@@ -65,12 +65,12 @@ class NoModelError(InputError):
 
 def check_number(image_dir: Path, number: int) -> None:
     """Raise a NoModelError for fewer images than a model has viewpoints."""
-    if number < VIEWPOINTS:
+    if number < MIN_VIEWPOINTS:
         raise NoModelError(
-            f"A map of photos alone needs {VIEWPOINTS} or more, from different places: {number} "
-            f"{'image is' if number == 1 else 'images are'} given of {image_dir}. Fewer do not "
-            "determine focal lengths. Take more photos, each overlapping the one before by two "
-            "thirds, or give a COLMAP model of their poses."
+            f"A map of photos alone needs {MIN_VIEWPOINTS} or more, from different places: "
+            f"{number} {'image is' if number == 1 else 'images are'} given of {image_dir}. Fewer "
+            "do not determine focal lengths. Take more photos, each overlapping the one before by "
+            "two thirds, or give a COLMAP model of their poses."
         )
 
 
@@ -80,8 +80,8 @@ def nothing(image_dir: Path, dropped: Iterable[Finding] = (), attempts_left_out:
     tries = ["take photos from several places, each overlapping the one before by two thirds"]
     tries += more_time(attempts_left_out)
     return (
-        f"COLMAP could not reconstruct the images of {image_dir} from {VIEWPOINTS} viewpoints or "
-        f"more. {why} What to try: {'; '.join(tries)}."
+        f"COLMAP could not reconstruct the images of {image_dir} from {MIN_VIEWPOINTS} viewpoints "
+        f"or more. {why} What to try: {'; '.join(tries)}."
     )
 
 

@@ -14,7 +14,7 @@ import pycolmap
 
 from .. import logger
 from ..localization import intrinsics
-from ..mapping.adjustment import MOST_ADJUSTED
+from ..mapping.adjustment import MAX_ADJUSTED_IMAGES
 from ..mapping.checks import CHECKS, Inputs, focal_lengths, judging, partial, run
 from ..mapping.findings import Finding, names_in, staying, warn, without
 from ..mapping.plausibility import focal_length_spread
@@ -237,7 +237,7 @@ def _judge_again(
         are_poses_estimated: from photos alone.
     """
     again = {kind for kind in judging(are_poses_estimated) if not CHECKS[kind].needs}
-    if are_poses_estimated and sfm.num_reg_images() <= MOST_ADJUSTED:
+    if are_poses_estimated and sfm.num_reg_images() <= MAX_ADJUSTED_IMAGES:
         again.add("intrinsics")
     before = {one.kind: one for one in built.findings}
     kept = without(built.findings, changed)

@@ -130,5 +130,5 @@ def test_photos_that_were_removed_do_not_count():
 
 
 def test_large_maps_are_not_judged(monkeypatch):
-    monkeypatch.setattr(intrinsics, "MOST_ADJUSTED", 7)
+    monkeypatch.setattr(intrinsics, "MAX_ADJUSTED_IMAGES", 7)
     assert intrinsics.measure(reconstructed(0.2)) == intrinsics.NOT_TRIED

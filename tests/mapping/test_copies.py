@@ -88,7 +88,7 @@ def test_points_are_expected_from_similar_directions_and_distances():
     for i, j in itertools.permutations(range(len(images)), 2):
         angle = np.degrees(np.arccos((rays[i] * rays[j]).sum(axis=1) / length[i] / length[j]))
         ratio = np.maximum(length[i] / length[j], length[j] / length[i])
-        wanted = seen[i] & (angle < copies.ANGLE) & (ratio < copies.DISTANCE)
+        wanted = seen[i] & (angle < copies.MAX_ANGLE_DEGREES) & (ratio < copies.MAX_DISTANCE_RATIO)
         expected[i, j] = (wanted & copies._inside(images[j], xyz)).sum()
     counted, _, _ = copies._count(model, images)
     assert 0 < (expected > 0).sum() < len(images) ** 2 - len(images)
@@ -96,7 +96,7 @@ def test_points_are_expected_from_similar_directions_and_distances():
 
 
 def test_some_of_the_points_are_enough(monkeypatch):
-    monkeypatch.setattr(copies, "WORK", 2e4)
+    monkeypatch.setattr(copies, "MAX_TESTS", 2e4)
     assert names_in(copies.find(Inputs(two_sides(12)))) in SIDES
     assert copies.find(Inputs(two_sides(200))) == []
 

@@ -12,21 +12,23 @@ from ...localization.projection import reprojection_errors
 from ...utils.colmap import point3D_ids
 from ..findings import Finding
 from . import groups
-from .inputs import TELLING, Inputs
+from .inputs import MIN_TELLING_POINTS, Inputs
 
 # a point is expected in a photo if another photo sees it from a direction that differs by at most
 # as many degrees, and from a distance that differs by at most this factor
-ANGLE, DISTANCE = 15.0, 1.5
+MAX_ANGLE_DEGREES, MAX_DISTANCE_RATIO = 15.0, 1.5
 # the largest distance between two such photos, in distances from the first one to the point
-REACH = np.sqrt(1 + DISTANCE**2 - 2 * DISTANCE * np.cos(np.radians(ANGLE)))
+REACH = np.sqrt(
+    1 + MAX_DISTANCE_RATIO**2 - 2 * MAX_DISTANCE_RATIO * np.cos(np.radians(MAX_ANGLE_DEGREES))
+)
 # Two groups of photos that share less of the expected points contradict each other, if a photo of
-# one expects `TELLING` of them in one of the other, on average. Sound maps share a quarter and
+# one expects `MIN_TELLING_POINTS` in one of the other, on average. Sound maps share a quarter and
 # more, the two that were merged by mistake 1 and 10 % (docs/maps.md).
 JOINED_SHARE = 0.15
 # The same for any two groups, also of sides that the mapper did not connect directly: sound maps
 # share a tenth and more, a pillar with two equal sides 0 %.
 APART_SHARE = 0.05
-WORK = 2e8  # pairs of observations and photos: above, only some of the points are used
+MAX_TESTS = 2e8  # of points in photos: above, only some of the points are used
 
 
 def find(inputs: Inputs) -> list[Finding]:
@@ -41,7 +43,7 @@ def find(inputs: Inputs) -> list[Finding]:
 
     def enough(wanted: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         several = np.minimum(first, second) > 1
-        return several & (wanted >= TELLING * used * 2 * first * second)
+        return several & (wanted >= MIN_TELLING_POINTS * used * 2 * first * second)
 
     found = groups.contradicting(shared, expected, JOINED_SHARE, enough, APART_SHARE)
     if not found:
@@ -67,7 +69,7 @@ def _count(
         was used.
     """
     number, points = len(images), model.points3D
-    used = min(1.0, WORK / (number * sum(image.num_points3D for image in images) or 1))
+    used = min(1.0, MAX_TESTS / (number * sum(image.num_points3D for image in images) or 1))
     chosen = np.random.default_rng(0).random(len(points)) < used
     ids = np.array(sorted(points), np.int64)[chosen]
     xyz = np.array([points[i].xyz for i in ids.tolist()]).reshape(-1, 3)
@@ -84,9 +86,10 @@ def _count(
         along = moved[near] @ ray.T
         product = squared - along  # of both rays
         its_squared = squared - 2 * along + (moved[near] ** 2).sum(axis=1)[:, None]
-        least = np.cos(np.radians(ANGLE)) ** 2 * squared * its_squared
+        least = np.cos(np.radians(MAX_ANGLE_DEGREES)) ** 2 * squared * its_squared
         alike = (product > 0) & (product**2 > least)
-        alike &= (its_squared > squared / DISTANCE**2) & (its_squared < squared * DISTANCE**2)
+        ratio = MAX_DISTANCE_RATIO**2
+        alike &= (its_squared > squared / ratio) & (its_squared < squared * ratio)
         wanted = alike & inside[np.ix_(near, its)]
         expected[i, near] = np.count_nonzero(wanted, axis=1)
         shared[i, near] = np.count_nonzero(wanted & seen[np.ix_(near, its)], axis=1)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-GROUPED = 300  # photos: any two of their groups are compared
+MAX_GROUPED_PHOTOS = 300  # any two groups of as many photos are compared
 
 
 def contradicting(
@@ -19,7 +19,7 @@ def contradicting(
     Groups are built by what their photos have in common, as by average linkage, and compared where
     two of them are joined: they contradict each other if they have less in common than `share` of
     what is expected. If none do, any other two groups do that have less than `apart`, in sets of up
-    to `GROUPED` photos.
+    to `MAX_GROUPED_PHOTOS`.
 
     Args:
         common: (N, N) what each pair of photos has in common, symmetric.
@@ -28,8 +28,8 @@ def contradicting(
             is expected.
         enough: whether sums of what is expected of two groups, of these sizes, are evidence: of
             arrays that broadcast.
-        apart: the same for groups that are not joined to each other, in sets of up to `GROUPED`
-            photos.
+        apart: the same for groups that are not joined to each other, in sets of up to
+            `MAX_GROUPED_PHOTOS`.
 
     Returns:
         Indices of the group; none if no groups contradict each other.
@@ -54,7 +54,7 @@ def contradicting(
     pairs, totals = joined, [_sums(values, joined) for values in (common, expected)]
     shares = shares_of(pairs, *totals)
     worst = shares.argmin()
-    if shares[worst] >= share and apart > 0 and number <= GROUPED:
+    if shares[worst] >= share and apart > 0 and number <= MAX_GROUPED_PHOTOS:
         belongs = np.zeros((len(sizes), number))  # photos to groups
         for group in range(len(sizes)):
             belongs[group, _members(group, joined)] = 1

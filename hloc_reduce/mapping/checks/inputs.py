@@ -12,7 +12,7 @@ import pycolmap
 from ..epipolar import Pair
 from ..registration import Registration
 
-TELLING = 100  # points: fewer tell nothing of a photo, or of two groups of photos
+MIN_TELLING_POINTS = 100  # fewer tell nothing of a photo, or of two groups of photos
 
 
 class Localize(Protocol):

@@ -6,16 +6,16 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from ..adjustment import GAIN_OF_FREE, MOST_ADJUSTED, adjusted_error, with_own_cameras
+from ..adjustment import GAIN_OF_FREE, MAX_ADJUSTED_IMAGES, adjusted_error, with_own_cameras
 from ..findings import Finding
-from .inputs import TELLING, Inputs
+from .inputs import MIN_TELLING_POINTS, Inputs
 
 # photos that share a camera gain by cameras of their own, too: if none is unlike the others, up to
 # 21 % in sound maps, and 31 % and more if many were cropped
 GAIN_OF_OWN = 0.25
 # a photo is altered if its focal length differs by more than this share of those of the others, or
 # its principal point by this share of the longer side
-UNLIKE = 0.1
+UNLIKE_SHARE = 0.1
 
 
 class Fit(NamedTuple):
@@ -46,13 +46,13 @@ def measure(sfm: pycolmap.Reconstruction) -> Fit:
         sfm: the map, all of whose poses and intrinsics may be wrong.
 
     Returns:
-        NOT_TRIED for more than MOST_ADJUSTED images, or too few points to tell.
+        NOT_TRIED for more than MAX_ADJUSTED_IMAGES images, or too few points to tell.
     """
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     cameras = {i: len(sfm.cameras[i].params) for i in {image.camera_id for image in images}}
     own = sum(cameras[image.camera_id] for image in images)
     residuals = 2 * sfm.compute_num_observations() - 3 * sfm.num_points3D() - 6 * len(images)
-    if len(images) > MOST_ADJUSTED or residuals <= 2 * own:
+    if len(images) > MAX_ADJUSTED_IMAGES or residuals <= 2 * own:
         return NOT_TRIED
     adjusted = copy.deepcopy(sfm)
     error = adjusted_error(adjusted)
@@ -88,9 +88,9 @@ def _altered(sfm: pycolmap.Reconstruction, assumed: dict[str, float]) -> list[st
     images = sorted((sfm.images[i] for i in sfm.reg_image_ids()), key=lambda image: image.name)
     zoom = np.array([np.log(found[image.name] / assumed[image.name]) for image in images])
     centre = np.array([_off_centre(sfm.cameras[image.camera_id]) for image in images])
-    zoomed = np.abs(zoom[:, None] - zoom) > np.log1p(UNLIKE)
-    moved = np.abs(centre[:, None] - centre).max(axis=2) > UNLIKE
-    seen = np.array([image.num_points3D for image in images]) >= TELLING
+    zoomed = np.abs(zoom[:, None] - zoom) > np.log1p(UNLIKE_SHARE)
+    moved = np.abs(centre[:, None] - centre).max(axis=2) > UNLIKE_SHARE
+    seen = np.array([image.num_points3D for image in images]) >= MIN_TELLING_POINTS
     differs = (zoomed | moved) & seen & seen[:, None]
     # of a photo that differs from the fewest of those that tell
     like_most = differs[np.where(seen, differs.sum(axis=1), len(images)).argmin()]

@@ -7,7 +7,7 @@ import pycolmap
 
 from ...utils.colmap import point3D_ids, visibility
 from ..findings import Finding
-from ..registration import VIEWPOINTS
+from ..registration import MIN_VIEWPOINTS
 from .inputs import Inputs, Localize
 
 CERTAIN = 0.9, 250.0  # least agreement and confidence of the mirror image of a mirrored photo
@@ -44,7 +44,7 @@ def finding(names: Iterable[str]) -> Finding:
 
 def mirrored(localize: Localize, names: set[str], by: set[str]) -> set[str]:
     """Return the mirrored ones of some photos, each of which is localized by some others."""
-    if len(by) < VIEWPOINTS or not names:
+    if len(by) < MIN_VIEWPOINTS or not names:
         return set()
     of_mirrored = localize(names, by, True)
     if not of_mirrored:

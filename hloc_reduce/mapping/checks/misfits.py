@@ -6,7 +6,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ...localization.projection import DETECTED, photo_scale
-from ..epipolar import EVIDENCE, errors_of_pairs
+from ..epipolar import MIN_VERIFIED_MATCHES, errors_of_pairs
 from ..findings import Finding
 from .inputs import Inputs
 
@@ -28,7 +28,9 @@ def find(inputs: Inputs) -> list[Finding]:
         return []
     cameras = {image.name: inputs.model.cameras[image.camera_id] for image in inputs.images}
     pixels = {name: one.cam_from_img_threshold(photo_scale(one)) for name, one in cameras.items()}
-    evidence = {pair: rows for pair, rows in inputs.verified.items() if len(rows) >= EVIDENCE}
+    evidence = {
+        pair: rows for pair, rows in inputs.verified.items() if len(rows) >= MIN_VERIFIED_MATCHES
+    }
     pairs: dict[str, list[tuple[int, float]]] = {}  # of an image: matches, median distance
     errors = errors_of_pairs(inputs.images, inputs.keypoints, evidence)
     for (name0, name1), errors0, errors1 in errors:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..epipolar import EVIDENCE, agreeing
+from ..epipolar import MIN_VERIFIED_MATCHES, agreeing
 from ..findings import Finding
 from . import groups
 from .inputs import Inputs
@@ -21,7 +21,9 @@ def find(inputs: Inputs) -> list[Finding]:
     images = inputs.images
     row = {image.name: i for i, image in enumerate(images)}
     agree, number = np.zeros((2, len(images), len(images)))
-    evidence = {pair: rows for pair, rows in inputs.verified.items() if len(rows) >= EVIDENCE}
+    evidence = {
+        pair: rows for pair, rows in inputs.verified.items() if len(rows) >= MIN_VERIFIED_MATCHES
+    }
     for (name0, name1), valid in agreeing(images, inputs.keypoints, evidence).items():
         i, j = row[name0], row[name1]
         agree[i, j] = agree[j, i] = valid.sum()
@@ -46,4 +48,6 @@ def _worst(agree: np.ndarray, number: np.ndarray) -> list[int]:
     shares = np.divide(agree.sum(axis=1), of_each, out=np.ones(len(agree)), where=of_each > 0)
     if shares.min() < 0.5:
         return [int(shares.argmin())]
-    return groups.contradicting(agree, number, 0.5, lambda wanted, *_: wanted >= EVIDENCE)
+    return groups.contradicting(
+        agree, number, 0.5, lambda wanted, *_: wanted >= MIN_VERIFIED_MATCHES
+    )

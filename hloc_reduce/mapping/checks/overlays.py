@@ -10,12 +10,12 @@ from ..epipolar import Pair
 from ..findings import PHOTOS_NAMED, Finding
 from .inputs import Inputs
 
-# pixels that a keypoint of an overlay moves from photo to photo, at most: also what a camera that
-# circles around an object looks at stays nearly where it is
-STILL = 1.0
-STILL_IN = 3  # other photos
-OVERLAY = 5  # keypoints, at least
-AROUND = 40.0  # pixels: what is so near is of the overlay, too, as the digits of a clock
+# that a keypoint of an overlay moves from photo to photo: also what a camera that circles around an
+# object looks at stays nearly where it is
+MAX_STILL_PIXELS = 1.0
+MIN_STILL_PHOTOS = 3  # other photos in which it is there
+MIN_OVERLAY_KEYPOINTS = 5
+OVERLAY_MARGIN_PIXELS = 40.0  # what is so near is of the overlay, too, as the digits of a clock
 
 
 def find(inputs: Inputs) -> list[Finding]:
@@ -74,17 +74,17 @@ def covered(
     number = {name: np.zeros(len(points), int) for name, points in keypoints.items()}
     for (a, b), indices in matches.items():
         first, second = indices.T
-        same = np.abs(keypoints[a][first] - keypoints[b][second]).max(axis=1, initial=0) <= STILL
+        moved = np.abs(keypoints[a][first] - keypoints[b][second]).max(axis=1, initial=0)
         for name, column in ((a, first), (b, second)):
             np.add.at(number[name], column, 1)
-            np.add.at(still[name], column, same)
-    least = max(2, min(STILL_IN, len(keypoints) - 1))
+            np.add.at(still[name], column, moved <= MAX_STILL_PIXELS)
+    least = max(2, min(MIN_STILL_PHOTOS, len(keypoints) - 1))
     inside = {name: np.zeros(len(points), bool) for name, points in keypoints.items()}
     for name, points in keypoints.items():
         overlay = (still[name] >= least) & (2 * still[name] >= number[name])
-        if overlay.sum() >= OVERLAY:
+        if overlay.sum() >= MIN_OVERLAY_KEYPOINTS:
             distance, _ = cKDTree(points[overlay]).query(points)
-            near = distance <= AROUND
+            near = distance <= OVERLAY_MARGIN_PIXELS
             if 2 * near.sum() <= len(near):
                 inside[name] = near
     return inside

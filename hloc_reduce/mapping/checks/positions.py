@@ -10,7 +10,7 @@ from ...localization.exif import WELL_KNOWN
 from ...localization.measures import INDEPENDENT_IF_BENT, uncertainty
 from ...localization.projection import FOCAL, POSE
 from ...utils import cli, colmap
-from ..adjustment import MOST_ADJUSTED, focal_length_deviations
+from ..adjustment import MAX_ADJUSTED_IMAGES, focal_length_deviations
 from ..findings import PHOTOS_NAMED, Finding
 from .inputs import Inputs
 
@@ -18,11 +18,11 @@ from .inputs import Inputs
 # map err together, so that its photos are off by a multiple of what independent errors explain.
 BENT_TOGETHER = 2.5
 MAX_DEVIATION = 0.05  # of a position, as a share of the distance
-VAGUE = 0.1  # share of the focal length: photos whose points tell it less are not tried with others
+VAGUE_FOCAL_SHARE = 0.1  # photos whose points tell it less are not tried with others
 # Share of the photos: a map with at least as many uncertain ones is refused. Of 28 photos localized
 # in maps of tourists' photos with a fifth of them 8 were wrong, of 24 in those with a tenth 1, and
 # of 30 in maps with a typical lens none.
-MANY_UNCERTAIN = 0.1
+MANY_UNCERTAIN_SHARE = 0.1
 HELP = (
     "More photos between them and the others help, or intrinsics: a COLMAP model, EXIF data, or "
     "--camera_mode single --overwrite if one camera with a fixed zoom took all."
@@ -47,7 +47,7 @@ def find(inputs: Inputs) -> list[Finding]:
         is_known = taken[camera.camera_id] >= WELL_KNOWN
         if is_known or (camera.width, camera.height) not in typical:
             counted[name] = share
-    if counted and len(counted) >= MANY_UNCERTAIN * len(cameras):
+    if counted and len(counted) >= MANY_UNCERTAIN_SHARE * len(cameras):
         return [_many(uncertain, counted, len(cameras))]
     return [finding(uncertain)] if uncertain else []
 
@@ -109,9 +109,9 @@ def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
             points2D, points3D, image.cam_from_world(), camera, freedom, INDEPENDENT_IF_BENT
         )
         found[image.name] = own.position
-        if not (own.position < 1 and own.focal_length < VAGUE):
+        if not (own.position < 1 and own.focal_length < VAGUE_FOCAL_SHARE):
             vague.append(image.name)
-    if len(images) - len(vague) > 1 and len(images) <= MOST_ADJUSTED:
+    if len(images) - len(vague) > 1 and len(images) <= MAX_ADJUSTED_IMAGES:
         deviations = focal_length_deviations(_without(sfm, vague))
         for image in images:
             if image.camera_id in deviations and image.camera_id not in several:

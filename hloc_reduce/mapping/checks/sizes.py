@@ -7,7 +7,7 @@ import pycolmap
 
 from ...utils import cli
 from ...utils.images import stored_size
-from ..adjustment import GAIN_OF_FREE, MOST_ADJUSTED, gain_of_free_intrinsics
+from ..adjustment import GAIN_OF_FREE, MAX_ADJUSTED_IMAGES, gain_of_free_intrinsics
 from ..findings import Finding
 from .inputs import Inputs
 
@@ -102,7 +102,7 @@ def scale_cameras(model: pycolmap.Reconstruction, found: Mapping[int, Size]) -> 
 def check_scaled(model: pycolmap.Reconstruction) -> None:
     """Check that photos fit the cameras that were scaled to them: cropped ones do not.
 
-    Of a model of more than `MOST_ADJUSTED` images this is not tried.
+    Of a model of more than `MAX_ADJUSTED_IMAGES` images this is not tried.
 
     Args:
         model: with the points that were triangulated with these cameras.
@@ -110,7 +110,7 @@ def check_scaled(model: pycolmap.Reconstruction) -> None:
     Raises:
         InputError: if they fit much better with other intrinsics.
     """
-    if model.num_reg_images() > MOST_ADJUSTED:
+    if model.num_reg_images() > MAX_ADJUSTED_IMAGES:
         return
     gain = gain_of_free_intrinsics(model)
     if gain > GAIN_OF_FREE:
