@@ -136,7 +136,7 @@ def _network(name: str, conf: dict) -> Content:
         kind = features_confs.base_of(conf["model"])["name"]
         raise InputError(
             f"{name} has the keypoints of {'DoG' if kind == 'dog' else kind}, but only features of "
-            f"{', '.join(features_confs.EXTRACTORS)} can be exported as a whole. Export a "
+            f"{', '.join(features_confs.DEFAULT_NETWORKS)} can be exported as a whole. Export a "
             "projection alone with --projection_only."
         )
     extractor = extractors.load(conf["model"]).eval()

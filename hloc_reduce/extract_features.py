@@ -12,7 +12,7 @@ import numpy as np
 from . import logger, projections
 from .confs import features as features_confs
 from .descriptors import DESCRIPTORS, check_weights
-from .detectors.dog import KEYPOINTS, KeypointSettings
+from .detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
 from .networks import NETWORKS, NOISE_REDUCTION, fetch_weights
 from .runtime import parallel, processes
 from .runtime.executors import SERIAL, Executor, Results
@@ -344,7 +344,7 @@ def without(left_out: list[str], names: list[str], accept_partial: bool, reason:
 def _conf(
     conf: str = features_confs.RECOMMENDED,
     storage: Storage = STORAGES[0],
-    keypoints: KeypointSettings = KEYPOINTS[0],
+    keypoints: KeypointSettings = KEYPOINT_SETTINGS[0],
 ) -> dict:
     """Return the configuration of a feature.
 

@@ -13,9 +13,9 @@ import pycolmap
 
 from . import logger
 from .confs import features as features_confs
-from .descriptors import COLMAP
+from .descriptors import COLMAP_SIFT
 from .descriptors.normalization import NORMALIZATIONS, Normalization
-from .detectors.dog import NOISE
+from .detectors.dog import KEYPOINT_UNCERTAINTY_PIXELS
 from .reduce import Described, Reduction, sampled, told_by
 from .utils import cli, colmap, options
 from .utils.cli import InputError
@@ -152,7 +152,7 @@ def _check_type(database: StoredDatabase, reduction: Reduction) -> None:
     if not reduction.of_colmap:
         raise InputError(
             f"{database.path} has descriptors of COLMAP's SIFT, not those of {reduction.name}: "
-            f"choose a feature of {COLMAP}, such as {features_confs.RECOMMENDED}."
+            f"choose a feature of {COLMAP_SIFT}, such as {features_confs.RECOMMENDED}."
         )
 
 
@@ -213,7 +213,7 @@ def _read(database: StoredDatabase, reduction: Reduction, names: list[str]) -> I
         if (shapes := colmap.shapes(keypoints)) is not None:
             scales, oris = (part.astype(np.float16) for part in shapes)
             arrays |= {"scales": scales, "oris": oris, "scores": scales}  # as the extractor `dog`
-        noise = NOISE * max(1.0, size.max() / LARGEST)
+        noise = KEYPOINT_UNCERTAINTY_PIXELS * max(1.0, size.max() / LARGEST)
         yield name, descriptors.astype(np.float32), (arrays, {"keypoints": {"uncertainty": noise}})
 
 

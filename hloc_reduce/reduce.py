@@ -16,7 +16,7 @@ import numpy as np
 
 from . import logger, projections
 from .confs import features as features_confs
-from .descriptors import COLMAP
+from .descriptors import COLMAP_SIFT
 from .descriptors.normalization import NORMALIZATIONS, Normalization, detect, to_colmap_sift
 from .runtime import parallel
 from .runtime.group_writer import Group, GroupWriter
@@ -69,7 +69,7 @@ def main(
     if output.resolve() == features.resolve():
         raise InputError(f"{output} cannot be reduced to itself: choose another --output.")
     if normalization is not None and not reduction.of_colmap:
-        raise InputError(f"--normalization is for features of {COLMAP}; {name} is none.")
+        raise InputError(f"--normalization is for features of {COLMAP_SIFT}; {name} is none.")
     names = list_h5_names(features)
     with open_h5(features) as file:
         if reduction.of_colmap:
@@ -105,7 +105,7 @@ class Reduction:
 
     def __init__(self, feature: str, projection: Path | None = None, storage: str = STORAGES[0]):
         self.name, self.conf = features_confs.get(feature, projection, storage)
-        self.of_colmap = features_confs.descriptor_of(self.conf["model"]) == COLMAP
+        self.of_colmap = features_confs.descriptor_of(self.conf["model"]) == COLMAP_SIFT
         self._storage, self._levels = storage, features_confs.levels(self.conf)
         self._project: Projection | None = None
         self._dim = None

@@ -15,7 +15,7 @@ from hloc_reduce import compact, extract_features, localize_sfm, logger, maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
-from hloc_reduce.detectors.dog import KEYPOINTS, KeypointSettings
+from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import trace
@@ -102,7 +102,7 @@ def open_map(
         "matcher": matcher,
         "overwrite": overwrite,
         "storage": storage or STORAGES[0],
-        "keypoints": keypoints or KEYPOINTS[0],
+        "keypoints": keypoints or KEYPOINT_SETTINGS[0],
         "retrieval": named or retrieval_confs.VLAD,
     }
     folder = outputs / "map"

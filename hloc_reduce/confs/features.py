@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from .. import projections
-from ..descriptors import BASES as AT_DOG
-from ..descriptors import COLMAP, DESCRIPTORS, DIM
-from ..detectors.dog import HLOC, KEYPOINTS
+from ..descriptors import BASE_DESCRIPTORS, COLMAP_SIFT, DESCRIPTORS, DIM
+from ..detectors.dog import HLOC_OPTIONS, KEYPOINT_SETTINGS
 from ..networks import ALIKED, EDGEPOINT2, MINI, NETWORKS
-from ..projections.released import FILES as RELEASED
+from ..projections.released import WEIGHT_FILES as RELEASED
 from ..utils.cli import InputError, choose
 from ..utils.codes import CODED, STORAGES
 from ..utils.parsers import read_yaml
@@ -26,7 +25,7 @@ DIMS = (64, 32, 24, 16)
 # the schemes and dimensions of the projections of each base descriptor; and who has a nested one
 PROJECTIONS: dict[str, tuple[tuple[str, ...], tuple[int, ...]]] = {
     **dict.fromkeys((*DESCRIPTORS, "aliked"), (("pca", "us", "ss", "sv"), DIMS)),
-    COLMAP: (("pca", "sv"), DIMS),
+    COLMAP_SIFT: (("pca", "sv"), DIMS),
     **dict.fromkeys(("xfeat", "edgepoint2_m64"), (("pca", "sv"), DIMS[1:])),
 }
 NESTED = (*DESCRIPTORS, "xfeat", "aliked")
@@ -50,13 +49,13 @@ MODELS = (
 
 
 # the extractors of networks, and the networks that they run by default
-EXTRACTORS = {"mini": "mini32", "edgepoint2": "M32", "xfeat": "xfeat", "aliked": "aliked-n16"}
-BASES = (*AT_DOG, *MODELS)  # features whose descriptors are projected
+DEFAULT_NETWORKS = {"mini": "mini32", "edgepoint2": "M32", "xfeat": "xfeat", "aliked": "aliked-n16"}
+BASES = (*BASE_DESCRIPTORS, *MODELS)  # features whose descriptors are projected
 
 
 def base(descriptor: str) -> dict:
     """Return the model configuration of a base descriptor."""
-    at_dog = {"name": "dog", "descriptor": descriptor, "keypoints": KEYPOINTS[0]}
+    at_dog = {"name": "dog", "descriptor": descriptor, "keypoints": KEYPOINT_SETTINGS[0]}
     return MODELS.get(descriptor, at_dog)
 
 
@@ -90,12 +89,12 @@ def base_of(model: dict) -> dict:
 def network_of(model: dict) -> str | None:
     """Return the key of `networks.NETWORKS` whose features a model has or projects, if any."""
     found = base_of(model)
-    if str(found["name"]) not in EXTRACTORS:
+    if str(found["name"]) not in DEFAULT_NETWORKS:
         return None
-    return str(found.get("model_name", EXTRACTORS[found["name"]]))
+    return str(found.get("model_name", DEFAULT_NETWORKS[found["name"]]))
 
 
-confs = {name: feature(name, base(name)) for name in AT_DOG} | {
+confs = {name: feature(name, base(name)) for name in BASE_DESCRIPTORS} | {
     name: feature(name, {"name": "reduced", "base": base(descriptor), "projection": name})
     for descriptor in PROJECTIONS
     for name in names(descriptor)
@@ -148,7 +147,7 @@ def get(
     name: str,
     projection: Path | None = None,
     storage: str = STORAGES[0],
-    keypoints: str = KEYPOINTS[0],
+    keypoints: str = KEYPOINT_SETTINGS[0],
 ) -> tuple[str, dict]:
     """Return the name and the configuration of a feature.
 
@@ -157,21 +156,21 @@ def get(
             names the feature.
         projection: file of another projection of the same base, which names the feature.
         storage: of the descriptors, one of `codes.STORAGES`.
-        keypoints: settings of DoG, one of `detectors.dog.KEYPOINTS`; "adaptive" keeps those of a
-            YAML file.
+        keypoints: settings of DoG, one of `detectors.dog.KEYPOINT_SETTINGS`; "adaptive" keeps those
+            of a YAML file.
 
     Raises:
         InputError: for an unknown name or a file that is not a feature's configuration.
     """
     choose("storage", storage, STORAGES)
-    choose("keypoints", keypoints, KEYPOINTS)
+    choose("keypoints", keypoints, KEYPOINT_SETTINGS)
     if Path(name).suffix in (".yaml", ".yml"):
         name, conf = Path(name).stem, read(Path(name))
     else:
         conf = confs[choose("feature", name, confs)]
     if storage != STORAGES[0]:
         conf = {**conf, "storage": storage}
-    if keypoints != KEYPOINTS[0]:
+    if keypoints != KEYPOINT_SETTINGS[0]:
         conf = {**conf, "model": with_keypoints(conf["model"], keypoints)}
     if projection is None:
         return name, conf
@@ -205,7 +204,7 @@ def descriptor_of(model: dict) -> str | None:
 def keypoints_of(model: dict) -> str | None:
     """Return the name of a model's DoG settings; None for its own options."""
     found = base_of(model)
-    return found.get("keypoints") if found.get("options", HLOC) == HLOC else None
+    return found.get("keypoints") if found.get("options", HLOC_OPTIONS) == HLOC_OPTIONS else None
 
 
 def levels(conf: dict) -> np.ndarray | None:
@@ -251,7 +250,7 @@ def of_patches(name: str) -> tuple[str, str | None]:
     """
     name, conf = get(name)
     descriptor = descriptor_of(conf["model"])
-    if descriptor in (None, COLMAP):
+    if descriptor in (None, COLMAP_SIFT):
         raise InputError(f"{name} describes photos, not patches.")
     return choose("descriptor", descriptor, DESCRIPTORS), conf["model"].get("projection")
 
@@ -290,7 +289,7 @@ def check(content: object, path: Path) -> dict:
     if projection is not None and not (isinstance(projection, str) and projection):
         raise InputError(f"{path}: the model {model['name']} needs a projection.")
     if base["name"] == "dog" and "keypoints" not in base:
-        model = with_keypoints(model, KEYPOINTS[0])
+        model = with_keypoints(model, KEYPOINT_SETTINGS[0])
     if projection and Path(projections.split_prefix(projection)[0]).suffix:
         model = {**model, "projection": str(Path(projection).absolute())}  # for other machines
     if (weights := base.get("weights")) is not None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 PATCH_SIZE = 32
 DIM = 128
-COLMAP = "colmap_sift"  # COLMAP's SIFT, a base descriptor that takes no patches
+COLMAP_SIFT = "colmap_sift"  # COLMAP's SIFT, a base descriptor that takes no patches
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ DESCRIPTORS = {
         hidden=(96,),
     ),
 }
-BASES = (*DESCRIPTORS, COLMAP)  # base descriptors of photos
+BASE_DESCRIPTORS = (*DESCRIPTORS, COLMAP_SIFT)  # base descriptors of photos
 
 
 def check_weights(name: str) -> None:

@@ -6,7 +6,7 @@ import torch
 from kornia.feature import SIFTDescriptor
 from torch import nn
 
-EPSILON = 1e-10  # kornia's: keeps the orientation of a zero gradient defined
+GRADIENT_EPSILON = 1e-10  # kornia's: keeps the orientation of a zero gradient defined
 
 
 class SIFT(nn.Module):
@@ -38,9 +38,11 @@ class SIFT(nn.Module):
         gx = (padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]).flatten(1) / 2
         gy = (padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]).flatten(1) / 2
         squared = gx * gx + gy * gy
-        magnitude = (squared + EPSILON).sqrt_() * (squared > 0)
+        magnitude = (squared + GRADIENT_EPSILON).sqrt_() * (squared > 0)
         # in bins, positive, so that truncation rounds down
-        orientation = torch.atan2(gy, gx + EPSILON) * (self.angles / (2 * math.pi)) + self.angles
+        orientation = (
+            torch.atan2(gy, gx + GRADIENT_EPSILON) * (self.angles / (2 * math.pi)) + self.angles
+        )
         lower = orientation.long()
         upper_share = (orientation - lower) * magnitude
         histogram = magnitude.new_zeros(len(patches), self.angles, magnitude.shape[1])

@@ -16,24 +16,28 @@ from ..utils import colmap
 from ..utils.cli import choose
 from ..utils.options import Option
 
-HLOC = {"first_octave": 0, "peak_threshold": 0.01}
-COLMAP = {"first_octave": -1, "peak_threshold": 0.0067}
+HLOC_OPTIONS = {"first_octave": 0, "peak_threshold": 0.01}
+COLMAP_OPTIONS = {"first_octave": -1, "peak_threshold": 0.0067}
 # name -> the settings to try first, and whether to try others if these find too few keypoints
-SETTINGS = {"adaptive": (HLOC, True), "colmap": (COLMAP, True), "hloc": (HLOC, False)}
-KEYPOINTS = tuple(SETTINGS)
+SETTINGS = {
+    "adaptive": (HLOC_OPTIONS, True),
+    "colmap": (COLMAP_OPTIONS, True),
+    "hloc": (HLOC_OPTIONS, False),
+}
+KEYPOINT_SETTINGS = tuple(SETTINGS)
 KeypointSettings = Annotated[
     str,
     Option(
         "keypoints",
-        KEYPOINTS,
+        KEYPOINT_SETTINGS,
         "adaptive finds more keypoints in small, dark and hazy photos; colmap finds several times "
         "as many in every photo; hloc uses hloc's settings for every photo",
     ),
 ]
 
-ENOUGH = 2500  # keypoints of a photo
-PIXELS = 200  # per keypoint: fewer keypoints are enough in small photos
-SMALL = 1200  # pixels on the longer side: detection is fast even at twice the size
+ENOUGH_KEYPOINTS = 2500  # of a photo
+PIXELS_PER_KEYPOINT = 200  # fewer keypoints are enough in small photos
+SMALL_PHOTO_PIXELS = 1200  # on the longer side: detection is fast even at twice the size
 # (first_octave, peak_threshold), tried in turn until there are enough keypoints. Octave -1 is the
 # photo at twice its size; 0.0067 is COLMAP's threshold.
 LADDERS = {
@@ -42,35 +46,35 @@ LADDERS = {
 }
 
 # of the extractor `dog`
-CONF = {
-    "options": HLOC,
+DEFAULT_CONF = {
+    "options": HLOC_OPTIONS,
     "keypoints": "adaptive",
     "descriptor": "sift",
     "max_keypoints": -1,
     "mr_size": 12,
 }
 
-NOISE = 1.0  # standard deviation of keypoints in pixels, as hloc assumes
+KEYPOINT_UNCERTAINTY_PIXELS = 1.0  # standard deviation, as hloc assumes
 
-BLUR = 4.0  # pixels, standard deviation of the blur that suppresses noise
+BLUR_PIXELS = 4.0  # standard deviation of the blur that suppresses noise
 LEAST_SIGNAL = 5.0  # minimum contrast after the blur, relative to that of pure noise
 
 
 def detector(conf: dict) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return what detects keypoints with a configuration like `CONF`, see `detect`.
+    """Return what detects keypoints with a configuration like `DEFAULT_CONF`, see `detect`.
 
     Raises:
         InputError: for unknown options or settings.
     """
-    name = choose("keypoints", conf["keypoints"], KEYPOINTS)
+    name = choose("keypoints", conf["keypoints"], KEYPOINT_SETTINGS)
     colmap.check_dog_options(conf["options"])
-    own = conf["options"] != HLOC
+    own = conf["options"] != HLOC_OPTIONS
     options, adaptive = (conf["options"], False) if own else SETTINGS[name]
     return partial(detect, options=options, adaptive=adaptive)
 
 
 def is_rotation_invariant(conf: dict) -> bool:
-    """Tell whether keypoints of a configuration like `CONF` have the orientations of the photo."""
+    """Tell whether keypoints of a conf like `DEFAULT_CONF` have the photo's orientations."""
     return not conf["options"].get("upright", False)
 
 
@@ -99,10 +103,10 @@ def detect(
         Keypoints and descriptors, see `colmap.detect_dog`.
     """
     found = colmap.detect_dog(image, options)
-    enough = min(ENOUGH, image.size / PIXELS)
+    enough = min(ENOUGH_KEYPOINTS, image.size / PIXELS_PER_KEYPOINT)
     if not adaptive or len(found[0]) >= enough or is_noise(image):
         return found
-    ladder = LADDERS["small" if max(image.shape) <= SMALL else "large"]
+    ladder = LADDERS["small" if max(image.shape) <= SMALL_PHOTO_PIXELS else "large"]
     for first_octave, peak_threshold in ladder:
         settings = {"first_octave": first_octave, "peak_threshold": peak_threshold}
         if first_octave > options["first_octave"] or peak_threshold >= options["peak_threshold"]:
@@ -121,8 +125,8 @@ def is_noise(image: np.ndarray) -> bool:
     """
     kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
     noise = np.median(np.abs(cv2.filter2D(image, -1, kernel))) / 0.6745 / 6
-    smooth = cv2.GaussianBlur(image, (0, 0), BLUR)
-    left = noise / (2 * np.sqrt(np.pi) * BLUR)  # standard deviation of blurred white noise
+    smooth = cv2.GaussianBlur(image, (0, 0), BLUR_PIXELS)
+    left = noise / (2 * np.sqrt(np.pi) * BLUR_PIXELS)  # standard deviation of blurred white noise
     # 98 % of it is within 2.33 deviations; at least an 8-bit step, because of dithering
     low, high = np.percentile(smooth, [1, 99])
     return bool(high - low <= max(LEAST_SIGNAL * 2 * 2.33 * left, 1 / 255))

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from torch.nn.functional import grid_sample
 
-from ..descriptors import BASES, COLMAP, PATCH_SIZE
+from ..descriptors import BASE_DESCRIPTORS, COLMAP_SIFT, PATCH_SIZE
 from ..descriptors.model import Descriptor
 from ..detectors import dog
 from ..utils.cli import InputError, choose
@@ -83,13 +83,13 @@ class DoG(Extractor):
     override `keypoints`.
     """
 
-    default_conf = dog.CONF
-    detection_noise = dog.NOISE
+    default_conf = dog.DEFAULT_CONF
+    detection_noise = dog.KEYPOINT_UNCERTAINTY_PIXELS
     detect: Detect
 
     def _init(self, conf: dict) -> None:
-        descriptor = choose("descriptor", conf["descriptor"], BASES)
-        self.describe = None if descriptor == COLMAP else Descriptor(descriptor)
+        descriptor = choose("descriptor", conf["descriptor"], BASE_DESCRIPTORS)
+        self.describe = None if descriptor == COLMAP_SIFT else Descriptor(descriptor)
         self.detect = dog.detector(conf)
         self.rotation_invariant = self.is_rotation_invariant(conf)
 

@@ -336,7 +336,7 @@ def check_model(model: dict, feature: str) -> None:
     """
     base = features_confs.base_of(model)
     for name in {str(model["name"]), str(base["name"])}:
-        if name not in ("dog", "reduced", *features_confs.EXTRACTORS):
+        if name not in ("dog", "reduced", *features_confs.DEFAULT_NETWORKS):
             raise InputError(f"Compact maps cannot have {feature}: its extractor is {name}.")
     if base.get("weights") is not None:
         raise InputError(f"Compact maps cannot have {feature}: its weights are in a file.")

@@ -11,7 +11,7 @@ from .. import extract_features, logger
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
-from ..detectors.dog import KEYPOINTS
+from ..detectors.dog import KEYPOINT_SETTINGS
 from ..extract_features import keep_present, without
 from ..localization import intrinsics
 from ..mapping import registration
@@ -44,7 +44,7 @@ def main(
     num_covis: int = 20,
     overwrite: bool = False,
     storage: str = STORAGES[0],
-    keypoints: str = KEYPOINTS[0],
+    keypoints: str = KEYPOINT_SETTINGS[0],
     accept_partial: bool = False,
     camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
     retrieval: str = retrieval_confs.VLAD,
@@ -65,7 +65,7 @@ def main(
             without a model, pairs are added where these leave images unconnected.
         overwrite: rebuild the map.
         storage: how descriptors are stored, one of `utils.codes.STORAGES`.
-        keypoints: settings of the DoG detector, one of `detectors.dog.KEYPOINTS`.
+        keypoints: settings of the DoG detector, one of `detectors.dog.KEYPOINT_SETTINGS`.
         accept_partial: do without images that are missing, unreadable or of another size than their
             cameras in the model; without a model, build a map even if fewer than half of the images
             are in it, or its focal lengths, positions or matches show that it may be wrong.

@@ -8,7 +8,7 @@ from .. import aggregate_features, extract_features, from_colmap, logger, triang
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
-from ..detectors.dog import KEYPOINTS
+from ..detectors.dog import KEYPOINT_SETTINGS
 from ..localization import intrinsics
 from ..mapping.checks import Inputs, judging, run
 from ..mapping.findings import staying
@@ -35,7 +35,7 @@ def main(
     matcher: str | None = None,
     overwrite: bool = False,
     storage: str = STORAGES[0],
-    keypoints: str = KEYPOINTS[0],
+    keypoints: str = KEYPOINT_SETTINGS[0],
     image_dir: Path | None = None,
     retrieval: str = retrieval_confs.VLAD,
 ) -> Map:

@@ -13,7 +13,7 @@ from .. import aggregate_features, extract_features, projections
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
-from ..detectors.dog import KEYPOINTS
+from ..detectors.dog import KEYPOINT_SETTINGS
 from ..localization import intrinsics
 from ..mapping.findings import Finding, warn
 from ..runtime import provenance
@@ -120,8 +120,8 @@ class Map:
         base = features_confs.base_of(conf["model"])
         if base["name"] == "dog" and "keypoints" not in base:  # of a version without this setting
             conf["model"] = features_confs.with_keypoints(conf["model"], "hloc")
-        found = features_confs.base_of(conf["model"]).get("keypoints", KEYPOINTS[0])
-        self.keypoints = choose("keypoints", content.get("keypoints", found), KEYPOINTS)
+        found = features_confs.base_of(conf["model"]).get("keypoints", KEYPOINT_SETTINGS[0])
+        self.keypoints = choose("keypoints", content.get("keypoints", found), KEYPOINT_SETTINGS)
         self.conf = with_projection(conf, lambda name: str(self.folder / _file_name(name)))
         self.sfm = self.folder / _file_name(content.get("sfm", SFM))
         self.features = self.folder / f"{_file_name(conf['output'])}.h5"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..descriptors import COLMAP
+from ..descriptors import COLMAP_SIFT
 from ..detectors import dog
 from ..utils.images import in_original, resized
 from .matching import IntegerMatching, Matching
@@ -13,7 +13,7 @@ from .numpy_features import Extract
 
 def is_colmap_sift(base: dict) -> bool:
     """Tell whether the configuration of a base extractor is of COLMAP's SIFT."""
-    return base["name"] == "dog" and base.get("descriptor") == COLMAP
+    return base["name"] == "dog" and base.get("descriptor") == COLMAP_SIFT
 
 
 class NumpyEngine:
@@ -37,4 +37,6 @@ class NumpyEngine:
             preprocessing: of the feature's configuration, and `mirrored`, to swap left and right.
         """
         pixels, size = resized(image, preprocessing)
-        return in_original(self._extract(pixels), pixels.shape, size, dog.NOISE)
+        return in_original(
+            self._extract(pixels), pixels.shape, size, dog.KEYPOINT_UNCERTAINTY_PIXELS
+        )

@@ -40,9 +40,9 @@ class ColmapSift:
     """
 
     def __init__(self, conf: dict, layers: Sequence[frozen.Layer] | None):
-        if unknown := set(conf) - set(dog.CONF) - {"name"}:
+        if unknown := set(conf) - set(dog.DEFAULT_CONF) - {"name"}:
             raise InputError(f"DoG has no option {', '.join(sorted(unknown))}.")
-        self._conf, self._layers = {**dog.CONF, **conf}, layers
+        self._conf, self._layers = {**dog.DEFAULT_CONF, **conf}, layers
         self._detect = dog.detector(self._conf)
         self.rotation_invariant = dog.is_rotation_invariant(self._conf)
 

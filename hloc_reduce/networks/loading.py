@@ -14,7 +14,7 @@ from ..utils.cli import InputError
 from . import NETWORKS, fetch_weights
 
 CONSTANT = "hw_grid"  # a buffer of kornia's ALIKED that its weights lack
-TOLERANCE = 1e-3  # of what the weights compute
+OUTPUT_TOLERANCE = 1e-3  # of what the weights compute
 
 Compute = Callable[[torch.Tensor], tuple[torch.Tensor, ...]]
 
@@ -38,7 +38,7 @@ def load_weights(module: nn.Module, name: str, compute: Compute | None = None) -
     expected = NETWORKS[name].computes
     found = fingerprint(compute or module)
     if expected and any(
-        abs(a - b) > TOLERANCE * (1 + abs(b)) for a, b in zip(found, expected, strict=True)
+        abs(a - b) > OUTPUT_TOLERANCE * (1 + abs(b)) for a, b in zip(found, expected, strict=True)
     ):
         raise InputError(
             f"{what}, {path}, are not the published ones: they compute {_rounded(found)} instead "

@@ -3,16 +3,16 @@
 import cv2
 import numpy as np
 
-BLOCK = 32  # pixels, the side of the blocks in which noise is measured
+BLOCK_PIXELS = 32  # the side of the blocks in which noise is measured
 SMOOTH = 0.1  # share of the blocks that are taken for smooth
 CLIPPED = 0.02, 0.98  # blocks of a mean beyond have lost their noise
 # lamps are brighter than this multiple of the median, and this share of the pixels at most
-LAMPS, LAMPS_SHARE = 2.5, 0.02
+LAMP_BRIGHTNESS, MAX_LAMP_SHARE = 2.5, 0.02
 STEP = 4  # every fourth row and column tells as much of them, in a tenth of the time
 NOISY = 0.08  # standard deviation of the noise, in that of the image, from which it is blurred
-# the blur, a standard deviation in pixels: the smaller of BLUR * sqrt(noise) and
-# BLUR_LITTLE * noise, which are equal at 0.34 (docs/lab.md)
-BLUR, BLUR_LITTLE = 2.8, 4.8
+# the blur, a standard deviation in pixels: the smaller of BLUR_PER_ROOT_NOISE * sqrt(noise)
+# and BLUR_PER_NOISE * noise, which are equal at 0.34 (docs/lab.md)
+BLUR_PER_ROOT_NOISE, BLUR_PER_NOISE = 2.8, 4.8
 
 
 def relative_noise(image: np.ndarray) -> float:
@@ -29,23 +29,25 @@ def relative_noise(image: np.ndarray) -> float:
         The ratio of two standard deviations: of the noise, and of the image; 0 for an image that
         is too small, or of one colour.
     """
-    height, width = (side // BLOCK * BLOCK for side in image.shape)
+    height, width = (side // BLOCK_PIXELS * BLOCK_PIXELS for side in image.shape)
     contrast = float(image.clip(max=lamps(image)).std()) if image.size else 0.0
     if not (height and width and contrast):
         return 0.0
     pixels = image[:height, :width]
     detail = pixels[::2, ::2] - pixels[1::2, ::2] - pixels[::2, 1::2] + pixels[1::2, 1::2]
-    side = BLOCK // 2
-    blocks = (detail / 2).reshape(height // BLOCK, side, width // BLOCK, side)
-    means = pixels.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean(axis=(1, 3))
+    side = BLOCK_PIXELS // 2
+    blocks = (detail / 2).reshape(height // BLOCK_PIXELS, side, width // BLOCK_PIXELS, side)
+    means = pixels.reshape(
+        height // BLOCK_PIXELS, BLOCK_PIXELS, width // BLOCK_PIXELS, BLOCK_PIXELS
+    ).mean(axis=(1, 3))
     measured = blocks.std(axis=(1, 3))[(means > CLIPPED[0]) & (means < CLIPPED[1])]
     return float(np.quantile(measured, SMOOTH)) / contrast if measured.size else 0.0
 
 
 def lamps(image: np.ndarray) -> float:
     """Return the value above which pixels (H, W) or (C, H, W) in [0, 1] are lamps."""
-    median, brightest = np.quantile(image[..., ::STEP, ::STEP], [0.5, 1 - LAMPS_SHARE])
-    return float(max(LAMPS * median, brightest))
+    median, brightest = np.quantile(image[..., ::STEP, ::STEP], [0.5, 1 - MAX_LAMP_SHARE])
+    return float(max(LAMP_BRIGHTNESS * median, brightest))
 
 
 def reduce_noise(channels: np.ndarray) -> tuple[np.ndarray, float]:
@@ -61,5 +63,5 @@ def reduce_noise(channels: np.ndarray) -> tuple[np.ndarray, float]:
     if noise < NOISY:
         return channels, 0.0
     cut = channels.clip(max=lamps(channels))
-    blur = min(BLUR * np.sqrt(noise), BLUR_LITTLE * noise)
+    blur = min(BLUR_PER_ROOT_NOISE * np.sqrt(noise), BLUR_PER_NOISE * noise)
     return np.stack([cv2.GaussianBlur(channel, (0, 0), blur) for channel in cut]), float(blur)

@@ -45,7 +45,7 @@ def find(projection: str | Path) -> Path:
     path = WEIGHTS / f"{name}.safetensors"
     if path.is_file():
         return path
-    if name in released.FILES:
+    if name in released.WEIGHT_FILES:
         return released.fetch(name)
     parts, shipped = NAME.fullmatch(name), filter(None, map(NAME.fullmatch, names()))
     if not parts or parts[1] not in {*DESCRIPTORS, *(other[1] for other in shipped)}:

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..utils.arrays import unit
 
-EPSILON = 1e-5  # of the batch normalizations
+BATCH_NORM_EPSILON = 1e-5
 Layer = tuple[np.ndarray, np.ndarray]  # weight (out, in) and bias (out,)
 
 
@@ -78,7 +78,7 @@ def fold(state: Mapping[str, np.ndarray]) -> list[Layer]:
                 state[f"norms.{i}.{key}"].astype(np.float32)
                 for key in ("running_mean", "running_var", "weight", "bias")
             )
-            scale = gain / np.sqrt(variance + np.float32(EPSILON))
+            scale = gain / np.sqrt(variance + np.float32(BATCH_NORM_EPSILON))
             shift = offset - mean * scale
     return layers
 

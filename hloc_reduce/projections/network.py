@@ -177,6 +177,6 @@ def read_released(path: Path) -> tuple[MLP, dict]:
     for layers, prefixes in ((mlp.linears, linears), (mlp.norms, norms)):
         for layer, prefix in zip(layers, prefixes, strict=True):
             layer.load_state_dict({key: state[prefix + key] for key in layer.state_dict()})
-    metadata = {"training_data": f"{path.name}, in the form of {released.SOURCE}"}
+    metadata = {"training_data": f"{path.name}, in the form of {released.REPOSITORY}"}
     descriptor = path.name.lower().partition("_")[0]  # SIFT_sv_dim64.pth
     return mlp, metadata | ({"descriptor": descriptor} if descriptor in DESCRIPTORS else {})

@@ -15,7 +15,7 @@ import torch
 from .. import extractors, logger, projections
 from ..confs import features as features_confs
 from ..datasets import phototour as layout
-from ..descriptors import COLMAP, DESCRIPTORS, DIM, check_weights
+from ..descriptors import COLMAP_SIFT, DESCRIPTORS, DIM, check_weights
 from ..evaluation import patch_verification as verification
 from ..projections import network
 from ..runtime.versions import versions
@@ -30,8 +30,8 @@ SCHEMES = {"pca": pca, "us": us, "ss": ss, "sv": sv, "nested": nested, "raw": ra
 RECIPE_NAMES = ("best", "paper", "tune")
 # hidden layers for descriptors that are not of patches; COLMAP's are computed so fast that larger
 # layers would take 5 % of the time
-HIDDEN = {COLMAP: (256, 256)}
-HIDDEN_BY_DEFAULT = (512, 512)
+HIDDEN_LAYERS = {COLMAP_SIFT: (256, 256)}
+DEFAULT_HIDDEN_LAYERS = (512, 512)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ class Command:
         Option("scheme", SCHEMES, "raw changes nothing and only fits levels for codes"),
     ] = ("sv",)
     dim: Sequence[int] = (64,)
-    map: Annotated[Sequence[str], tracks.MAPS] = ()
+    map: Annotated[Sequence[str], tracks.MAP_OPTION] = ()
     phototour: Annotated[Sequence[Path], Option(repeated=True, metavar="DIR")] = ()
     validate: Annotated[Path, Option(metavar="DIR")] | None = None
     recipe: Annotated[
@@ -191,7 +191,9 @@ def complete_recipe(scheme: str, recipe: str, descriptor: str, name: str) -> dic
         return {}
     base = DESCRIPTORS.get(descriptor)
     settings = {
-        "hidden": list(base.hidden if base else HIDDEN.get(descriptor, HIDDEN_BY_DEFAULT)),
+        "hidden": list(
+            base.hidden if base else HIDDEN_LAYERS.get(descriptor, DEFAULT_HIDDEN_LAYERS)
+        ),
         "distance_weight": trainer.DISTANCE_WEIGHTS.get(descriptor, 0.0),
         **trainer.RECIPES[cli.choose(f"recipe of {scheme}", recipe, trainer.RECIPES)],
     }
@@ -226,7 +228,7 @@ def _check(args: Command, conf: dict | None) -> None:
         cli.choose("descriptor", descriptor, DESCRIPTORS if of_patches else features_confs.BASES)
         if descriptor in DESCRIPTORS:
             check_weights(descriptor)
-        elif descriptor != COLMAP:
+        elif descriptor != COLMAP_SIFT:
             extractors.load(features_confs.confs[descriptor]["model"])
     if "ss" in args.scheme:
         ss.check()

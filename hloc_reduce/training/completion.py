@@ -9,11 +9,11 @@ import numpy as np
 import pycolmap
 from scipy.spatial import cKDTree
 
-MAX_DISTANCE = 2.0  # pixels
-MAX_OCTAVES = 0.5
-MAX_ROTATION = 30.0  # degrees
-MAX_VIEW_ANGLE = 40.0  # degrees between the rays of the known and the new observation
-NEIGHBORS = 8  # candidates at each place
+MAX_DISTANCE_PIXELS = 2.0
+MAX_SCALE_OCTAVES = 0.5
+MAX_ROTATION_DEGREES = 30.0
+MAX_VIEW_ANGLE_DEGREES = 40.0  # between the rays of the known and the new observation
+NUM_CANDIDATES = 8  # at each place
 
 
 class Completion:
@@ -72,13 +72,15 @@ class Completion:
         orientation = np.degrees(np.arctan2(along[:, 1], along[:, 0]))
         keypoints = self.keypoints[name][free]
         distance, nearest = cKDTree(keypoints[:, :2]).query(
-            place, k=range(1, NEIGHBORS + 1), distance_upper_bound=MAX_DISTANCE
+            place, k=range(1, NUM_CANDIDATES + 1), distance_upper_bound=MAX_DISTANCE_PIXELS
         )
         nearest = np.minimum(nearest, len(keypoints) - 1)
         octaves = np.abs(np.log2(keypoints[nearest, 2] / scale[:, None]))
         turned = keypoints[nearest, 3] - orientation[:, None]
         turned = np.abs((turned + 180) % 360 - 180)
-        fits = np.isfinite(distance) & (octaves < MAX_OCTAVES) & (turned < MAX_ROTATION)
+        fits = (
+            np.isfinite(distance) & (octaves < MAX_SCALE_OCTAVES) & (turned < MAX_ROTATION_DEGREES)
+        )
         cost = np.where(fits, distance, np.inf)
         found = np.flatnonzero(fits.any(axis=1))
         best = cost[found].argmin(axis=1)
@@ -92,7 +94,7 @@ class Completion:
     def _candidates(self, name: str) -> np.ndarray:
         """Return the observations of points that an image may see, one per point.
 
-        It is the one from the nearest direction, within `MAX_VIEW_ANGLE`.
+        It is the one from the nearest direction, within `MAX_VIEW_ANGLE_DEGREES`.
         """
         view = self.centers[name] - self.points
         view /= np.linalg.norm(view, axis=1, keepdims=True)
@@ -100,7 +102,7 @@ class Completion:
         order = np.lexsort((-cosine, self.point_id))
         order = order[np.diff(self.point_id[order], prepend=-1) > 0]
         seen_here = np.isin(self.point_id[order], self.observed[name])
-        return order[~seen_here & (cosine[order] > np.cos(np.radians(MAX_VIEW_ANGLE)))]
+        return order[~seen_here & (cosine[order] > np.cos(np.radians(MAX_VIEW_ANGLE_DEGREES)))]
 
 
 def _steps(

@@ -7,7 +7,7 @@ from torch.nn.functional import conv2d, pad
 
 KEPT = 0.25  # share of views that are not degraded
 KERNEL = 13  # pixels, the side of a blur
-LAMPS = 5  # at most, in a view
+MAX_LAMPS = 5  # in a view
 # Quantization of JPEG's luminance, ITU-T T.81, table K.1
 QUANTIZATION = """
     16 11 10 16 24 40 51 61 12 12 14 19 26 58 60 55 14 13 16 24 40 57 69 56 14 17 22 29 51 87 80 62
@@ -55,8 +55,8 @@ def _lamps(
     rng: np.random.Generator, lit: np.ndarray, side: int, device: torch.device
 ) -> torch.Tensor:
     """Return the light (V, 1, side, side) of lamps with their glow, 0 in views not lit (V,)."""
-    shape = len(lit), LAMPS
-    on = lit[:, None] & (np.arange(LAMPS) < rng.integers(1, LAMPS + 1, (len(lit), 1)))
+    shape = len(lit), MAX_LAMPS
+    on = lit[:, None] & (np.arange(MAX_LAMPS) < rng.integers(1, MAX_LAMPS + 1, (len(lit), 1)))
     centres = rng.uniform(0, side, (2, *shape))
     power = on * rng.uniform(10, 60, shape) * rng.integers(2, 9, shape) ** 2 / 2
     # a spot and its glow: standard deviations, and their shares of the light

@@ -6,14 +6,14 @@ import torch
 from scipy.spatial import cKDTree
 
 from .. import extractors
-from ..descriptors import COLMAP, DIM
+from ..descriptors import COLMAP_SIFT, DIM
 from ..descriptors.model import Descriptor
 from ..extractors.dog import extract_patches
 from .loop import device
 
 VARIANTS = 4  # the photo and three photometric variants, each as seen and mirrored
 MAX_SHIFT = 1.5  # pixels between a keypoint of the photo and the same one of a variant
-NEIGHBORS = 4  # candidates for it
+NUM_CANDIDATES = 4  # for it
 
 
 class PatchDescriber:
@@ -81,7 +81,7 @@ class FeatureDescriber:
             descriptors = features["descriptors"][0].T.cpu().numpy()
             # several keypoints may lie at one place with different orientations: take the best
             distance, near = cKDTree(found).query(
-                keypoints[:, :2], k=range(1, NEIGHBORS + 1), distance_upper_bound=MAX_SHIFT
+                keypoints[:, :2], k=range(1, NUM_CANDIDATES + 1), distance_upper_bound=MAX_SHIFT
             )
             candidates = descriptors[np.minimum(near, len(found) - 1)]
             likeness = np.einsum("nkd,nd->nk", candidates, known.astype(np.float32))
@@ -98,7 +98,7 @@ def mirror_colmap_sift(descriptors: np.ndarray) -> np.ndarray:
     return mirrored.reshape(descriptors.shape)
 
 
-MIRRORS = {COLMAP: mirror_colmap_sift}
+MIRRORS = {COLMAP_SIFT: mirror_colmap_sift}
 
 
 def describe_mirrored(patches: torch.Tensor, describe: Descriptor) -> np.ndarray:

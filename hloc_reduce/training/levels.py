@@ -24,8 +24,8 @@ from ..utils.paths import strings_as_paths
 from . import nested, tracks
 from .tracks import Tracks
 
-SAMPLE = 100_000  # descriptors that levels are fitted to
-ROUNDS = 100  # of Lloyd's algorithm
+SAMPLED_DESCRIPTORS = 100_000  # descriptors that levels are fitted to
+LLOYD_ROUNDS = 100
 
 
 def fit(numbers: torch.Tensor, bits: int) -> torch.Tensor:
@@ -44,7 +44,7 @@ def fit(numbers: torch.Tensor, bits: int) -> torch.Tensor:
     sums = nn.functional.pad(ordered.double().cumsum(1), (1, 0))
     place = ((torch.arange(count) + 0.5) * number / count).long()
     levels = ordered[:, place].contiguous()
-    for _ in range(ROUNDS):
+    for _ in range(LLOYD_ROUNDS):
         middle = ((levels[:, 1:] + levels[:, :-1]) / 2).contiguous()
         inner = torch.searchsorted(ordered, middle)
         ends = nn.functional.pad(nn.functional.pad(inner, (1, 0)), (0, 1), value=number)
@@ -62,7 +62,7 @@ def sample(maps: list[Tracks]) -> torch.Tensor:
     # all variants, so that codes are good in the dark, too
     size = maps[0].descriptors.shape[-1]
     everything = np.concatenate([part.descriptors[:, 0].reshape(-1, size) for part in maps])
-    return torch.from_numpy(everything[:: -(-len(everything) // SAMPLE)]).float()
+    return torch.from_numpy(everything[:: -(-len(everything) // SAMPLED_DESCRIPTORS)]).float()
 
 
 def of_projection(mlp: network.MLP, metadata: dict, maps: list[Tracks]) -> dict[str, torch.Tensor]:
@@ -123,7 +123,7 @@ def main(projection: Path, maps: dict[str, tuple[Path, Path]], cache: Path) -> P
 
 def of_maps(
     projection: list[str],
-    map: Annotated[list[str], tracks.MAPS],
+    map: Annotated[list[str], tracks.MAP_OPTION],
     cache: Path = Path("outputs/training/maps"),
 ) -> None:
     """Add levels to projections, or replace them.

@@ -25,6 +25,7 @@ from torch.nn.functional import (
 )
 
 from .. import logger
+from ..extractors.edgepoint2 import MIN_SCORE, RADIUS
 from ..networks import EDGEPOINT2, MINI, MINI_SIZE, fetch_weights
 from ..networks.edgepoint2 import EdgePoint2
 from ..networks.loading import load_weights, output_size, read_into
@@ -41,9 +42,9 @@ RECIPE = {"weight_decay": 0.0, "final_lr": 0.0}
 HIGHEST = 14.0  # logit at which the scores of the teacher are clamped
 SCORES, MATCHES = 0.5, 0.5  # weights of the losses
 # Scores near keypoints are few, and count more; errors above this many logits grow linearly.
-HIGH, WEIGHT, LINEAR = -6.0, 9.0, 4.0
-KEYPOINTS, RADIUS, MIN_SCORE, BORDER = 256, 2, -5.0, 8  # of a view
-NEAR = 4.0  # pixels: keypoints nearer than that need not be told apart
+HIGH_SCORE, HIGH_SCORE_WEIGHT, LINEAR_BEYOND = -6.0, 9.0, 4.0
+NUM_KEYPOINTS, BORDER = 256, 8  # of a view
+NEAR_PIXELS = 4.0  # keypoints nearer than that need not be told apart
 TEMPERATURE = 0.06
 # Lloyd-Max levels of 2 bits of a normal distribution, and the threshold between them
 INNER, OUTER, THRESHOLD = 0.4528, 1.5104, 0.9816
@@ -65,12 +66,13 @@ def find(scores: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         scores: (B, 1, H, W), logits.
 
     Returns:
-        Their pixels x, y (B, KEYPOINTS, 2), float32, and whether there is one (B, KEYPOINTS).
+        Their pixels x, y (B, NUM_KEYPOINTS, 2), float32, and whether there is one
+            (B, NUM_KEYPOINTS).
     """
     highest = max_pool2d(scores, 2 * RADIUS + 1, stride=1, padding=RADIUS)
     maxima = torch.where((scores == highest) & (scores > MIN_SCORE), scores, -torch.inf)
     inner = maxima[:, 0, BORDER:-BORDER, BORDER:-BORDER]
-    found, index = inner.flatten(1).topk(KEYPOINTS)
+    found, index = inner.flatten(1).topk(NUM_KEYPOINTS)
     width = inner.shape[2]
     pixels = torch.stack([index % width, index // width], dim=2) + BORDER
     return pixels.float(), found.isfinite()
@@ -111,8 +113,8 @@ def matching_loss(
         return dense.new_zeros(())
     here, there = sample(dense[::2], pixels), sample(dense[1::2], places)
     there = there.masked_scatter(valid[..., None], rounded(there[valid]))
-    same = torch.eye(KEYPOINTS, dtype=torch.bool, device=dense.device)
-    apart = same | (torch.cdist(places, places) > NEAR)
+    same = torch.eye(NUM_KEYPOINTS, dtype=torch.bool, device=dense.device)
+    apart = same | (torch.cdist(places, places) > NEAR_PIXELS)
     compared = apart & valid[:, :, None] & valid[:, None]
     return contrastive_loss(here, there, TEMPERATURE, compared)
 
@@ -120,8 +122,8 @@ def matching_loss(
 def score_loss(scores: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
     """Compute how far scores are from those of the teacher, (B, 1, H, W) logits; a scalar."""
     wanted = wanted.clamp(-HIGHEST, HIGHEST)
-    errors = smooth_l1_loss(scores, wanted, reduction="none", beta=LINEAR)
-    weights = 1 + WEIGHT * (wanted > HIGH)
+    errors = smooth_l1_loss(scores, wanted, reduction="none", beta=LINEAR_BEYOND)
+    weights = 1 + HIGH_SCORE_WEIGHT * (wanted > HIGH_SCORE)
     return (weights * errors).sum() / weights.sum()
 
 

@@ -36,13 +36,13 @@ from .completion import Completion
 
 NUM_COVIS = 20
 MATCHED = "sift"  # finds the tracks of all descriptors of patches
-MAPS = Option(
+MAP_OPTION = Option(
     note="folder of images and folder of their COLMAP model, or a map of pipelines.localize; may "
     "be repeated",
     repeated=True,
     metavar="IMAGES:MODEL|MAP",
 )
-KEYPOINTS = "hloc"  # settings of DoG that the shipped projections were trained with
+DOG_SETTINGS = "hloc"  # which the shipped projections were trained with
 
 
 @dataclass
@@ -148,7 +148,7 @@ def _described(
     _check_source(images, model, output / "source.json")
     patches = conf is None and descriptor in DESCRIPTORS
     found_by = MATCHED if patches else descriptor
-    conf = conf or features_confs.get(found_by, keypoints=KEYPOINTS)[1]
+    conf = conf or features_confs.get(found_by, keypoints=DOG_SETTINGS)[1]
     names = sorted(image.name for image in colmap.read_model(model).images.values())
     sfm = output / f"sfm_{found_by}"
     features, reconstruction = _triangulate(images, model, names, conf, sfm)

@@ -11,7 +11,7 @@ from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs.retrieval import confs
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.layouts import layout_of
-from hloc_reduce.detectors.dog import KEYPOINTS
+from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.executors import Executor
 from hloc_reduce.runtime.group_writer import GroupWriter
@@ -91,7 +91,7 @@ class Shared:
         extract_features.provenance(conf)
         model = extractors.load(conf["model"])
         stored = "" if job.storage == STORAGES[0] else f"-{job.storage}"
-        found = "" if job.keypoints == KEYPOINTS[0] else f"-keypoints_{job.keypoints}"
+        found = "" if job.keypoints == KEYPOINT_SETTINGS[0] else f"-keypoints_{job.keypoints}"
         path = self.folder / f"{conf['output']}{stored}{found}.h5"
         if self.confs.setdefault(path, conf) != conf:
             raise InputError(f"{path.name} is the file of two features: rename a YAML file.")

@@ -7,7 +7,7 @@ from typing import Annotated
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.confs.retrieval import VLAD
-from hloc_reduce.detectors.dog import KEYPOINTS, KeypointSettings
+from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.utils.codes import STORAGES, Storage
@@ -36,7 +36,7 @@ class Method(Checked):
 
     feature: str = features_confs.RECOMMENDED
     storage: Storage = STORAGES[0]
-    keypoints: KeypointSettings = KEYPOINTS[0]
+    keypoints: KeypointSettings = KEYPOINT_SETTINGS[0]
     matcher: Matcher | None = None
     retrieval: Retrieval = VLAD
     ground_truth: Path | None = None

@@ -16,7 +16,7 @@ from hostile import Harm
 
 from hloc_reduce import descriptors, extract_features, extractors
 from hloc_reduce.confs import features
-from hloc_reduce.descriptors import COLMAP, DESCRIPTORS, Base
+from hloc_reduce.descriptors import COLMAP_SIFT, DESCRIPTORS, Base
 from hloc_reduce.descriptors.model import Descriptor
 from hloc_reduce.extract_features import provenance
 from hloc_reduce.training import __main__ as training
@@ -136,7 +136,7 @@ def test_kornia_looks_for_the_same_files(name):
 PATCHES = set(DESCRIPTORS)
 
 
-PHOTOS = {*DESCRIPTORS, COLMAP}
+PHOTOS = {*DESCRIPTORS, COLMAP_SIFT}
 
 
 def command_line(*arguments):

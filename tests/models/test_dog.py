@@ -126,24 +126,24 @@ def test_descriptors_turn_with_the_image(textured, angle):
 def test_settings_follow_the_photo(textured):
     """A photo with enough keypoints keeps hloc's; a dark and a small one get more."""
     photo = np.tile(textured, (3, 4)).astype(np.float32) / 255
-    assert max(photo.shape) > dog.SMALL
-    keypoints, descriptors = dog.detect(photo, dog.HLOC, adaptive=True)
-    expected = colmap.detect_dog(photo, dog.HLOC)
-    assert len(keypoints) >= dog.ENOUGH
+    assert max(photo.shape) > dog.SMALL_PHOTO_PIXELS
+    keypoints, descriptors = dog.detect(photo, dog.HLOC_OPTIONS, adaptive=True)
+    expected = colmap.detect_dog(photo, dog.HLOC_OPTIONS)
+    assert len(keypoints) >= dog.ENOUGH_KEYPOINTS
     np.testing.assert_array_equal(keypoints, expected[0])
     np.testing.assert_array_equal(descriptors, expected[1])
 
     dark = np.round(photo * 0.06 * 255) / 255
-    assert len(colmap.detect_dog(dark, dog.HLOC)[0]) < 10
-    found, _ = dog.detect(dark, dog.HLOC, adaptive=True)
+    assert len(colmap.detect_dog(dark, dog.HLOC_OPTIONS)[0]) < 10
+    found, _ = dog.detect(dark, dog.HLOC_OPTIONS, adaptive=True)
     distance, _ = cKDTree(expected[0][:, :2]).query(found[:, :2])
-    assert len(found) >= dog.ENOUGH and (distance < 2).sum() > 0.5 * len(expected[0])
+    assert len(found) >= dog.ENOUGH_KEYPOINTS and (distance < 2).sum() > 0.5 * len(expected[0])
 
     small = cv2.resize(0.15 * photo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    few = colmap.detect_dog(small, dog.HLOC)[0]
-    assert len(few) < small.size / dog.PIXELS
-    assert len(dog.detect(small, dog.HLOC, adaptive=True)[0]) > 2 * len(few)
-    assert len(dog.detect(small, dog.HLOC)[0]) == len(few)
+    few = colmap.detect_dog(small, dog.HLOC_OPTIONS)[0]
+    assert len(few) < small.size / dog.PIXELS_PER_KEYPOINT
+    assert len(dog.detect(small, dog.HLOC_OPTIONS, adaptive=True)[0]) > 2 * len(few)
+    assert len(dog.detect(small, dog.HLOC_OPTIONS)[0]) == len(few)
 
 
 @pytest.mark.parametrize("noise", [0, 0.003, 0.02, 0.1])
@@ -153,8 +153,8 @@ def test_noise_does_not_become_keypoints(noise, size):
     view = 0.05 + noise * np.random.default_rng(0).standard_normal(size)
     view = (np.round(view.clip(0, 1) * 255) / 255).astype(np.float32)
     assert dog.is_noise(view)
-    found = dog.detect(view, dog.HLOC, adaptive=True)
-    assert len(found[0]) == len(colmap.detect_dog(view, dog.HLOC)[0])
+    found = dog.detect(view, dog.HLOC_OPTIONS, adaptive=True)
+    assert len(found[0]) == len(colmap.detect_dog(view, dog.HLOC_OPTIONS)[0])
 
 
 def test_a_very_dark_photo_is_not_noise(textured):
@@ -171,10 +171,12 @@ def test_options_of_ones_own_are_used_as_they_are(textured):
     expected, _ = colmap.detect_dog(image[0, 0].numpy(), options)
     np.testing.assert_array_equal(found, expected[:, :2])
     hloc = DoG({"keypoints": "hloc"})({"image": image})["keypoints"][0].numpy()
-    np.testing.assert_array_equal(hloc, colmap.detect_dog(image[0, 0].numpy(), dog.HLOC)[0][:, :2])
+    np.testing.assert_array_equal(
+        hloc, colmap.detect_dog(image[0, 0].numpy(), dog.HLOC_OPTIONS)[0][:, :2]
+    )
     colmaps = DoG({"keypoints": "colmap"})({"image": image})["keypoints"][0].numpy()
     np.testing.assert_array_equal(
-        colmaps, colmap.detect_dog(image[0, 0].numpy(), dog.COLMAP)[0][:, :2]
+        colmaps, colmap.detect_dog(image[0, 0].numpy(), dog.COLMAP_OPTIONS)[0][:, :2]
     )
     with pytest.raises(
         InputError, match="Unknown keypoints 'many'. There are: colmap, adaptive, hloc"

@@ -117,7 +117,7 @@ OF_PATCHES = [
     name
     for name in confs
     if confs[name]["model"].get("projection") in projections.names()
-    and features.descriptor_of(confs[name]["model"]) not in (None, features.COLMAP)
+    and features.descriptor_of(confs[name]["model"]) not in (None, features.COLMAP_SIFT)
 ]
 
 

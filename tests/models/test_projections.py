@@ -195,7 +195,7 @@ def test_released_networks_are_downloaded_once_and_checked(tmp_path, monkeypatch
         projections.load("hardnet_sv24")
     assert not list(tmp_path.rglob("*.pth"))
     known = ("HardNet_sv_dim24.pth", hashlib.sha256(content).hexdigest())
-    monkeypatch.setitem(released.FILES, "hardnet_sv24", known)
+    monkeypatch.setitem(released.WEIGHT_FILES, "hardnet_sv24", known)
     for _ in range(2):
         assert projections.load("hardnet_sv24").sizes == (128, 96, 24)
     assert asked == [f"{released.URL}/HardNet_sv_dim24.pth"] * 2
@@ -208,9 +208,9 @@ def test_released_networks_are_downloaded_once_and_checked(tmp_path, monkeypatch
         projections.load("hardnet_sv64")
 
 
-@pytest.mark.parametrize("name", released.FILES)
+@pytest.mark.parametrize("name", released.WEIGHT_FILES)
 def test_the_real_released_networks(name):
-    file, sha256 = released.FILES[name]
+    file, sha256 = released.WEIGHT_FILES[name]
     path = SHARED / "released_projections" / file
     if not path.is_file():
         pytest.skip(f"{path} is not on this machine")
