@@ -5,7 +5,7 @@ import numpy as np
 from ..runtime import parallel
 from ..utils import best_two
 from ..utils.arrays import distinct
-from ..utils.codes import UNIT
+from ..utils.codes import INTEGER_SCALE
 
 TILE = 2**19  # products at once
 ROWS = 2048  # descriptors that a thread matches at once
@@ -40,7 +40,9 @@ def nearest(
     """
     search = best_two.best_two if best_two.instructions() else best_two_of_blocks
     index, *products = search(descriptors0, descriptors1)
-    cosine, runner_up = (part.astype(np.float32) / np.float32(UNIT**2) for part in products)
+    cosine, runner_up = (
+        part.astype(np.float32) / np.float32(INTEGER_SCALE**2) for part in products
+    )
     # squared distances of unit vectors are 2 - 2 * cosine
     distance = 1 - cosine
     accepted = np.ones(len(index), bool)

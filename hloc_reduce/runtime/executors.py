@@ -24,10 +24,10 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Results = Generator[Result, None, None]
 Work = Callable[[Iterable[Item]], Results[Result]]
-BACKLOG = 2  # chunks handed out per worker
+BACKLOG_CHUNKS = 2  # handed out per worker
 RETRIES = 20  # of a chunk whose machine was lost
-TIMEOUT = 10  # seconds to wait for a Ray cluster
-PATIENCE = 5  # seconds between checks for workers
+CLUSTER_TIMEOUT_SECONDS = 10  # of waiting for a Ray cluster
+WORKER_CHECK_SECONDS = 5  # between checks for workers
 TOKEN = Path.home() / ".ray/auth_token"  # clusters of Ray 2.60 and later ask for it
 
 
@@ -98,12 +98,12 @@ class Pool:
         pending: dict[Future, list[Item]] = {}
         try:
             while (workers := self.workers()) or self.instead is None:
-                backlog = BACKLOG * max(1, workers)
+                backlog = BACKLOG_CHUNKS * max(1, workers)
                 while len(pending) < backlog and (chunk := list(islice(drawn, size))):
                     pending[self.submit(work, chunk)] = chunk
                 if not pending:
                     return
-                for future in wait(pending, PATIENCE, FIRST_COMPLETED).done:
+                for future in wait(pending, WORKER_CHECK_SECONDS, FIRST_COMPLETED).done:
                     del pending[future]
                     if isinstance(found := future.result(), Exception):
                         raise found
@@ -219,7 +219,9 @@ def _connect(address: str, thread: ThreadPoolExecutor) -> None:
     try:
         if match := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
             # Ray itself would try for minutes
-            socket.create_connection((match[1], int(match[2])), timeout=TIMEOUT).close()
+            socket.create_connection(
+                (match[1], int(match[2])), timeout=CLUSTER_TIMEOUT_SECONDS
+            ).close()
         if address == "local":
             with uninterrupted():  # half started, it would not end
                 thread.submit(begin, num_cpus=parallel.cores()).result()

@@ -20,11 +20,11 @@ SHARED = "shared"  # folder of the files that the jobs of a batch share on a dat
 CONF = "conf.json"
 STAGES = "stages.json"
 FILES = "files.json"  # names of the files and folders that runs wrote, noted before they write
-WHOLE = ("map.json", "queries.csv", "summary.json")  # mark a finished run, so deleted first
+WRITTEN_LAST = ("map.json", "queries.csv", "summary.json")  # mark a finished run, so deleted first
 BOOKKEEPING = {CONF, STAGES, FILES, "summary.json", "queries.csv", "trace.json"}
 DELETING = {"is": "being deleted"}  # configuration of a folder whose deletion was interrupted
-NAMED = 3  # differences that a message names
-SHORT = 60  # characters of values that it shows
+MAX_NAMED_DIFFERENCES = 3  # in a message
+MAX_SHOWN_CHARACTERS = 60  # of values in it
 REMEDY = "Choose other --outputs, one folder for each configuration, or --overwrite."
 
 
@@ -137,7 +137,7 @@ class RunFolder:
         noted = provenance.read(self.path / FILES).get("written")
         if noted is None:  # of a version without this record
             noted = [name for stage in self._stages().values() for name in stage["wrote"]]
-            noted += WHOLE if noted else ()
+            noted += WRITTEN_LAST if noted else ()
         names = {str(name) for name in noted}
         return {name for name in names if Path(name).name == name and name not in self.kept}
 
@@ -146,7 +146,7 @@ class RunFolder:
         if not path.resolve().is_relative_to(self.path.resolve()):
             return
         name = path.resolve().relative_to(self.path.resolve()).parts[0]
-        if name not in self.written | self.kept | (BOOKKEEPING - {*WHOLE}):
+        if name not in self.written | self.kept | (BOOKKEEPING - {*WRITTEN_LAST}):
             self.written.add(name)
             provenance.write(self.path / FILES, {"written": sorted(self.written)})
 
@@ -183,7 +183,7 @@ class RunFolder:
                     raise InputError(f"{file} is in {path}, which --overwrite deletes: move it.")
             # if the deletion is interrupted, the next run completes it
             provenance.write(conf_file, DELETING)
-            self.delete(sorted(self.written, key=lambda name: name not in WHOLE))
+            self.delete(sorted(self.written, key=lambda name: name not in WRITTEN_LAST))
             for name in (STAGES, FILES):
                 delete(path / name)
         if is_new or overwrite:
@@ -250,10 +250,12 @@ def _changes(before: dict, after: dict) -> dict[str, str]:
             old, new = _leaves(before.get(key, "not given")), _leaves(after.get(key, "not given"))
             names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
             said = []
-            for name in names[:NAMED]:
+            for name in names[:MAX_NAMED_DIFFERENCES]:
                 values = f"{old.get(name, 'not given')} before, {new.get(name, 'not given')} now"
-                said.append(f"{name} {values}".strip() if len(values) < SHORT else name)
-            more = ", ..." if len(names) > NAMED else ""
+                said.append(
+                    f"{name} {values}".strip() if len(values) < MAX_SHOWN_CHARACTERS else name
+                )
+            more = ", ..." if len(names) > MAX_NAMED_DIFFERENCES else ""
             changes[key] = f" ({', '.join(said)}{more})" if any(said) else ""
     return changes
 

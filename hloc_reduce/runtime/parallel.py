@@ -15,7 +15,7 @@ from .trace import span
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-BACKLOG = 4  # results per worker that may wait to be taken
+BACKLOG_RESULTS = 4  # per worker, that may wait to be taken
 
 
 class _OfThread(local):
@@ -124,7 +124,7 @@ def ordered(
                 except Exception as error:
                     is_over, failure = True, error
                 while pending and (
-                    is_over or pending[0].done() or len(pending) > BACKLOG * workers
+                    is_over or pending[0].done() or len(pending) > BACKLOG_RESULTS * workers
                 ):
                     yield pending.popleft().result()
             if failure is not None:

@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 MAX_MB = 20.0  # 1,000,000 bytes of a photo
 QUEUE = 32  # requests that may wait
 MAX_PIXELS = 100_000_000  # of a photo: a small file may be a huge image
-SHOWN = 5  # retrieved images in an answer
+RETRIEVED_SHOWN = 5  # retrieved images in an answer
 BUSY, BUSY_SECONDS = 503, 2  # status of a full queue, after which a client may try again
 UPLOAD_SECONDS = 60.0
-FORMATS = ("JPEG", "PNG")
+PHOTO_FORMATS = ("JPEG", "PNG")
 PARAMETERS = ("camera", "inliers")  # of a request, as docs/serve.md has them
 
 
@@ -157,7 +157,7 @@ def answer(
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(BytesIO(photo), formats=FORMATS) as opened:
+        with Image.open(BytesIO(photo), formats=PHOTO_FORMATS) as opened:
             width, height = opened.size
     except Image.DecompressionBombError:
         width = height = MAX_PIXELS
@@ -184,7 +184,7 @@ def answer(
         "camera": to_list(info["camera"]),
         "intrinsics": info["intrinsics"],
         "map_doubts": info["map_doubts"],
-        "retrieved": info["retrieved"][:SHOWN],
+        "retrieved": info["retrieved"][:RETRIEVED_SHOWN],
         "seconds": {stage: round(value, 4) for stage, value in info["seconds"].items()},
     }
     if pose is not None:

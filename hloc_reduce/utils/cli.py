@@ -14,7 +14,7 @@ from . import interrupts
 # packages that an installation for a robot leaves out
 LEFT_OUT = ("kornia", "sklearn", "torch")
 # an unknown name is answered by all that are known, or by the nearest ones of many
-MANY, NEAREST = 30, 8
+MAX_LISTED_NAMES, NEAREST_NAMES = 30, 8
 
 
 class InputError(ValueError):
@@ -35,7 +35,7 @@ def run(main: Callable[[], None]) -> None:
         module = spec and f"-m {spec.name.removesuffix('.__main__')}"
         sys.argv[0] = f"python {module or sys.argv[0]}"
         main()
-        if spec and spec.name.startswith(interrupts.COMMANDS):
+        if spec and spec.name.startswith(interrupts.COMMAND_PREFIXES):
             interrupts.ignore()
     except BrokenPipeError:  # a pager or `head` has read enough
         sys.stdout = None
@@ -59,15 +59,16 @@ def run(main: Callable[[], None]) -> None:
 def choose(kind: str, name: str, names: Iterable[str]) -> str:
     """Return `name` if it is one of `names`, else raise an InputError.
 
-    The message lists the names, the nearest first: all of up to `MANY`, else the `NEAREST`.
+    The message lists the names, the nearest first: all of up to `MAX_LISTED_NAMES`, else
+    `NEAREST_NAMES`.
     """
     names = list(names)
     if name not in names:
         by_lower = {known.lower(): known for known in names}
-        number = NEAREST if len(names) > MANY else max(1, len(names))
+        number = NEAREST_NAMES if len(names) > MAX_LISTED_NAMES else max(1, len(names))
         near = difflib.get_close_matches(str(name).lower(), by_lower, n=number, cutoff=0)
         shown = ", ".join(by_lower[lower] for lower in near) or "none"
-        there_are = f"The nearest of {len(names)}" if len(names) > MANY else "There are"
+        there_are = f"The nearest of {len(names)}" if len(names) > MAX_LISTED_NAMES else "There are"
         raise InputError(f"Unknown {kind} '{name}'. {there_are}: {shown}.")
     return name
 

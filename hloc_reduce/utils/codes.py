@@ -24,9 +24,9 @@ STORAGE = Option(
 Storage = Annotated[str, STORAGE]
 STEPS = 255
 # The integer that stands for 1, and the least mean norm of what codes stand for. Products of
-# restored vectors are at most (UNIT / LEAST_NORM)**2 < 2**30, which `best_two` needs. At least
-# 99.9 % of the matches of real descriptors stay the same, with a ratio test or without.
-UNIT, LEAST_NORM = 20_000, 0.75
+# restored vectors are at most (INTEGER_SCALE / MIN_MEAN_NORM)**2 < 2**30, which `best_two` needs.
+# At least 99.9 % of the matches of real descriptors stay the same, with a ratio test or without.
+INTEGER_SCALE, MIN_MEAN_NORM = 20_000, 0.75
 
 
 def descriptor_bytes(dim: int, storage: str) -> int:
@@ -98,12 +98,12 @@ def restore(
     norm = np.linalg.norm(descriptors, axis=1, keepdims=True)
     descriptors /= np.maximum(norm, np.finfo(np.float32).tiny)
     if unbiased and storage in CODED and len(norm):
-        descriptors /= norm.mean().clip(LEAST_NORM, 1)
+        descriptors /= norm.mean().clip(MIN_MEAN_NORM, 1)
     return np.ascontiguousarray(descriptors)
 
 
 def to_integers(descriptors: np.ndarray) -> np.ndarray:
-    """Round descriptors to multiples of 1 / `UNIT`, for fast matching.
+    """Round descriptors to multiples of 1 / `INTEGER_SCALE`, for fast matching.
 
     Args:
         descriptors: (N, D) float32 from `restore`.
@@ -111,7 +111,7 @@ def to_integers(descriptors: np.ndarray) -> np.ndarray:
     Returns:
         (N, D) int16.
     """
-    scaled = descriptors * np.float32(UNIT)
+    scaled = descriptors * np.float32(INTEGER_SCALE)
     return np.rint(scaled, out=scaled).astype(np.int16)
 
 

@@ -9,7 +9,7 @@ from urllib.request import urlopen
 from .cli import InputError
 from .files import file_sha256, replacing
 
-TIMEOUT = 5  # seconds to wait for a server
+SERVER_TIMEOUT_SECONDS = 5
 TORCH_FILE = b"PK"  # torch.save writes zip files
 
 
@@ -42,7 +42,7 @@ def fetch(path: Path, urls: Iterable[str], sha256: str | None, what: str, otherw
     reasons = {}
     for url in urls:
         try:
-            with urlopen(url, timeout=TIMEOUT) as response:
+            with urlopen(url, timeout=SERVER_TIMEOUT_SECONDS) as response:
                 content = response.read()
         except (OSError, HTTPException) as error:
             reasons[url] = getattr(error, "reason", error)

@@ -11,7 +11,7 @@ from packaging.version import InvalidVersion, Version
 
 from .cli import InputError, choose
 
-SOURCE = "git+https://github.com/cvg/Hierarchical-Localization"
+PIP_URL = "git+https://github.com/cvg/Hierarchical-Localization"
 # hloc has been 1.5 since 2023; its `min_version` tells whether its pycolmap is new enough
 LAST_OLD = Version("1.5")
 MIN_PYCOLMAP = Version("3.13.0")
@@ -30,14 +30,14 @@ def extractors_package() -> tuple[ModuleType, Callable]:
         InputError: when hloc is missing, too old or cannot be imported.
     """
     if not is_installed():
-        raise InputError(f"hloc is not installed: pip install {SOURCE}")
+        raise InputError(f"hloc is not installed: pip install {PIP_URL}")
     hloc = import_module("")
     version = getattr(hloc, "__version__", "0")
     wanted = str(getattr(hloc, "min_version", "0"))  # of pycolmap
     if parse_version(version) <= LAST_OLD and parse_version(wanted) < MIN_PYCOLMAP:
         raise InputError(
             f"The installed hloc {version} is too old, it was written for a pycolmap before "
-            f"{MIN_PYCOLMAP}: pip install --upgrade {SOURCE}"
+            f"{MIN_PYCOLMAP}: pip install --upgrade {PIP_URL}"
         )
     return import_module("extractors"), import_module("utils.base_model").dynamic_load
 

@@ -15,7 +15,7 @@ from typing import NoReturn, TypeVar
 Result = TypeVar("Result")
 INTERRUPTED = "Interrupted. Run the same command again, without --overwrite, to resume."
 STOPS = (signal.SIGINT, signal.SIGTERM)
-COMMANDS = ("hloc_reduce.", "pipelines.")  # prefixes of the modules of commands
+COMMAND_PREFIXES = ("hloc_reduce.", "pipelines.")  # of modules
 REPEATED = 2.0  # seconds within which a second signal is ignored: `timeout` sends two
 logger = logging.getLogger("hloc_reduce")
 
@@ -30,7 +30,7 @@ def while_importing() -> None:
     """
     # while Python looks for the module, argv still begins with -m
     name = sys.orig_argv[-len(sys.argv)] if sys.argv[:1] == ["-m"] else ""
-    if name.startswith(COMMANDS):
+    if name.startswith(COMMAND_PREFIXES):
         signal.signal(signal.SIGINT, _quit)
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 

@@ -19,7 +19,7 @@ from . import cli
 from .cli import InputError, choose
 
 KINDS = (str, Path, float, int, bool)  # of several in an annotation the first one is taken
-LISTS = (list, tuple, Iterable, Collection, Sequence)
+LIST_TYPES = (list, tuple, Iterable, Collection, Sequence)
 REQUIRED = inspect.Parameter.empty
 
 
@@ -178,7 +178,7 @@ def _members(annotation: Any) -> Iterator[tuple[type, bool, Option]]:
             yield from _members(part)
     elif annotation in KINDS or is_dataclass(annotation):
         yield annotation, False, Option()
-    elif origin in LISTS and parts[1:] in ((), (...,)):
+    elif origin in LIST_TYPES and parts[1:] in ((), (...,)):
         yield from (
             (kind, True, option) for kind, nested, option in _members(parts[0]) if not nested
         )

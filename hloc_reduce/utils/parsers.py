@@ -21,10 +21,10 @@ _ENDS = r"\t\n\v\f\r\x1c-\x1f\x85\u2028\u2029"  # ends of lines and of names
 _LETTER = rf"[^{_ENDS}/\0\ud800-\udfff]"
 _PART = rf"(?!\.\.?(?:/|$))(?!\s){_LETTER}+(?<!\s)"  # not . or ..
 # lines of the lists that users write
-IMAGE = "name"
-QUERY = "name MODEL width height params..."
-PAIR = "name0 name1"
-POSE = "name qw qx qy qz tx ty tz"
+IMAGE_LINE = "name"
+QUERY_LINE = "name MODEL width height params..."
+PAIR_LINE = "name0 name1"
+POSE_LINE = "name qw qx qy qz tx ty tz"
 _NUMBER = re.compile(r"[-+]?\d+\.\d+(e[-+]?\d+)?")
 _NAME = re.compile(rf"(?!#){_PART}(?:/{_PART})*")
 
@@ -127,7 +127,7 @@ def read_yaml(path: Path) -> object:
 
 def parse_image_list(path: Path) -> list[str]:
     """Read image names, the first word of every line."""
-    return [words[0] for _, words in _lines(path, IMAGE)]
+    return [words[0] for _, words in _lines(path, IMAGE_LINE)]
 
 
 def image_names(images: Path | str | Iterable[str]) -> list[str]:
@@ -153,14 +153,14 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
             empty list, or COLMAP's cameras.txt.
     """
     queries: dict[str, pycolmap.Camera] = {}
-    for place, (name, *words) in _lines(path, QUERY):
+    for place, (name, *words) in _lines(path, QUERY_LINE):
         try:
             camera = parse_camera(words)
         except ValueError as error:
             # a name with spaces, or commas between the words, leave no model behind the name
             spaced = not any(word in CAMERA_MODELS for word in words[:1])
             hint = "; put spaces between the words, and put a tab after a name that has spaces"
-            raise wrong_line(place, "a query", QUERY, str(error), hint * spaced) from None
+            raise wrong_line(place, "a query", QUERY_LINE, str(error), hint * spaced) from None
         if name in queries:
             raise InputError(f"{place}: query {name} is listed twice.")
         queries[name] = camera
@@ -169,7 +169,7 @@ def parse_query_list(path: Path) -> list[tuple[str, pycolmap.Camera]]:
     if all(name.isdecimal() for name in queries):
         raise InputError(
             f"{path} lists cameras by their numbers, as COLMAP's cameras.txt does, and no images. "
-            f"A query list has lines `{QUERY}`, one for each photo."
+            f"A query list has lines `{QUERY_LINE}`, one for each photo."
         )
     return list(queries.items())
 
@@ -252,10 +252,10 @@ def parse_query_lists(paths: Path) -> dict[str, list[tuple[str, pycolmap.Camera]
 
 def parse_pairs(path: Path) -> Iterator[tuple[str, str]]:
     """Yield pairs, one `name0 name1` a line, without reading the whole list."""
-    for place, words in _lines(path, PAIR):
+    for place, words in _lines(path, PAIR_LINE):
         if len(words) != 2:
             hint = "; put a tab between names that have spaces"
-            raise wrong_line(place, "a pair", PAIR, hint=hint)
+            raise wrong_line(place, "a pair", PAIR_LINE, hint=hint)
         yield words[0], words[1]
 
 
@@ -284,7 +284,7 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
         InputError: for a broken line, or a name that is listed twice.
     """
     poses = {}
-    for place, (name, *values) in _lines(path, POSE):
+    for place, (name, *values) in _lines(path, POSE_LINE):
         if name in poses:
             raise InputError(
                 f"{place}: {name} is listed twice: full names are needed, as in the "
@@ -299,7 +299,7 @@ def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
             rotation = pycolmap.Rotation3d(quaternion / norm)
             poses[name] = pycolmap.Rigid3d(rotation, np.array(translation).reshape(3))
         except ValueError:
-            raise wrong_line(place, "a pose", POSE) from None
+            raise wrong_line(place, "a pose", POSE_LINE) from None
     return poses
 
 

@@ -63,7 +63,7 @@ def test_items_are_drawn_as_workers_get_free():
 
     results = Pool(submit, lambda: 2).map(squares, (drawn.append(i) or i for i in range(1000)), 5)
     assert next(results) in [(i, i * i) for i in range(20)]
-    assert len(drawn) == 5 * 2 * executors.BACKLOG
+    assert len(drawn) == 5 * 2 * executors.BACKLOG_CHUNKS
 
 
 @pytest.mark.parametrize("work, message", [(failing, "seven"), (killed, "A process was killed")])

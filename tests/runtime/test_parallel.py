@@ -31,7 +31,7 @@ def test_items_are_drawn_as_workers_get_free():
     items = (drawn.append(i) or i for i in range(1000))
     results = parallel.ordered("test", lambda i: i, items, 2)
     assert next(results) == 0
-    assert len(drawn) <= 1 + 2 * parallel.BACKLOG + 1
+    assert len(drawn) <= 1 + 2 * parallel.BACKLOG_RESULTS + 1
     results.close()
 
 

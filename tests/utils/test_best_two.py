@@ -5,7 +5,7 @@ import pytest
 
 from hloc_reduce.matchers import integers
 from hloc_reduce.utils import best_two
-from hloc_reduce.utils.codes import LEAST_NORM, UNIT, to_integers
+from hloc_reduce.utils.codes import INTEGER_SCALE, MIN_MEAN_NORM, to_integers
 
 LOWEST = np.iinfo(np.int32).min
 compiled = pytest.mark.skipif(
@@ -26,7 +26,7 @@ def draw(number, dim, kind, seed):
     generator = np.random.default_rng(seed)
     if kind == "extreme":  # the longest rows that there are
         rows = np.zeros((number, dim), np.int16)
-        rows[np.arange(number), generator.integers(0, dim, number)] = UNIT / LEAST_NORM
+        rows[np.arange(number), generator.integers(0, dim, number)] = INTEGER_SCALE / MIN_MEAN_NORM
         return rows * generator.choice([-1, 1], (number, 1)).astype(np.int16)
     if kind == "equal":
         return np.full((number, dim), -3, np.int16)
@@ -82,5 +82,5 @@ def test_integers_are_close_and_their_products_fit():
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
         integers = to_integers(vectors)
         assert integers.dtype == np.int16
-        np.testing.assert_allclose(integers / UNIT, vectors, atol=0.51 / UNIT)
-        assert (integers.astype(np.int64) ** 2).sum(axis=1).max() < LEAST_NORM**2 * 2**30
+        np.testing.assert_allclose(integers / INTEGER_SCALE, vectors, atol=0.51 / INTEGER_SCALE)
+        assert (integers.astype(np.int64) ** 2).sum(axis=1).max() < MIN_MEAN_NORM**2 * 2**30

@@ -67,7 +67,7 @@ def test_other_files_are_no_lists_of_queries(line, tmp_path):
     with pytest.raises(InputError) as error:
         parsers.parse_query_list(path)
     message = str(error.value)
-    assert str(path) in message and words in message and f"`{parsers.QUERY}`" in message
+    assert str(path) in message and words in message and f"`{parsers.QUERY_LINE}`" in message
 
 
 @pytest.mark.fault(7)

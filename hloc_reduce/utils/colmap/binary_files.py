@@ -17,7 +17,7 @@ from ..parsers import CAMERA_MODELS
 from .records import Camera, Frame, Image, Pose, Records, Rig, Sensor
 
 KEYPOINT_SIZE = 24  # bytes
-POINT = np.dtype(
+POINT_TYPE = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
 Parsed = TypeVar("Parsed")
@@ -43,7 +43,7 @@ def rewrite(folder: Path, output: Path, with_tracks: bool) -> None:
     for part in ("cameras", "frames", "images", "rigs"):
         if (folder / f"{part}.bin").is_file():
             (output / f"{part}.bin").symlink_to((folder / f"{part}.bin").resolve())
-    points = np.zeros(0, POINT)
+    points = np.zeros(0, POINT_TYPE)
     if (folder / "points3D.bin").is_file():
         points = _parse(folder / "points3D.bin", _points)
     points["length"] = 0
@@ -166,12 +166,12 @@ def _check_points(data: mmap, number: int, path: Path) -> tuple[int, int]:
     if not finite.all():
         wrong = _anywhere(data, np.dtype("<u8"))[starts[np.argmin(finite)]]
         raise InputError(f"{path}, point {wrong}: its position is not finite.")
-    return (end - 8 - POINT.itemsize * number) // 8, end
+    return (end - 8 - POINT_TYPE.itemsize * number) // 8, end
 
 
 def _points(data: mmap, number: int, path: Path) -> tuple[np.ndarray, int]:
     starts, end = _starts(data, number)
-    return _anywhere(data, POINT)[starts], end
+    return _anywhere(data, POINT_TYPE)[starts], end
 
 
 def _starts(data: mmap, number: int) -> tuple[np.ndarray, int]:

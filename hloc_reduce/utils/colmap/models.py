@@ -17,18 +17,18 @@ from ..cli import InputError
 from ..files import replacing
 from ..images import NO_IMAGE, check_format, unreadable
 from . import binary_files, text_files
-from .records import PARTS, UNIT
+from .records import PARTS, UNIT_TOLERANCE
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 NEEDED = ("cameras", "images", "points3D")  # files; models of COLMAP 3.11 and older have no others
-ROUNDED = 1e-5  # quaternions of lengths that far from 1 are as good as unit quaternions
-COMPARED = 300  # points of a model whose tracks are compared with the images
+QUATERNION_ROUNDING = 1e-5  # quaternions of lengths that far from 1 are as good as unit quaternions
+COMPARED_POINTS = 300  # of a model, whose tracks are compared with the images
 # which pycolmap raises for broken files
 COLMAP_ERRORS = (RuntimeError, ValueError, IndexError, KeyError, OverflowError)
 # as COLMAP, binary files are read rather than text
-FORMATS = {".bin": binary_files, ".txt": text_files}
+FILE_FORMATS = {".bin": binary_files, ".txt": text_files}
 
 
 def find_model(path: Path) -> Path:
@@ -63,7 +63,7 @@ def _find(path: Path) -> tuple[Path, ModuleType]:
 def _format(folder: Path) -> ModuleType | None:
     """Return the module for the files that COLMAP reads in a folder; points may be missing."""
     for parts in (NEEDED, NEEDED[:2]):
-        for suffix, files in FORMATS.items():
+        for suffix, files in FILE_FORMATS.items():
             if all((folder / f"{part}{suffix}").is_file() for part in parts):
                 return files
     return None
@@ -71,7 +71,7 @@ def _format(folder: Path) -> ModuleType | None:
 
 def _lacking(folder: Path) -> str:
     """Return the name of the file without which those in a folder are no model, "" if none."""
-    for suffix in FORMATS:
+    for suffix in FILE_FORMATS:
         is_there = {part: (folder / f"{part}{suffix}").is_file() for part in PARTS}
         if any(is_there.values()):
             return next(f"{part}{suffix}" for part in NEEDED if not is_there[part])
@@ -130,9 +130,9 @@ def read_normalized(path: Path) -> tuple[pycolmap.Reconstruction, bool]:
         image.name = record.name
         if image.num_points2D() != record.num_points2D:
             raise text_files.wrong_keypoints(record.place)
-    if distance >= UNIT:
+    if distance >= UNIT_TOLERANCE:
         _normalize(model)
-    return model, distance > ROUNDED
+    return model, distance > QUATERNION_ROUNDING
 
 
 def _read_copy(
@@ -167,7 +167,7 @@ def _agree(model: pycolmap.Reconstruction, num_elements: int) -> bool:
     """
     if model.compute_num_observations() != num_elements:
         return False
-    for point_id, point in islice(model.points3D.items(), COMPARED):
+    for point_id, point in islice(model.points3D.items(), COMPARED_POINTS):
         for element in point.track.elements:
             if not model.exists_image(element.image_id):
                 return False

@@ -18,7 +18,8 @@ from ..parsers import check_camera, check_names
 PARTS = ("cameras", "frames", "images", "points3D", "rigs")  # files of a model
 # largest ids: COLMAP's databases number pairs of images by theirs, 2**32 - 1 stands for no id
 MAX_IMAGE_ID, MAX_ID = 2**31 - 2, 2**32 - 2
-UNIT = 1e-9  # how far the length of a unit quaternion may be from 1
+UNIT_TOLERANCE = 1e-9  # how far the length of a unit quaternion may be from 1
+MIN_QUATERNION_LENGTH = 1e-9  # shorter ones, and longer ones than its inverse, are no rotations
 
 Pose = tuple[float, ...]  # QW QX QY QZ TX TY TZ, camera or rig from world, or camera from rig
 Sensor = tuple[int, int]  # type and id
@@ -191,7 +192,8 @@ def _distance_from_unit(poses: Iterable[tuple[str, Pose]]) -> float:
     numbers = np.array(values).reshape(-1, 7)
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(numbers[:, :4], axis=1)
-    wrong = ~np.isfinite(numbers).all(axis=1) | ~((lengths > UNIT) & (lengths < 1 / UNIT))
+    are_rotations = (lengths > MIN_QUATERNION_LENGTH) & (lengths < 1 / MIN_QUATERNION_LENGTH)
+    wrong = ~np.isfinite(numbers).all(axis=1) | ~are_rotations
     if wrong.any():
         place = places[int(np.argmax(wrong))]
         raise InputError(

@@ -18,10 +18,17 @@ from ..locks import has_locks
 
 MAGIC = b"SQLite format 3\0"
 WAL = 2  # the value of the bytes 18 and 19 of a file that has a write-ahead log beside it
-PATIENCE = 2.0  # seconds in which another program may release a lock
+LOCK_TIMEOUT_SECONDS = 2.0  # in which another program may release a lock
 SIFT = "SIFT"
 # COLMAP's types of features; databases of versions before 4 have SIFT only
-TYPES = {-1: SIFT, 0: SIFT, 1: "ALIKED_N16ROT", 2: "ALIKED_N32", 3: "LOMA_B", 4: "LOMA_B128"}
+FEATURE_TYPES = {
+    -1: SIFT,
+    0: SIFT,
+    1: "ALIKED_N16ROT",
+    2: "ALIKED_N32",
+    3: "LOMA_B",
+    4: "LOMA_B128",
+}
 
 
 def log_of(path: Path) -> Path:
@@ -72,7 +79,7 @@ class StoredDatabase:
         return {name: rows[i] for name, i in self.images.items() if i in rows}
 
     def descriptor_type(self) -> str:
-        """Return the type of all descriptors, a value of `TYPES`.
+        """Return the type of all descriptors, a value of `FEATURE_TYPES`.
 
         Raises:
             InputError: if there are several types, or an unknown one.
@@ -80,7 +87,7 @@ class StoredDatabase:
         if not self._has_types:
             return SIFT
         rows = self._rows("SELECT DISTINCT type FROM descriptors WHERE rows > 0")
-        found = {TYPES.get(number, f"type {number}") for (number,) in rows} or {SIFT}
+        found = {FEATURE_TYPES.get(number, f"type {number}") for (number,) in rows} or {SIFT}
         if len(found) > 1:
             raise InputError(
                 f"{self.path} has descriptors of several types: {', '.join(sorted(found))}."
@@ -174,7 +181,10 @@ def open_stored(path: Path) -> Iterator[StoredDatabase]:
     if not has_locks(path, fcntl.lockf):
         mode += "&nolock=1"
     uri = f"{path.resolve().as_uri()}?{mode}"
-    with _reading(path), closing(sqlite3.connect(uri, uri=True, timeout=PATIENCE)) as connection:
+    with (
+        _reading(path),
+        closing(sqlite3.connect(uri, uri=True, timeout=LOCK_TIMEOUT_SECONDS)) as connection,
+    ):
         yield StoredDatabase(path, connection)
 
 

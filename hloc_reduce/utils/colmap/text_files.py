@@ -12,12 +12,14 @@ from ..cli import InputError
 from ..parsers import camera_of, not_text, wrong_line
 from .records import PARTS, Camera, Frame, Image, Pose, Records, Rig, Sensor
 
-CAMERA = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
-RIG = "RIG_ID NUM_SENSORS REF_SENSOR_TYPE REF_SENSOR_ID (SENSOR_TYPE SENSOR_ID HAS_POSE POSE)..."
-FRAME = "FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA_IDS (SENSOR_TYPE SENSOR_ID DATA_ID)..."
-IMAGE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-KEYPOINTS = "X Y POINT3D_ID X Y POINT3D_ID ..."
-POINT = "POINT3D_ID X Y Z R G B ERROR (IMAGE_ID POINT2D_IDX)..."
+CAMERA_LINE = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
+RIG_LINE = (
+    "RIG_ID NUM_SENSORS REF_SENSOR_TYPE REF_SENSOR_ID (SENSOR_TYPE SENSOR_ID HAS_POSE POSE)..."
+)
+FRAME_LINE = "FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA_IDS (SENSOR_TYPE SENSOR_ID DATA_ID)..."
+IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+KEYPOINTS_LINE = "X Y POINT3D_ID X Y POINT3D_ID ..."
+POINT_LINE = "POINT3D_ID X Y Z R G B ERROR (IMAGE_ID POINT2D_IDX)..."
 
 _MARK, _UTF16 = b"\xef\xbb\xbf", (b"\xff\xfe", b"\xfe\xff")  # byte order marks
 TOO_SHORT = "it has too few words"
@@ -102,7 +104,7 @@ def explain(folder: Path) -> None:
 
 def wrong_keypoints(place: str) -> InputError:
     """Return the error for an image whose keypoints COLMAP reads only in part."""
-    return _wrong(f"{place} or the line after it", "keypoints", KEYPOINTS, [])
+    return _wrong(f"{place} or the line after it", "keypoints", KEYPOINTS_LINE, [])
 
 
 def _has_mark(path: Path) -> bool:
@@ -232,11 +234,11 @@ def _image_line(place: str, line: bytes, no_keypoints: ValueError | None) -> Ima
         if len(words) < 10:
             raise ValueError(TOO_SHORT)
     except ValueError as error:
-        what, form, reason = "an image", IMAGE, error
+        what, form, reason = "an image", IMAGE_LINE, error
         if no_keypoints is not None:
             what, form = (
                 f"an image ({error}) nor its keypoints",
-                f"{IMAGE}` or, after that, `{KEYPOINTS}",
+                f"{IMAGE_LINE}` or, after that, `{KEYPOINTS_LINE}",
             )
             reason = no_keypoints
         raise _wrong(place, what, form, words, reason) from None
@@ -266,7 +268,7 @@ def _camera(place: str, words: list[bytes]) -> Camera:
             _number(word, float)
         camera = camera_of([word.decode(errors="replace") for word in words[1:]])
     except ValueError as error:
-        raise _wrong(place, "a camera", CAMERA, words, error) from None
+        raise _wrong(place, "a camera", CAMERA_LINE, words, error) from None
     return Camera(place, camera_id, camera)
 
 
@@ -282,7 +284,7 @@ def _rig(place: str, words: list[bytes]) -> Rig:
             if i and _take(rest, int) == [1]:
                 poses[sensors[-1]] = tuple(_take(rest, *[float] * 7))
     except ValueError as error:
-        raise _wrong(place, "a rig", RIG, words, error) from None
+        raise _wrong(place, "a rig", RIG_LINE, words, error) from None
     return Rig(place, rig_id, sensors, poses)
 
 
@@ -293,7 +295,7 @@ def _frame(place: str, words: list[bytes]) -> Frame:
         frame_id, rig_id, *pose, number = _take(rest, int, int, *[float] * 7, int)
         data = [(_sensor(rest), *_take(rest, int)) for _ in range(number)]
     except ValueError as error:
-        raise _wrong(place, "a frame", FRAME, words, error) from None
+        raise _wrong(place, "a frame", FRAME_LINE, words, error) from None
     return Frame(place, frame_id, rig_id, tuple(pose), data)
 
 
@@ -357,7 +359,7 @@ def _point(place: str, line: bytes) -> list[bytes]:
         words[first - 1 : first] = map(_error, words[first - 1 : first])
         _take(iter(words), *_POINT_TYPES, *[int] * max(0, len(words) - first))
     except ValueError as error:
-        raise _wrong(place, "a point", POINT, given, error) from None
+        raise _wrong(place, "a point", POINT_LINE, given, error) from None
     return words
 
 
