@@ -32,14 +32,15 @@ from .utils.options import Option
 from .utils.paths import strings_as_paths
 
 FEATURE = "colmap_sift"  # whose descriptors are in databases
-DATABASE, IMAGES, SIFT = "--database", "--images", "SIFT descriptors in the database"
+DATABASE_OPTION, IMAGES_OPTION = "--database", "--images"
+SIFT_NEEDED = "SIFT descriptors in the database"
 # attributes of `Inputs`, and what tells them
 TOLD_BY = {
-    "verified": {DATABASE},
-    "cameras": {DATABASE},
-    "registration": {DATABASE},
-    "image_dir": {IMAGES},
-    "localize": {DATABASE, IMAGES},
+    "verified": {DATABASE_OPTION},
+    "cameras": {DATABASE_OPTION},
+    "registration": {DATABASE_OPTION},
+    "image_dir": {IMAGES_OPTION},
+    "localize": {DATABASE_OPTION, IMAGES_OPTION},
 }
 
 
@@ -100,13 +101,14 @@ def _check(
 
 def _run(inputs: Inputs) -> tuple[list[Finding], dict[str, set[str]]]:
     """Run the checks that are possible; return also what the others lack."""
-    told = {DATABASE: inputs.verified, IMAGES: inputs.image_dir}
+    told = {DATABASE_OPTION: inputs.verified, IMAGES_OPTION: inputs.image_dir}
     given = {option for option, value in told.items() if value is not None}
     lacking: dict[str, set[str]] = {}
     for kind, check in CHECKS.items():
         absent = [need for need in check.needs if getattr(inputs, need) is None]
         if absent:
-            lacking[kind] = set().union(*(TOLD_BY[need] for need in absent)) - given or {SIFT}
+            told_by = set().union(*(TOLD_BY[need] for need in absent))
+            lacking[kind] = told_by - given or {SIFT_NEEDED}
     found = run(inputs, [kind for kind in CHECKS if kind not in lacking])
     return found, lacking
 

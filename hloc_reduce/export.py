@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import torch
 
 OPSET = 18
-TOLERANCE = 1e-4  # between ONNX Runtime and torch
+ONNX_TOLERANCE = 1e-4  # between ONNX Runtime and torch
 PACKAGES = ("onnx", "onnxruntime", "onnxscript")
 # images of these sides, in strides, make the graph and check it
 MADE_WITH, CHECKED_WITH = (3, 4), (8, 11)
@@ -226,7 +226,7 @@ def _check(content: Content, path: Path) -> float:
     """Return the greatest difference between ONNX Runtime and torch; of scores, the relative one.
 
     Raises:
-        InputError: when it is above `TOLERANCE`, or the keypoints are others.
+        InputError: when it is above `ONNX_TOLERANCE`, or the keypoints are others.
     """
     import onnxruntime
     import torch
@@ -243,11 +243,11 @@ def _check(content: Content, path: Path) -> float:
         if "scores" in names:  # may be logits of any size
             errors[1] /= 1 + content.expected[1].abs()
         difference = max((float(error.max()) for error in errors if error.numel()), default=0.0)
-    if not difference <= TOLERANCE:
+    if not difference <= ONNX_TOLERANCE:
         raise InputError(
             f"ONNX Runtime does not compute the features of torch: they differ by {difference:.0e} "
-            f"instead of at most {TOLERANCE:.0e}. No file was written. Try the versions of onnx, "
-            "onnxruntime, onnxscript and torch in constraints.txt."
+            f"instead of at most {ONNX_TOLERANCE:.0e}. No file was written. Try the versions of "
+            "onnx, onnxruntime, onnxscript and torch in constraints.txt."
         )
     return difference
 

@@ -26,8 +26,8 @@ from .utils.parsers import check_names
 from .utils.paths import strings_as_paths
 
 LARGEST = 3200  # pixels: COLMAP detects in smaller versions of larger photos, by default
-COMPARED = 50  # keypoints of each image whose positions are compared with those of a model
-NEAR = 0.05  # pixels: positions that differ by less are equal
+COMPARED_KEYPOINTS = 50  # of each image, whose positions are compared with those of a model
+SAME_POSITION_PIXELS = 0.05  # positions that differ by less are equal
 
 
 @strings_as_paths
@@ -182,12 +182,12 @@ def check_model(database: StoredDatabase, model: pycolmap.Reconstruction) -> Non
 
 def _agree(image: pycolmap.Image, keypoints: np.ndarray) -> bool:
     """Return whether keypoints of a database are where an image of a model has them."""
-    rows = np.unique(np.linspace(0, len(keypoints) - 1, COMPARED).astype(int))
+    rows = np.unique(np.linspace(0, len(keypoints) - 1, COMPARED_KEYPOINTS).astype(int))
     if not len(keypoints):
         return True
     points2D = image.points2D
     expected = np.array([points2D[i].xy for i in rows.tolist()])
-    return bool(np.abs(expected - keypoints[rows, :2]).max() < NEAR)
+    return bool(np.abs(expected - keypoints[rows, :2]).max() < SAME_POSITION_PIXELS)
 
 
 def _normalization(database: StoredDatabase, names: list[str]) -> str:

@@ -12,7 +12,7 @@ from .utils import cli, colmap, options
 from .utils.parsers import write_pairs
 from .utils.paths import strings_as_paths
 
-BLOCK = 256  # images whose covisibility with all others is computed at once
+IMAGES_PER_BLOCK = 256  # whose covisibility with all others is computed at once
 
 
 @strings_as_paths
@@ -76,8 +76,8 @@ def most_covisible(point3D_ids: Iterable[np.ndarray], number: int) -> Iterator[n
     """
     observed = colmap.visibility(point3D_ids)
     seen_by = observed.T.tocsr()
-    for start in range(0, observed.shape[0], BLOCK):
-        counts = (observed[start : start + BLOCK] @ seen_by).tocsr()
+    for start in range(0, observed.shape[0], IMAGES_PER_BLOCK):
+        counts = (observed[start : start + IMAGES_PER_BLOCK] @ seen_by).tocsr()
         for i, (begin, end) in enumerate(pairwise(counts.indptr), start):
             others, shared = counts.indices[begin:end], counts.data[begin:end]
             best = np.lexsort((others, -shared))

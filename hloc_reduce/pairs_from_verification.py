@@ -24,7 +24,7 @@ from .utils.paths import strings_as_paths
 
 MIN_INLIERS = 15  # verified matches of a connected pair, COLMAP's min_num_matches
 MIN_PAIRS = 3  # connected pairs of a well connected image
-BLOCK = 256  # images whose similarity to all others is in memory at once
+IMAGES_PER_BLOCK = 256  # whose similarity to all others is in memory at once
 
 
 @strings_as_paths
@@ -131,8 +131,8 @@ def more_pairs(
     )
     limits = dict.fromkeys(names, num_covis) | {names[i]: num_matched for i in weak}
     found = dict.fromkeys(_by_neighbours(limits, listed, connected))
-    for start in range(0, len(weak), BLOCK):
-        block = weak[start : start + BLOCK]
+    for start in range(0, len(weak), IMAGES_PER_BLOCK):
+        block = weak[start : start + IMAGES_PER_BLOCK]
         ranking = rank(similarity(descriptors[block], descriptors), len(names))
         for i, row in zip(block, ranking, strict=True):
             others = (

@@ -30,11 +30,12 @@ from ..utils.files import MEGABYTE, replacing
 from ..utils.options import ABOVE_0, Option
 from ..utils.paths import strings_as_paths
 
-TRIES = 12  # sizes that are tried to come close to a limit
-AIM, CLOSE = 0.998, 0.995  # shares of the limit that are aimed at, and are close enough
+MAX_TRIES = 12  # of sizes, to come close to a limit
+AIMED_SHARE = 0.998  # of the limit
+CLOSE_SHARE = 0.995  # of the limit, which is close enough
 # descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
-FEW = 32  # dimensions of DoG's features that are stored as uint4; others as uint2
+MAX_UINT4_DIM = 32  # of DoG's features that are stored as uint4; others as uint2
 
 
 @strings_as_paths
@@ -206,7 +207,7 @@ def _storage(conf: dict, storage: str | None) -> str:
         return STORAGES[0]
     try:
         levels = features_confs.levels({**conf, "storage": "uint4"})
-        few = levels is not None and len(levels) <= FEW
+        few = levels is not None and len(levels) <= MAX_UINT4_DIM
         return "uint4" if few and not features_confs.network_of(conf["model"]) else "uint2"
     except InputError:  # a projection without levels
         return STORAGES[0]
@@ -230,20 +231,20 @@ def _fit(
     """
     limit, best = max_mb * MEGABYTE, (0, b"", dict[str, int]())
     low, high, tried = 0, number + 1, number  # the first number fits, the second one does not
-    for _ in range(TRIES):
+    for _ in range(MAX_TRIES):
         content, parts = encode(tried)
         size = len(content)
         fixed = size - sum(parts[part] for part in ("coordinates", "descriptors", "visible"))
         if size <= limit:
             low, best = tried, (tried, content, parts)
-            if tried == number or size >= CLOSE * limit:
+            if tried == number or size >= CLOSE_SHARE * limit:
                 break
         else:
             high = tried
         if high - low < 2 or limit <= fixed:
             break
         # points that many images show come first, so that fewer take more than their share
-        guess = int(AIM * tried * (limit - fixed) / (size - fixed))
+        guess = int(AIMED_SHARE * tried * (limit - fixed) / (size - fixed))
         tried = guess if low < guess < high else (low + high) // 2
     if not low:
         raise InputError(

@@ -11,7 +11,7 @@ from ..utils.cli import InputError
 from ..utils.parsers import parse_query_lists
 from . import SOURCE, Queries, check_folders, refuse, thresholds, true_poses
 
-MODEL = "3D-models/aachen_v_1_1"
+MODEL_FOLDER = "3D-models/aachen_v_1_1"
 AACHEN_SOURCE = f"{SOURCE} (Aachen Day-Night v1.1); --demo makes a small town in its layout."
 
 
@@ -41,7 +41,7 @@ class Aachen:
 
     def _missing_model(self) -> list[Path]:
         """Return what is missing of the model."""
-        model = self.root / MODEL
+        model = self.root / MODEL_FOLDER
         if not model.is_dir():
             return [model]
         parts = ("cameras", "images", "points3D")
@@ -72,7 +72,7 @@ class Aachen:
     @property
     def reference_model(self) -> Path:
         """The COLMAP model with the poses of the map images, in its folder or one in that."""
-        return colmap.find_model(self.root / MODEL)
+        return colmap.find_model(self.root / MODEL_FOLDER)
 
     @property
     def queries(self) -> Path:

@@ -14,7 +14,7 @@ from ..utils import colmap
 from ..utils.cli import InputError
 from ..utils.parsers import parse_query_list
 from . import SOURCE
-from .aachen import MODEL, Aachen
+from .aachen import MODEL_FOLDER, Aachen
 
 NVM = "3D-models/aachen_cvpr2018_db.nvm"
 INTRINSICS = "3D-models/database_intrinsics.txt"
@@ -37,7 +37,7 @@ class AachenV1(Aachen):
     @classmethod
     def recognizes(cls, root: Path) -> bool:
         """Tell whether a folder has the NVM file, and not the model of v1.1, too."""
-        return (root / NVM).is_file() and not (root / MODEL).exists()
+        return (root / NVM).is_file() and not (root / MODEL_FOLDER).exists()
 
     @property
     def nvm(self) -> Path:

@@ -13,8 +13,8 @@ import numpy as np
 from ..descriptors import PATCH_SIZE
 from ..utils.cli import InputError
 
-SHEET, SIDE = 16, 64
-PAIRS = "m50_100000_100000_0.txt"  # preferred to other lists
+PATCHES_PER_SIDE, PATCH_PIXELS = 16, 64
+PREFERRED_PAIRS = "m50_100000_100000_0.txt"  # preferred to other lists
 
 
 def read_points(folder: Path) -> np.ndarray:
@@ -37,7 +37,7 @@ def read_points(folder: Path) -> np.ndarray:
             raise InputError(f"{info}, line {number}: no number of a point.") from None
     if len(set(points)) == len(points):
         raise InputError(f"{info}: no two patches show the same point.")
-    missing = -(-len(points) // SHEET**2) - len(sheets(folder))
+    missing = -(-len(points) // PATCHES_PER_SIDE**2) - len(sheets(folder))
     if missing > 0:
         raise InputError(f"{info} names {len(points)} patches, {missing} sheets are missing.")
     return np.array(points)
@@ -55,9 +55,13 @@ def read_sheet(path: Path) -> np.ndarray:
         InputError: if it is not a sheet.
     """
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if image is None or image.shape != (SHEET * SIDE,) * 2:
+    if image is None or image.shape != (PATCHES_PER_SIDE * PATCH_PIXELS,) * 2:
         raise InputError(f"{path} is not a sheet of 16x16 patches of 64x64 pixels.")
-    patches = image.reshape(SHEET, SIDE, SHEET, SIDE).swapaxes(1, 2).reshape(-1, SIDE, SIDE)
+    patches = (
+        image.reshape(PATCHES_PER_SIDE, PATCH_PIXELS, PATCHES_PER_SIDE, PATCH_PIXELS)
+        .swapaxes(1, 2)
+        .reshape(-1, PATCH_PIXELS, PATCH_PIXELS)
+    )
     size = (PATCH_SIZE, PATCH_SIZE)
     small = [cv2.resize(patch, size, interpolation=cv2.INTER_AREA) for patch in patches]
     return np.stack(small).astype(np.float32) / 255
@@ -69,7 +73,7 @@ def read_pairs(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         InputError: if the list is missing or broken.
     """
-    path = folder / PAIRS
+    path = folder / PREFERRED_PAIRS
     if not path.is_file():
         path = max(folder.glob("m50_*_*_0.txt"), default=path)
     if not path.is_file():

@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 
 from .. import logger
+from ..datasets.aachen import MODEL_FOLDER
 from ..runtime import provenance
 from ..utils.cli import InputError
 from ..utils.files import replacing
@@ -28,9 +29,9 @@ from .render import rasterize
 from .surface import View
 from .town import build_town
 
-VERSION = 1  # of the scene and its photos; a town of another version is not resumed
-IMAGES, MODEL, QUERIES = "images_upright", "3D-models/aachen_v_1_1", "queries"
-FOLDERS = (IMAGES, "3D-models", QUERIES)
+TOWN_VERSION = 1  # of the scene and its photos; a town of another version is not resumed
+IMAGE_FOLDER, QUERY_FOLDER = "images_upright", "queries"
+FOLDERS = (IMAGE_FOLDER, "3D-models", QUERY_FOLDER)
 MAX_WORKERS = 16  # each takes about half a gigabyte
 DONE, PARTIAL = "town.json", "town.json.partial"
 
@@ -58,24 +59,24 @@ def main(
     num_photos = len(WALK) if num_photos is None else num_photos
     if num_photos < len(WALK):
         raise InputError(f"The demo town has at least {len(WALK)} photos, not {num_photos}.")
-    state = {"seed": seed, "version": VERSION}
+    state = {"seed": seed, "version": TOWN_VERSION}
     if num_photos > len(WALK):
         state["photos"] = num_photos
     if not _start(dataset, state, overwrite):
         return dataset
     photos = list_photos(seed, num_photos)
-    missing = [photo for photo in photos if not (dataset / IMAGES / photo.name).exists()]
+    missing = [photo for photo in photos if not (dataset / IMAGE_FOLDER / photo.name).exists()]
     logger.info("Rendering %d photos of the demo town into %s", len(missing), dataset)
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # before the fork: every process uses one core
     try:
         scene = build_town(seed)
-        rendered = _run(partial(_render, seed, dataset / IMAGES), missing)
+        rendered = _run(partial(_render, seed, dataset / IMAGE_FOLDER), missing)
         list(progress(rendered, "Rendering the town", "photo", len(missing)))
-        _write_lists(dataset / QUERIES, photos)
+        _write_lists(dataset / QUERY_FOLDER, photos)
         map_photos = [photo for photo in photos if photo.kind == MAP]
         buffers = list(_run(partial(_rasterize, seed), map_photos))
-        write_model(dataset / MODEL, scene, map_photos, buffers, seed)
+        write_model(dataset / MODEL_FOLDER, scene, map_photos, buffers, seed)
     finally:
         cv2.setNumThreads(threads)
         build_town.cache_clear()

@@ -9,7 +9,7 @@ from .town import OBSTACLES, OPEN_GROUND
 
 MAP, DAY, NIGHT = range(3)  # kinds of photos, which seed them
 # of each kind, and one for each eight map photos if these are more
-QUERIES = 10
+MIN_QUERIES = 10
 
 # Positions of the camera and of its target, (x, y, x, y) in metres.
 WALK = [
@@ -73,7 +73,7 @@ def list_photos(seed: int, num_map: int = len(WALK)) -> list[Photo]:
     Map photos after those of the walk are taken anywhere, as queries are.
     """
     photos = [_map_photo(seed, index) for index in range(num_map)]
-    number = max(QUERIES, num_map // 8)
+    number = max(MIN_QUERIES, num_map // 8)
     return photos + [_query(seed, kind, i) for kind in (DAY, NIGHT) for i in range(number)]
 
 

@@ -11,8 +11,8 @@ from .render import Scene
 from .surface import View
 
 Buffers = tuple[np.ndarray, np.ndarray]  # of `rasterize`: surface, inverse depth
-POINTS = 550  # drawn per photo
-TOLERANCE = 0.01  # of the depth buffer, relative
+POINTS_PER_PHOTO = 550  # at most
+DEPTH_TOLERANCE = 0.01  # of the depth buffer, relative
 
 
 def write_model(
@@ -63,8 +63,8 @@ def write_model(
 def _sample_points(
     scene: Scene, view: View, surface: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Draw up to `POINTS` pixels evenly and lift them to the surfaces they show, world (n, 3)."""
-    pixels = rng.uniform((2, 2), np.array(view.shape[::-1]) - 2, (POINTS, 2))
+    """Draw pixels evenly and lift them to the surfaces they show, world (n, 3)."""
+    pixels = rng.uniform((2, 2), np.array(view.shape[::-1]) - 2, (POINTS_PER_PHOTO, 2))
     shown = surface[tuple(pixels.astype(int).T[::-1])]
     pixels, shown = pixels[shown >= 0], shown[shown >= 0]
     inverses = np.linalg.inv(scene.homographies(view)[shown])
@@ -84,5 +84,5 @@ def _visible(view: View, nearness: np.ndarray, points: np.ndarray) -> tuple[np.n
     kept = ((pixels >= 1) & (pixels < np.array(view.shape[::-1]) - 1)).all(axis=1)
     inside, pixels = inside[kept], pixels[kept]
     agreement = nearness[tuple(pixels.astype(int).T[::-1])] * z[inside]
-    kept = abs(agreement - 1) < TOLERANCE
+    kept = abs(agreement - 1) < DEPTH_TOLERANCE
     return inside[kept], pixels[kept]

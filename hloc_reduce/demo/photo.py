@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from .cameras import MAP, NIGHT, QUERIES, Photo
+from .cameras import MAP, MIN_QUERIES, NIGHT, Photo
 from .render import SUPERSAMPLING, Light, Scene, downsample, render
 from .surface import View
 
@@ -16,8 +16,8 @@ def take(scene: Scene, photo: Photo, seed: int) -> bytes:
     view = View.of(photo.camera, photo.cam_from_world, SUPERSAMPLING)
     if photo.kind == NIGHT:
         # Every degree of difficulty occurs once, whatever the seed.
-        ranks = np.random.default_rng([seed, 30]).permutation(QUERIES)
-        rank = (ranks[photo.index % QUERIES] + rng.uniform(0.2, 0.8)) / QUERIES
+        ranks = np.random.default_rng([seed, 30]).permutation(MIN_QUERIES)
+        rank = (ranks[photo.index % MIN_QUERIES] + rng.uniform(0.2, 0.8)) / MIN_QUERIES
         difficulty = 0.2 + 0.75 * rank
         image = _night(rng, downsample(render(scene, view, _moonlight(rng))), difficulty)
     else:

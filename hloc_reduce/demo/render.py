@@ -13,10 +13,10 @@ import numpy as np
 
 from .surface import Points, Surface, View, remap
 
-NEAR = 0.05  # metres
+NEAR_PLANE_METRES = 0.05
 SUPERSAMPLING = 2
 LAMP_REACH = 8.0  # metres at which the light of a lamp of strength 1 is neglected
-LINEAR = ((np.arange(256) / 255) ** 2.2).astype(np.float32)  # sRGB level to linear light
+LINEAR_LIGHT = ((np.arange(256) / 255) ** 2.2).astype(np.float32)  # sRGB level to linear light
 
 
 @dataclass(frozen=True)
@@ -93,13 +93,13 @@ def _spans(
         int32; None if there is no pixel.
     """
     points = np.column_stack([outline, np.ones(len(outline))]) @ matrix.T
-    if points[:, 2].min() < NEAR:  # clip, keeping the order of the corners
+    if points[:, 2].min() < NEAR_PLANE_METRES:  # clip, keeping the order of the corners
         kept = []
         for p, q in zip(points, [*points[1:], points[0]], strict=True):
-            if p[2] >= NEAR:
+            if p[2] >= NEAR_PLANE_METRES:
                 kept.append(p)
-            if (p[2] >= NEAR) != (q[2] >= NEAR):
-                kept.append(p + (NEAR - p[2]) / (q[2] - p[2]) * (q - p))
+            if (p[2] >= NEAR_PLANE_METRES) != (q[2] >= NEAR_PLANE_METRES):
+                kept.append(p + (NEAR_PLANE_METRES - p[2]) / (q[2] - p[2]) * (q - p))
         if not kept:
             return None
         points = np.array(kept)
@@ -166,7 +166,7 @@ def _candidates(scene: Scene, view: View) -> np.ndarray:
     facing = ((view.center - scene.planes[:, :, 2]) * scene.normals).sum(axis=1) > 1e-6
     points = (scene.corners @ view.rotation.T + view.translation) @ view.calibration.T
     x, y, z = np.moveaxis(points, 2, 0)
-    outside = (z < NEAR).all(1) | (x < 0).all(1) | (y < 0).all(1)
+    outside = (z < NEAR_PLANE_METRES).all(1) | (x < 0).all(1) | (y < 0).all(1)
     outside |= (x > view.shape[1] * z).all(1) | (y > view.shape[0] * z).all(1)
     return np.flatnonzero(facing & ~outside)
 
@@ -190,7 +190,7 @@ def render(scene: Scene, view: View, light: Light) -> np.ndarray:
         u = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) * z
         v = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) * z
         color = scene.surfaces[k].texture.sample(u, v, scale * z**3)
-        image[pixels] = LINEAR.take(color) * _irradiance(scene, k, u, v, light)
+        image[pixels] = LINEAR_LIGHT.take(color) * _irradiance(scene, k, u, v, light)
     return image.reshape(*view.shape, 3)
 
 
@@ -203,7 +203,7 @@ def _sky(scene: Scene, view: View, light: Light, pixels: np.ndarray) -> np.ndarr
     azimuth = np.arctan2(rays[1], rays[0]) / (2 * np.pi) + light.sky_shift
     elevation = np.arctan2(rays[2], np.hypot(rays[0], rays[1])) / (np.pi / 2)
     row = (1 - np.clip(elevation, 0, 1)) * (height - 1)
-    return LINEAR[remap(scene.sky, azimuth * width, row)] * (1.6 * light.sky_color)
+    return LINEAR_LIGHT[remap(scene.sky, azimuth * width, row)] * (1.6 * light.sky_color)
 
 
 def _irradiance(scene: Scene, k: np.intp, u: np.ndarray, v: np.ndarray, light: Light) -> np.ndarray:

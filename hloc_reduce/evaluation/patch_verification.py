@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..datasets.phototour import SHEET, read_pairs, read_points, read_sheet, sheets
+from ..datasets.phototour import PATCHES_PER_SIDE, read_pairs, read_points, read_sheet, sheets
 from ..utils.cli import InputError
 from ..utils.h5 import get_dataset, open_h5
 from ..utils.paths import strings_as_paths
@@ -51,7 +51,7 @@ def _describe(folder: Path, path: Path, descriptor: str, patches: np.ndarray) ->
     """Return the descriptors (N, 128) float32 of numbered patches, ascending (N,)."""
     files = {file.stem: file for file in sheets(folder)}
     names = list(files)
-    sheet, row = np.divmod(patches, SHEET**2)
+    sheet, row = np.divmod(patches, PATCHES_PER_SIDE**2)
     used = np.unique(sheet)
 
     def read(name: str) -> Iterator[tuple[str, np.ndarray]]:

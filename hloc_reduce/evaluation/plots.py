@@ -28,9 +28,9 @@ LEGEND_ENTRY = 1.6  # width in inches
 AXES = np.array([220, 140])  # approximate size of a panel in points
 SIDES = np.array([(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)])
 NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-LINES = (("-", "o"), ("--", "s"), (":", "^"))  # style and marker of each query list
+LINE_STYLES = (("-", "o"), ("--", "s"), (":", "^"))  # style and marker of each query list
 # the marker of each kind of map, if it is not that of the query list
-MAPS: dict[str, dict] = {
+MAP_MARKERS: dict[str, dict] = {
     "compact map": {},
     "whole map": {"linestyle": "", "markerfacecolor": "none"},
     "hloc's files": {"linestyle": "", "marker": "x"},
@@ -124,7 +124,7 @@ def _label(name: str) -> str:
 def _curves(axis: "Axes", name: str, runs: Mapping, place: int, unit: str) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    styles = product([line for line, _ in LINES], COLOURS)
+    styles = product([line for line, _ in LINE_STYLES], COLOURS)
     # thinner and thinner, so that equal curves do not hide each other
     widths = np.linspace(1.3 + 0.5 * min(len(runs) - 1, 5), 1.3, len(runs))
     curves = {run: cumulative(error[place] for error in errors) for run, errors in runs.items()}
@@ -175,7 +175,7 @@ def _against(axis: "Axes", measure: str, lists: Mapping, key: str, label: str) -
     marked = []
     families = dict.fromkeys(run["family"] for runs in lists.values() for run in runs)
     for colour, family in zip(cycle(COLOURS), families, strict=False):
-        for (line, marker), (name, runs) in zip(cycle(LINES), lists.items(), strict=False):
+        for (line, marker), (name, runs) in zip(cycle(LINE_STYLES), lists.items(), strict=False):
             own = sorted((r for r in runs if r["family"] == family), key=lambda run: run["bytes"])
             axis.plot(
                 [run[key] for run in own],
@@ -215,7 +215,7 @@ def map_sizes(points: Mapping[str, Mapping[str, list[dict]]]) -> "dict[str, Pane
 
     Args:
         points: from measure and query list to a dict for each map: `feature`, whose compact maps a
-            line joins; `kind`, a key of `MAPS`; `megabytes`; and `value` of the measure.
+            line joins; `kind`, a key of `MAP_MARKERS`; `megabytes`; and `value` of the measure.
 
     Returns:
         Panels by name, such as `mean_inliers_megabytes`.
@@ -233,10 +233,10 @@ def _map_sizes(axis: "Axes", measure: str, lists: Mapping) -> None:
 
     features = dict.fromkeys(run["feature"] for runs in lists.values() for run in runs)
     for colour, feature in zip(cycle(COLOURS), features, strict=False):
-        for (line, marker), (name, runs) in zip(cycle(LINES), lists.items(), strict=False):
+        for (line, marker), (name, runs) in zip(cycle(LINE_STYLES), lists.items(), strict=False):
             own = sorted((r for r in runs if r["feature"] == feature), key=lambda r: r["megabytes"])
             style = {"linestyle": line, "marker": marker, "markersize": 5, "linewidth": 1.2}
-            for i, (kind, special) in enumerate(MAPS.items()):
+            for i, (kind, special) in enumerate(MAP_MARKERS.items()):
                 axis.plot(
                     [run["megabytes"] for run in own if run["kind"] == kind],
                     [run["value"] for run in own if run["kind"] == kind],
@@ -244,8 +244,8 @@ def _map_sizes(axis: "Axes", measure: str, lists: Mapping) -> None:
                     label=None if i else _label(f"{feature}, {name}"),
                     **style | special,
                 )
-    for kind in list(MAPS)[1:]:
-        axis.plot([], [], color="#555555", label=kind, **{"marker": "o", **MAPS[kind]})
+    for kind in list(MAP_MARKERS)[1:]:
+        axis.plot([], [], color="#555555", label=kind, **{"marker": "o", **MAP_MARKERS[kind]})
     axis.set(xlabel="megabytes of the map", ylabel=measure, xscale="log")
     _limit(axis, measure, [run["value"] for runs in lists.values() for run in runs])
     axis.xaxis.set_major_locator(LogLocator(subs=(1, 3)))

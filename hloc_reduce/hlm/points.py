@@ -12,12 +12,12 @@ from ..utils.feature_files import dimension, get_descriptors
 from ..utils.h5 import open_h5
 from ..utils.progress import progress
 
-ERROR = 0.1  # of coordinates, as a share of the mean reprojection error
-NEAREST = 0.02  # quantile of the depths at which it holds
+COORDINATE_ERROR_SHARE = 0.1  # of the mean reprojection error
+NEAR_DEPTH_QUANTILE = 0.02  # of the depths, at which it holds
 MAX_BITS = 32
-GRID = 8  # cells along each side of an image that selected points are spread over
-CHUNK = 2**16  # points that are packed at once, a multiple of 8
-ROUNDS = 64  # in which points are selected, some at once
+CELLS_PER_SIDE = 8  # of an image, over which selected points are spread
+POINTS_PER_CHUNK = 2**16  # that are packed at once, a multiple of 8
+SELECTION_ROUNDS = 64  # in which points are selected, some at once
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,10 @@ def collect(sfm: pycolmap.Reconstruction, features: Path) -> Points:
         camera = sfm.cameras[image.camera_id]
         points2D = image.points2D
         xy = np.array([points2D[i].xy for i in keypoints]).reshape(-1, 2)
-        column, row = (xy * GRID / [camera.width, camera.height]).clip(0, GRID - 1).astype(int).T
+        cell = xy * CELLS_PER_SIDE / [camera.width, camera.height]
+        column, row = cell.clip(0, CELLS_PER_SIDE - 1).astype(int).T
         visible.append(rows)
-        cells.append(row * GRID + column)
+        cells.append(row * CELLS_PER_SIDE + column)
     if not len(ids):
         raise InputError("The map has no points.")
     norms = np.linalg.norm(sums, axis=1, keepdims=True)
@@ -122,10 +123,10 @@ def select(points: Points, number: int) -> np.ndarray:
         return np.arange(len(points))
     point = np.concatenate(points.visible)
     image = np.repeat(np.arange(len(points.names)), [len(part) for part in points.visible])
-    cell = image * GRID * GRID + np.concatenate(points.cells)
-    count = np.zeros(len(points.names) * GRID * GRID)
+    cell = image * CELLS_PER_SIDE**2 + np.concatenate(points.cells)
+    count = np.zeros(len(points.names) * CELLS_PER_SIDE**2)
     chosen = np.zeros(len(points), bool)
-    for left in range(ROUNDS, 0, -1):
+    for left in range(SELECTION_ROUNDS, 0, -1):
         gain = np.bincount(point, 1 / (1 + count[cell]), minlength=len(points))
         gain[chosen] = -1
         more = -(-(number - int(chosen.sum())) // left)
@@ -140,9 +141,10 @@ def select(points: Points, number: int) -> np.ndarray:
 def precision(points: Points, sfm: pycolmap.Reconstruction) -> float:
     """Return the step of coordinates whose error is hardly seen in the images.
 
-    At nearly all points it projects to less than `ERROR` of the mean reprojection error.
+    At nearly all points it projects to less than `COORDINATE_ERROR_SHARE` of the mean reprojection
+    error.
     """
-    pixels = max(sfm.compute_mean_reprojection_error(), 0.1) * ERROR
+    pixels = max(sfm.compute_mean_reprojection_error(), 0.1) * COORDINATE_ERROR_SHARE
     images = {image.name: image for image in sfm.images.values()}
     depths = [np.zeros(0)]
     for name, rows in zip(points.names, points.visible, strict=True):
@@ -151,7 +153,8 @@ def precision(points: Points, sfm: pycolmap.Reconstruction) -> float:
         focal_length = sfm.cameras[image.camera_id].mean_focal_length()
         depths.append(local[:, 2] / focal_length)  # of a pixel
     found = np.concatenate(depths)
-    per_pixel = float(np.quantile(found[found > 0], NEAREST)) if (found > 0).any() else 1.0
+    found = found[found > 0]
+    per_pixel = float(np.quantile(found, NEAR_DEPTH_QUANTILE)) if found.size else 1.0
     return 2 * pixels * per_pixel / np.sqrt(3)  # the error is up to half a step in each axis
 
 
@@ -171,8 +174,8 @@ def quantize(xyz: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, floa
     whole = np.rint((xyz - least) / step).astype(np.uint64)
     bits = [max(1, int(largest).bit_length()) for largest in whole.max(axis=0)]
     packed = []
-    for start in range(0, len(whole), CHUNK):
-        columns = whole[start : start + CHUNK].T[..., None]
+    for start in range(0, len(whole), POINTS_PER_CHUNK):
+        columns = whole[start : start + POINTS_PER_CHUNK].T[..., None]
         flags = [
             column >> np.arange(number, dtype=np.uint64) & 1
             for column, number in zip(columns, bits, strict=True)
@@ -217,7 +220,7 @@ class Coordinates:
 
     def all(self) -> np.ndarray:
         """Return the coordinates (P, 3) float64 of all points."""
-        parts = np.split(np.arange(len(self)), range(CHUNK, len(self), CHUNK))
+        parts = np.split(np.arange(len(self)), range(POINTS_PER_CHUNK, len(self), POINTS_PER_CHUNK))
         return np.concatenate([self[part] for part in parts])
 
 
@@ -299,7 +302,9 @@ class Visible:
             raise ValueError(f"{len(last)} differences, not {total}")
         numbers = np.concatenate([[0], np.cumsum(self.counts)])
         ends = np.concatenate([[0], last + 1])[numbers]
-        for images in np.array_split(np.arange(len(self)), min(len(self), 1 + total // CHUNK)):
+        for images in np.array_split(
+            np.arange(len(self)), min(len(self), 1 + total // POINTS_PER_CHUNK)
+        ):
             deltas = _deltas(self._packed[ends[images[0]] : ends[images[-1] + 1]])
             starts = (numbers - numbers[images[0]])[images[self.counts[images] > 0]]
             if len(deltas) and (

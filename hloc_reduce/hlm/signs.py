@@ -3,7 +3,7 @@
 import numpy as np
 
 SIGNS = 1024  # bits of a descriptor, at most
-ROWS = 1024  # descriptors that are unpacked at once
+DESCRIPTORS_PER_BLOCK = 1024  # that are unpacked at once
 
 
 def hadamard(rows: np.ndarray, number: int) -> np.ndarray:
@@ -59,8 +59,8 @@ class Signs:
         """Return the products (I,) of a descriptor (G,) with `descriptors`, without these."""
         transformed = hadamard(descriptor[None], self._number)[0]
         parts = [
-            self._unpacked(slice(start, start + ROWS)) @ transformed[: self._count]
-            for start in range(0, len(self._packed), ROWS)
+            self._unpacked(slice(start, start + DESCRIPTORS_PER_BLOCK)) @ transformed[: self._count]
+            for start in range(0, len(self._packed), DESCRIPTORS_PER_BLOCK)
         ]
         return np.concatenate(parts) * self._scale(len(transformed))
 

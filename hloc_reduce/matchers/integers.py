@@ -7,8 +7,8 @@ from ..utils import best_two
 from ..utils.arrays import distinct
 from ..utils.codes import INTEGER_SCALE
 
-TILE = 2**19  # products at once
-ROWS = 2048  # descriptors that a thread matches at once
+TILE_PRODUCTS = 2**19  # at once
+DESCRIPTORS_PER_BLOCK = 2048  # that a thread matches at once
 
 
 def is_worthwhile(coded: bool) -> bool:
@@ -64,7 +64,7 @@ def best_two_of_blocks(
     index = np.empty(number, np.int32)
     best, second = np.empty((2, number))
     others = descriptors1.astype(np.float64).T
-    rows = max(1, TILE // len(descriptors1))
+    rows = max(1, TILE_PRODUCTS // len(descriptors1))
     for start in range(0, number, rows):
         chosen = slice(start, start + rows)
         products = descriptors0[chosen].astype(np.float64) @ others
@@ -169,7 +169,10 @@ def match_images_of_points(
     """
     limits = ratio_threshold, distance_threshold
     forward, cosine = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
-    blocks = [slice(start, start + ROWS) for start in range(0, len(points), ROWS)]
+    blocks = [
+        slice(start, start + DESCRIPTORS_PER_BLOCK)
+        for start in range(0, len(points), DESCRIPTORS_PER_BLOCK)
+    ]
 
     def search(block: slice) -> None:
         forward[block], cosine[block] = nearest(points[block], query, *limits)

@@ -9,7 +9,7 @@ from . import integers
 from .base import GPU_BYTES, Features, Matcher, Tensors
 
 PART_BYTES = 2**19  # of descriptors1 at once: they stay in the cache of a core
-TILE = 2**20  # similarities at once
+TILE_SIMILARITIES = 2**20  # at once
 
 
 def nearest(
@@ -56,7 +56,7 @@ def _best_two(
     number, dim = descriptors0.shape
     on_cpu = descriptors0.is_cpu
     parts = descriptors1.split(max(1, PART_BYTES // (4 * dim)) if on_cpu else len(descriptors1))
-    rows = max(1, (TILE if on_cpu else gpu_bytes // 4) // len(parts[0]))
+    rows = max(1, (TILE_SIMILARITIES if on_cpu else gpu_bytes // 4) // len(parts[0]))
     best, second = descriptors0.new_empty(2, len(parts), number)
     index = best.new_empty(best.shape, dtype=torch.int64)
     buffer = best.new_empty(min(rows, number) * len(parts[0]))

@@ -21,10 +21,10 @@ from ..utils.progress import progress
 from . import pictures, runs, scene
 from .runs import Run
 
-FOLDER = Path(__file__).parent
-NUM_QUERIES = 6
+PAGE_FOLDER = Path(__file__).parent
+DEFAULT_NUM_QUERIES = 6
 RECALL, INLIERS = "recall, finest threshold [%]", "mean inliers"
-ERROR = "median error [cm]"
+MEDIAN_ERROR = "median error [cm]"
 
 
 @strings_as_paths
@@ -32,7 +32,7 @@ def main(
     folders: Annotated[list[Path], Option(flags=("folders",), metavar="OUTPUTS")],
     output: Annotated[Path, Option(flags=("-o", "--output"))],
     queries: list[str] | None = None,
-    num_queries: Annotated[int, POSITIVE] = NUM_QUERIES,
+    num_queries: Annotated[int, POSITIVE] = DEFAULT_NUM_QUERIES,
     pictures_dir: Path | None = None,
 ) -> Path:
     """Write the report of runs.
@@ -142,7 +142,7 @@ def map_panels(compared: list[Run]) -> "dict[str, plots.Panel]":
     """Return the panels of accuracy against the size of maps by name; none without compact maps."""
     if not any(run.is_compact for run in compared):
         return {}
-    compact, whole, hloc = plots.MAPS
+    compact, whole, hloc = plots.MAP_MARKERS
     points = []
     for run in compared:
         sizes = {compact if run.is_compact else whole: run.map_bytes, hloc: run.hloc_bytes}
@@ -151,7 +151,7 @@ def map_panels(compared: list[Run]) -> "dict[str, plots.Panel]":
             for kind, size in sizes.items()
             if size
         ]
-    return plots.map_sizes(_measured(points, (RECALL, ERROR, INLIERS)))
+    return plots.map_sizes(_measured(points, (RECALL, MEDIAN_ERROR, INLIERS)))
 
 
 def _measured(
@@ -164,7 +164,7 @@ def _measured(
             error = summary.get("median_position_error_m")
             values = {
                 RECALL: summary.get("recall_percent", [None])[0],
-                ERROR: None if error is None else 100 * error,
+                MEDIAN_ERROR: None if error is None else 100 * error,
                 INLIERS: summary["mean_inliers"],
             }
             for measure in measures:
@@ -190,7 +190,7 @@ def _page(content: dict) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
-        loader=FileSystemLoader(FOLDER),
+        loader=FileSystemLoader(PAGE_FOLDER),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -206,8 +206,8 @@ def _page(content: dict) -> str:
     return environment.get_template("page.html").render(
         **content,
         packed=packed,
-        style=(FOLDER / "page.css").read_text(encoding="utf-8"),
-        script=(FOLDER / "page.js").read_text(encoding="utf-8"),
+        style=(PAGE_FOLDER / "page.css").read_text(encoding="utf-8"),
+        script=(PAGE_FOLDER / "page.js").read_text(encoding="utf-8"),
     )
 
 

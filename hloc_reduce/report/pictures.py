@@ -13,10 +13,10 @@ from ..utils.images import read_image
 from ..utils.match_files import get_matches
 from .runs import Run
 
-HEIGHT = 320  # pixels of both images
+PICTURE_HEIGHT = 320  # pixels of both images
 GAP = 8
-BORDER = 5
-LINES = 80  # of each colour, at most
+FRAME = 5  # pixels
+MAX_LINES = 80  # of each colour
 GREEN, RED = (40, 170, 60), (225, 50, 40)
 QUALITY = 80  # of JPEG
 
@@ -91,7 +91,7 @@ def draw(run: Run, query: str, found: dict) -> np.ndarray:
     first, scale0 = _resized(run.files["query_images"] / query)
     second, scale1 = _resized(run.files["map_images"] / found["name"])
     shift = first.shape[1] + GAP
-    gap = np.full((HEIGHT, GAP, 3), 255, np.uint8)
+    gap = np.full((PICTURE_HEIGHT, GAP, 3), 255, np.uint8)
     canvas = np.ascontiguousarray(np.concatenate([first, gap, second], axis=1))
     starts = (found["first"] + 0.5) * scale0
     ends = (found["second"] + 0.5) * scale1 + [shift, 0]
@@ -99,23 +99,21 @@ def draw(run: Run, query: str, found: dict) -> np.ndarray:
     # inliers last, on top of the others
     for colour, chosen in ((RED, ~found["inliers"]), (GREEN, found["inliers"])):
         rows = np.flatnonzero(chosen)
-        rows = rows[np.linspace(0, len(rows) - 1, min(LINES, len(rows))).astype(int)]
+        rows = rows[np.linspace(0, len(rows) - 1, min(MAX_LINES, len(rows))).astype(int)]
         for start, end in eighths[rows].tolist():
             cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA, shift=3)
             for place in (start, end):
                 cv2.circle(canvas, place, 16, colour, -1, cv2.LINE_AA, shift=3)
     frame = GREEN if run.records[query]["localized"] else RED
-    return cv2.copyMakeBorder(
-        canvas, BORDER, BORDER, BORDER, BORDER, cv2.BORDER_CONSTANT, value=frame
-    )
+    return cv2.copyMakeBorder(canvas, FRAME, FRAME, FRAME, FRAME, cv2.BORDER_CONSTANT, value=frame)
 
 
 def _resized(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read an image and resize it to HEIGHT; return the image and its scale in x and y (2,)."""
     image = read_image(path)
     height, width = image.shape[:2]
-    size = max(1, round(width * HEIGHT / height)), HEIGHT
-    interpolation = cv2.INTER_AREA if height > HEIGHT else cv2.INTER_LINEAR
+    size = max(1, round(width * PICTURE_HEIGHT / height)), PICTURE_HEIGHT
+    interpolation = cv2.INTER_AREA if height > PICTURE_HEIGHT else cv2.INTER_LINEAR
     return cv2.resize(image, size, interpolation=interpolation), np.array(size) / (width, height)
 
 

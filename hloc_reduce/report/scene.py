@@ -15,9 +15,9 @@ from ..utils.h5 import open_h5
 from ..utils.images import read_image
 from .runs import Run
 
-POINTS = 6000  # at most
-IMAGES = 24  # map images that the points and their colours are taken from
-CAMERAS = 1000  # of the map, about and at most
+MAX_POINTS = 6000
+SAMPLED_IMAGES = 24  # of the map, from which the points and their colours are taken
+MAX_CAMERAS = 1000  # of the map, about
 GREY = 120  # colour of points if there is no photo
 
 
@@ -66,7 +66,7 @@ def _scene(run: Run, cameras: dict[str, list[float]], records: dict[str, dict]) 
                 "truth": _axes(run.truth[name]) if name in run.truth else None,
             }
         )
-    shown = list(cameras.values())[:: -(-len(cameras) // CAMERAS)]
+    shown = list(cameras.values())[:: -(-len(cameras) // MAX_CAMERAS)]
     looks = np.array([*shown, *(q["truth"] or q["pose"] for q in queries if q["pose"])])
     # points and cameras count alike; a tenth of them may be far off
     groups = [part for part in (points, looks[:, :3]) if len(part)]
@@ -105,7 +105,7 @@ def _axes(pose: pycolmap.Rigid3d) -> list[float]:
 
 def _points(run: Run, names: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Return points (N, 3) that some of the map images see and their colours (N, 3)."""
-    chosen = [names[i] for i in np.linspace(0, len(names) - 1, IMAGES).astype(int)]
+    chosen = [names[i] for i in np.linspace(0, len(names) - 1, SAMPLED_IMAGES).astype(int)]
     points, colours = [], []
     seen: set[int] = set()
     with open_h5(run.files["map_features"]) as file:
@@ -113,7 +113,7 @@ def _points(run: Run, names: list[str]) -> tuple[np.ndarray, np.ndarray]:
             keypoints, _ = get_keypoints(file, name)
             ids, xyz = run.reference.lift(name, np.arange(len(keypoints)))
             new = [row for row in np.flatnonzero(ids >= 0) if ids[row] not in seen]
-            rows = np.array(new[:: max(1, -(-len(new) // (POINTS // IMAGES)))], int)
+            rows = np.array(new[:: max(1, -(-len(new) // (MAX_POINTS // SAMPLED_IMAGES)))], int)
             seen.update(ids[rows].tolist())
             points.append(xyz[rows])
             try:

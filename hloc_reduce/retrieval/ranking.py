@@ -9,8 +9,8 @@ from ..utils.h5 import get_array, open_h5
 
 # global descriptors of queries, and of database images, in memory at once: at most this many rows
 # and bytes
-BLOCK, BLOCK_BYTES = 2**14, 2**28
-QUERIES = 1024  # rows of the similarity matrix in memory at once
+MAX_BLOCK_ROWS, MAX_BLOCK_BYTES = 2**14, 2**28
+MAX_SIMILARITY_ROWS = 1024  # in memory at once
 
 
 def similarity(queries: np.ndarray, database: np.ndarray) -> np.ndarray:
@@ -70,8 +70,8 @@ def rank_file(
             )
         new = np.arange(start, start + len(database))
         best = []
-        for i in range(0, len(queries), QUERIES):
-            part = slice(i, i + QUERIES)
+        for i in range(0, len(queries), MAX_SIMILARITY_ROWS):
+            part = slice(i, i + MAX_SIMILARITY_ROWS)
             values = np.hstack([cosines[part], similarity(queries[part], database)])
             found = np.hstack([rows[part], np.broadcast_to(new, (len(values), len(new)))])
             order = rank(values, num_matched)
@@ -82,7 +82,7 @@ def rank_file(
 
 def block(path: Path, name: str) -> int:
     """Return how many global descriptors like that of an image in a file are read at once."""
-    return max(1, min(BLOCK, BLOCK_BYTES // read_global(path, [name]).nbytes))
+    return max(1, min(MAX_BLOCK_ROWS, MAX_BLOCK_BYTES // read_global(path, [name]).nbytes))
 
 
 def read_global(path: Path, names: list[str]) -> np.ndarray:

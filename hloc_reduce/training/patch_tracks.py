@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..datasets.phototour import SHEET, read_points, read_sheet, sheets
+from ..datasets.phototour import PATCHES_PER_SIDE, read_points, read_sheet, sheets
 from ..descriptors import DIM
 from ..descriptors.model import Descriptor
 from ..runtime.group_writer import resume_or_replace
@@ -38,12 +38,14 @@ def main(folder: Path, output: Path, descriptor: str = "sift", seed: int = 0) ->
     if is_current(path, made_from):
         return path
     describe = Descriptor(descriptor).to(device())
-    files = sheets(folder)[: -(-len(points) // SHEET**2)]  # those with listed patches
+    files = sheets(folder)[: -(-len(points) // PATCHES_PER_SIDE**2)]  # those with listed patches
     with resume_or_replace(parts_of(path), made_from) as writer:
         todo = [number for number, sheet in enumerate(files) if sheet.stem not in writer]
         done = len(files) - len(todo)
         for number in progress(todo, "Describing patches", "sheet", len(files), done):
-            rows = np.arange(len(points))[number * SHEET**2 : (number + 1) * SHEET**2]
+            rows = np.arange(len(points))[
+                number * PATCHES_PER_SIDE**2 : (number + 1) * PATCHES_PER_SIDE**2
+            ]
             patches = views = read_sheet(files[number])[: len(rows)]
             generator = np.random.default_rng([seed, number])
             described = np.empty((len(rows), 2, VARIANTS, DIM), np.float16)

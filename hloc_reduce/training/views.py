@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 
-from ..demo.cameras import DAY, MAP, NIGHT, QUERIES, list_photos
+from ..demo.cameras import DAY, MAP, MIN_QUERIES, NIGHT, list_photos
 from ..demo.photo import take
 from ..demo.town import build_town
 from ..utils.files import replacing
@@ -75,7 +75,7 @@ def render_towns(seeds: Iterable[int], output: Path) -> list[Source]:
             paths = [output / f"{seed}-{photo.index}-{time}.jpg" for time in ("day", "night")]
             for path, kind in zip(paths, (DAY, NIGHT), strict=True):
                 if not path.exists():
-                    seen = dataclasses.replace(photo, kind=kind, index=photo.index % QUERIES)
+                    seen = dataclasses.replace(photo, kind=kind, index=photo.index % MIN_QUERIES)
                     with replacing(path) as temporary:
                         temporary.write_bytes(take(build_town(seed), seen, seed))
             sources.append(Source(*paths))

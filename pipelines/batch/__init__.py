@@ -26,7 +26,7 @@ from .shared import Shared, is_shared
 
 # what --dry_run assumes: keypoints of an image of 1600 pixels, and bytes of a keypoint without its
 # descriptor in a feature file, in a pair of a match file, and in a map
-KEYPOINTS = 5000
+KEYPOINTS_PER_IMAGE = 5000
 FEATURE_BYTES, MATCH_BYTES, MAP_BYTES = 14, 0.75, 67
 
 
@@ -125,8 +125,8 @@ def dry_run(job_file: Path, outputs: Path | None = None, overwrite: bool = False
     if len(lines) > 1:
         print(aligned(lines, left=3))
     print(
-        f"About {total / 1e3:,.2f} GB in {outputs}, for {KEYPOINTS:,} keypoints an image. Numbers "
-        "of pairs are upper limits. Finished steps are not counted."
+        f"About {total / 1e3:,.2f} GB in {outputs}, for {KEYPOINTS_PER_IMAGE:,} keypoints an "
+        "image. Numbers of pairs are upper limits. Finished steps are not counted."
     )
     return failed
 
@@ -144,7 +144,7 @@ def steps(shared: Shared, overwrite: bool) -> Iterator[tuple[str, str, int, str,
             missing = set(shared.images()) - set(list_h5_names(path) if done else ())
             storage = shared.confs[path].get("storage", STORAGES[0])
             each = FEATURE_BYTES + descriptor_bytes(shared.dims[path], storage)
-            size += len(missing) * KEYPOINTS * each
+            size += len(missing) * KEYPOINTS_PER_IMAGE * each
             todo |= missing
         names = ", ".join(path.stem.removeprefix("feats-dog-") for path in group)
         yield "extract_features", names, len(todo), "images", size
@@ -157,9 +157,9 @@ def steps(shared: Shared, overwrite: bool) -> Iterator[tuple[str, str, int, str,
         numbers = shared.numbers(job)
         if "num_covis" in numbers:
             pairs = map_images * min(numbers["num_covis"], map_images - 1)
-            yield "match_map", job.name, pairs, "pairs", pairs * KEYPOINTS * MATCH_BYTES
-            size = map_images * KEYPOINTS * MAP_BYTES
+            yield "match_map", job.name, pairs, "pairs", pairs * KEYPOINTS_PER_IMAGE * MATCH_BYTES
+            size = map_images * KEYPOINTS_PER_IMAGE * MAP_BYTES
             yield "triangulation", job.name, map_images, "images", size
         pairs = queries * min(numbers["num_loc"], map_images)
-        yield "match_queries", job.name, pairs, "pairs", pairs * KEYPOINTS * MATCH_BYTES
+        yield "match_queries", job.name, pairs, "pairs", pairs * KEYPOINTS_PER_IMAGE * MATCH_BYTES
         yield "localization", job.name, queries, "queries", 0

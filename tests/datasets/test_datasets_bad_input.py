@@ -18,7 +18,7 @@ TEXTS = {
         lambda path: phototour.read_points(path.parent),
     ),
     "pairs of PhotoTour": (
-        phototour.PAIRS,
+        phototour.PREFERRED_PAIRS,
         ["0 0 0 1 0 0 0", "0 0 0 2 1 0 0"],
         lambda path: phototour.read_pairs(path.parent),
     ),

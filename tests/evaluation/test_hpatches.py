@@ -23,7 +23,7 @@ def root(tmp_path):
         folder.mkdir(parents=True)
         patches = 0.9 * shared + 0.1 * generator.uniform(0, 255, (12 + 2 * number, 9, 9))
         patches = np.stack([cv2.resize(patch, (65, 65)) for patch in patches])
-        for kind in data.TYPES:
+        for kind in data.PATCH_TYPES:
             noise = 0 if kind == "ref" else {"e": 10, "h": 40, "t": 120}[kind[0]]
             noisy = patches + noise * generator.standard_normal(patches.shape)
             image = noisy.clip(0, 255).astype(np.uint8).reshape(-1, 65)

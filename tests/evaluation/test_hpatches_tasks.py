@@ -31,7 +31,7 @@ def described(tmp_path, of_sequence):
     sequences = ["i_one", "v_two"]
     with GroupWriter(tmp_path / "d.h5", {}) as writer:
         for number, name in enumerate(sequences):
-            writer.add(name, {kind: of_sequence(number, kind) for kind in data.TYPES})
+            writer.add(name, {kind: of_sequence(number, kind) for kind in data.PATCH_TYPES})
     return data.Descriptors(tmp_path / "d.h5", sequences, torch.nn.Identity())
 
 

@@ -61,7 +61,7 @@ def test_coordinates_move_less_than_is_said(scene):
 def test_coordinates_of_many_points_are_packed_in_parts(monkeypatch):
     xyz = np.random.default_rng(0).uniform(-5, 90, (100, 3))
     whole = points.quantize(xyz, 0.01)
-    monkeypatch.setattr(points, "CHUNK", 16)
+    monkeypatch.setattr(points, "POINTS_PER_CHUNK", 16)
     parts = points.quantize(xyz, 0.01)
     assert np.array_equal(whole[0], parts[0])
     every = [points.Coordinates(packed, 100, *rest).all() for packed, *rest in (whole, parts)]
@@ -102,7 +102,7 @@ def test_hadamard_is_its_own_inverse():
 
 @pytest.mark.parametrize("number", [12, 1024, 3000])
 def test_signs_retrieve_as_the_descriptors_that_they_tell(number, monkeypatch):
-    monkeypatch.setattr(signs, "ROWS", 3)
+    monkeypatch.setattr(signs, "DESCRIPTORS_PER_BLOCK", 3)
     descriptors = np.random.default_rng(0).standard_normal((10, number)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     found = Signs(pack(descriptors)[0], number)

@@ -76,7 +76,7 @@ def test_matches_by_definition(sizes, ratio_threshold, options):
 @pytest.mark.parametrize(("part", "tile"), [(1, 1), (7, 70), (200, 1000)])
 def test_tiles_of_any_size_give_the_same(part, tile, ratio_threshold, monkeypatch):
     monkeypatch.setattr(nearest_neighbor, "PART_BYTES", 4 * 16 * part)
-    monkeypatch.setattr(nearest_neighbor, "TILE", tile)
+    monkeypatch.setattr(nearest_neighbor, "TILE_SIMILARITIES", tile)
     descriptors0, descriptors1 = unit(60, 16, 0), unit(50, 16, 1)
     descriptors1[:30] = torch.nn.functional.normalize(descriptors0[:30] + 0.1 * descriptors1[:30])
     matches, _ = match(descriptors0, descriptors1, ratio_threshold)

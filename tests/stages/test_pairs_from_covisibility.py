@@ -16,7 +16,7 @@ def built(scene):
 
 @pytest.mark.parametrize("block", [1, 256])
 def test_covisibility_by_hand(monkeypatch, block):
-    monkeypatch.setattr(pairs_from_covisibility, "BLOCK", block)
+    monkeypatch.setattr(pairs_from_covisibility, "IMAGES_PER_BLOCK", block)
     # image 0 sees point 9 twice, so that it shares 2 with 1, 3 with 2, which share 1; 4 is as 1
     ids = [[7, -1, 9, 9], [9, -1], [7, 9, 4], [-1], [9, -1]]
     ranking = pairs_from_covisibility.most_covisible(map(np.array, ids), 10)

@@ -12,8 +12,8 @@ from hloc_reduce.utils.parsers import parse_retrieval
 
 @pytest.mark.parametrize("block", [1, 2, 2**26])
 def test_retrieval_ranks_by_similarity(tmp_path, monkeypatch, block):
-    monkeypatch.setattr(ranking, "BLOCK_BYTES", block * 3 * 4)
-    monkeypatch.setattr(ranking, "QUERIES", 1)
+    monkeypatch.setattr(ranking, "MAX_BLOCK_BYTES", block * 3 * 4)
+    monkeypatch.setattr(ranking, "MAX_SIMILARITY_ROWS", 1)
     path = tmp_path / "global.h5"
     vectors = {
         "q/0": [1, 0, 0],

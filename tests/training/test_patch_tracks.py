@@ -42,7 +42,7 @@ def sequence(tmp_path):
         same = np.flatnonzero(points == points[i])
         for j in (same[same != i][0], (i + 1) % 300):
             lines.append(f"{i} {10 * points[i]} 0 {j} {10 * points[j]} 0 0")
-    (folder / layout.PAIRS).write_text("\n".join(lines))
+    (folder / layout.PREFERRED_PAIRS).write_text("\n".join(lines))
     return folder, patches, points
 
 
@@ -129,10 +129,10 @@ def test_broken_sequences_are_refused(sequence, tmp_path):
     (folder / "info.txt").write_text("1 0\nx 0\n")
     with pytest.raises(InputError, match="info.txt, line 2"):
         patch_tracks.main(folder, tmp_path / "cache")
-    (folder / layout.PAIRS).write_text("1 2 3\n")
+    (folder / layout.PREFERRED_PAIRS).write_text("1 2 3\n")
     with pytest.raises(InputError, match="line 1: not a pair"):
         layout.read_pairs(folder)
-    (folder / layout.PAIRS).write_text("0 5 0 1 5 0\n")
+    (folder / layout.PREFERRED_PAIRS).write_text("0 5 0 1 5 0\n")
     with pytest.raises(InputError, match="both matching pairs and others"):
         layout.read_pairs(folder)
     cv2.imwrite(str(folder / "patches0000.bmp"), np.zeros((64, 64), np.uint8))

@@ -55,7 +55,7 @@ def test_each_instruction_set_agrees_with_the_definition(kind, instruction_set):
 @pytest.mark.parametrize("kind", KINDS)
 def test_numpy_agrees_with_the_definition(kind, monkeypatch):
     """Whatever the machine; in blocks of a few rows."""
-    monkeypatch.setattr(integers, "TILE", 100)
+    monkeypatch.setattr(integers, "TILE_PRODUCTS", 100)
     for number0, number1 in SIZES[1:]:
         for dim in DIMS:
             rows0, rows1 = draw(number0, dim, kind, 0), draw(number1, dim, kind, 1)

@@ -19,7 +19,7 @@ from ...utils.paths import strings_as_paths
 from ...utils.tables import aligned
 from .. import published
 from . import data, tasks
-from .data import NOISE, Descriptors
+from .data import NOISE_LEVELS, Descriptors
 from .lists import TaskLists
 
 TASKS = ("matching", "verification", "retrieval")
@@ -120,7 +120,7 @@ def _evaluate(
 def _score_rows(scores: dict[str, dict[str, list]]) -> list[dict]:
     keys = ("feature", "task", "noise", "variant", "score")
     return [
-        dict(zip(keys, (feature, task, NOISE[noise], variant, score), strict=True))
+        dict(zip(keys, (feature, task, NOISE_LEVELS[noise], variant, score), strict=True))
         for feature, by_task in scores.items()
         for task, rows in by_task.items()
         for noise, variant, score in rows
@@ -135,10 +135,10 @@ def _means(scores: dict[str, list], paper: dict[str, float]) -> dict[str, float 
             noise: float(
                 np.mean([s for n, v, s in found if n == noise and not v.endswith(NOT_IN_MEAN)])
             )
-            for noise in NOISE
+            for noise in NOISE_LEVELS
         }
         means[task] = 100 * float(np.mean(list(by_noise.values())))
-        means |= {f"{task}_{NOISE[noise]}": 100 * mean for noise, mean in by_noise.items()}
+        means |= {f"{task}_{NOISE_LEVELS[noise]}": 100 * mean for noise, mean in by_noise.items()}
         means[f"{task}_paper"] = paper.get(task)
     return means
 

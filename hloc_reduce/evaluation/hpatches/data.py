@@ -16,14 +16,14 @@ from ...utils.images import read_image
 from ...utils.progress import progress
 from ..patches import describe_patches
 
-SIDE = 65
-NOISE = {"e": "easy", "h": "hard", "t": "tough"}
-IMAGES = range(1, 6)
-TYPES = ("ref", *(f"{noise}{image}" for noise in NOISE for image in IMAGES))
+PATCH_PIXELS = 65
+NOISE_LEVELS = {"e": "easy", "h": "hard", "t": "tough"}
+IMAGE_NUMBERS = range(1, 6)
+PATCH_TYPES = ("ref", *(f"{noise}{image}" for noise in NOISE_LEVELS for image in IMAGE_NUMBERS))
 # splits that need no splits.json -> how the names of their sequences begin
-WHOLE = {"full": ("i_", "v_"), "illum": ("i_",), "view": ("v_",)}
-SPLITS = ("a", "b", "c", *WHOLE)
-SOURCE = "https://github.com/hpatches/hpatches-benchmark"
+WHOLE_SPLITS = {"full": ("i_", "v_"), "illum": ("i_",), "view": ("v_",)}
+SPLITS = ("a", "b", "c", *WHOLE_SPLITS)
+REPOSITORY = "https://github.com/hpatches/hpatches-benchmark"
 
 
 def test_sequences(root: Path, tasks: Path, split: str) -> list[str]:
@@ -32,7 +32,7 @@ def test_sequences(root: Path, tasks: Path, split: str) -> list[str]:
     Args:
         root: the folder of the sequences.
         tasks: the benchmark's folder of lists, which has splits.json; without it there are only
-            the splits of `WHOLE`.
+            the splits of `WHOLE_SPLITS`.
         split: one of `SPLITS`.
 
     Raises:
@@ -43,16 +43,16 @@ def test_sequences(root: Path, tasks: Path, split: str) -> list[str]:
     file = next((path for path in places if path.is_file()), None)
     present = {path.parent.name for path in root.glob("*/ref.png")}
     if not present:
-        raise InputError(f"{root} has no sequence: <sequence>/ref.png (HPatches, {SOURCE}).")
+        raise InputError(f"{root} has no sequence: <sequence>/ref.png (HPatches, {REPOSITORY}).")
     if file is not None:
         try:
             names = list(map(str, json.loads(file.read_text())[split]["test"]))
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             raise InputError(f"{file} is broken or has no split {split}.") from None
-    elif split in WHOLE:
-        names = sorted(name for name in present if name.startswith(WHOLE[split]))
+    elif split in WHOLE_SPLITS:
+        names = sorted(name for name in present if name.startswith(WHOLE_SPLITS[split]))
     else:
-        raise InputError(f"There is no {places[0]}: give the tasks folder of {SOURCE}.")
+        raise InputError(f"There is no {places[0]}: give the tasks folder of {REPOSITORY}.")
     missing = [name for name in names if name not in present]
     if missing or not names:
         raise InputError(
@@ -69,9 +69,11 @@ def read_patches(path: Path) -> np.ndarray:
         InputError: when the image is not a column of such patches.
     """
     image = read_image(path, grayscale=True)
-    if image.shape[1] != SIDE or len(image) % SIDE:
-        raise InputError(f"{path} is not a column of patches of {SIDE} x {SIDE} pixels.")
-    return image.reshape(-1, SIDE, SIDE)
+    if image.shape[1] != PATCH_PIXELS or len(image) % PATCH_PIXELS:
+        raise InputError(
+            f"{path} is not a column of patches of {PATCH_PIXELS} x {PATCH_PIXELS} pixels."
+        )
+    return image.reshape(-1, PATCH_PIXELS, PATCH_PIXELS)
 
 
 def describe(root: Path, sequences: list[str], descriptor: str, path: Path) -> None:
@@ -81,7 +83,7 @@ def describe(root: Path, sequences: list[str], descriptor: str, path: Path) -> N
         root: the folder of the sequences.
         sequences: names; sequences that the file already has are skipped.
         descriptor: the base descriptor.
-        path: the h5 file: for each sequence (N, 128) float32 of each of `TYPES`.
+        path: the h5 file: for each sequence (N, 128) float32 of each of `PATCH_TYPES`.
 
     Raises:
         InputError: for a broken sequence.
@@ -89,7 +91,7 @@ def describe(root: Path, sequences: list[str], descriptor: str, path: Path) -> N
 
     def read(name: str) -> Iterator[tuple[str, np.ndarray]]:
         number = None
-        for kind in TYPES:
+        for kind in PATCH_TYPES:
             large = read_patches(root / name / f"{kind}.png")
             if number not in (None, len(large)):
                 raise InputError(f"{root / name}: its images have different numbers of patches.")
@@ -121,10 +123,10 @@ class Descriptors:
     """
 
     def __init__(self, path: Path, sequences: list[str], project: torch.nn.Module):
-        parts: dict[str, list[np.ndarray]] = {kind: [] for kind in TYPES}
+        parts: dict[str, list[np.ndarray]] = {kind: [] for kind in PATCH_TYPES}
         with open_h5(path) as file, torch.no_grad():
             for name in progress(sequences, "Projecting", "sequence"):
-                for kind in TYPES:
+                for kind in PATCH_TYPES:
                     rows = torch.from_numpy(get_dataset(file, name, kind)[()])
                     parts[kind].append(project(rows).numpy())
         self._of_type = {kind: np.concatenate(part) for kind, part in parts.items()}
@@ -133,12 +135,12 @@ class Descriptors:
         self.sequence = np.repeat(np.arange(len(sequences)), list(self.sizes.values()))
 
     def of(self, sequence: str, kind: str) -> np.ndarray:
-        """Return the descriptors (N, D) float32 of an image of a sequence, one of `TYPES`."""
+        """Return the descriptors (N, D) float32 of an image of a sequence, one of `PATCH_TYPES`."""
         first = self._first[sequence]
         return self._of_type[kind][first : first + self.sizes[sequence]]
 
     def rows(self, patches: np.ndarray, kind: str) -> np.ndarray:
-        """Return the descriptors (N, D) of numbered patches in the images of one of `TYPES`."""
+        """Return the descriptors (N, D) of numbered patches of one of `PATCH_TYPES`."""
         return self._of_type[kind][patches]
 
     def rows_of_images(self, patches: np.ndarray, images: np.ndarray, noise: str) -> np.ndarray:

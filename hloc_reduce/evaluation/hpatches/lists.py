@@ -15,7 +15,7 @@ import numpy as np
 from ...utils.cli import InputError
 from ...utils.files import replacing
 from ...utils.progress import progress
-from .data import IMAGES, first_patches
+from .data import IMAGE_NUMBERS, first_patches
 
 SEED = 42
 NUM_PAIRS, NUM_QUERIES, NUM_DISTRACTORS = 10**6, 10**4, 2 * 10**4
@@ -169,6 +169,6 @@ def _parse(cells: list[str], columns: tuple[str, ...], sizes: Mapping[str, int])
             raise ValueError(f"the sequence {name!r} is not of this split")
         if not 0 <= patch < sizes[name]:
             raise ValueError(f"{name} has {sizes[name]} patches")
-        if not all(0 <= image <= len(IMAGES) for image in images):
+        if not all(0 <= image <= len(IMAGE_NUMBERS) for image in images):
             raise ValueError(f"there is no image {images[0]}")
     return tuple(row)

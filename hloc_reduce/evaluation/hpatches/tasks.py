@@ -8,12 +8,12 @@ from scipy.spatial.distance import cdist
 from ...runtime import parallel
 from ...utils.progress import progress
 from ..ranking import average_precision, roc_area
-from .data import IMAGES, NOISE, TYPES, Descriptors
+from .data import IMAGE_NUMBERS, NOISE_LEVELS, PATCH_TYPES, Descriptors
 
 POOLS = (100, 500, 1000, 5000, 10000, 15000, 20000)
 IMBALANCE = 0.2  # share of the positive pairs in the imbalanced protocol
-OWN = len(IMAGES)  # noisy patches of a query in the retrieval task
-PAIRS, QUERIES = 2**16, 2**8  # per block
+OWN = len(IMAGE_NUMBERS)  # noisy patches of a query in the retrieval task
+PAIRS_PER_BLOCK, QUERIES_PER_BLOCK = 2**16, 2**8  # per block
 
 
 def matching_ap(reference: np.ndarray, target: np.ndarray) -> float:
@@ -41,7 +41,9 @@ def matching(descriptors: Descriptors) -> Iterator[tuple[str, str, float]]:
     Yields:
         The noise, the sequence and image, and the average precision.
     """
-    images = [(s, noise, i) for s in descriptors.sizes for noise in NOISE for i in IMAGES]
+    images = [
+        (s, noise, i) for s in descriptors.sizes for noise in NOISE_LEVELS for i in IMAGE_NUMBERS
+    ]
 
     def match(task: tuple[str, str, int]) -> float:
         sequence, noise, image = task
@@ -67,7 +69,7 @@ def verification(
         curve (balanced), or the average precision of the first fifth of the positives among all
         negatives (imbalanced).
     """
-    for noise in progress(NOISE, "Verification", "noise"):
+    for noise in progress(NOISE_LEVELS, "Verification", "noise"):
         right = pair_distances(descriptors, pairs["pos"], noise)
         few = np.sort(right[: int(IMBALANCE * len(right))])
         for kind in ("inter", "intra"):
@@ -82,7 +84,7 @@ def verification(
 def pair_distances(descriptors: Descriptors, pairs: np.ndarray, noise: str) -> np.ndarray:
     """Return the L2 distances (P,) of pairs (P, 2, 2) of images and patches at a noise."""
     apart = []
-    for part in np.array_split(pairs, -(-len(pairs) // PAIRS)):
+    for part in np.array_split(pairs, -(-len(pairs) // PAIRS_PER_BLOCK)):
         first, second = (
             descriptors.rows_of_images(part[:, side, 1], part[:, side, 0], noise) for side in (0, 1)
         )
@@ -107,10 +109,10 @@ def retrieval(
 
     def rank(block: np.ndarray) -> np.ndarray:
         described = descriptors.rows(block, "ref")
-        own = np.stack([descriptors.rows(block, kind) for kind in TYPES[1:]], axis=1)
+        own = np.stack([descriptors.rows(block, kind) for kind in PATCH_TYPES[1:]], axis=1)
         # summed as in the pool, so that equal descriptors are equally far
         right = np.stack([cdist(described[i : i + 1], own[i])[0] for i in range(len(block))])
-        right = np.sort(right.reshape(len(block), len(NOISE), OWN))
+        right = np.sort(right.reshape(len(block), len(NOISE_LEVELS), OWN))
         apart = cdist(described, pool)
         return np.stack(
             [
@@ -119,10 +121,10 @@ def retrieval(
             ]
         )
 
-    blocks = np.array_split(queries, -(-len(queries) // QUERIES))
+    blocks = np.array_split(queries, -(-len(queries) // QUERIES_PER_BLOCK))
     ranks = progress(parallel.ordered("rank", rank, blocks), "Retrieval", "block", len(blocks))
     precision = average_precision(np.concatenate(list(ranks)), OWN).mean(axis=0)
-    for noise, row in zip(NOISE, precision, strict=True):
+    for noise, row in zip(NOISE_LEVELS, precision, strict=True):
         for size, value in zip(POOLS, row, strict=True):
             yield noise, str(size), float(value)
 
@@ -141,5 +143,5 @@ def ranks_in_pools(right: np.ndarray, wrong: np.ndarray) -> np.ndarray:
     nearer = np.zeros((len(wrong) + 1, right.size), np.int64)
     np.cumsum(wrong[:, None] < right.reshape(-1), axis=0, out=nearer[1:])
     number = np.minimum(np.array(POOLS) - OWN, len(wrong))
-    before = nearer[number].reshape(len(POOLS), len(NOISE), OWN)
+    before = nearer[number].reshape(len(POOLS), len(NOISE_LEVELS), OWN)
     return before.swapaxes(0, 1) + np.arange(1, OWN + 1)

@@ -7,7 +7,7 @@ from pathlib import Path
 from ... import datasets
 from ...datasets import INLOC_THRESHOLDS
 
-FOLDER = Path(__file__).parent
+TABLE_FOLDER = Path(__file__).parent
 # data set -> beginning of a list's name -> number of its queries, beginning of their names
 DATASETS = {
     "Aachen Day-Night v1.1": {"day": (824, "query/day/"), "night": (191, "query/night/")},
@@ -70,7 +70,7 @@ def thresholds(query_list: str) -> tuple[tuple[float, float], ...]:
 def _read(name: str) -> dict[str, dict[str, float]]:
     """Read a table: from this project's name of each feature to its numbers, by column."""
     table = {}
-    with (FOLDER / name).open(newline="") as file:
+    with (TABLE_FOLDER / name).open(newline="") as file:
         for row in csv.DictReader(file):
             descriptor, scheme, dim = (row.pop(key) for key in ("descriptor", "scheme", "dim"))
             feature = descriptor if scheme == "raw" else f"{descriptor}_{scheme}{dim}"
