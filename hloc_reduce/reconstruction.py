@@ -11,7 +11,7 @@ from .mapping import checks, findings, registration
 from .mapping.checks.overlays import drop_overlays
 from .mapping.mapper import MODEL_CHOICE, Mapper, attempts_for
 from .runtime import provenance
-from .triangulation import MADE_FROM, read_matches, replacing_map
+from .triangulation import read_matches, replacing_map
 from .utils import cli, colmap, options
 from .utils.cli import InputError
 from .utils.h5 import list_h5_names
@@ -107,7 +107,8 @@ def main(
     }
     made_from = provenance.of_inputs({**options, **chosen}, [pairs, features, matches])
     is_whole = bool(provenance.read(sfm_dir / registration.REGISTRATION))
-    if not overwrite and is_whole and provenance.is_current(sfm_dir / MADE_FROM, made_from):
+    is_current = provenance.is_current(sfm_dir / provenance.MADE_FROM, made_from)
+    if not overwrite and is_whole and is_current:
         logger.info("The map %s is up to date.", sfm_dir)
         sfm = colmap.read_model(sfm_dir)
     else:

@@ -26,7 +26,6 @@ from .utils.parsers import parse_retrieval
 from .utils.paths import strings_as_paths
 from .utils.progress import progress
 
-MADE_FROM = "made_from.json"
 WRITTEN_BY_HLOC = {"database.db", *(f"{part}.bin" for part in colmap.PARTS)}
 
 Pair = tuple[str, str]
@@ -103,7 +102,7 @@ def main(
         chosen["camera_sizes"] = {str(one): list(size) for one, size in resized.items()}
     inputs = [*colmap.model_files(reference_model), pairs, features, matches]
     made_from = provenance.of_inputs({**options, **chosen}, inputs)
-    if not overwrite and provenance.is_current(sfm_dir / MADE_FROM, made_from):
+    if not overwrite and provenance.is_current(sfm_dir / provenance.MADE_FROM, made_from):
         logger.info("The map %s is up to date.", sfm_dir)
         return colmap.read_model(sfm_dir)
     if unfit:
@@ -162,7 +161,7 @@ def replacing_map(
     inside = {path.name for path in sfm_dir.iterdir()} if sfm_dir.is_dir() else set()
     of_hloc = "database.db" in inside and inside <= WRITTEN_BY_HLOC
     is_reference = reference_model is not None and sfm_dir == reference_model.resolve()
-    if inside and MADE_FROM not in inside and not of_hloc or is_reference:
+    if inside and provenance.MADE_FROM not in inside and not of_hloc or is_reference:
         raise InputError(
             f"{sfm_dir} is not a map that this program or hloc triangulated, so it is not "
             "replaced. Choose another folder."
@@ -174,7 +173,7 @@ def replacing_map(
     building.mkdir(parents=True)
     try:
         yield building
-        provenance.write(building / MADE_FROM, made_from)
+        provenance.write(building / provenance.MADE_FROM, made_from)
     except BaseException:
         shutil.rmtree(building, ignore_errors=True)
         raise

@@ -21,6 +21,7 @@ from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import trace
 from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
+from hloc_reduce.runtime.provenance import MADE_FROM
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES, Storage
@@ -32,8 +33,6 @@ from .common.options import Matcher, Positive, Retrieval
 from .common.queries import LISTED, Photos, Queries, identity, results_folder
 from .common.retrieval import check_retrieval, retrieval_name, retrieve, retrieve_in_map
 from .common.run import Run, readable
-
-MADE_FROM = "made_from.json"  # the map and the photos of the queries
 
 
 @strings_as_paths

@@ -18,7 +18,6 @@ from .aachen import MODEL_FOLDER, Aachen
 
 NVM = "3D-models/aachen_cvpr2018_db.nvm"
 INTRINSICS = "3D-models/database_intrinsics.txt"
-MADE_FROM = "made_from.json"
 Lines = Iterator[tuple[int, list[str]]]  # numbers and words
 
 
@@ -61,10 +60,10 @@ class AachenV1(Aachen):
             InputError: for a broken file.
         """
         made_from = provenance.of_inputs({}, [self.nvm, self.intrinsics])
-        if not provenance.is_current(folder / MADE_FROM, made_from):
-            (folder / MADE_FROM).unlink(missing_ok=True)
+        if not provenance.is_current(folder / provenance.MADE_FROM, made_from):
+            (folder / provenance.MADE_FROM).unlink(missing_ok=True)
             colmap.write_model(read_nvm(self.nvm, self.intrinsics), folder)
-            provenance.write(folder / MADE_FROM, made_from)
+            provenance.write(folder / provenance.MADE_FROM, made_from)
         return folder
 
 

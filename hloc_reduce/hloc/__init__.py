@@ -16,7 +16,7 @@ from ..utils.hloc import MIN_PYCOLMAP, extractors_package, import_module, parse_
 # this pycolmap and later ones skip geometries of undefined configuration, which all of hloc's have
 NO_POINTS = Version("4.2.1")
 EXTRACTORS = Path(__file__).parent / "extractors"
-VLAD = {
+VLAD_CONF = {
     "output": "global-feats-vlad",
     "model": {"name": "vlad"},
     "preprocessing": features_confs.PREPROCESSING,
@@ -32,7 +32,7 @@ def register(features: Iterable[Path] | Path = ()) -> list[str]:
         package.__path__.append(str(EXTRACTORS))
         warn()
     offered = {name: for_hloc(conf) for name, conf in features_confs.confs.items()}
-    offered["vlad"] = VLAD
+    offered["vlad"] = VLAD_CONF
     registered = import_module("extract_features").confs
     for file in features:
         name, conf = features_confs.get(str(file))

@@ -14,6 +14,8 @@ from pathlib import Path
 from ..utils.files import file_sha256, replacing
 from ..utils.progress import progress
 
+MADE_FROM = "made_from.json"  # the provenance of files beside it, such as a COLMAP model
+
 
 def of_inputs(options: dict, inputs: list[Path]) -> dict:
     """Return the provenance of a file: options, and the size and time of each input file."""

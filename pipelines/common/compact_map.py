@@ -21,7 +21,6 @@ from .retrieval import retrieve_in_map
 from .run import Run, Thresholds, readable
 
 FILE = f"map{SUFFIX}"
-MADE_FROM = "made_from.json"  # the model that the file was made from
 
 
 def check(is_compact: bool, max_mb: float | None, retrieval: str) -> None:
@@ -68,13 +67,13 @@ def main(
     """
     outputs = folder(run.folder.path, True, max_mb)
     made_from = provenance.of_inputs({}, [sfm / "points3D.bin"])
-    is_old = (outputs / MADE_FROM).exists()
-    if stale := is_old and not provenance.is_current(outputs / MADE_FROM, made_from):
+    is_old = (outputs / provenance.MADE_FROM).exists()
+    if stale := is_old and not provenance.is_current(outputs / provenance.MADE_FROM, made_from):
         logger.info("Results in %s are stale, as the map has changed.", outputs)
     results = RunFolder(outputs, {"max_mb": max_mb}, overwrite=False, stale=stale)
     matcher = compact.matcher_of(run.matcher)
     with Run(results, run.feature, matcher, run.executor, run.folder) as part:
-        provenance.write(outputs / MADE_FROM, made_from)
+        provenance.write(outputs / provenance.MADE_FROM, made_from)
         built = _pack(run, part, place, sfm, max_mb)
         features, num_loc = run.features, run.options.num_loc
         retrieved = f"{built.retrieval}{num_loc}"
