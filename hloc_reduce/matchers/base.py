@@ -34,7 +34,7 @@ class Matcher(BaseModel):
 
     takes_codes = False
 
-    required_inputs = ("descriptors0", "descriptors1")
+    required_inputs: tuple[str, ...] = ("descriptors0", "descriptors1")
 
     @property
     def feature_keys(self) -> tuple[str, ...]:
