@@ -40,7 +40,7 @@ class Options(DatasetOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        compact_map.check(self.compact, self.max_mb, self.retrieval)
+        compact_map.check(self.compact, self.max_mb, self.retrieval, self.matcher)
 
 
 @strings_as_paths

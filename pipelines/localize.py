@@ -286,6 +286,8 @@ def _check(given: dict, is_changed: bool) -> None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
     if given["compact"] is not None:
         compact.check_output(given["compact"])
+        if given["matcher"] is not None:
+            compact.check_matcher(given["matcher"])
         if (folder := given["model_or_map"]) is not None and maps.is_compact(folder):
             raise InputError(f"--map {folder} is a compact map: leave out --compact.")
 

@@ -233,8 +233,16 @@ def test_compact_maps_have_no_scores(place, tmp_path, run, monkeypatch):
         return model
 
     monkeypatch.setattr(matchers, "load", demanding)
-    with pytest.raises(InputError, match="in_plane, which needs scores of keypoints"):
-        Localizer(tmp_path / "place.hlm")
+    message = "in_plane, which needs scores of keypoints"
+    for use in (
+        lambda: Localizer(tmp_path / "place.hlm"),
+        lambda: compact.main(tmp_path / "other.hlm", outputs / "map"),
+        lambda: aachen.Options(matcher="in_plane", compact=True),
+    ):
+        with pytest.raises(InputError, match=message):
+            use()
+    assert message in refused(*given, "--compact", tmp_path / "other.hlm")
+    assert not (tmp_path / "other.hlm").exists()
 
 
 def test_a_toy_retrieval_in_a_batch(aachen_layout, run_batch):

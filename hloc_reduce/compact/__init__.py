@@ -12,16 +12,17 @@ from typing import Annotated
 
 import numpy as np
 
-from .. import logger
+from .. import logger, matchers
 from ..aggregate_features import output_of, vocabulary_if_any
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..hlm import points, writer
-from ..hlm.reader import SUFFIX
+from ..hlm.reader import SUFFIX, check_feature_keys
 from ..hlm.writer import Source
 from ..localization import intrinsics
 from ..maps.map import Map
+from ..maps.matching import is_integer_matcher
 from ..retrieval.ranking import read_global
 from ..utils import cli, colmap
 from ..utils.cli import InputError
@@ -117,10 +118,11 @@ def write(
         The bytes of each part of the file.
 
     Raises:
-        InputError: for an unknown matcher, or a size that is too small.
+        InputError: for a matcher that is unknown or needs what compact maps do not have, or a size
+            that is too small.
     """
     matcher = matcher or matcher_of(source.matcher)
-    cli.choose("matcher", matcher, matchers_confs.confs)
+    check_matcher(matcher)
     conf = {**source.conf, "storage": _storage(source.conf, storage)}
     source = replace(source, matcher=matcher, conf=conf)
     everything = points.collect(source.model, features)
@@ -150,6 +152,14 @@ def check_output(output: Path) -> None:
     if output.suffix != SUFFIX:
         raise InputError(f"{output}, a compact map, must end in {SUFFIX}.")
     cli.check_file(output)
+
+
+def check_matcher(matcher: str) -> None:
+    """Raise an InputError for a matcher that compact maps cannot have."""
+    cli.choose("matcher", matcher, matchers_confs.confs)
+    model = matchers_confs.confs[matcher]["model"]
+    if not is_integer_matcher(model):  # the others need torch
+        check_feature_keys(matcher, matchers.load(model).feature_keys)
 
 
 def matcher_of(matcher: str) -> str:

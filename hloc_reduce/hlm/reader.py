@@ -30,6 +30,7 @@ VERSION_RETRIEVAL = 3  # of files whose global descriptors are not VLAD's
 # that are read; in the first one, all coordinates have the same bits
 VERSIONS = 1, VERSION, VERSION_RETRIEVAL
 SUFFIX = ".hlm"
+FEATURES = "keypoints", "descriptors", "image_size"  # of an image, see `matchers.base.Matcher`
 # what a file may ask for
 MAX_DIM, MAX_GLOBAL, MAX_SIDE, LEAST_OCTAVE = 512, 2**14, 4096, -1
 PROJECTION = re.compile(r"[\w+-]+(@\d+)?")  # a name, and a prefix of a nested one
@@ -359,6 +360,20 @@ def _array(
     if found.dtype != dtype or not fits:
         raise ValueError(f"{name} of {found.dtype} {found.shape}")
     return found
+
+
+def check_feature_keys(matcher: str, feature_keys: Iterable[str]) -> None:
+    """Raise an InputError for a matcher that needs what images of a compact map do not have.
+
+    Args:
+        matcher: a key of `confs.matchers`.
+        feature_keys: what it needs of the features of an image.
+    """
+    if missing := [key for key in feature_keys if key not in FEATURES]:
+        raise InputError(
+            f"Compact maps cannot have the matcher {matcher}, which needs {' and '.join(missing)} "
+            "of keypoints: choose another --matcher."
+        )
 
 
 def is_compact(path: Path) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
-from ..hlm.reader import CompactMap, is_compact
+from ..hlm.reader import CompactMap, check_feature_keys, is_compact
 from ..localization import intrinsics
 from ..localization.references import Reference, SfmMap
 from ..retrieval import load as load_retrieval
@@ -159,12 +159,9 @@ def _of_file(path: Path, onnx: Path | None) -> Contents:
     matcher = matchers_confs.confs[compact.matcher]["model"]
     engine = _numpy_engine(compact, matcher, onnx) or _torch_engine(compact, matcher)
     matching = engine.matching
+    with naming(path):
+        check_feature_keys(compact.matcher, matching.feature_keys)
     others = [key for key in matching.feature_keys if key != "descriptors"]
-    if missing := [key for key in others if key not in ("keypoints", "image_size")]:
-        raise InputError(
-            f"{path} has the matcher {compact.matcher}, which needs {', '.join(missing)} of "
-            "keypoints; compact maps do not have these."
-        )
 
     def match(features: Features, names: list[str]) -> dict[str, np.ndarray]:
         visible = [compact.visible(name) for name in names]

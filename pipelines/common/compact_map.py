@@ -23,7 +23,7 @@ from .run import Run, Thresholds, readable
 FILE = f"map{SUFFIX}"
 
 
-def check(is_compact: bool, max_mb: float | None, retrieval: str) -> None:
+def check(is_compact: bool, max_mb: float | None, retrieval: str, matcher: str | None) -> None:
     """Raise an InputError for options that do not go together."""
     if max_mb is not None and not is_compact:
         raise InputError(f"--max_mb {max_mb:g} is the size of a compact map: give --compact, too.")
@@ -32,6 +32,8 @@ def check(is_compact: bool, max_mb: float | None, retrieval: str) -> None:
             "Images of a compact map are retrieved by what is in it: leave out --retrieval, or "
             f"choose one of {', '.join(retrieval_confs.confs)}."
         )
+    if is_compact and matcher is not None:
+        compact.check_matcher(matcher)
 
 
 def folder(outputs: Path, is_compact: bool, max_mb: float | None) -> Path:
