@@ -27,7 +27,7 @@ from .utils.feature_files import (
     get_features,
     read_descriptors,
 )
-from .utils.h5 import file_provenance, open_h5
+from .utils.h5 import file_provenance, iterate_h5_names, open_h5
 from .utils.match_files import check_distinct, names_to_pair
 from .utils.options import HIDDEN, Option
 from .utils.parsers import parse_pairs
@@ -178,12 +178,25 @@ def _match(
     matcher = matchers.load(conf["model"]).eval().to(device)
     match = partial(_match_batch, matcher, device, gpu_bytes or GPU_BYTES)
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
+        for file in (file0, file1):
+            _check_features(file, matcher.feature_keys, conf["model"]["name"])
         cache = FeatureCache(CACHE_BYTES, matcher.feature_keys)
         read = map(partial(_read, cache, file0, file1), pairs)
         batches = iter(lambda: list(islice(read, size)), [])
         with closing(parallel.ordered("match", match, batches, workers)) as matched:
             for groups in matched:
                 yield from groups
+
+
+def _check_features(file: h5py.File, keys: Iterable[str], matcher: str) -> None:
+    """Raise an InputError if the first image of a feature file lacks what a matcher needs."""
+    name = next(iterate_h5_names(file.id), None)
+    needed = [key for key in keys if key != "descriptors"]  # there are several kinds of these
+    if missing := [key for key in needed if name is not None and key not in file[name]]:
+        raise InputError(
+            f"The matcher {matcher} needs {' and '.join(missing)}, which the features in "
+            f"{file.filename} do not have: choose another matcher or feature."
+        )
 
 
 def _read(

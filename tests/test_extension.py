@@ -216,13 +216,16 @@ def test_only_what_a_matcher_needs_is_read(tmp_path):
     given = tmp_path / "pairs.txt", tmp_path / "features.h5"
     conf = matchers_confs.confs["NN-mutual"]
     match_features.main(conf, *given, matches=tmp_path / "m.h5")
-    with pytest.raises(InputError, match="not a file of image_size"):
+    message = "in_plane needs image_size, which the features in .*features.h5 do not have"
+    with pytest.raises(InputError, match=message):
         match_features.main(IN_PLANE, *given, matches=tmp_path / "n.h5")
 
 
-def test_compact_maps_have_no_scores(place, tmp_path, run, monkeypatch):
+def test_compact_maps_have_no_scores(place, tmp_path, run, refused, monkeypatch):
+    """A matcher that needs them is refused before any work."""
     build, *_, outputs = place
-    run(*build, "--feature", "colmap_sift_sv32", "--matcher", "in_plane")
+    given = (*build, "--feature", "colmap_sift_sv32", "--matcher", "in_plane")
+    run(*given)
     compact.main(tmp_path / "place.hlm", outputs / "map")
     needed = ("scores0", "scores1")
     loaded = matchers.load
