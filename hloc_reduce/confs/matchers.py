@@ -17,4 +17,5 @@ confs: dict[str, dict] = {
         "output": "matches-NN-mutual",
         "model": {"name": "nearest_neighbor"},
     },
+    "adalam": {"output": "matches-adalam", "model": {"name": "adalam"}},
 }
