@@ -6,12 +6,13 @@ import sys
 import command
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from colmap_database import write_old
 from command import state
 from row_of_photos import row
 
-from hloc_reduce import check
+from hloc_reduce import check, maps
 from hloc_reduce.mapping.checks import CHECKS
 from hloc_reduce.utils import colmap
 
@@ -28,7 +29,8 @@ def given(tmp_path):
             for point in image.points2D:
                 point.xy += generator.normal(0, 0.3, 2)
             keypoints[image.name] = np.array([point.xy for point in image.points2D])
-            cv2.imwrite(str(tmp_path / image.name), np.zeros((480, 640), np.uint8))
+            grey = np.full((480, 640), 40 * int(image.name[0]), np.uint8)
+            cv2.imwrite(str(tmp_path / image.name), grey)
         model.update_point_3d_errors()
         (tmp_path / "sparse").mkdir()
         model.write(tmp_path / "sparse")
@@ -91,6 +93,30 @@ def test_photos_of_another_size_are_named(given, tmp_path, run):
     cv2.imwrite(str(tmp_path / "3.jpg"), np.zeros((640, 480), np.uint8))
     said = run(model, "--images", tmp_path)
     assert "sizes: These photos do not have the size of their cameras in the model: 3.jpg" in said
+
+
+def test_copies_of_photos_are_named(given, tmp_path, run):
+    """Those of a photo that comes before; not photos of which only the sizes are equal."""
+    model, _ = given({})
+    contents = {i: (tmp_path / f"{i}.jpg").read_bytes() for i in range(6)}
+    for i, content in ((1, contents[4]), (3, contents[4]), (5, contents[2]), (0, b"a"), (4, b"b")):
+        (tmp_path / f"{i}.jpg").write_bytes(content)
+    said = run(model, "--images", tmp_path)
+    assert "duplicates: These photos are copies of others: 3.jpg, 5.jpg. Points" in said
+    (tmp_path / "3.jpg").unlink()
+    (tmp_path / "5.jpg").unlink()
+    assert "duplicates" not in run(model, "--images", tmp_path)
+
+
+def test_a_map_warns_of_copies_of_photos(plane, tmp_path, caplog):
+    """Their poses are not doubted."""
+    images = plane / "images"
+    (images / "copy of 2.png").write_bytes((images / "2.png").read_bytes())
+    one_camera = pycolmap.CameraMode.SINGLE
+    built = maps.main(tmp_path / "map", images, feature="colmap_sift_sv32", camera_mode=one_camera)
+    (found,) = [one for one in built.findings if one.kind == "duplicates"]
+    assert found.names == ("copy of 2.png",) and found.verdict == "warn"
+    assert "photos are copies of others: copy of 2.png." in caplog.text and not built.doubts
 
 
 def test_a_database_of_an_old_version(given, tmp_path, run):
