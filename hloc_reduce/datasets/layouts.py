@@ -7,12 +7,13 @@ from . import ModelPlace, Place
 from .aachen import Aachen
 from .aachen_v1 import AachenV1
 from .cambridge import Cambridge
+from .cmu import CMU
 from .inloc import InLoc
 from .scenes import Scene
 from .sevenscenes import SevenScenes
 
 # the first one that recognizes a folder reads it
-MODEL_LAYOUTS: tuple[type[ModelPlace], ...] = (AachenV1, Aachen, Cambridge, SevenScenes)
+MODEL_LAYOUTS: tuple[type[ModelPlace], ...] = (AachenV1, Aachen, Cambridge, SevenScenes, CMU)
 LAYOUTS: tuple[type[Place], ...] = (*MODEL_LAYOUTS, InLoc)
 
 

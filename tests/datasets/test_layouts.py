@@ -12,12 +12,13 @@ from command import table
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.aachen_v1 import NVM, AachenV1, read_nvm
 from hloc_reduce.datasets.cambridge import Cambridge
+from hloc_reduce.datasets.cmu import CMU
 from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.datasets.layouts import LAYOUTS, layout_of, open_model_place
 from hloc_reduce.datasets.sevenscenes import SevenScenes
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.parsers import to_line
+from hloc_reduce.utils.parsers import to_line, write_poses
 from pipelines import aachen, compare
 
 QUERY = "4.png"  # of the plane
@@ -158,11 +159,35 @@ def sevenscenes_layout(plane) -> Path:
     return root
 
 
+@pytest.fixture
+def cmu_layout(plane) -> Path:
+    """The plane as a slice of Extended CMU Seasons, whose names tell the camera: c0 or c1."""
+    root = plane / "cmu/slice2"
+    for folder in ("database", "query", "sparse"):
+        (root / folder).mkdir(parents=True)
+    model = pycolmap.Reconstruction(plane / "model")
+    camera = model.cameras[1]
+    line = to_line("c0", camera.model.name, camera.width, camera.height, *camera.params)
+    other = to_line("c1", "SIMPLE_PINHOLE", 36, 27, 9, 18, 13.5)
+    (root.parent / "intrinsics.txt").write_text(f"# cameras\n\n{other}{line}")
+    for image in list(model.images.values()):
+        name, folder = f"img_0000{image.name[0]}_c0_99us.png", "database"
+        if image.name == QUERY:
+            (root / "test-images-slice2.txt").write_text(f"{name}\n")
+            model.deregister_frame(image.frame_id)
+            folder = "query"
+        shutil.copy(plane / "images" / image.name, root / folder / name)
+        image.name = name
+    model.write_binary(root / "sparse")
+    return root
+
+
 KINDS = {
     "aachen_layout": Aachen,
     "nvm_layout": AachenV1,
     "cambridge_layout": Cambridge,
     "sevenscenes_layout": SevenScenes,
+    "cmu_layout": CMU,
     "inloc_layout": InLoc,
 }
 
@@ -195,6 +220,28 @@ def test_the_queries_of_a_layout_are_localized(kind, request, tmp_path):
         assert name == open_model_place(root).query_names()[0]
 
 
+def test_the_queries_of_a_slice_are_localized(cmu_layout, plane, tmp_path):
+    """Files of poses have names as the benchmark wants them, without the folder."""
+    (name,) = CMU(cmu_layout).query_names()
+    truth = colmap.read_model(plane / "model").find_image_with_name(QUERY).cam_from_world()
+    write_poses({name: truth}, tmp_path / "truth.txt", name_parts=None)
+    truth = tmp_path / "truth.txt"
+    summary = aachen.main(cmu_layout, tmp_path / "outputs", "sift_sv16", ground_truth=truth)
+    assert summary["map_images"] == 4 and summary["lists"]["slice2"]["localized"] == 1
+    assert summary["lists"]["slice2"]["median_position_error_m"] < 0.02
+    poses = tmp_path / "outputs" / summary["poses"]
+    assert poses.name.startswith("CMU_hloc_") and poses.read_text().split()[0] == name[6:]
+
+
+def test_the_camera_of_a_query_is_in_its_name(cmu_layout):
+    listed = CMU(cmu_layout).query_list
+    listed.write_text("img_00007_c1_99us.png\n")
+    assert CMU(cmu_layout).queries[0][1].width == 36
+    listed.write_text("img_00007_c2_99us.png\n")
+    with pytest.raises(InputError, match="slice2.txt: query/img_00007_c2_.* names no camera of"):
+        _ = CMU(cmu_layout).queries
+
+
 def test_intrinsics_of_queries_are_those_of_their_photos(cambridge_layout):
     place = Cambridge(cambridge_layout)
     ((name, camera),) = place.queries
@@ -210,6 +257,8 @@ def test_intrinsics_of_queries_are_those_of_their_photos(cambridge_layout):
         ("cambridge_layout", f"../{Cambridge.models}/Plane/list_query.txt", "Cambridge/README.md"),
         ("cambridge_layout", f"../{Cambridge.models}/Plane/empty_all", "Cambridge/README.md"),
         ("sevenscenes_layout", "../" + SevenScenes.models + "/plane/triangulated", "7Scenes/READ"),
+        ("cmu_layout", "../intrinsics.txt", "visuallocalization.net"),
+        ("cmu_layout", "test-images-slice2.txt", "visuallocalization.net"),
     ],
 )
 def test_what_is_missing_is_named(kind, part, said, request):
