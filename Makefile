@@ -15,6 +15,10 @@ OLD := $(VENV)/pycolmap-$(OLDEST)
 STAGES_OF_COLMAP := from_colmap localize_sfm more_pairs pairs_from_covisibility \
 	pairs_from_verification reconstruction to_colmap triangulation
 
+# Without bytecode, which some environments do not write, each process compiles all that it imports:
+# 16 s of each worker.
+export PYTHONDONTWRITEBYTECODE :=
+
 # Workers take files in alphabetical order; in pytest-xdist's own order the slowest come last. Three
 # keep two cores busy, because some tests wait.
 WORKERS := -n 3 --dist loadfile --no-loadscope-reorder
