@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+from collections.abc import Callable
 
 import cv2
 import h5py
@@ -12,6 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 import rigs
+import torch
 from command import contents, write
 
 from hloc_reduce import Localizer, maps
@@ -274,22 +276,29 @@ def test_a_photo_that_was_cropped_is_refused(height, width, grown, refused):
     assert names(folder) == BASE
 
 
-def _kill(stage: str, folder, new, model) -> None:
-    """Add photos in a process that is killed when a stage begins."""
-    module, _, name = stage.rpartition(".")
-    target = getattr(placing, module) if module else grow
-    setattr(target, name, lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL))
-    maps.add(maps.Map(folder), new, model)
+def killed_at(target: object, name: str, change: Callable[[], object]) -> None:
+    """Change a map in a forked process that is killed when it calls a function."""
+
+    def kill(*_, **__) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def run() -> None:
+        setattr(target, name, kill)
+        torch.set_num_threads(1)  # a fork hangs if it waits for OpenMP's threads, which it lacks
+        change()
+
+    process = multiprocessing.get_context("fork").Process(target=run, daemon=True)
+    process.start()
+    process.join(120)
+    assert process.exitcode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_killed_change_goes_on(grown, stage):
     folder, new, model = grown
-    context = multiprocessing.get_context("fork")
-    process = context.Process(target=_kill, args=(stage, folder, new, model))
-    process.start()
-    process.join(120)
-    assert process.exitcode == -signal.SIGKILL
+    module, _, name = stage.rpartition(".")
+    target = getattr(placing, module) if module else grow
+    killed_at(target, name, lambda: maps.add(maps.Map(folder), new, model))
     finished = stage == STAGES[-1]
     assert names(folder) == ([*BASE, NEW] if finished else BASE)  # whole at any moment
     maps.add(maps.Map(folder), new, model)
@@ -316,17 +325,9 @@ def test_copies_in_the_map_keep_their_features(place, tmp_path, run):
     assert list_h5_names(maps.Map(folder).descriptors) == [*BASE, NEW]
 
 
-def _kill_removal(folder) -> None:
-    grow.merge = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-    maps.remove(maps.Map(folder), BASE[:1])
-
-
 def test_a_killed_removal_goes_on(grown):
     folder, _, _ = grown
-    process = multiprocessing.get_context("fork").Process(target=_kill_removal, args=(folder,))
-    process.start()
-    process.join(120)
-    assert process.exitcode == -signal.SIGKILL
+    killed_at(grow, "merge", lambda: maps.remove(maps.Map(folder), BASE[:1]))
     assert names(folder) == BASE[1:]
     maps.remove(maps.Map(folder), BASE[:1])
     assert list_h5_names(maps.Map(folder).features) == BASE[1:]
