@@ -50,6 +50,55 @@ def detected_once() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
+def computed() -> dict[tuple, object]:
+    """Descriptors by patches, and vocabularies by descriptors."""
+    return {}
+
+
+@pytest.fixture
+def described_once(monkeypatch, computed) -> None:
+    """Has patches described once, and a vocabulary learned once from the same descriptors."""
+    from hloc_reduce.descriptors.model import Descriptor
+    from hloc_reduce.retrieval.vlad import VLAD
+
+    describe, fit = Descriptor.forward, VLAD.fit
+
+    def digest(array: np.ndarray) -> tuple:
+        return array.shape, hashlib.sha256(np.ascontiguousarray(array)).digest()
+
+    def describe_once(descriptor, patches):
+        key = descriptor.name, *digest(patches.numpy())
+        if key not in computed:
+            computed[key] = describe(descriptor, patches)
+        return computed[key].clone()
+
+    def fit_once(vlad, descriptors):
+        key = json.dumps(vlad.conf, sort_keys=True), *digest(descriptors)
+        if key not in computed:
+            fit(vlad, descriptors)
+            computed[key] = vlad.vocabulary
+        vlad.vocabulary = computed[key].copy()
+
+    monkeypatch.setattr(Descriptor, "forward", describe_once)
+    monkeypatch.setattr(VLAD, "fit", fit_once)
+
+
+@pytest.fixture(scope="session")
+def written_once(tmp_path_factory) -> Callable[..., None]:
+    """Has a folder written by a function the first time, and copied from there for other tests."""
+    copies = {}
+
+    def write_or_copy(folder: Path, write: Callable[[], object], *key: object) -> None:
+        if key in copies:
+            shutil.copytree(copies[key], folder, dirs_exist_ok=True)
+            return
+        write()
+        copies[key] = shutil.copytree(folder, tmp_path_factory.mktemp("copy") / folder.name)
+
+    return write_or_copy
+
+
+@pytest.fixture(scope="session")
 def herz_jesus() -> Path:
     path = SHARED / "aachen_like/herz-jesus"
     if not path.is_dir():
@@ -113,6 +162,7 @@ def scene(tmp_path) -> SimpleNamespace:
     reference = pycolmap.Reconstruction()
     poses, seen = {}, {}
     features = tmp_path / "features.h5"
+    photo = cv2.imencode(".jpg", np.full((480, 640), 99, np.uint8))[1].tobytes()
     with h5py.File(features, "w") as file:
         for i in range(8):
             name = f"db/{i}.jpg" if i < 6 else f"query/{i}.jpg"
@@ -130,7 +180,7 @@ def scene(tmp_path) -> SimpleNamespace:
                 image = pycolmap.Image(name=name, camera_id=1, image_id=i + 1)
                 colmap.add_image(reference, camera, image, poses[name])
             (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(tmp_path / "images" / name), np.full((480, 640), 99, np.uint8))
+            (tmp_path / "images" / name).write_bytes(photo)
     model = tmp_path / "reference"
     model.mkdir()
     reference.write(model)
@@ -164,8 +214,13 @@ def symmetric() -> float:
 
 
 @pytest.fixture
-def plane(tmp_path, symmetric):
+def plane(tmp_path, symmetric, written_once, described_once) -> Path:
     """Photos of the plane z = 0 and a COLMAP model of their poses with covisibility."""
+    written_once(tmp_path, lambda: write_plane(tmp_path, symmetric), "plane", symmetric)
+    return tmp_path
+
+
+def write_plane(root: Path, symmetric: float) -> None:
     generator = np.random.default_rng(0)
     texture = np.zeros((600, 600))
     for sigma in (2, 4, 8):
@@ -184,7 +239,7 @@ def plane(tmp_path, symmetric):
         camera_id=1,
     )
     points = np.column_stack([generator.uniform(-0.5, 0.5, (30, 2)), np.zeros(30)])
-    (tmp_path / "images").mkdir()
+    (root / "images").mkdir()
     poses = []
     for i in range(5):
         rotation = cv2.Rodrigues(np.array([0.1 * i - 0.2, 0.15 * i - 0.3, 0.2 * i]))[0]
@@ -196,7 +251,7 @@ def plane(tmp_path, symmetric):
         calibration = camera.calibration_matrix() - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         homography = calibration @ matrix @ to_plane
         photo = cv2.warpPerspective(texture, homography, SIZE, flags=cv2.INTER_AREA)
-        cv2.imwrite(str(tmp_path / f"images/{i}.png"), photo)
+        cv2.imwrite(str(root / f"images/{i}.png"), photo)
         pixels = camera.img_from_cam(points @ rotation.T + translation)
         image = pycolmap.Image(
             name=f"{i}.png", keypoints=pixels.reshape(-1, 2), camera_id=1, image_id=i + 1
@@ -205,18 +260,22 @@ def plane(tmp_path, symmetric):
     for j, point in enumerate(points):
         track = pycolmap.Track([pycolmap.TrackElement(i, j) for i in range(1, 6)])
         reference.add_point3D(point, track)
-    (tmp_path / "model").mkdir()
-    reference.write(tmp_path / "model")
-    return tmp_path
+    (root / "model").mkdir()
+    reference.write(root / "model")
 
 
 @pytest.fixture
-def aachen_layout(plane) -> Path:
+def aachen_layout(plane, symmetric, written_once) -> Path:
     """The photos of the plane in the layout of Aachen: four of the map, and three queries.
 
     The queries are one by day, the same by night (darker), and one of a uniform grey.
     """
     root = plane / "dataset"
+    written_once(root, lambda: write_aachen_layout(plane, root), "aachen_layout", symmetric)
+    return root
+
+
+def write_aachen_layout(plane: Path, root: Path) -> None:
     images, model = root / "images_upright", root / "3D-models/aachen_v_1_1"
     for folder in ("db", "query/day", "query/night"):
         (images / folder).mkdir(parents=True)
@@ -247,11 +306,10 @@ def aachen_layout(plane) -> Path:
         path = root / f"queries/{time}_time_queries_with_intrinsics.txt"
         path.write_text("".join(f"query/{name}.png {intrinsics}" for name in names))
     (root / "queries/ground_truth_poses.txt").write_text("".join(truth))
-    return root
 
 
 @pytest.fixture
-def inloc_layout(plane) -> Path:
+def inloc_layout(plane, symmetric, written_once) -> Path:
     """The photos of the plane in the layout of InLoc: scans on two floors, and three queries.
 
     Cutouts 0 to 2 are on floor PLA1, 3 on PLA2, in whose frame the plane is 100 m away. Each scan
@@ -259,6 +317,11 @@ def inloc_layout(plane) -> Path:
     and as b.JPG, and one of a uniform grey.
     """
     root = plane / "inloc"
+    written_once(root, lambda: write_inloc_layout(plane, root), "inloc_layout", symmetric)
+    return root
+
+
+def write_inloc_layout(plane: Path, root: Path) -> None:
     (root / "query/iphone7").mkdir(parents=True)
     reference = pycolmap.Reconstruction(plane / "model")
     names = []
@@ -301,7 +364,6 @@ def inloc_layout(plane) -> Path:
     queries.write_text("".join(f"{name} {intrinsics}\n" for name in sorted(names)))
     truth = root / "ground_truth_poses.txt"
     truth.write_text("".join(f"{name} {values}\n" for name in names))
-    return root
 
 
 def scan_frame(number: int) -> np.ndarray:

@@ -29,10 +29,10 @@ PIPELINE = localize
 
 
 @pytest.fixture
-def built(place, run):
+def built(place, run, written_once):
     """The map of the plane, and its photos."""
     build, images, outputs = place
-    run(*build, "--feature", "colmap_sift_sv32")
+    written_once(outputs, lambda: run(*build, "--feature", "colmap_sift_sv32"), "built")
     return outputs / "map", images
 
 

@@ -47,11 +47,12 @@ STAGES = (
 
 
 @pytest.fixture
-def grown(place, tmp_path, run):
+def grown(place, tmp_path, run, written_once):
     """A map of three photos with poses; a folder with the fourth, and the model of all four."""
     (_, model, _, images, _, outputs), _, _ = place
     part = colmap.write_part(model, BASE, tmp_path / "part")
-    run("--map", part, "--map_images", images, "--outputs", outputs)
+    build = "--map", part, "--map_images", images, "--outputs", outputs
+    written_once(outputs, lambda: run(*build), "grown")
     (tmp_path / "new/db").mkdir(parents=True)
     shutil.copy(images / NEW, tmp_path / "new" / NEW)
     return outputs / "map", tmp_path / "new", model
