@@ -21,7 +21,7 @@ from hloc_reduce import networks
 from hloc_reduce.confs import features
 from hloc_reduce.descriptors import DESCRIPTORS, weights
 from hloc_reduce.utils import cli, colmap, downloads
-from pipelines import batch
+from pipelines import batch, localize
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -398,6 +398,21 @@ def place(aachen_layout, tmp_path) -> tuple[tuple, Path, Path]:
     model, images = aachen_layout / "3D-models/aachen_v_1_1", aachen_layout / "images_upright"
     outputs = tmp_path / "outputs"
     return ("--map", model, "--map_images", images, "--outputs", outputs), images, outputs
+
+
+@pytest.fixture
+def build_map(place, symmetric, written_once, monkeypatch) -> Callable[..., Path]:
+    """Builds the map of `place` with more options, once for all tests, and returns its folder."""
+    build, _, outputs = place
+
+    def build_once(*options: str) -> Path:
+        def write() -> None:
+            command.run(monkeypatch, localize, *build, *options)
+
+        written_once(outputs, write, "map", symmetric, options)
+        return outputs / "map"
+
+    return build_once
 
 
 @pytest.fixture

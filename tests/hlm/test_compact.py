@@ -29,11 +29,9 @@ PIPELINE = localize
 
 
 @pytest.fixture
-def built(place, run, written_once):
+def built(place, build_map):
     """The map of the plane, and its photos."""
-    build, images, outputs = place
-    written_once(outputs, lambda: run(*build, "--feature", "colmap_sift_sv32"), "built")
-    return outputs / "map", images
+    return build_map("--feature", "colmap_sift_sv32"), place[1]
 
 
 def test_a_file_localizes_as_its_map(built, tmp_path, run):
@@ -193,11 +191,11 @@ def test_global_descriptors_of_another_file(built, tmp_path, monkeypatch):
         )
 
 
-def test_the_vocabulary_that_ships_is_named(place, tmp_path, run):
+def test_the_vocabulary_that_ships_is_named(place, build_map, tmp_path):
     """A file is refused where another one ships; older files do not name it."""
-    build, images, outputs = place
-    run(*build, "--feature", "colmap_sift_sv64")
-    known = maps.Map(outputs / "map")
+    _, images, _ = place
+    known = maps.Map(build_map())
+    assert known.feature == "colmap_sift_sv64"
     descriptors = aggregate_features.main(
         aggregate_features.confs["vlad"],
         known.features,

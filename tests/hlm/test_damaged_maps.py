@@ -43,16 +43,15 @@ def with_header(content, header):
 
 
 @pytest.fixture(params=["uint4 bitmaps", "float16 deltas"])
-def file(request, place, run, tmp_path, monkeypatch):
+def file(request, build_map, tmp_path, monkeypatch):
     """A small map, and the content of its file."""
-    build, _, outputs = place
-    run(*build, "--feature", "colmap_sift_sv32")
+    built = build_map("--feature", "colmap_sift_sv32")
     storage, kind = request.param.split()
     if kind == "deltas":  # which are shorter only in large maps
         pack = points.pack_visible
         monkeypatch.setattr(writer.points_of_map, "pack_visible", lambda of, _: pack(of, 10**9))
     path = tmp_path / "place.hlm"
-    compact.main(path, outputs / "map", storage=storage, max_mb=0.02)
+    compact.main(path, built, storage=storage, max_mb=0.02)
     content = path.read_bytes()
     assert f'visible\\": \\"{kind}'.encode() in content
     assert use(path).names

@@ -112,10 +112,8 @@ def match(shown, query, ratio):
 
 
 @pytest.fixture
-def built(place, run):
-    build, _, outputs = place
-    run(*build, "--feature", "colmap_sift_sv32")
-    return outputs / "map"
+def built(build_map):
+    return build_map("--feature", "colmap_sift_sv32")
 
 
 def test_a_reader_of_the_documented_format(built, tmp_path):

@@ -196,16 +196,15 @@ def test_a_photo_with_a_pose(grown, place, tmp_path, capsys, run):
     assert names(folder) == [*BASE, NEW]
 
 
-def test_photos_that_are_localized(place, tmp_path, monkeypatch, caplog, run, refused):
+def test_photos_that_are_localized(place, build_map, tmp_path, monkeypatch, caplog, run, refused):
     paired, pair = [], placing.pairs_from_retrieval.main
 
     def logged(descriptors, output, number, query_list, db_list):
         paired.append((output.name, query_list, db_list))
         return pair(descriptors, output, number, query_list=query_list, db_list=db_list)
 
-    build, images, outputs = place
-    run(*build)
-    folder = outputs / "map"
+    _, images, _ = place
+    folder = build_map()
     before = poses(folder)
     new = images / "query/day"  # one that the map shows, and a grey one
     cv2.imwrite(str(new / "noise.png"), np.random.default_rng(0).integers(0, 255, (270, 360)))

@@ -105,7 +105,7 @@ def with_exif(photo, path, focal_35mm):
     path.write_bytes(b"\xff\xd8\xff\xe1" + length + segment + jpeg.tobytes()[2:])
 
 
-def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, caplog, run):
+def test_intrinsics_of_exif_or_guessed(place, build_map, aachen_layout, tmp_path, caplog, run):
     """The camera has 375 pixels; 36 mm say 374 (of the diagonal), a guess is 432."""
     build, images, outputs = place
     photos = tmp_path / "photos"
@@ -114,6 +114,7 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, caplog, r
     with_exif(photo, photos / "exif.jpg", 36)
     cv2.imwrite(str(photos / "guess.png"), photo)
     truth = parsers.parse_poses(aachen_layout / "queries/ground_truth_poses.txt")["query/day/a.png"]
+    build_map()
     caplog.set_level("INFO")
     run(*build, "--query_images", photos)
     assert "1 queries are from EXIF data" in caplog.text and "1 queries are guessed" in caplog.text
@@ -156,8 +157,11 @@ def test_intrinsics_of_exif_or_guessed(place, aachen_layout, tmp_path, caplog, r
             localizer.localize(photos / name)
 
 
-def test_large_photos_have_larger_limits_in_files_and_in_memory(place, tmp_path, monkeypatch, run):
+def test_large_photos_have_larger_limits_in_files_and_in_memory(
+    place, build_map, tmp_path, monkeypatch, run
+):
     build, images, outputs = place
+    build_map()
     small = cv2.imread(str(images / "query/day/a.png"))
     (tmp_path / "new").mkdir()
     large = tmp_path / "new/large.png"
@@ -219,10 +223,10 @@ def test_names_with_spaces(by_model, plane, tmp_path, run):
 
 
 @pytest.mark.parametrize("takes_codes", [True, False])
-def test_only_matchers_that_take_codes_get_them(takes_codes, place, run, monkeypatch):
+def test_only_matchers_that_take_codes_get_them(takes_codes, place, build_map, monkeypatch):
     """The others get unit descriptors, as in `match_features`."""
-    build, images, outputs = place
-    run(*build, "--feature", "colmap_sift_sv32", "--storage", "uint2")
+    _, images, outputs = place
+    build_map("--feature", "colmap_sift_sv32", "--storage", "uint2")
     compact.main(outputs / "place.hlm", outputs / "map")
     monkeypatch.setattr(NearestNeighbor, "takes_codes", takes_codes)
     for module in (contents, torch_engine):
@@ -241,9 +245,9 @@ def test_only_matchers_that_take_codes_get_them(takes_codes, place, run, monkeyp
         assert (max(longest) > 1.01) == takes_codes
 
 
-def test_codes_with_foreign_levels_are_refused(place, run):
-    build, _, outputs = place
-    run(*build, "--feature", "colmap_sift_sv32", "--storage", "uint2")
+def test_codes_with_foreign_levels_are_refused(place, build_map):
+    _, _, outputs = place
+    build_map("--feature", "colmap_sift_sv32", "--storage", "uint2")
     features = next((outputs / "map").glob("feats-*.h5"))
     other = projections.levels("sift_sv32", "uint2")
     for names, said in ((slice(-1, None), "^The codes"), (slice(None), "is broken: The codes")):

@@ -86,8 +86,9 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
     assert "poses in it may be off by a tenth of the distance or more" in caplog.text
 
 
-def test_what_has_changed_is_noticed(place, aachen_layout, run, refused):
+def test_what_has_changed_is_noticed(place, build_map, aachen_layout, run, refused):
     build, images, outputs = place
+    build_map()
     new = ("--query_images", images / "query/day")
     run(*build, *new)
     before, results = state(outputs / "map"), state(outputs / "queries-day")
@@ -147,9 +148,9 @@ def test_a_map_of_rotations_that_were_not_normalized_is_stale(
     assert "differs: normalized" in refused(*build)
 
 
-def test_inputs_are_not_deleted(place, tmp_path, run, refused):
-    build, images, outputs = place
-    run(*build)
+def test_inputs_are_not_deleted(place, build_map, refused):
+    build, _, outputs = place
+    build_map()
     before = state(outputs / "map")
     arguments = ("--map", outputs / "map/sfm", *build[2:], "--overwrite", "--feature", "sift")
     message = refused(*arguments)
@@ -157,10 +158,10 @@ def test_inputs_are_not_deleted(place, tmp_path, run, refused):
     assert state(outputs / "map") == before
 
 
-def test_a_deletion_that_was_cut_short_goes_on(place, monkeypatch, run):
+def test_a_deletion_that_was_cut_short_goes_on(place, build_map, monkeypatch, run):
     """Nothing of the map before gets into the new one."""
     build, images, outputs = place
-    run(*build)
+    build_map()
     old = (outputs / "map/feats-dog-colmap_sift_sv64.h5").read_bytes()
     unlink = type(outputs).unlink
 
@@ -183,9 +184,9 @@ def test_a_deletion_that_was_cut_short_goes_on(place, monkeypatch, run):
 FINDING = {"kind": "a", "text": "b", "names": [], "values": {}, "verdict": "warn", "doubt": ""}
 
 
-def test_a_broken_map_is_refused(place, tmp_path, run, refused):
-    build, images, outputs = place
-    run(*build)
+def test_a_broken_map_is_refused(place, build_map, tmp_path, refused):
+    _, images, outputs = place
+    build_map()
     file = outputs / "map/map.json"
     sound = json.loads(file.read_text())
     for key, value in (
@@ -213,10 +214,11 @@ def test_a_broken_map_is_refused(place, tmp_path, run, refused):
     assert "no sound map.json" in refused(*arguments)
 
 
-def test_a_map_with_a_broken_file_is_refused_before_any_work(place, tmp_path, run, refused):
-    build, images, outputs = place
-    run(*build, "--feature", "sift_sv16")
-    folder = outputs / "map"
+def test_a_map_with_a_broken_file_is_refused_before_any_work(
+    place, build_map, tmp_path, run, refused
+):
+    _, images, _ = place
+    folder = build_map("--feature", "sift_sv16")
     given = ("--map", folder, "--outputs", tmp_path / "x", "--query_images", images / "query/day")
     stem = "global-feats-vlad_feats-dog-sift_sv16"
     for name in (
@@ -252,10 +254,10 @@ def test_a_map_with_a_broken_file_is_refused_before_any_work(place, tmp_path, ru
 
 
 @pytest.mark.fault(4)
-def test_a_map_in_use_is_not_broken(place, run, refused):
+def test_a_map_in_use_is_not_broken(place, build_map, refused):
     """Whoever builds it again loses a good map."""
     build, images, outputs = place
-    run(*build)
+    build_map()
     (path,) = outputs.glob("map/feats-*64.h5")
     with path.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # as a program does that writes to it
@@ -412,11 +414,10 @@ def test_a_photo_of_an_odd_size_may_be_left_out(
 
 
 @pytest.mark.fault(2)
-def test_a_map_knows_its_fisheyes(place, run):
+def test_a_map_knows_its_fisheyes(place, build_map):
     """In map.json; that of an earlier version does not have them, but the model does."""
-    build, _, outputs = place
-    run(*build)
-    folder = outputs / "map"
+    _, _, outputs = place
+    folder = build_map()
     assert maps.Map(folder).cameras.sizes == {SIZE} and not maps.Map(folder).cameras.lenses
     written = json.loads((folder / "map.json").read_text())
     fisheye = ["SIMPLE_RADIAL_FISHEYE", *SIZE, 130.0, SIZE[0] / 2, SIZE[1] / 2, 0.0]

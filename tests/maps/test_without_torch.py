@@ -79,12 +79,10 @@ def without_torch(path: Path, photo: Path, onnx: Path | None = None, threads: in
 
 
 @pytest.fixture
-def file(place, run, tmp_path):
+def file(place, build_map, tmp_path):
     """A compact map of the plane, and a photo of it."""
-    build, images, outputs = place
-    run(*build, "--feature", "colmap_sift_sv32")
-    compact.main(tmp_path / "place.hlm", outputs / "map")
-    return tmp_path / "place.hlm", images / "query/day/a.png"
+    compact.main(tmp_path / "place.hlm", build_map("--feature", "colmap_sift_sv32"))
+    return tmp_path / "place.hlm", place[1] / "query/day/a.png"
 
 
 def test_localization_without_torch(file, monkeypatch):

@@ -10,8 +10,9 @@ from pipelines import localize
 PIPELINE = localize
 
 
-def test_results_of_another_map_are_kept(place, tmp_path, run, refused):
+def test_results_of_another_map_are_kept(place, build_map, tmp_path, run, refused):
     build, images, outputs = place
+    build_map()
     new = ("--query_images", images / "query/day")
     run(*build, *new)
     results = state(outputs / "queries-day")
@@ -22,10 +23,11 @@ def test_results_of_another_map_are_kept(place, tmp_path, run, refused):
     assert state(outputs / "queries-day") == results
 
 
-def test_another_num_loc_needs_no_other_map(place, run, refused):
+def test_another_num_loc_needs_no_other_map(place, build_map, run, refused):
     """The message offered --overwrite, with which --map_images builds the whole map again."""
     build, images, outputs = place
     new = ("--query_images", images / "query/day")
+    build_map()
     run(*build, *new)
     message = refused(*build, *new, "--num_loc", 2)
     assert "differs: num_loc (50 before, 2 now)" in message
@@ -36,8 +38,9 @@ def test_another_num_loc_needs_no_other_map(place, run, refused):
     assert (outputs / "map/map.json").stat().st_mtime_ns == written
 
 
-def test_queries_of_the_same_name_have_folders_of_their_own(place, tmp_path, run):
+def test_queries_of_the_same_name_have_folders_of_their_own(place, build_map, tmp_path, run):
     build, images, outputs = place
+    build_map()
     run(*build, "--query_images", images / "query/day")
     results = state(outputs / "queries-day")
     other = shutil.move(images / "query/night", tmp_path / "day")
@@ -55,8 +58,9 @@ def test_queries_of_the_same_name_have_folders_of_their_own(place, tmp_path, run
     assert state(outputs / "queries-day") == results
 
 
-def test_queries_that_have_changed_are_localized_anew(place, run):
+def test_queries_that_have_changed_are_localized_anew(place, build_map, run):
     build, images, outputs = place
+    build_map()
     run(*build, "--query_images", images / "query/day")
     assert outcome(outputs / "queries-day")[1]["grey.png"]["status"] == "fallback"
     shutil.copy(images / "query/day/a.png", images / "query/day/grey.png")
@@ -90,7 +94,7 @@ def test_a_folder_with_a_broken_photo_only(kind, place, tmp_path, run, refused, 
     assert "a.png" in message and str(photo.parent) in message
 
 
-def test_wrong_input(place, tmp_path, run, refused):
+def test_wrong_input(place, build_map, tmp_path, refused):
     build, images, outputs = place
     assert "Give --map_images" in refused("--outputs", outputs)
     assert "--query_images, too" in refused(*build, "--queries", "list.txt")
@@ -124,7 +128,7 @@ def test_wrong_input(place, tmp_path, run, refused):
     assert refused(*build[:4], "--outputs", photo) == message
     assert "--num_covis 0" in refused(*build, "--num_covis", 0)
     assert not (outputs / "map").exists()
-    run(*build)
+    build_map()
     for name in ("x/1.png", "x-1.png"):
         (tmp_path / "new/x").mkdir(parents=True, exist_ok=True)
         shutil.copy(photo, tmp_path / "new" / name)

@@ -63,9 +63,10 @@ def test_poses_like_those_of_mirrored_photos_are_doubtful(kind, agreement, confi
 
 
 @pytest.mark.usefixtures("as_certain_as_right_ones")
-def test_photos_of_ones_own(place, tmp_path, monkeypatch):
+def test_photos_of_ones_own(place, build_map, tmp_path, monkeypatch):
     """The mirrored photo is refused by the pipeline and in memory, and would not be otherwise."""
     build, images, outputs = place
+    build_map(*MATCHER)
     new = tmp_path / "new"
     new.mkdir()
     photo = images / "query/day/a.png"
@@ -92,9 +93,10 @@ def test_photos_of_ones_own(place, tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("as_certain_as_right_ones")
-def test_a_run_that_stops_before_the_mirror_images_resumes(place, tmp_path, monkeypatch):
+def test_a_run_that_stops_before_the_mirror_images_resumes(place, build_map, tmp_path, monkeypatch):
     """Its records say localized, but no poses are written."""
     build, images, outputs = place
+    build_map(*MATCHER)
     new = tmp_path / "new"
     new.mkdir()
     mirror(new / "mirrored.png", images / "query/day/a.png")

@@ -60,12 +60,11 @@ def ask(url, body=None):
 CAMERA = "?camera=" + quote("SIMPLE_PINHOLE 360 270 375 180 135")
 
 
-def test_a_photo_gets_its_pose(place, run, tmp_path, start):
+def test_a_photo_gets_its_pose(place, build_map, tmp_path, start):
     """As from the Localizer, eight at a time; photos of nothing get a reason."""
-    build, images, outputs = place
-    run(*build)
+    _, images, _ = place
     file = tmp_path / "place.hlm"
-    compact.main(file, outputs / "map")
+    compact.main(file, build_map())
     localizer = Localizer(file)
     url = start(localizer)
     photo = (images / "query/day/a.png").read_bytes()
