@@ -332,7 +332,7 @@ def test_clusters_of_matches_of_few_points_are_refused(number, repeated):
         assert solve(keypoints, world, [np.arange(len(world))]).refusal is not None
 
 
-@pytest.mark.parametrize("number", [51, 70])
+@pytest.mark.parametrize("number", [51, 62])
 def test_a_rival_is_looked_for_where_many_matches_disagree(number):
     """Of two places that look the same, one with fewer photos, the matches are divided."""
     other = 100 - number
@@ -345,7 +345,7 @@ def test_a_rival_is_looked_for_where_many_matches_disagree(number):
 def test_a_rival_is_found_in_a_sample_of_many_matches(monkeypatch):
     first = matches(800, 0)
     # the right ones come last
-    second = (part[::-1] for part in matches(300, 1900, seed=1, pose=pose_of(0, (50, 0, 8))))
+    second = (part[::-1] for part in matches(600, 1600, seed=1, pose=pose_of(0, (50, 0, 8))))
     keypoints, points = (np.concatenate(part) for part in zip(first, second, strict=True))
     estimate, numbers = absolute_pose._estimate, []
 
@@ -357,7 +357,7 @@ def test_a_rival_is_found_in_a_sample_of_many_matches(monkeypatch):
     found = solve(keypoints, points, [np.arange(800), np.arange(800, 3000)])
     assert numbers[-1] == absolute_pose.RIVAL_SAMPLE
     assert found.refusal is not None
-    assert re.fullmatch("ambiguous: another pose has 3.. inliers, this one 8..", found.refusal)
+    assert re.fullmatch("ambiguous: another pose has [56].. inliers, this one 8..", found.refusal)
 
 
 @pytest.mark.parametrize("replaced", [False, True])
