@@ -18,6 +18,7 @@ PAGES = (
     "docs/results.md",
     "docs/features.md",
     "docs/localize.md",
+    "docs/maps.md",
     "docs/performance.md",
 )
 LONGEST_NUMBER = 30  # characters of a cell, with units

@@ -7,7 +7,22 @@ from pathlib import Path
 from benchmarks.rows import Row, read, select
 from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
-from hloc_reduce.localization.gate import RULES
+from hloc_reduce.localization.exif import WELL_KNOWN
+from hloc_reduce.localization.gate import DEFAULT_GATE, FOCAL_LENGTHS, REFINED, RULES
+from hloc_reduce.mapping.adjustment import GAIN_OF_FREE, MAX_ADJUSTED_IMAGES
+from hloc_reduce.mapping.checks import (
+    contradictions,
+    copies,
+    few_points,
+    focal_lengths,
+    intrinsics,
+    lenses,
+    misfits,
+    partial,
+    positions,
+)
+from hloc_reduce.mapping.plausibility import SAME_VIEWPOINT
+from hloc_reduce.mapping.registration import MIN_VIEWPOINTS
 from hloc_reduce.utils.cli import InputError
 
 # kinds of trials, by what they are called in tables
@@ -304,6 +319,67 @@ def limits_table() -> Table:
     return [["a pose must", "limit"], *([rule.text, rule.limit] for rule in RULES)]
 
 
+def map_limits_table() -> Table:
+    """List what is judged of a map."""
+    low, high = FOCAL_LENGTHS
+    tolerance = contradictions.ELSEWHERE
+    few, share = few_points.HINGE_POINTS, few_points.HINGE_SHARE
+    spread = focal_lengths.SPREAD
+    return [
+        ["what is judged", "limit"],
+        [
+            "viewpoints of a model",
+            f"at least {MIN_VIEWPOINTS}; photos nearer than {100 * SAME_VIEWPOINT:g} % of the "
+            "distance to the scene are one",
+        ],
+        [
+            "focal length of a photo",
+            f"{low:g} to {high:g} longer sides; within a factor of {REFINED:g} of its EXIF data, "
+            f"unless {WELL_KNOWN} photos share the camera",
+        ],
+        ["distortion of a photo", f"at most {lenses.MAX_DISTORTION:g}"],
+        [
+            "shared points of a photo",
+            f"at least {DEFAULT_GATE.min_inliers}; {few}, where most photos have more than "
+            f"{1 / share:g} times as many",
+        ],
+        [
+            "share of the predicted points that two groups share",
+            f"{100 * copies.JOINED_SHARE:g} %, or {100 * copies.APART_SHARE:g} % for groups that "
+            "the mapper did not connect directly",
+        ],
+        [
+            "ratio of estimated focal lengths of photos of one size",
+            f"a warning above {focal_lengths.SPREAD_OF_FEW:g}, refused above {spread:g}",
+        ],
+        [
+            "photo placed elsewhere by the points of others",
+            f"{100 * tolerance.position:g} % of the distance or {tolerance.rotation:g}°, while "
+            "less than half of its matches agree",
+        ],
+        [
+            "matches of a photo off their epipolar lines",
+            f"half of them by more than {misfits.MISFIT_PIXELS:g} pixel, and "
+            f"{misfits.MISFIT_RATIO:g} times as far as is typical: refused",
+        ],
+        [
+            "uncertain position of a photo",
+            f"a warning above {100 * positions.MAX_DEVIATION:g} % of the distance; refused if "
+            f"{100 * positions.MANY_UNCERTAIN_SHARE:g} % of the photos are above",
+        ],
+        [
+            f"fall of the reprojection error with free principal points (up to "
+            f"{MAX_ADJUSTED_IMAGES} photos)",
+            f"photos are left out, or a warning, above {100 * GAIN_OF_FREE:g} %; "
+            f"{100 * intrinsics.GAIN_OF_OWN:g} % if photos share cameras",
+        ],
+        [
+            "photos in the map",
+            f"a warning below {100 * partial.ENOUGH_REGISTERED:g} %, refused below half",
+        ],
+    ]
+
+
 TABLES: dict[str, Callable[[], Table]] = {
     "features": features_table,
     "readme": readme_table,
@@ -312,6 +388,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "maps": maps_table,
     "false_accepts": false_accepts_table,
     "limits": limits_table,
+    "map_limits": map_limits_table,
     "runs": runs_table,
     "extraction": extraction_table,
     "gpu": gpu_table,

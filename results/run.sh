@@ -36,6 +36,17 @@ for place in fox kitchen liberty-statue south-building; do
     run photos_alone --map "$(scene $place)" --subset 10 --subsets 3 "$@"
 done
 
+run strangers --output $data/strangers
+maps=
+for place in bronze-statue cyprus entry-P10 fountain-P11 fox kitchen liberty-statue monstree sceaux south-building; do
+    maps="$maps --map $(scene $place)"
+done
+tried="--same entry-P10 fountain-P11 herz-jesus --trials 60 --strangers $data/strangers"
+for feature in colmap_sift_sv64 xfeat_sv32; do
+    run trials $maps --dataset $data/herz-jesus $tried --feature $feature
+done
+run trials $maps $tried --feature colmap_sift_sv64 --seed 1
+
 # how fast?
 run extraction --dataset $data/herz-jesus "$@" \
     --feature colmap_sift colmap_sift_sv64 sift_sv64 mini32 mini64 edgepoint2_m32 edgepoint2_m64 xfeat aliked

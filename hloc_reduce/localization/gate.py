@@ -124,8 +124,8 @@ class OfMatches(NamedTuple):
         weights: of the evidence. With the bias, the weighted sum is the log odds of a right pose.
         bias: of right poses and of those of photos that do not belong, if half of all are right.
         min_probability: the least of a pose that is trusted. With a strict ratio test, copies of
-            repeated structures may have as much. Without, mostly mirrored photos are probable, which
-            `max_mirrored` refutes.
+            repeated structures may have as much. Without, mirrored photos do, which `max_mirrored`
+            refutes.
         max_mirrored: the largest confidence of the mirror image, as a share of its own. On
             symmetric facades networks, which match without a ratio test, have up to 0.73 for right
             poses; of mirrored photos of a castle, localized 90 degrees off by matches with a strict
