@@ -107,12 +107,14 @@ def main(
             _check_some_matched(matches, [name for name, _ in queries], retrieved)
             for name, record in solve(features, matches, tasks, True, "Localizing"):
                 log.add(name, record)
-        gate = _of_matches(gate, matches)
-        tasks = [
-            (name, mirror(camera), retrieved.get(name, []))
-            for name, camera in queries
-            if camera and _may_be_mirrored(log.records[name], gate)
-        ]
+        tasks = []
+        if mirror_images and any(log.records[name]["localized"] for name, _ in queries):
+            gate = _of_matches(gate, matches)
+            tasks = [
+                (name, mirror(camera), retrieved.get(name, []))
+                for name, camera in queries
+                if camera and _may_be_mirrored(log.records[name], gate)
+            ]
         if mirror_images and tasks:
             files, reference = mirror_images([name for name, _, _ in tasks]), load_reference()
             config = partial(_mirrored, config)
