@@ -54,8 +54,8 @@ def main(
         features: names of features, see pipelines.aachen --list_features, or their YAML files.
         outputs: folder for compare.csv, with a folder for each feature; default: outputs/<dataset>.
         page: the report; default: <outputs>/report.html.
-        retrieval: vlad, or netvlad, openibl, megaloc, eigenplaces or dir of an installed hloc; or
-            hloc's text file of pairs or h5 file of global descriptors.
+        retrieval: a name (those of networks need an installed hloc), or hloc's text file of pairs
+            or h5 file of global descriptors.
         ground_truth: true poses of the queries; default: as in finished runs, else those of the
             data set.
         gate: what a pose must have for the query to be called localized.

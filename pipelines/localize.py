@@ -77,9 +77,8 @@ def open_map(
         camera_mode: which photos share a camera; default: auto.
         database: COLMAP database that `map` was made from: its keypoints and descriptors make the
             map, without photos. Photos, if given, only tell more about the cameras.
-        retrieval: vlad, or netvlad, openibl, megaloc, eigenplaces or dir of an installed hloc; or,
-            for the queries only, hloc's text file of pairs or h5 file of global descriptors;
-            default: vlad.
+        retrieval: a name (those of networks need an installed hloc); or, for the queries only,
+            hloc's text file of pairs or h5 file of global descriptors; default: vlad.
 
     Raises:
         InputError: when an old map was built with other options, or something is missing or wrong.

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
-from hloc_reduce.confs.retrieval import VLAD
+from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.runtime.executors import SERIAL, Executor
@@ -15,7 +15,7 @@ from hloc_reduce.utils.options import HIDDEN, POSITIVE, Checked, Option
 
 Positive = Annotated[int, POSITIVE]
 Matcher = Annotated[str, Option("matcher", matchers_confs.confs)]
-Retrieval = Annotated[str, Option(metavar="vlad|NAME|FILE")]
+Retrieval = Annotated[str, Option(metavar="|".join([*retrieval_confs.confs, "FILE"]))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,8 +27,8 @@ class Method(Checked):
         storage: storage of the descriptors of map images (those of queries stay floats).
         keypoints: settings of the DoG detector.
         matcher: matcher; default: the feature's, see `list_features`.
-        retrieval: vlad, or netvlad, openibl, megaloc, eigenplaces or dir of an installed hloc; or
-            hloc's text file of pairs or h5 file of global descriptors.
+        retrieval: a name (those of networks need an installed hloc), or hloc's text file of pairs
+            or h5 file of global descriptors.
         ground_truth: true poses of the queries; default: those of the data set.
         num_loc: retrieved map images per query.
         gate: what a pose must have for the query to be called localized.
@@ -38,7 +38,7 @@ class Method(Checked):
     storage: Storage = STORAGES[0]
     keypoints: KeypointSettings = KEYPOINT_SETTINGS[0]
     matcher: Matcher | None = None
-    retrieval: Retrieval = VLAD
+    retrieval: Retrieval = retrieval_confs.VLAD
     ground_truth: Path | None = None
     num_loc: Positive | None = None
     gate: Gate = DEFAULT_GATE
