@@ -20,6 +20,7 @@ confs: dict[str, dict] = {
         "output": "global-feats-vlad",
         "model": {"name": "vlad", "num_words": 64, "max_samples": 200_000},
     },
+    "vlad256": {"output": "global-feats-vlad256", "model": {"name": "vlad", "num_words": 256}},
     **{name: _of_hloc(name) for name in ("netvlad", "openibl", "megaloc", "eigenplaces", "dir")},
 }
 

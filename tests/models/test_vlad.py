@@ -3,10 +3,15 @@
 import h5py
 import numpy as np
 import pytest
+from command import outcome
 
-from hloc_reduce import aggregate_features
+from hloc_reduce import Localizer, aggregate_features, compact, maps
+from hloc_reduce.retrieval.ranking import read_global
 from hloc_reduce.retrieval.vlad import VLAD
 from hloc_reduce.utils.cli import InputError
+from pipelines import localize
+
+PIPELINE = localize
 
 CONF = {"output": "vlad", "model": {"name": "vlad", "num_words": 4, "max_samples": 1000}}
 
@@ -79,3 +84,19 @@ def test_descriptors_by_a_stale_vocabulary_are_replaced(features):
     assert (output.read_bytes(), vocabulary.read_bytes()) == before
     aggregate_features.main(CONF, features, ["db/1.jpg"])
     assert output.read_bytes() != before[0] and vocabulary.read_bytes() != before[1]
+
+
+def test_more_words_in_maps(place, run, tmp_path):
+    """In the folder of a map, in files and in memory, and in a compact map."""
+    build, images, outputs = place
+    photos = images / "query/day"
+    given = ("--feature", "colmap_sift_sv32", "--retrieval", "vlad256")
+    run(*build, *given, "--query_images", photos)
+    _, rows = outcome(outputs / "queries-day")
+    assert rows["a.png"]["status"] == "localized"
+    built = maps.Map(outputs / "map")
+    assert read_global(built.descriptors, built.names()).shape == (4, 256 * 32)
+    compact.main(tmp_path / "place.hlm", built.folder)
+    for path in (built.folder, tmp_path / "place.hlm"):
+        pose, info = Localizer(path).localize(photos / "a.png")
+        assert pose is not None and info["retrieved"][0] == rows["a.png"]["retrieved"]
