@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
+import small_map
 from scipy.io import savemat
 
 from hloc_reduce import networks
@@ -199,6 +200,13 @@ def scene(tmp_path) -> SimpleNamespace:
         seen=seen,
         points=points,
     )
+
+
+@pytest.fixture
+def built(scene, written_once) -> SimpleNamespace:
+    """The scene with its map and the matches of its queries."""
+    written_once(scene.root, lambda: small_map.build(scene), "small_map")
+    return small_map.opened(scene)
 
 
 SIZE = (360, 270)

@@ -40,17 +40,31 @@ def enlarge(scene, factor, noise):
 
 def build(scene):
     """Match and triangulate the images of the map, and match the queries with them."""
-    scene.pairs = all_pairs(scene.root / "pairs-db.txt")
-    scene.matches = scene.root / "matches-db.h5"
+    _name(scene)
+    all_pairs(scene.pairs)
     match_features.main(MATCHER, scene.pairs, scene.features, matches=scene.matches)
+    scene.map = scene.triangulate()
+    all_pairs(scene.loc_pairs, ["query/6.jpg", "query/7.jpg"])
+    match_features.main(MATCHER, scene.loc_pairs, scene.features, matches=scene.loc_matches)
+    return scene
+
+
+def opened(scene):
+    """Return a scene that was built in its folder before."""
+    _name(scene)
+    scene.map = colmap.read_model(scene.sfm)
+    return scene
+
+
+def _name(scene) -> None:
+    """Name the files of the map, and the stages of it."""
+    scene.pairs, scene.matches = scene.root / "pairs-db.txt", scene.root / "matches-db.h5"
+    scene.loc_pairs = scene.root / "pairs-loc.txt"
+    scene.loc_matches = scene.root / "matches-loc.h5"
     scene.sfm = scene.root / "sfm"
     scene.triangulate = lambda sfm=scene.sfm, **options: triangulation.main(
         sfm, scene.model, scene.images, scene.pairs, scene.features, scene.matches, **options
     )
-    scene.map = scene.triangulate()
-    scene.loc_pairs = all_pairs(scene.root / "pairs-loc.txt", ["query/6.jpg", "query/7.jpg"])
-    scene.loc_matches = scene.root / "matches-loc.h5"
-    match_features.main(MATCHER, scene.loc_pairs, scene.features, matches=scene.loc_matches)
     scene.localize = lambda **overrides: localize_sfm.main(
         **{
             "reference_sfm": scene.sfm,
@@ -62,4 +76,3 @@ def build(scene):
             **overrides,
         }
     )
-    return scene

@@ -1,5 +1,7 @@
 """Queries without intrinsics, of the size of the map's photos: perhaps by their lens."""
 
+from functools import cache
+
 import numpy as np
 import pycolmap
 import pytest
@@ -17,6 +19,7 @@ def camera_of(*params: float) -> pycolmap.Camera:
     return pycolmap.Camera(model="SIMPLE_RADIAL", width=1280, height=960, params=params)
 
 
+@cache
 def solve(
     typical: intrinsics.Lens | None,
     number: int,

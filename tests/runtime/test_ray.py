@@ -22,11 +22,14 @@ from pipelines import aachen, batch
 
 pytestmark = pytest.mark.check
 
-ray = pytest.importorskip("ray")
+
+@pytest.fixture(scope="module", autouse=True)
+def ray():
+    return pytest.importorskip("ray")
 
 
 @pytest.fixture(scope="module")
-def cluster():
+def cluster(ray):
     from ray.cluster_utils import Cluster
 
     # no node can import this module
@@ -39,6 +42,8 @@ def cluster():
 
 
 def slow_squares(items):
+    import ray
+
     for i in items:
         time.sleep(0.2)
         yield i, i * i, os.environ["OMP_NUM_THREADS"], ray.get_runtime_context().get_node_id()

@@ -17,12 +17,18 @@ from hloc_reduce.utils.cli import InputError
 pytestmark = pytest.mark.check
 
 PIPELINE = export
-onnx = pytest.importorskip("onnx")
-onnxruntime = pytest.importorskip("onnxruntime")
-pytest.importorskip("onnxscript")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def onnx():
+    for name in ("onnxruntime", "onnxscript"):
+        pytest.importorskip(name)
+    return pytest.importorskip("onnx")
 
 
 def session(path: Path):
+    import onnxruntime
+
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
@@ -55,7 +61,7 @@ def check_network(path: Path, conf: dict, most: int) -> None:
 @pytest.mark.parametrize(
     "name", ["xfeat", "mini64", pytest.param("aliked_t16", marks=pytest.mark.long)]
 )
-def test_a_network(name, run, base_weights, tmp_path):
+def test_a_network(name, onnx, run, base_weights, tmp_path):
     base_weights(name)
     path = tmp_path / "network.onnx"
     run("--feature", name, "--output", path)

@@ -22,11 +22,6 @@ from hloc_reduce.utils.h5 import list_h5_names
 from hloc_reduce.utils.parsers import parse_poses, write_pairs
 
 
-@pytest.fixture
-def built(scene):
-    return small_map.build(scene)
-
-
 def test_queries_are_localized_exactly(built):
     records = built.localize()
     for name, record in records.items():

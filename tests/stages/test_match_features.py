@@ -3,7 +3,6 @@
 import h5py
 import numpy as np
 import pytest
-import small_map
 import torch
 from command import refused
 from small_map import MATCHER
@@ -21,11 +20,6 @@ from hloc_reduce.utils.match_files import get_matches
 from hloc_reduce.utils.parsers import parse_pairs, write_pairs
 
 KEYS = ("descriptors",)
-
-
-@pytest.fixture
-def built(scene):
-    return small_map.build(scene)
 
 
 def test_a_pair_that_is_listed_again_and_reversed_is_matched_once(built, tmp_path):

@@ -2,16 +2,10 @@
 
 import numpy as np
 import pytest
-import small_map
 
 from hloc_reduce import pairs_from_covisibility
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.parsers import parse_retrieval
-
-
-@pytest.fixture
-def built(scene):
-    return small_map.build(scene)
 
 
 @pytest.mark.parametrize("block", [1, 256])

@@ -6,18 +6,12 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
-import small_map
 from small_map import all_pairs
 
 from hloc_reduce import triangulation
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.h5 import list_h5_names
-
-
-@pytest.fixture
-def built(scene):
-    return small_map.build(scene)
 
 
 def test_map_is_where_the_points_are(built):
