@@ -1,11 +1,12 @@
 """Fit the gate's probability to labelled trials, and say how often the gate errs.
 
 Reads the rows of `benchmarks.trials`. For each kind of matches, a logistic regression on
-`gate.Evidence` tells right poses from those of photos that do not belong in the map. (Other wrong
-poses are by right matches, but imprecise, or of wrong intrinsics.) Each piece of evidence can only
-speak for a pose. In five folds of places, the gate then judges all photos by weights that were
-fitted to other places. Prints what it accepts, what single rules save, how often right poses are
-among those of a probability, and the weights for `gate.py`.
+`gate.Evidence` tells right poses from those of photos that do not belong in the map. Poses of
+photos of the place that are near or wrong are left out: their matches are right, but their
+intrinsics or their precision are not. Each piece of evidence can only speak for a pose. In five
+folds of maps, the gate then judges the poses by weights that were fitted to other maps; whether a
+mirror image counts is decided by the weights of `gate.py`. Prints what is accepted, also without
+each other rule, how often right poses are among those of a probability, and the weights.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,7 +19,7 @@ from scipy.special import expit
 from benchmarks.trial_rows import OUTCOMES, TRIALS, label, read
 from hloc_reduce.localization import gate
 from hloc_reduce.localization.gate import (
-    OF_MATCHES,
+    MATCH_KINDS,
     RULES,
     Evidence,
     Gate,
@@ -118,7 +119,7 @@ def _main() -> None:
     parser.add_argument("trials", type=Path, nargs="*", help="default: all of results/trials")
     args = parser.parse_args()
     rows = [row for row in read(args.trials or sorted(TRIALS.glob("*.csv"))) if "measures" in row]
-    for kind in OF_MATCHES:
+    for kind in MATCH_KINDS:
         poses = [row for row in rows if row["matcher"] == kind]
         if not poses:
             continue

@@ -141,10 +141,10 @@ def trials():
     return found
 
 
-@pytest.mark.parametrize("kind", gate.OF_MATCHES)
+@pytest.mark.parametrize("kind", gate.MATCH_KINDS)
 def test_the_weights_of_the_gate_are_those_of_the_trials(trials, kind):
     poses = [row for row in trials if row["matcher"] == kind and "measures" in row]
-    weights, bias, *_ = gate.OF_MATCHES[kind]
+    weights, bias, *_ = gate.MATCH_KINDS[kind]
     assert fit_gate.fit_rows(poses).round(2) == pytest.approx([*weights, bias], abs=0.02)
 
 

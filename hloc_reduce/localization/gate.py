@@ -1,4 +1,4 @@
-"""Whether to trust a pose: every limit, and the one verdict on what `measures` tells."""
+"""Whether to trust a pose: every limit of the verdict, and the verdict on what `measures` tells."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,17 +31,17 @@ class Tolerance(NamedTuple):
     rotation: float
 
 
-ALIKE = Tolerance(0.06, 2.4)  # many listed focal lengths are 5 % off
+ALIKE = Tolerance(0.06, 2.4)  # a focal length 5 % off, as many listed ones are, moves it by 5 %
 RIVALS = Tolerance(0.25, 10.0)  # of poses by other matches
 # standard deviations of a pose; one error in ten is more than 1.9 times as large
 PRECISE = Tolerance(0.03, 2.0)
 CROPPED = Tolerance(0.15, 2.0)  # with unknown intrinsics, of a photo that may be cropped
-# standard deviations between poses with the intrinsics of a map's own lens and with another focal
-# length: photos of a flat scene hardly tell one, and errors of the map decide which fits better
-UNCERTAIN = 1.5
+# another focal length does not contradict that of a map's own lens if it moves the pose by fewer
+# standard deviations: photos of a flat scene hardly tell one, and errors of the map decide
+WITHIN_DEVIATIONS = 1.5
 
-# ratios of the confidences of two poses; above BETTER, other intrinsics replace guessed ones
-AS_LIKELY, LIKELIER, BETTER = 0.8, 1.0, 1.1
+# ratios of the confidences of two poses
+AS_LIKELY, LIKELIER, MUCH_LIKELIER = 0.8, 1.0, 1.1
 STRETCHED = (
     "it may be cropped or stretched: another principal point and aspect ratio fit about as well, "
     "and the pose differs; known intrinsics would help"
@@ -72,7 +72,7 @@ ALTERNATIVES = {
         "fit better, and the pose differs",
     ),
     "principal_point": Limit(
-        BETTER,
+        MUCH_LIKELIER,
         "its intrinsics contradict the map: another principal point and aspect ratio fit much "
         "better, and the pose differs",
     ),
@@ -92,7 +92,7 @@ ALTERNATIVES = {
     "cropped": Limit(AS_LIKELY, STRETCHED),
     "stretched": Limit(LIKELIER, STRETCHED),
     "typical_lens": Limit(AS_LIKELY, STRETCHED),
-    # by other matches; a statue on a symmetric pedestal has up to 0.46
+    # by other matches; right poses of a statue on a symmetric pedestal have rivals of up to 0.46
     "rival": Limit(
         0.5, "ambiguous: another pose has {detail:.0f} inliers, this one {inliers}", RIVALS
     ),
@@ -109,32 +109,33 @@ class Evidence(NamedTuple):
     """What speaks for the matches of a pose: the larger, the better.
 
     Args:
-        confidence: its decimal logarithm, of at most MOST_TELLING.
+        log10_confidence: the decimal logarithm of `Measures.confidence`, of at most MOST_TELLING.
         agreement: see `measures.agreement`.
     """
 
-    confidence: float
+    log10_confidence: float
     agreement: float
 
 
-class OfMatches(NamedTuple):
+class MatchKind(NamedTuple):
     """What depends on the kind of the matches.
 
     Args:
-        weights: of the evidence. With the bias, the weighted sum is the log odds of a right pose.
-        bias: of right poses and of those of photos that do not belong, if half of all are right.
-        min_probability: the least of a pose that is trusted. With a strict ratio test, copies of
-            repeated structures may have as much. Without, mirrored photos do, which `max_mirrored`
-            refutes.
-        max_mirrored: the largest confidence of the mirror image, as a share of its own. On
-            symmetric facades networks, which match without a ratio test, have up to 0.73 for right
-            poses; of mirrored photos of a castle, localized 90 degrees off by matches with a strict
-            one, seven have 0.47 to 0.97.
+        weights: of the evidence. With the bias, the weighted sum is the log odds of a right pose,
+            as opposed to one of a photo that does not belong, if both are as frequent.
+        bias: the constant term.
+        default_min_probability: the least of a pose that is trusted. With a strict ratio test,
+            wrong poses at copies of repeated structures may come near it. Without, right poses in
+            the dark have less; wrong ones of mirrored photos, which have more, are refuted by
+            `max_mirrored`.
+        max_mirrored: the largest confidence of the mirror image, as a share of its own. Right poses
+            by networks on symmetric facades have up to 0.73. Wrong ones of seven mirrored photos of
+            a castle by SIFT have 0.47 to 0.97.
     """
 
     weights: Evidence
     bias: float
-    min_probability: float
+    default_min_probability: float
     max_mirrored: float
 
 
@@ -142,11 +143,13 @@ MOST_TELLING = 300.0  # confidence: more does not count
 BEST = Evidence(float(np.log10(MOST_TELLING)), 1.0)
 STRICT = 0.8  # the largest ratio of a strict ratio test
 # with a strict ratio test and without; weights and biases by `python -m benchmarks.fit_gate`
-OF_MATCHES = {
-    "ratio": OfMatches(Evidence(2.44, 15.4), -15.15, 0.7, 0.4),
-    "mutual": OfMatches(Evidence(1.67, 10.56), -7.28, 0.3, 0.8),
+MATCH_KINDS = {
+    "ratio": MatchKind(Evidence(2.44, 15.4), -15.15, 0.7, 0.4),
+    "mutual": MatchKind(Evidence(1.67, 10.56), -7.28, 0.3, 0.8),
 }
-SURE = 0.995  # probability from which on mirror images are not tried; one of a castle has 0.994
+# probability from which on mirror images are not tried; the wrong pose of a mirrored photo of a
+# castle has 0.994
+SURE = 0.995
 
 
 @dataclass(frozen=True)
@@ -159,7 +162,7 @@ class Gate:
         min_inliers: minimum number of RANSAC's inliers of a localized query.
         min_probability: minimum probability of a localized query, see `gate.probability`; default:
             0.7 with a strict ratio test, else 0.3.
-        matches: a key of `OF_MATCHES`; default: "mutual". See `of_matches`.
+        matches: a key of `MATCH_KINDS`; default: "mutual". See `of_matches`.
 
     Raises:
         InputError: for a confidence that is not finite, a negative number of inliers, or a
@@ -187,15 +190,15 @@ class Gate:
         return replace(self, matches="ratio" if is_strict else "mutual")
 
     @property
-    def kind(self) -> OfMatches:
+    def kind(self) -> MatchKind:
         """What depends on the kind of the matches."""
-        return OF_MATCHES[self.matches or "mutual"]
+        return MATCH_KINDS[self.matches or "mutual"]
 
     @property
     def least_probability(self) -> float:
         """The minimum probability of a localized query."""
         given = self.min_probability
-        return self.kind.min_probability if given is None else given
+        return self.kind.default_min_probability if given is None else given
 
 
 DEFAULT_GATE = Gate()
@@ -309,7 +312,7 @@ def _improbable(measures: Measures, gate: Gate) -> str | None:
     reason = (
         f"its confidence of {confidence} is low"
         if lacking[0] > lacking[1]
-        else f"the matches of no image agree with the pose: agreement {agreement}"
+        else f"too few matches of any image agree with the pose: agreement {agreement}"
     )
     least = f"at least {gate.least_probability:g} is needed"
     return f"{reason} (probability {_down(found, 2)}, {least})"
@@ -365,22 +368,24 @@ RULES = (
     Rule(
         _swapped,
         "have a listed principal point in the order x, y",
-        f"off the centre by less than {200 * CENTRED:g} % of the size, or by more than "
-        f"{100 * CENTRED:g} % if swapped",
+        f"refused if more than {200 * CENTRED:g} % of the size off the centre, but less than "
+        f"{100 * CENTRED:g} % with x and y swapped",
     ),
     Rule(
         _another_pose,
-        "not be contradicted by another pose: with another focal length, or a skew, that fits "
-        "better; with another principal point, aspect ratio or lens of the map that fits about as "
-        "well; by other matches; or, in InLoc, on another floor",
-        f"confidence of the other one: {100 * LIKELIER:g} %, {100 * AS_LIKELY:g} %, "
-        f"{100 * ALTERNATIVES['rival'].ratio:g} % and {100 * AS_LIKELY:g} % (of the inliers); "
-        f"farther away than {_words(ALIKE)}; by other matches {_words(RIVALS)}",
+        "not be contradicted by another pose that is nearly as likely: with other intrinsics, by "
+        "other matches (a rival), or by other images, as of another floor",
+        f"farther apart than {_words(ALIKE)} ({_words(RIVALS)} by other matches or images), with a "
+        "confidence above "
+        + ", ".join(
+            f"{100 * limit.ratio:g} % ({kind.replace('_', ' ')})"
+            for kind, limit in ALTERNATIVES.items()
+        ),
     ),
     Rule(
         _imprecise,
-        "be determined by its inliers: standard deviations, where more than "
-        f"{INDEPENDENT} inliers count as {INDEPENDENT}",
+        f"be determined by its inliers: standard deviations. More than {INDEPENDENT} inliers count "
+        f"as {INDEPENDENT}, because neighbors err alike",
         f"{_words(PRECISE)}; with all intrinsics free, if the photo may be cropped or its listed "
         f"principal point is more than {100 * OFF_CENTRE:g} % of the size off the centre: "
         f"{_words(CROPPED)}",
@@ -389,15 +394,15 @@ RULES = (
         _improbable,
         "be by the right matches: `probability`, by its confidence and its `agreement`, the "
         "largest share of a map image's matches that are inliers, less a standard deviation",
-        " and ".join(f"{kind.min_probability:g}" for kind in OF_MATCHES.values())
+        " and ".join(f"{kind.default_min_probability:g}" for kind in MATCH_KINDS.values())
         + " with and without a strict ratio test (`--min_probability`)",
     ),
     Rule(
         _mirrored,
-        f"fit better than its mirror image, below a probability of {SURE:g}, unless the intrinsics "
-        "are given",
+        f"fit much better than its mirror image, if its probability is below {SURE:g} and its "
+        "intrinsics are not given",
         "confidence of the mirror image: "
-        + " and ".join(f"{100 * kind.max_mirrored:g} %" for kind in OF_MATCHES.values())
+        + " and ".join(f"{100 * kind.max_mirrored:g} %" for kind in MATCH_KINDS.values())
         + " with and without a strict ratio test",
     ),
 )
@@ -416,7 +421,7 @@ def is_doubtful(kind: str, other: Alternative) -> bool:
 
 def is_within(other: Alternative, uncertainty: Uncertainty) -> bool:
     """Return whether the uncertainty of a pose explains how far an alternative is."""
-    explained = UNCERTAIN * uncertainty.position, UNCERTAIN * uncertainty.rotation
+    explained = WITHIN_DEVIATIONS * uncertainty.position, WITHIN_DEVIATIONS * uncertainty.rotation
     return not differ(other, Tolerance(*explained))
 
 

@@ -55,7 +55,7 @@ def with_other_intrinsics(matches: Matches, pose: Pose) -> tuple[Pose, Alternati
             return likelier, others
     if other is None:
         return assumed, others
-    if other.confidence > gate.BETTER * assumed.confidence:
+    if other.confidence > gate.MUCH_LIKELIER * assumed.confidence:
         return other, others
     is_cropped = matches.may_be_cropped(assumed)
     # a scene that tells no principal point lets any error of the map move it

@@ -272,8 +272,7 @@ class Measures:
         focal_range: the least and the largest plausible one, in pixels.
         off_centre: how far the principal point is from the centre, as a share of the size.
         off_centre_swapped: the same if its coordinates are swapped.
-        alternatives: other poses by kind, those of `gate.ALTERNATIVES` and `gate.BY_MATCHES`: of
-            each kind the likeliest.
+        alternatives: other poses by kind, a key of `gate.ALTERNATIVES`: of each kind the likeliest.
         mirror_image: confidence of the pose of the mirror image, None if that was not tried.
     """
 

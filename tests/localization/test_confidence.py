@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from hloc_reduce.localization import absolute_pose, measures
-from hloc_reduce.localization.gate import DEFAULT_GATE, OF_MATCHES, Gate, probability, refusal
+from hloc_reduce.localization.gate import DEFAULT_GATE, MATCH_KINDS, Gate, probability, refusal
 from hloc_reduce.localization.measures import (
     Measures,
     Uncertainty,
@@ -256,7 +256,7 @@ def test_a_gate_is_of_numbers():
         Gate(min_probability=30)
 
 
-@pytest.mark.parametrize("kind", OF_MATCHES)
+@pytest.mark.parametrize("kind", MATCH_KINDS)
 def test_each_piece_of_evidence_speaks_for_a_pose(kind):
     gate = Gate(matches=kind)
     doubtful = Measures(confidence=20, agreement=0.5)
@@ -288,7 +288,9 @@ def test_a_pose_that_no_image_agrees_with_is_refused():
     gate = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8})
     found = solve(keypoints, points, images, gate=gate)
     assert found.confidence > 100
-    assert found.refusal.startswith("the matches of no image agree with the pose: agreement 0.")
+    assert found.refusal.startswith(
+        "too few matches of any image agree with the pose: agreement 0."
+    )
     # without a strict ratio test most matches of any image are wrong
     for matcher in ({}, {"ratio_threshold": 0.95}):
         lenient = DEFAULT_GATE.of_matches(matcher)
