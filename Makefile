@@ -19,9 +19,9 @@ STAGES_OF_COLMAP := from_colmap localize_sfm more_pairs pairs_from_covisibility 
 # 16 s of each worker.
 export PYTHONDONTWRITEBYTECODE :=
 
-# Workers take files in alphabetical order; in pytest-xdist's own order the slowest come last. Three
+# Workers take files in alphabetical order; in pytest-xdist's own order the slowest come last. Four
 # keep two cores busy, because some tests wait.
-WORKERS := -n 3 --dist loadfile --no-loadscope-reorder
+WORKERS := -n 4 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test types suite check test-long results results-quick docs lint clean
 .DELETE_ON_ERROR:
