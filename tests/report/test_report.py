@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from functools import partial
 
 import command
 import h5py
@@ -20,23 +21,14 @@ pytestmark = pytest.mark.check
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """Where the runs of `compared` are kept."""
-    return tmp_path_factory.mktemp("finished")
-
-
 @pytest.fixture
-def compared(aachen_layout, finished, tmp_path, monkeypatch):
+def compared(aachen_layout, tmp_path, written_once, monkeypatch):
     """Two runs in the plane: of three queries, one is grey and cannot be localized."""
     folders = [tmp_path / feature for feature in ("colmap_sift", "colmap_sift_sv32")]
     for folder in folders:
-        if not (finished / folder.name).exists():
-            given = ("--dataset", aachen_layout, "--outputs", folder, "--feature", folder.name)
-            command.run(monkeypatch, aachen, *given)
-            shutil.copytree(folder, finished / folder.name)
-        else:  # the data set, which is made anew, lies beside it again
-            shutil.copytree(finished / folder.name, folder)
+        given = ("--dataset", aachen_layout, "--outputs", folder, "--feature", folder.name)
+        write = partial(command.run, monkeypatch, aachen, *given)
+        written_once(folder, write, "compared", folder.name)
     return folders
 
 

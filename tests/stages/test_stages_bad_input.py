@@ -94,7 +94,7 @@ FEATURES = {
 
 
 @pytest.fixture
-def stages(scene, tmp_path_factory):
+def stages(scene, written_once):
     """The stages of a localization by name, each as a function of its features and matches."""
     root, names = scene.root, list(scene.poses)
     pairs, retrieval, every = (root / f"{name}.txt" for name in ("pairs", "retrieval", "every"))
@@ -106,11 +106,7 @@ def stages(scene, tmp_path_factory):
             model, scene.queries, retrieval, features, matches, root / "results.txt"
         )
 
-    # made once, and then copied
-    made = tmp_path_factory.getbasetemp() / "stages_bad_input"
-    if made.exists():
-        shutil.copytree(made, root, dirs_exist_ok=True)
-    else:
+    def write() -> None:
         parsers.write_pairs([(a, b) for a in names[:6] for b in names[:6] if a < b], pairs)
         parsers.write_pairs([(a, b) for a in names[6:] for b in names[:6]], retrieval)
         every.write_text(pairs.read_text() + retrieval.read_text())
@@ -118,7 +114,8 @@ def stages(scene, tmp_path_factory):
         match_features.main(conf, every, sound, matches=matches)
         triangulation.main(model, scene.model, scene.images, pairs, sound, matches)
         assert all(record["localized"] for record in localize(sound, matches).values())
-        shutil.copytree(root, made)
+
+    written_once(root, write, "stages_bad_input")
     by_name = {
         "match": lambda features, _: match_features.main(
             conf, every, features, matches=root / "m.h5", overwrite=True
