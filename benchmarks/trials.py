@@ -293,7 +293,7 @@ def run(
 ) -> list[dict]:
     """Try a map with all photos, and return the rows of trials.csv."""
     model = matchers_confs.confs[matcher]["model"]
-    ratio_threshold, gate = model.get("ratio_threshold"), DEFAULT_GATE.of_matches(model)
+    ratio_threshold = model.get("ratio_threshold")
     tried = list(trials(place, others, output, number, seed))
     describe = Described(feature)
     shown, rows = {}, []
@@ -303,6 +303,7 @@ def run(
         ids, _ = place.reference.lift(name, np.arange(len(descriptors)))
         shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
     dim = described[place.names[0]].shape[1]
+    gate = DEFAULT_GATE.of_matches(model, dim)
     labels = {"feature": feature, "matcher": gate.matches, "dim": dim}
     labels["commit"] = how()["commit"]
 

@@ -142,9 +142,12 @@ class MatchKind(NamedTuple):
 MOST_TELLING = 20.0  # confidence: more does not count
 BEST = Evidence(float(np.log10(MOST_TELLING)), 1.0)
 STRICT = 0.8  # the largest ratio of a strict ratio test
-# with a strict ratio test and without; weights and biases by `python -m benchmarks.fit_gate`
+FEW = 32  # dimensions of descriptors: with fewer, fewer matches are right
+# with a strict ratio test, also of few dimensions, and without; weights and biases by
+# `python -m benchmarks.fit_gate`
 MATCH_KINDS = {
     "ratio": MatchKind(Evidence(4.13, 17.45), -17.21, 0.8, 0.4),
+    "few": MatchKind(Evidence(2.72, 14.71), -8.2, 0.8, 0.4),
     "mutual": MatchKind(Evidence(4.01, 11.42), -8.89, 0.3, 0.8),
 }
 # probability from which on mirror images are not tried; the wrong pose of a mirrored photo of a
@@ -184,10 +187,16 @@ class Gate:
         if self.min_probability is not None and not 0 <= self.min_probability <= 1:
             raise InputError(f"min_probability is {self.min_probability}: from 0 to 1.")
 
-    def of_matches(self, matcher: dict) -> "Gate":
-        """Return the gate for a matcher, given the configuration of its model."""
-        is_strict = (matcher.get("ratio_threshold") or 1) <= STRICT
-        return replace(self, matches="ratio" if is_strict else "mutual")
+    def of_matches(self, matcher: dict, dim: int) -> "Gate":
+        """Return the gate for a matcher and descriptors.
+
+        Args:
+            matcher: configuration of the matcher's model.
+            dim: dimension of the descriptors.
+        """
+        if (matcher.get("ratio_threshold") or 1) > STRICT:
+            return replace(self, matches="mutual")
+        return replace(self, matches="few" if dim < FEW else "ratio")
 
     @property
     def kind(self) -> MatchKind:
@@ -394,16 +403,15 @@ RULES = (
         _improbable,
         "be by the right matches: `probability`, by its confidence and its `agreement`, the "
         "largest share of a map image's matches that are inliers, less a standard deviation",
-        " and ".join(f"{kind.default_min_probability:g}" for kind in MATCH_KINDS.values())
-        + " with and without a strict ratio test (`--min_probability`)",
+        f"{MATCH_KINDS['ratio'].default_min_probability:g} with a strict ratio test, else "
+        f"{MATCH_KINDS['mutual'].default_min_probability:g} (`--min_probability`)",
     ),
     Rule(
         _mirrored,
         f"fit much better than its mirror image, if its probability is below {SURE:g} and its "
         "intrinsics are not given",
-        "confidence of the mirror image: "
-        + " and ".join(f"{100 * kind.max_mirrored:g} %" for kind in MATCH_KINDS.values())
-        + " with and without a strict ratio test",
+        f"confidence of the mirror image: {100 * MATCH_KINDS['ratio'].max_mirrored:g} % with a "
+        f"strict ratio test, else {100 * MATCH_KINDS['mutual'].max_mirrored:g} %",
     ),
 )
 

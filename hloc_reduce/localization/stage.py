@@ -17,7 +17,7 @@ from ..runtime.executors import SERIAL, Executor
 from ..runtime.group_writer import failure_of, failures
 from ..utils import cli
 from ..utils.cli import InputError
-from ..utils.feature_files import get_colmap_keypoints, get_image_size
+from ..utils.feature_files import dimension, get_colmap_keypoints, get_image_size
 from ..utils.h5 import open_h5
 from ..utils.match_files import find_pair, get_matcher, get_matches, most_similar_first
 from ..utils.parsers import parse_query_lists, write_poses
@@ -109,7 +109,7 @@ def main(
                 log.add(name, record)
         tasks = []
         if mirror_images and any(log.records[name]["localized"] for name, _ in queries):
-            gate = _of_matches(gate, matches)
+            gate = _of_matches(gate, features, matches)
             tasks = [
                 (name, mirror(camera), retrieved.get(name, []))
                 for name, camera in queries
@@ -235,7 +235,7 @@ def localize_all(
         said: what the progress bar says.
     """
     files = features, matches
-    gate = _of_matches(gate, matches)
+    gate = _of_matches(gate, features, matches)
     work = partial(_localize_chunk, load_reference, *files, config, skip_matches, gate, thorough)
     with closing(executor.map(work, tasks, CHUNK)) as found:
         yield from progress(found, said, "query", len(tasks))
@@ -247,10 +247,10 @@ def check_threshold(ransac_thresh: float) -> None:
         raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
 
 
-def _of_matches(gate: Gate, matches: Path) -> Gate:
-    """Return the gate for the matcher of a match file."""
+def _of_matches(gate: Gate, features: Path, matches: Path) -> Gate:
+    """Return the gate for the matcher of a match file and descriptors like those of a file."""
     with open_h5(matches) as file:
-        return gate.of_matches(get_matcher(file) or _by_name(matches))
+        return gate.of_matches(get_matcher(file) or _by_name(matches), dimension(features))
 
 
 def _by_name(matches: Path) -> dict:

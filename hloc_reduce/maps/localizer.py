@@ -62,7 +62,7 @@ class Localizer:
         self.doubts = contents.doubts
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
-        self.gate = gate.of_matches(contents.matcher)
+        self.gate = gate.of_matches(contents.matcher, contents.dim)
         self.engine, self.reference = contents.engine, contents.reference
         self.names = contents.names
         self._describe, self._similarity = contents.describe, contents.similarity

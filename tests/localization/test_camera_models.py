@@ -8,7 +8,7 @@ from hloc_reduce.localization import absolute_pose
 from hloc_reduce.localization.gate import DEFAULT_GATE
 
 POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04])), [0.3, 0.1, 8.0])
-GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8})
+GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
 LENSES = {
     "SIMPLE_RADIAL": [900, 640, 480, -0.15],
     "FULL_OPENCV": [900, 910, 630, 485, -0.2, 0.05, 1e-3, -1e-3, 0, 0.01, 0, 0],

@@ -76,7 +76,7 @@ def localize(
     points = np.concatenate([points, generator.permutation(points)[: number // 6]])
     assumed, source = infer(photo, of_map)
     options = refinement(assumed, source, of_map)
-    gate = DEFAULT_GATE.of_matches({})
+    gate = DEFAULT_GATE.of_matches({}, 64)
     found = lens_choice.estimate(pixels, points, [np.arange(len(pixels))], assumed, options, gate)
     if found.cam_from_world is None:
         return found, np.inf, np.inf

@@ -10,7 +10,7 @@ from hloc_reduce.localization.pose import Pose
 from hloc_reduce.localization.projection import reprojection_errors
 
 POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04])), [0.3, 0.1, 8.0])
-GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8})
+GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
 
 
 def solve(

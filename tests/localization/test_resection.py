@@ -23,7 +23,7 @@ from hloc_reduce.localization.resection import (
 
 TURN = pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04]))  # axis and angle
 POSE = pycolmap.Rigid3d(TURN, [0.3, 0.1, 8.0])
-GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8})
+GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
 
 
 def camera_of(width: int, height: int, params: list[float], model: str) -> pycolmap.Camera:

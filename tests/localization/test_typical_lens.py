@@ -11,7 +11,7 @@ from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.localization.pose import Pose
 
 POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.04])), [0.3, 0.1, 8.0])
-GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8})
+GATE = DEFAULT_GATE.of_matches({"ratio_threshold": 0.8}, 64)
 LENS = intrinsics.Lens(900 / 1280, -0.05)
 
 

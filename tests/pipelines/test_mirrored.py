@@ -129,7 +129,7 @@ def test_a_run_that_stops_before_the_mirror_images_resumes(place, build_map, tmp
     ],
 )
 def test_mirror_images_that_fit_nearly_as_well(matcher, confidence, of_mirror_image, expected):
-    gate = DEFAULT_GATE.of_matches(matcher)
+    gate = DEFAULT_GATE.of_matches(matcher, 64)
     measures = Measures(confidence=confidence, mirror_image=of_mirror_image)
     assert bool(gates._mirrored(measures, gate)) == expected
 
