@@ -80,7 +80,7 @@ def out_of_fold(rows: Sequence[dict]) -> np.ndarray:
 
 def passes(rows: Sequence[dict], rules: Iterable[Rule]) -> np.ndarray:
     """Return which poses (N,) no rule refuses."""
-    given = [(row["measures"], Gate(matches=row["matcher"])) for row in rows]
+    given = [(row["measures"], Gate(match_kind=row["matcher"])) for row in rows]
     return np.array([not any(rule.refusal(*one) for rule in rules) for one in given])
 
 
@@ -99,7 +99,7 @@ def report(rows: Sequence[dict]) -> str:
     table = [["accepted", *OUTCOMES]]
     for least in PROBABILITIES:
         table.append([f"probability {least:g}", *counts(rows, passed & (probability >= least))])
-    probable = probability >= Gate(matches=rows[0]["matcher"]).least_probability
+    probable = probability >= Gate(match_kind=rows[0]["matcher"]).least_probability
     table.append(["without a probability", *counts(rows, passed)])
     for rule in OTHER_RULES:
         others = passes(rows, [other for other in OTHER_RULES if other is not rule])

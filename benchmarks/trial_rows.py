@@ -77,7 +77,7 @@ def read(files: Iterable[Path]) -> list[dict]:
         row["accepted"] = False
         if row["outcome"] != "none":
             row["measures"] = of_row(row)
-            its_gate = Gate(matches=row["matcher"])
+            its_gate = Gate(match_kind=row["matcher"])
             if not gate.may_be_mirrored(row["measures"], its_gate):
                 row["measures"] = replace(row["measures"], mirror_image=None)
             found = gate.verdict(row["measures"], its_gate)

@@ -304,7 +304,7 @@ def run(
         shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
     dim = described[place.names[0]].shape[1]
     gate = DEFAULT_GATE.of_matches(model, dim)
-    labels = {"feature": feature, "matcher": gate.matches, "dim": dim}
+    labels = {"feature": feature, "matcher": gate.match_kind, "dim": dim}
     labels["commit"] = how()["commit"]
 
     def match(path: Path, name: str) -> tuple[np.ndarray, dict, float]:

@@ -27,7 +27,7 @@ from .utils.feature_files import (
     get_features,
     read_descriptors,
 )
-from .utils.h5 import file_provenance, iterate_h5_names, open_h5
+from .utils.h5 import file_provenance, get_conf, iterate_h5_names, open_h5
 from .utils.match_files import check_distinct, names_to_pair
 from .utils.options import HIDDEN, Option
 from .utils.parsers import parse_pairs
@@ -137,6 +137,21 @@ def _paths(
     return export_dir / f"{name}.h5", matches
 
 
+def check_model(conf: dict, made_from: dict) -> None:
+    """Fail on a matcher that cannot match some features before any work.
+
+    Args:
+        conf: the matcher, an entry of confs.matchers.
+        made_from: of the features, see `extract_features.provenance`.
+
+    Raises:
+        InputError: when it cannot be made.
+    """
+    from . import matchers
+
+    matchers.load(conf["model"], made_from)
+
+
 def provenance(conf: dict, *feature_files: h5py.File) -> dict:
     """Return what determines the matches: the configurations of matcher and features."""
     made_from = {"model": conf["model"]}
@@ -175,12 +190,13 @@ def _match(
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
     size, workers = (1, parallel.cores()) if device == "cpu" else (PAIRS_ON_GPU, 1)
-    matcher = matchers.load(conf["model"]).eval().to(device)
-    match = partial(_match_batch, matcher, device, gpu_bytes or GPU_BYTES)
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
+        made_from = get_conf(file0) or get_conf(file1)
+        matcher = matchers.load(conf["model"], made_from).eval().to(device)
+        match = partial(_match_batch, matcher, device, gpu_bytes or GPU_BYTES)
         for file in (file0, file1):
-            _check_features(file, matcher.feature_keys, conf["model"]["name"])
-        cache = FeatureCache(CACHE_BYTES, matcher.feature_keys)
+            _check_features(file, matcher.keys(), conf["model"]["name"])
+        cache = FeatureCache(CACHE_BYTES, matcher.keys())
         read = map(partial(_read, cache, file0, file1), pairs)
         batches = iter(lambda: list(islice(read, size)), [])
         with closing(parallel.ordered("match", match, batches, workers)) as matched:

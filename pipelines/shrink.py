@@ -33,6 +33,7 @@ from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned
 
 from .common import retrieval
+from .common.options import Matcher
 
 FEATURE, STORAGE, NUM_LOC = "colmap_sift_sv32", "uint4", 50
 TABLE = "shrink.csv"
@@ -53,6 +54,7 @@ def main(
     ground_truth: Path | None = None,
     num_loc: int = NUM_LOC,
     max_mb: float | None = None,
+    matcher: Matcher | None = None,
     overwrite: bool = False,
 ) -> list[dict]:
     """Reduce the features and the map of an outputs folder of hloc, and compare.
@@ -68,6 +70,7 @@ def main(
         ground_truth: true poses of the queries.
         num_loc: retrieved map images per query, by VLAD.
         max_mb: size of the compact map in 1,000,000 bytes; default: with all points.
+        matcher: matcher of the queries; default: the feature's.
         overwrite: replace earlier results.
 
     Returns:
@@ -89,10 +92,16 @@ def main(
     map_names = sorted(image.name for image in colmap.read_model(sfm).images.values())
     listed = [] if queries is None else read_queries(queries)
     truth = true_poses([name for name, _ in listed], ground_truth, True) if ground_truth else {}
-    matcher = features_confs.matcher_of(features_confs.get(feature)[1])
+    model = features_confs.get(feature)[1]["model"]
+    given, matcher = matcher, matcher or features_confs.matcher_of({"model": model})
+    of_hloc = matcher  # hloc's files do not say what their features are
+    if matcher == "lightglue":
+        of_hloc = f"{matchers_confs.features_of(features_confs.base_of(model))}+lightglue"
+        cli.choose("matcher", of_hloc, matchers_confs.confs)
     paths = {"hloc_outputs": hloc_outputs, "features": features, "sfm": sfm, "queries": queries}
     conf: dict[str, object] = {name: path and str(path.resolve()) for name, path in paths.items()}
     conf |= {"feature": feature, "storage": storage, "num_loc": num_loc, "max_mb": max_mb}
+    conf |= {"matcher": given} if given else {}
     made_from = [features, *sorted(sfm.glob("*.*"))]
     conf["made_from"] = provenance.of_inputs({}, made_from)["inputs"]
     absent = {name for name, _ in listed}.difference(list_h5_names(features))
@@ -113,6 +122,7 @@ def main(
                 features=small,
                 global_descriptors=described,
                 feature=feature,
+                matcher=given,
                 storage=storage,
                 max_mb=max_mb,
             )
@@ -128,7 +138,7 @@ def main(
             names = [name for name, _ in listed]
             retrieval.retrieve_in_map(built, small, pairs, num_loc, names, map_names)
             tried = {
-                "localize-hloc": (sfm, features, features, matcher),
+                "localize-hloc": (sfm, features, features, of_hloc),
                 "localize-reduced": (sfm, small, small, matcher),
                 "localize-compact": (built.sfm, small, built.features, built.matcher),
             }

@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 import pytest
 import small_map
+from hypothesis import settings
 from scipy.io import savemat
 
 from hloc_reduce import networks
@@ -23,6 +24,10 @@ from hloc_reduce.confs import features
 from hloc_reduce.descriptors import DESCRIPTORS, weights
 from hloc_reduce.utils import cli, colmap, downloads
 from pipelines import batch, localize
+
+# an example may take long on a busy machine
+settings.register_profile("no_deadline", deadline=None)
+settings.load_profile("no_deadline")
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -109,7 +114,10 @@ def herz_jesus() -> Path:
 
 @pytest.fixture
 def base_weights(monkeypatch, tmp_path_factory) -> Callable[[str], None]:
-    """Skips a test for want of the weights of a base, in the shared folders if they are there."""
+    """Skips a test for want of the weights of a base, in the shared folders if they are there.
+
+    Those of LightGlue are named as its matchers, such as xfeat+lightglue.
+    """
     if (SHARED / "torch_home").is_dir():
         home = tmp_path_factory.mktemp("torch_home")
         checkpoints = home / "hub/checkpoints"
@@ -121,6 +129,11 @@ def base_weights(monkeypatch, tmp_path_factory) -> Callable[[str], None]:
         monkeypatch.setenv("TORCH_HOME", str(home))
 
     def need(name: str) -> None:
+        if name.endswith("+lightglue"):
+            file = networks.LIGHTGLUE[name.removesuffix("+lightglue")].file
+            if not (downloads.cache() / file).is_file():
+                pytest.skip(f"the weights {file} are not on this machine")
+            return
         model = features.confs[name]["model"]
         network = networks.NETWORKS.get(features.network_of(model) or "")
         if network and not network.urls:  # they ship

@@ -37,7 +37,7 @@ TOYS = Path(__file__).parent / "toys"
 PIPELINE = localize
 
 
-IN_PLANE = {"output": "matches-in-plane", "model": {"name": "in_plane"}}
+IN_PLANE = {"output": "matches-in-plane", "model": {"name": "in_plane", "match_kind": "mutual"}}
 THUMBNAIL = {
     "output": "global-feats-thumbnail",
     "model": {"name": "thumbnail"},
@@ -228,14 +228,7 @@ def test_compact_maps_have_no_scores(place, tmp_path, run, refused, monkeypatch)
     run(*given)
     compact.main(tmp_path / "place.hlm", outputs / "map")
     needed = ("scores0", "scores1")
-    loaded = matchers.load
-
-    def demanding(conf):
-        model = loaded(conf)
-        model.required_inputs = needed
-        return model
-
-    monkeypatch.setattr(matchers, "load", demanding)
+    monkeypatch.setattr(matchers.find(IN_PLANE["model"]), "required_inputs", needed)
     message = "in_plane, which needs scores of keypoints"
     for use in (
         lambda: Localizer(tmp_path / "place.hlm"),

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import numpy as np
 
-from .. import logger, matchers
+from .. import extract_features, logger, matchers
 from ..aggregate_features import output_of, vocabulary_if_any
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
@@ -123,6 +123,8 @@ def write(
     """
     matcher = matcher or matcher_of(source.matcher)
     check_matcher(matcher)
+    if not is_integer_matcher(model := matchers_confs.confs[matcher]["model"]):
+        matchers.load(model, extract_features.provenance(source.conf))
     conf = {**source.conf, "storage": _storage(source.conf, storage)}
     source = replace(source, matcher=matcher, conf=conf)
     everything = points.collect(source.model, features)
@@ -159,7 +161,7 @@ def check_matcher(matcher: str) -> None:
     cli.choose("matcher", matcher, matchers_confs.confs)
     model = matchers_confs.confs[matcher]["model"]
     if not is_integer_matcher(model):  # the others need torch
-        check_feature_keys(matcher, matchers.load(model).feature_keys)
+        check_feature_keys(matcher, matchers.find(model).keys())
 
 
 def matcher_of(matcher: str) -> str:

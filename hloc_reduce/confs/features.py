@@ -116,11 +116,13 @@ def dimension(name: str) -> int | None:
 
 def table() -> str:
     """Format the features with the size of their descriptors, as float16, and their weights."""
-    lines = [("feature", "dim", "bytes", "matcher", "weights")]
+    from .matchers import all_of
+
+    lines = [("feature", "dim", "bytes", "matchers", "weights")]
     for name, conf in confs.items():
         dim = dimension(name)
         numbers = (str(dim), str(2 * dim)) if dim else ("", "")
-        lines.append((name, *numbers, matcher_of(conf), _weights(conf["model"])))
+        lines.append((name, *numbers, ", ".join(all_of(conf)), _weights(conf["model"])))
     return aligned(lines, left=5)
 
 

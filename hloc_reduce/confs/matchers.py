@@ -1,5 +1,44 @@
 """Matchers, by hloc's names."""
 
+from pathlib import Path
+
+from .. import projections
+from ..networks import LIGHTGLUE
+from .features import base_of, matcher_of, network_of
+
+WEIGHTS = Path(__file__).parents[1] / "matchers/weights"
+
+
+def lightglue_weights() -> list[str]:
+    """List the features that this package has weights of LightGlue for."""
+    return sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
+
+
+def all_of(feature: dict) -> list[str]:
+    """Return the matchers that suit the configuration of a feature, the default first."""
+    has_weights = features_of(feature["model"]) in {*LIGHTGLUE, *lightglue_weights()}
+    return [matcher_of(feature), *(["lightglue"] if has_weights else [])]
+
+
+def lightglue(features: str) -> dict:
+    """Return the configuration of LightGlue for one kind of features."""
+    return {
+        "output": f"matches-{features}-lightglue",
+        "model": {"name": "lightglue", "features": features},
+    }
+
+
+def features_of(model: dict) -> str | None:
+    """Return what LightGlue calls the features of a model's configuration, None for {}."""
+    if projection := model.get("projection"):
+        file, prefix = projections.split_prefix(projection)
+        return Path(file).name.removesuffix(".safetensors") + (prefix and f"@{prefix}")
+    if not model:
+        return None
+    base = base_of(model)
+    name = network_of(model) or base.get("descriptor") or str(base.get("name"))
+    return name.removeprefix("hloc.").removesuffix("-n16")
+
 
 def _ratio(threshold: float) -> dict:
     return {
@@ -18,4 +57,17 @@ confs: dict[str, dict] = {
         "model": {"name": "nearest_neighbor"},
     },
     "adalam": {"output": "matches-adalam", "model": {"name": "adalam"}},
+    # for the features of the file, and hloc's for one kind of features
+    "lightglue": {
+        "output": "matches-lightglue",
+        "model": {"name": "lightglue", "max_keypoints": 2048},
+    },
+    **{f"{name}+lightglue": lightglue(name) for name in LIGHTGLUE},
+}
+
+# the models of other matches of hloc, by what it calls their files
+OF_HLOC = {
+    "matches-superglue": {"name": "superglue"},
+    "matches-superglue-it5": {"name": "superglue"},
+    "matches-NN-mutual-dist.7": {"name": "nearest_neighbor", "distance_threshold": 0.7},
 }

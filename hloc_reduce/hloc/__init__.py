@@ -15,7 +15,7 @@ from ..utils.hloc import MIN_PYCOLMAP, extractors_package, import_module, parse_
 
 # this pycolmap and later ones skip geometries of undefined configuration, which all of hloc's have
 NO_POINTS = Version("4.2.1")
-EXTRACTORS = Path(__file__).parent / "extractors"
+EXTRACTORS, MATCHERS = (Path(__file__).parent / name for name in ("extractors", "matchers"))
 VLAD_CONF = {
     "output": "global-feats-vlad",
     "model": {"name": "vlad"},
@@ -30,6 +30,7 @@ def register(features: Iterable[Path] | Path = ()) -> list[str]:
     package, _ = extractors_package()
     if str(EXTRACTORS) not in package.__path__:
         package.__path__.append(str(EXTRACTORS))
+        import_module("matchers").__path__.append(str(MATCHERS))
         warn()
     offered = {name: for_hloc(conf) for name, conf in features_confs.confs.items()}
     offered["vlad"] = VLAD_CONF
@@ -39,9 +40,18 @@ def register(features: Iterable[Path] | Path = ()) -> list[str]:
         conf = offered[name] = for_hloc(conf)
         if registered.get(name, conf) != conf:
             raise InputError(f"hloc has a feature {name} already: rename {file}.")
-    return _add(offered, registered) + _add(
-        matchers_confs.confs, import_module("match_features").confs
-    )
+    known = import_module("match_features").confs
+    return _add(offered, registered) + _add(_matchers(), known)
+
+
+def _matchers() -> dict[str, dict]:
+    """Return the matchers for hloc: of LightGlue, one for each projection with an adapter."""
+    confs = {key: conf for key, conf in matchers_confs.confs.items() if key != "lightglue"}
+    for features in matchers_confs.lightglue_weights():
+        conf = matchers_confs.lightglue(features)
+        model = {**conf["model"], "name": "reduced_lightglue"}
+        confs.setdefault(f"{features}+lightglue", {**conf, "model": model})
+    return confs
 
 
 def _add(offered: dict[str, dict], registered: dict[str, dict]) -> list[str]:

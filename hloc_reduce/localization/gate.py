@@ -7,8 +7,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import pycolmap
 
-from ..utils.cli import InputError
-from ..utils.options import HIDDEN
+from ..utils.cli import InputError, choose
+from ..utils.options import Option
 from .measures import INDEPENDENT, Alternative, Measures, Uncertainty
 
 FOCAL_LENGTHS = 0.3, 5.0  # range of estimated ones, in longer sides: 11 to 180 mm on 35 mm film
@@ -150,6 +150,8 @@ MATCH_KINDS = {
     "few": MatchKind(Evidence(2.72, 14.71), -8.2, 0.8, 0.4),
     "mutual": MatchKind(Evidence(4.01, 11.42), -8.89, 0.3, 0.8),
 }
+NEAREST_NEIGHBOR = "nearest_neighbor"  # whose kind its ratio test tells
+KINDS_OF_MATCHERS = dict.fromkeys(("adalam", "lightglue", "superglue"), "mutual")
 # probability from which on mirror images are not tried; the wrong pose of a mirrored photo of a
 # castle has 0.986
 SURE = 0.99
@@ -165,17 +167,18 @@ class Gate:
         min_inliers: minimum number of RANSAC's inliers of a localized query.
         min_probability: minimum probability of a localized query, see `gate.probability`; default:
             0.8 with a strict ratio test, else 0.3.
-        matches: a key of `MATCH_KINDS`; default: "mutual". See `of_matches`.
+        match_kind: what the limits are for: mutual nearest neighbours with a strict ratio test,
+            the same with few dimensions, or without; default: that of the matcher.
 
     Raises:
-        InputError: for a confidence that is not finite, a negative number of inliers, or a
-            probability that is none.
+        InputError: for a confidence that is not finite, a negative number of inliers, a probability
+            that is none, or an unknown kind.
     """
 
     min_confidence: float = 8.0
     min_inliers: int = 8
     min_probability: float | None = None
-    matches: Annotated[str | None, HIDDEN] = None
+    match_kind: Annotated[str, Option("match_kind", MATCH_KINDS)] | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < np.inf:
@@ -184,24 +187,40 @@ class Gate:
             )
         if self.min_inliers < 0:
             raise InputError(f"min_inliers is {self.min_inliers}: at least 0.")
+        if self.match_kind is not None:
+            choose("match_kind", self.match_kind, MATCH_KINDS)
         if self.min_probability is not None and not 0 <= self.min_probability <= 1:
             raise InputError(f"min_probability is {self.min_probability}: from 0 to 1.")
 
     def of_matches(self, matcher: dict, dim: int) -> "Gate":
-        """Return the gate for a matcher and descriptors.
+        """Return the gate for a matcher and descriptors, unless its kind of matches is given.
 
         Args:
-            matcher: configuration of the matcher's model.
+            matcher: configuration of the matcher's model, which may have a `match_kind`.
             dim: dimension of the descriptors.
+
+        Raises:
+            InputError: for a matcher without limits.
         """
+        name = matcher.get("name", NEAREST_NEIGHBOR)
+        if self.match_kind is not None:
+            return self
+        if name != NEAREST_NEIGHBOR:
+            kind = matcher.get("match_kind", KINDS_OF_MATCHERS.get(name))
+            if kind is None:
+                raise InputError(
+                    f"The matcher {name} has no limits for trusting poses: add `match_kind` to the "
+                    f"model in its configuration, or give --match_kind, {' or '.join(MATCH_KINDS)}."
+                )
+            return replace(self, match_kind=kind)
         if (matcher.get("ratio_threshold") or 1) > STRICT:
-            return replace(self, matches="mutual")
-        return replace(self, matches="few" if dim < FEW else "ratio")
+            return replace(self, match_kind="mutual")
+        return replace(self, match_kind="few" if dim < FEW else "ratio")
 
     @property
     def kind(self) -> MatchKind:
         """What depends on the kind of the matches."""
-        return MATCH_KINDS[self.matches or "mutual"]
+        return MATCH_KINDS[self.match_kind or "mutual"]
 
     @property
     def least_probability(self) -> float:

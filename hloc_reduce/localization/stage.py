@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 
 from .. import logger
-from ..confs.matchers import confs
+from ..confs.matchers import OF_HLOC, confs
 from ..runtime import parallel
 from ..runtime.executors import SERIAL, Executor
 from ..runtime.group_writer import failure_of, failures
@@ -22,7 +22,7 @@ from ..utils.h5 import open_h5
 from ..utils.match_files import find_pair, get_matcher, get_matches, most_similar_first
 from ..utils.parsers import parse_query_lists, write_poses
 from ..utils.progress import progress
-from .gate import DEFAULT_GATE, Gate, may_be_mirrored
+from .gate import DEFAULT_GATE, MATCH_KINDS, Gate, may_be_mirrored
 from .mirrored import MirrorImages, mirror, mirror_options
 from .query import localize
 from .records import (
@@ -250,13 +250,19 @@ def check_threshold(ransac_thresh: float) -> None:
 def _of_matches(gate: Gate, features: Path, matches: Path) -> Gate:
     """Return the gate for the matcher of a match file and descriptors like those of a file."""
     with open_h5(matches) as file:
-        return gate.of_matches(get_matcher(file) or _by_name(matches), dimension(features))
+        matcher = get_matcher(file) or _by_name(matches)
+    if not matcher and gate.match_kind is None:
+        raise InputError(
+            f"{matches} does not say which matcher made it, nor does its name: give --match_kind, "
+            f"{' or '.join(MATCH_KINDS)}."
+        )
+    return gate.of_matches(matcher, dimension(features))
 
 
 def _by_name(matches: Path) -> dict:
     """Return the configuration of a matcher from the name that hloc gives its match files."""
-    named = (conf["model"] for conf in confs.values() if f"_{conf['output']}_" in matches.name)
-    return next(named, {})
+    known = {conf["output"]: conf["model"] for conf in confs.values()} | OF_HLOC
+    return next((model for name, model in known.items() if f"_{name}_" in matches.name), {})
 
 
 def _localize_chunk(

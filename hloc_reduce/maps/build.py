@@ -7,7 +7,7 @@ from typing import Any
 
 import pycolmap
 
-from .. import extract_features, logger
+from .. import extract_features, logger, match_features
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
@@ -94,6 +94,7 @@ def main(
     exhaustive = len(names) <= MAX_EXHAUSTIVE
     if overwrite or not (map_dir / CONF).exists():
         extract_features.check_model(conf)
+        match_features.check_model(matchers_confs.confs[matcher], extract_features.provenance(conf))
         load_retrieval(described_by["model"])
     usable = names
     if reference is not None and (overwrite or not (map_dir / FINISHED).exists()):

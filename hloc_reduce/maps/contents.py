@@ -106,14 +106,15 @@ def _check_torch(path: Path, kind: str) -> None:
 
 
 def _of_folder(path: Path) -> Contents:
-    from .. import extractors
+    from .. import extract_features, extractors
     from .torch_engine import TorchEngine
 
     built = Map(path)
     matcher = matchers_confs.confs[built.matcher]["model"]
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)
-    engine = TorchEngine(extractors.load(built.conf["model"]), matcher, built.storage)
+    made_from = extract_features.provenance(built.conf)
+    engine = TorchEngine(extractors.load(built.conf["model"]), matcher, built.storage, made_from)
     matching, levels, prepared = engine.matching, built.levels(), {}
     others = [key for key in matching.feature_keys if key != "descriptors"]
     with open_h5(built.features) as file:
@@ -210,14 +211,15 @@ def _numpy_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engi
 
 def _torch_engine(compact: CompactMap, matcher: dict) -> Engine:
     _check_torch(compact.path, f"a map with the feature {compact.feature}")
-    from .. import extractors
+    from .. import extract_features, extractors
     from .torch_engine import TorchEngine
 
     with TemporaryDirectory() as folder:
-        model = compact.write_projection(Path(folder))["model"]
+        conf = compact.write_projection(Path(folder))
         with naming(compact.path):
-            extractor = extractors.load(model)
-    return TorchEngine(extractor, matcher, compact.storage)
+            extractor = extractors.load(conf["model"])
+            made_from = extract_features.provenance(conf)
+            return TorchEngine(extractor, matcher, compact.storage, made_from)
 
 
 def _describe(

@@ -23,9 +23,12 @@ class TorchEngine:
         extractor: of the map's feature.
         matcher: configuration of the matcher.
         storage: of the map's descriptors.
+        made_from: of the map's features, see `extract_features.provenance`.
     """
 
-    def __init__(self, extractor: extractors.Extractor, matcher: dict, storage: str):
+    def __init__(
+        self, extractor: extractors.Extractor, matcher: dict, storage: str, made_from: dict
+    ):
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._extractor = extractor.eval().to(self._device)
         self.rotation_invariant = extractor.rotation_invariant
@@ -33,7 +36,7 @@ class TorchEngine:
         self.matching: Matching = (
             IntegerMatching(matcher)
             if by_integers and is_integer_matcher(matcher)
-            else TorchMatching(matchers.load(matcher), self._device)
+            else TorchMatching(matchers.load(matcher, made_from), self._device)
         )
 
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
@@ -51,7 +54,7 @@ class TorchMatching:
 
     def __init__(self, matcher: Matcher, device: str):
         self._matcher, self._device = matcher.eval().to(device), device
-        self.feature_keys, self.takes_codes = matcher.feature_keys, matcher.takes_codes
+        self.feature_keys, self.takes_codes = matcher.keys(), matcher.takes_codes
 
     def prepare(self, features: Features) -> Tensors:
         """Return what the matcher needs of the features of an image."""

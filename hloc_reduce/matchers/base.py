@@ -36,10 +36,24 @@ class Matcher(BaseModel):
 
     required_inputs: tuple[str, ...] = ("descriptors0", "descriptors1")
 
-    @property
-    def feature_keys(self) -> tuple[str, ...]:
-        """What it needs of the features of an image, such as descriptors."""
-        return tuple(dict.fromkeys(name.rstrip("01") for name in self.required_inputs))
+    @classmethod
+    def for_features(cls, conf: dict, made_from: dict) -> dict:
+        """Return the configuration for some features; a subclass may choose weights by them.
+
+        Args:
+            conf: of the matcher.
+            made_from: what the features are made from, see `extract_features.provenance`; empty if
+                that is unknown.
+
+        Raises:
+            InputError: when it cannot match such features.
+        """
+        return conf
+
+    @classmethod
+    def keys(cls) -> tuple[str, ...]:
+        """Return what it needs of the features of an image, such as descriptors."""
+        return tuple(dict.fromkeys(name.rstrip("01") for name in cls.required_inputs))
 
     @torch.no_grad()
     def match(
@@ -48,7 +62,7 @@ class Matcher(BaseModel):
         """Match several pairs; a subclass may match them at once.
 
         Args:
-            pairs: the features of both images, at least those that `feature_keys` names: as in
+            pairs: the features of both images, at least those that `keys` names: as in
                 `_forward`, without the batch dimension, all on one device.
             gpu_bytes: GPU memory to use at once.
 

@@ -84,13 +84,7 @@ def read_into(module: nn.Module, path: Path, what: str) -> nn.Module:
     Raises:
         InputError: when the weights are missing, broken, or another network's.
     """
-    try:
-        if path.suffix == ".safetensors":
-            weights = safetensors.torch.load_file(path)
-        else:
-            weights = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, SafetensorError):
-        raise InputError(f"{what}, {path}, are broken.") from None
+    weights = read_weights(path, what)
     try:
         missing, unexpected = module.load_state_dict(weights, strict=False)
     except (RuntimeError, TypeError, AttributeError):
@@ -98,6 +92,20 @@ def read_into(module: nn.Module, path: Path, what: str) -> nn.Module:
     if unexpected or any(not key.endswith(CONSTANT) for key in missing):
         raise InputError(f"{what}, {path}, are those of another network.")
     return module
+
+
+def read_weights(path: Path, what: str) -> dict[str, torch.Tensor]:
+    """Read the tensors of a file, see `read_into`.
+
+    Raises:
+        InputError: when it is missing or broken.
+    """
+    try:
+        if path.suffix == ".safetensors":
+            return safetensors.torch.load_file(path)
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, SafetensorError):
+        raise InputError(f"{what}, {path}, are broken.") from None
 
 
 def fingerprint(compute: Compute) -> tuple[float, ...]:

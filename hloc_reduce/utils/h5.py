@@ -1,5 +1,6 @@
 """h5 files. A broken one is a user's error, with a message that names it."""
 
+import json
 import os
 import traceback
 from collections.abc import Iterator
@@ -273,6 +274,15 @@ def get_text(item: h5py.Group | h5py.Dataset, key: str, default: str | None = No
     if isinstance(value, h5py.Empty):
         return ""
     return value.decode(errors="replace") if isinstance(value, bytes) else value
+
+
+def get_conf(file: h5py.File) -> dict:
+    """Return what the contents of an open h5 file are made from, {} if it does not say."""
+    try:
+        conf = json.loads(get_text(file, "conf") or "{}")
+    except ValueError:
+        return {}
+    return conf if isinstance(conf, dict) else {}
 
 
 def file_provenance(file: h5py.File) -> str:

@@ -1,6 +1,5 @@
 """Match files in hloc's format."""
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -8,15 +7,12 @@ import h5py
 import numpy as np
 
 from .cli import InputError
-from .h5 import get_array, get_text, iterate_h5_names, open_h5, reading
+from .h5 import get_array, get_conf, iterate_h5_names, open_h5, reading
 
 
 def get_matcher(match_file: h5py.File) -> dict:
     """Return the model configuration of the matcher of a match file, {} if the file has none."""
-    try:
-        model = json.loads(get_text(match_file, "conf") or "{}")["model"]
-    except (ValueError, TypeError, KeyError):
-        return {}
+    model = get_conf(match_file).get("model")
     return model if isinstance(model, dict) else {}
 
 

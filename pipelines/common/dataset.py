@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from hloc_reduce import extract_features
+from hloc_reduce import extract_features, match_features
 from hloc_reduce.aggregate_features import output_of
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
@@ -91,6 +91,7 @@ class DatasetRun(Run):
             overwrite |= redone and {**before, "features": conf["features"]} == conf
         elif overwrite or not (outputs / CONF).exists():
             extract_features.check_model(self.conf)
+            match_features.check_model(matchers_confs.confs[matcher], conf["feature"])
             check_model(options.retrieval)
         return RunFolder(outputs, conf, overwrite, inputs)
 

@@ -258,7 +258,7 @@ def test_a_gate_is_of_numbers():
 
 @pytest.mark.parametrize("kind", MATCH_KINDS)
 def test_each_piece_of_evidence_speaks_for_a_pose(kind):
-    gate = Gate(matches=kind)
+    gate = Gate(match_kind=kind)
     doubtful = Measures(confidence=10, agreement=0.5)
     better = [
         replace(doubtful, confidence=200),

@@ -80,6 +80,7 @@ MODULES = {
     "utils/base_model.py": BASE_MODEL,
     "extractors/__init__.py": "",
     "extractors/dots.py": DOTS,
+    "matchers/__init__.py": "",
     "extractors/netvlad.py": NETVLAD,
     "extract_features.py": EXTRACT_FEATURES,
     "match_features.py": 'confs = {"NN-ratio": {"output": "hlocs own"}}',

@@ -15,6 +15,7 @@ from hloc_double import INIT
 import hloc_reduce
 from hloc_reduce import extractors, projections, retrieval, training
 from hloc_reduce import hloc as plugin
+from hloc_reduce import matchers as matchers_package
 from hloc_reduce.confs import features
 from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.confs.matchers import confs as matchers
@@ -66,8 +67,30 @@ def test_confs_are_added_once_and_none_is_replaced(double):
     assert matcher_confs["NN-mutual"] == matchers["NN-mutual"]
     before = {**confs}
     assert hloc_reduce.register() == [] and confs == before
-    path = importlib.import_module("hloc.extractors").__path__
-    assert len(path) == 2
+    assert matcher_confs["aliked_sv32+lightglue"] == {
+        "output": "matches-aliked_sv32-lightglue",
+        "model": {"name": "reduced_lightglue", "features": "aliked_sv32"},
+    }
+    assert matcher_confs["aliked+lightglue"] == matchers["aliked+lightglue"]  # hloc's
+    assert "lightglue" not in matcher_confs  # hloc's matchers do not know the features
+    for package in ("extractors", "matchers"):
+        assert len(importlib.import_module(f"hloc.{package}").__path__) == 2
+
+
+def test_a_registered_matcher_is_loaded_by_name(double, base_weights):
+    base_weights("xfeat+lightglue")
+    hloc_reduce.register()
+    package = importlib.import_module("hloc.matchers")
+    load = importlib.import_module("hloc.utils.base_model").dynamic_load
+    conf = importlib.import_module("hloc.match_features").confs["mini32+lightglue"]["model"]
+    data = {"image0": torch.empty(1, 1, 480, 640), "image1": torch.empty(1, 1, 480, 640)}
+    for i in (0, 1):
+        data[f"keypoints{i}"] = 480 * torch.rand(1, 9, 2)
+        data[f"descriptors{i}"] = torch.nn.functional.normalize(torch.randn(1, 32, 9), dim=1)
+        data[f"image_size{i}"] = torch.tensor([[640.0, 480.0]])
+    found = load(package, conf["name"])(conf).eval()(data)
+    own = matchers_package.load({**conf, "name": "lightglue"})(data)
+    assert torch.equal(found["matches0"], own["matches0"]) and found["matches0"].shape == (1, 9)
 
 
 def test_confs_are_copies(double):

@@ -13,6 +13,7 @@ from small_map import MATCHER
 from hloc_reduce import localize_sfm, match_features
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import query, stage
+from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.localization.records import log_file, pose_of, read_records
 from hloc_reduce.localization.references import SfmMap
 from hloc_reduce.utils import cli, colmap
@@ -238,7 +239,19 @@ def test_the_gate_knows_the_matcher_by_its_file(built, conf, name, kind, monkeyp
     gates, localize = [], query.localize
     monkeypatch.setattr(stage, "localize", lambda *a: gates.append(a[5]) or localize(*a))
     assert built.localize()["query/6.jpg"]["localized"]
-    assert {gate.matches for gate in gates} == {kind}
+    assert {gate.match_kind for gate in gates} == {kind}
+
+
+def test_matches_of_unknown_origin_need_a_kind(built):
+    """Instead of the limits of another matcher."""
+    with h5py.File(built.loc_matches, "r+") as file:
+        del file.attrs["conf"]
+    message = "does not say which matcher made it, nor does its name: give --match_kind, ratio or "
+    with pytest.raises(InputError, match=message):
+        built.localize()
+    assert built.localize(gate=Gate(match_kind="ratio"))["query/6.jpg"]["localized"]
+    with pytest.raises(InputError, match="The matcher new has no limits .* add `match_kind` to"):
+        DEFAULT_GATE.of_matches({"name": "new"}, 64)
 
 
 def test_images_without_descriptors_are_skipped(built):

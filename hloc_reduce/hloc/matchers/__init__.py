@@ -1,0 +1,1 @@
+"""Modules that `register` adds to hloc.matchers."""

@@ -1,0 +1,192 @@
+"""Fit LightGlue to projected descriptors: adapters, first layers that ship.
+
+LightGlue's first layer takes the descriptors that it was trained for. An adapter is that layer
+after the linear map from projected descriptors, floats and codes alike, back to these, which has
+the least squared error on the keypoints of some photos. It costs no more time than the layer that
+it replaces. Descriptors of a mini are mapped to XFeat's at their keypoints.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+from torch.nn.functional import grid_sample, interpolate, normalize
+
+from .. import extract_features, extractors, logger, projections
+from ..confs import features as features_confs
+from ..confs import matchers as matchers_confs
+from ..confs.matchers import WEIGHTS
+from ..matchers import lightglue
+from ..networks import LIGHTGLUE
+from ..runtime.versions import versions
+from ..utils import cli, options
+from ..utils.cli import InputError
+from ..utils.codes import restore, store
+from ..utils.files import replacing
+from ..utils.images import list_images
+from ..utils.options import Option
+from ..utils.paths import strings_as_paths
+from ..utils.progress import progress
+
+STORAGES = ("float16", "uint4", "uint2")  # which a descriptor is learned in
+TEACHER = "xfeat"  # of features that LightGlue has no weights for
+STRIDE = 32  # the sides of photos that it takes are multiples of this
+RIDGE = 1e-4  # of the mean square of a number
+
+Described = tuple[np.ndarray, np.ndarray]  # descriptors (N, D), and those that LightGlue takes
+
+
+@strings_as_paths
+def main(
+    feature: Annotated[Sequence[str], Option("feature", features_confs.confs)],
+    images: Iterable[Path],
+    output: Path = WEIGHTS,
+    photos: Annotated[int, Option(least=1)] = 60,
+) -> list[Path]:
+    """Fit adapters.
+
+    Args:
+        feature: features with a projection, or of a mini.
+        images: folders of photos.
+        output: folder for `<feature>.safetensors`.
+        photos: how many photos of the folders are used, evenly.
+
+    Returns:
+        The files.
+
+    Raises:
+        InputError: when there are no photos, or LightGlue has no weights for the base of a feature.
+    """
+    paths = [folder / name for folder in images for name in list_images(folder)]
+    if not paths:
+        raise InputError("Give photos, --images.")
+    paths = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, photos).astype(int))]
+    groups: dict[str, list[str]] = {}
+    for name in feature:
+        base = features_confs.base_of(features_confs.confs[name]["model"])
+        groups.setdefault(json.dumps(base), []).append(name)
+    files = []
+    for names in groups.values():
+        described = list(_describe(names[0], paths))
+        files += [_fit(name, described, len(paths), output) for name in names]
+    return files
+
+
+def _describe(feature: str, paths: list[Path]) -> Iterator[Described]:
+    """Yield the descriptors of each photo by the base of a feature, and those that LightGlue takes.
+
+    Both are the same unless the base has no LightGlue of its own.
+    """
+    conf = features_confs.confs[feature]
+    base = features_confs.base_of(conf["model"])
+    extractor = extractors.load(base).eval()
+    teacher = None
+    if _network(feature) != matchers_confs.features_of(base):
+        teacher = extractors.load(features_confs.confs[TEACHER]["model"]).eval()
+    for path in progress(paths, f"Describing for {feature}", "photo", len(paths)):
+        found = extractors.extract(extractor, path, conf["preprocessing"])
+        own = np.asarray(found["descriptors"], np.float32).T
+        taken = own if teacher is None else at_keypoints(teacher, path, conf, found)
+        yield own, taken
+
+
+@torch.no_grad()
+def at_keypoints(teacher: extractors.Extractor, path: Path, conf: dict, found: dict) -> np.ndarray:
+    """Return XFeat's descriptors (N, 64) at the keypoints of other features of a photo."""
+    pixels, size = extractors.load_image(path, conf["preprocessing"])
+    sides = [side // STRIDE * STRIDE for side in pixels.shape[2:]]
+    network: Any = teacher.model
+    dense = normalize(network.net(interpolate(pixels, sides, mode="bilinear"))[0], dim=1)
+    grid = ((torch.from_numpy(found["keypoints"]) + 0.5) / torch.tensor(size) * 2 - 1)[None, None]
+    sampled = grid_sample(dense, grid.float(), mode="bicubic", align_corners=False)[0, :, 0]
+    return normalize(sampled, dim=0).T.numpy()
+
+
+def _network(feature: str) -> str:
+    """Return the key of `networks.LIGHTGLUE` that an adapter of a feature is for."""
+    base = matchers_confs.features_of(
+        features_confs.base_of(features_confs.confs[feature]["model"])
+    )
+    if base in LIGHTGLUE:
+        return base
+    if base in features_confs.MODELS:
+        return TEACHER
+    raise InputError(f"LightGlue has no weights for the base of {feature}, {base}.")
+
+
+def _fit(feature: str, described: list[Described], photos: int, output: Path) -> Path:
+    """Fit the adapter of a feature and write it."""
+    conf, network = features_confs.confs[feature], _network(feature)
+    projection = conf["model"].get("projection")
+    project = projections.load(projection) if projection else torch.nn.Identity()
+    taken = np.concatenate([taken for _, taken in described]).astype(np.float64)
+    own = project(torch.from_numpy(np.concatenate([own for own, _ in described]))).numpy()
+    kinds = [rounded(own, feature, storage).astype(np.float64) for storage in STORAGES]
+    decoder, offset = least_squares(kinds, taken)
+    unlike = [1 - _cosine(kind @ decoder.T + offset, taken) for kind in kinds]
+    layer = lightglue.published(network)
+    weight, bias = (layer[f"input_proj.{part}"].double().numpy() for part in ("weight", "bias"))
+    adapter = {"weight": weight @ decoder, "bias": weight @ offset + bias}
+    metadata = {
+        "network": network,
+        "made_from": json.dumps(lightglue.identity(extract_features.provenance(conf))),
+        "photos": str(photos),
+        "cosine": json.dumps(
+            {kind: round(1 - part, 4) for kind, part in zip(STORAGES, unlike, strict=True)}
+        ),
+        "versions": json.dumps(versions()),
+    }
+    path = output / f"{feature}.safetensors"
+    tensors = {
+        f"input_proj.{key}": torch.from_numpy(np.ascontiguousarray(value)).half()
+        for key, value in adapter.items()
+    }
+    with replacing(path) as temporary:
+        save_file(tensors, temporary, metadata)
+    logger.info("%s: cosine %s. It is in %s.", feature, metadata["cosine"], path)
+    return path
+
+
+def rounded(own: np.ndarray, feature: str, storage: str) -> np.ndarray:
+    """Return descriptors (N, D) as a file of a storage has them."""
+    levels = features_confs.levels({**features_confs.confs[feature], "storage": storage})
+    return restore(*store({"descriptors": own.T}, storage, levels))
+
+
+def least_squares(kinds: Sequence[np.ndarray], taken: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fit a linear map and an offset.
+
+    Args:
+        kinds: descriptors (N, D) of the same keypoints, in different storages.
+        taken: (N, E), what each of them is to be mapped to.
+
+    Returns:
+        The map (E, D) and the offset (E,).
+    """
+    size = kinds[0].shape[1]
+    squares, products = np.zeros((size + 1, size + 1)), np.zeros((size + 1, taken.shape[1]))
+    for kind in kinds:
+        with_one = np.concatenate([kind, np.ones((len(kind), 1))], axis=1)
+        squares += with_one.T @ with_one
+        products += with_one.T @ taken
+    squares[:size, :size] += RIDGE * np.eye(size) * np.trace(squares[:size, :size]) / size
+    solution = np.linalg.solve(squares, products)
+    return solution[:size].T, solution[size]
+
+
+def _cosine(found: np.ndarray, taken: np.ndarray) -> float:
+    norms = np.linalg.norm(found, axis=1) * np.linalg.norm(taken, axis=1)
+    return float(((found * taken).sum(axis=1) / norms).mean())
+
+
+def _main() -> None:
+    example = "--feature aliked_sv32 --images scenes/fox/images"
+    options.call(main, __doc__, example)
+
+
+if __name__ == "__main__":
+    cli.run(_main)

@@ -1,0 +1,214 @@
+"""LightGlue: published weights, adapters for projected descriptors, and what it refuses."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from kornia.feature import LightGlue as KorniaLightGlue
+from safetensors.torch import load_file, save_file
+from torch.nn.functional import normalize
+
+from hloc_reduce import extract_features, extractors, matchers, projections
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.matchers import lightglue
+from hloc_reduce.matchers.lightglue import LightGlue
+from hloc_reduce.networks import LIGHTGLUE
+from hloc_reduce.utils import downloads
+from hloc_reduce.utils.cli import InputError
+
+SIZE = torch.tensor([640.0, 480.0])
+
+
+def photos(descriptors: torch.Tensor) -> tuple[dict, dict, torch.Tensor]:
+    """Two photos of a plane, the second turned by 20 degrees, its keypoints in another order.
+
+    Returns:
+        Their features, and for each keypoint of the first its number in the second.
+    """
+    generator = torch.Generator().manual_seed(0)
+    number = descriptors.shape[0]
+    first = 120 + torch.rand(number, 2, generator=generator) * torch.tensor([400.0, 240.0])
+    matrix = torch.from_numpy(cv2.getRotationMatrix2D((320, 240), 20, 1)).float()
+    second = first @ matrix[:, :2].T + matrix[:, 2]
+    order = torch.randperm(number, generator=generator)
+    noise = 0.02 * torch.randn(descriptors.shape, generator=generator)
+    again = normalize(descriptors + noise, dim=1)[order]
+    return (
+        {"keypoints": first, "descriptors": descriptors.T, "image_size": SIZE},
+        {"keypoints": second[order], "descriptors": again.T, "image_size": SIZE},
+        order.argsort(),
+    )
+
+
+def drawn(number: int, dim: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return normalize(torch.randn(number, dim, generator=generator), dim=1)
+
+
+@pytest.fixture
+def described(base_weights) -> torch.Tensor:
+    """Descriptors (N, 64) by XFeat of a drawn photo."""
+    base_weights("xfeat")
+    generator = np.random.default_rng(0)
+    pixels = cv2.resize(generator.integers(0, 255, (30, 40, 3), np.uint8), (640, 480))
+    conf = features_confs.confs["xfeat"]
+    found = extractors.extract(extractors.load(conf["model"]).eval(), pixels, conf["preprocessing"])
+    return torch.from_numpy(found["descriptors"].T[:256])
+
+
+@pytest.mark.parametrize("network", ["aliked", "xfeat"])
+def test_it_is_kornias(base_weights, network):
+    base_weights(f"{network}+lightglue")
+    first, second, _ = photos(drawn(200, LIGHTGLUE[network].dim))
+    ((matches, scores),) = LightGlue({"features": network}).match([(first, second)])
+    given = {
+        f"image{i}": {
+            "keypoints": one["keypoints"][None],
+            "descriptors": one["descriptors"].T[None],
+            "image_size": one["image_size"][None],
+        }
+        for i, one in enumerate((first, second))
+    }
+    expected = KorniaLightGlue(network)(given)
+    assert torch.equal(matches, expected["matches0"][0])
+    assert torch.equal(scores, expected["matching_scores0"][0])
+
+
+def test_keypoints_match_by_place_and_descriptor(base_weights):
+    base_weights("aliked+lightglue")
+    first, second, right = photos(drawn(200, 128))
+    ((matches, scores),) = LightGlue({"features": "aliked"}).match([(first, second)])
+    assert (matches == right).float().mean() > 0.95
+    assert 0.9 < scores[matches >= 0].mean() <= 1
+    few = LightGlue({"features": "aliked", "filter_threshold": 0.999}).match([(first, second)])
+    assert (few[0][0] >= 0).sum() < (matches >= 0).sum()
+
+
+@pytest.mark.parametrize("feature", ["xfeat_sv32", "xfeat_pca32", "xfeat_nested@32"])
+@pytest.mark.parametrize("storage", ["float16", "uint4"])
+def test_projected_descriptors_match_as_they_are(base_weights, described, feature, storage):
+    """By an adapter, which takes codes, too."""
+    from hloc_reduce.training.adapters import rounded
+
+    base_weights("xfeat+lightglue")
+    first, second, right = photos(described)
+    ((expected, _),) = LightGlue({"features": "xfeat"}).match([(first, second)])
+    project = projections.load(feature)
+    pair = []
+    for one in (first, second):
+        small = rounded(project(one["descriptors"].T).numpy(), feature, storage)
+        pair.append(one | {"descriptors": torch.from_numpy(small).T})
+    matcher = LightGlue({"features": feature})
+    assert matcher.net.input_proj.in_features == 32
+    ((matches, _),) = matcher.match([pair])
+    number = (expected == right).sum()
+    assert number > 0.8 * len(right)
+    assert (matches == right).sum() > 0.97 * number
+
+
+def test_the_features_of_a_file_choose_the_weights(base_weights):
+    base_weights("xfeat")
+    base_weights("xfeat+lightglue")
+    for feature in ("xfeat", "xfeat_sv32", "xfeat_nested@16", "mini32"):
+        made_from = extract_features.provenance(features_confs.confs[feature])
+        model = matchers.load(matchers_confs.confs["lightglue"]["model"], made_from)
+        assert model.conf["features"] == feature
+    moved = json.loads(json.dumps(made_from))  # as a file has it
+    assert matchers.load({"name": "lightglue"}, moved).conf["features"] == "mini32"
+
+
+def test_every_projection_of_its_networks_has_an_adapter(base_weights):
+    for base in ("aliked", "xfeat"):
+        base_weights(base)
+    named = {name for base in ("aliked", "xfeat") for name in features_confs.names(base)}
+    assert {*named, "mini32", "mini64"} == set(matchers_confs.lightglue_weights())
+    for name in named:
+        made_from = extract_features.provenance(features_confs.confs[name])
+        assert lightglue.metadata_of(name)["made_from"] == lightglue.identity(made_from)
+
+
+def test_features_without_weights_are_refused():
+    made_from = extract_features.provenance(features_confs.confs["colmap_sift_sv64"])
+    message = "lightglue has no weights for colmap_sift_sv64, only for aliked, aliked_nested, "
+    with pytest.raises(InputError, match=message):
+        matchers.load({"name": "lightglue"}, made_from)
+    with pytest.raises(InputError, match="no weights for features of unknown origin, only for"):
+        matchers.load({"name": "lightglue"}, {})
+    with pytest.raises(InputError, match="no weights for ../../secret, only for"):
+        matchers.load({"name": "lightglue", "features": "../../secret"})
+
+
+def test_an_adapter_of_another_projection_is_refused(base_weights, tmp_path):
+    base_weights("xfeat")
+    made_from = extract_features.provenance(features_confs.confs["xfeat_sv32"])
+    other = made_from | {"projection_sha256": "0" * 64}
+    with pytest.raises(InputError, match="are for the xfeat_sv32 that ships .*, not for this one"):
+        matchers.load({"name": "lightglue"}, other)
+    # a file of the same name and contents is the same
+    file = shutil.copy(projections.find("xfeat_sv32"), tmp_path)
+    conf = features_confs.get("xfeat", projection=file)[1]
+    assert LightGlue.for_features({}, extract_features.provenance(conf)) == {
+        "features": "xfeat_sv32"
+    }
+
+
+@pytest.mark.parametrize(
+    "number0, number1", [(0, 5), (5, 0), (1, 5), (5, 1), (1, 1), (2, 2), (0, 0)]
+)
+def test_few_keypoints(base_weights, number0, number1):
+    base_weights("xfeat+lightglue")
+    pair = [
+        {"keypoints": torch.rand(n, 2) * 400, "descriptors": drawn(n, 64).T, "image_size": SIZE}
+        for n in (number0, number1)
+    ]
+    ((matches, scores),) = LightGlue({"features": "xfeat"}).match([pair])
+    assert matches.shape == scores.shape == (number0,)
+    assert matches.dtype == torch.int64 and (matches < number1).all()
+
+
+def test_keypoints_beyond_the_border(base_weights):
+    """Those of compact maps are projections, and may be a little outside."""
+    base_weights("xfeat+lightglue")
+    first, second, right = photos(drawn(50, 64))
+    first["keypoints"][0], second["keypoints"][right[0]] = -3, torch.tensor([700.0, 500.0])
+    ((matches, _),) = LightGlue({"features": "xfeat"}).match([(first, second)])
+    assert len(matches) == 50
+
+
+@pytest.mark.parametrize("change", ["truncated", "other", "missing"])
+def test_broken_adapters(base_weights, change, tmp_path, monkeypatch):
+    base_weights("xfeat+lightglue")
+    monkeypatch.setattr(lightglue, "WEIGHTS", tmp_path)
+    file = tmp_path / "xfeat_sv32.safetensors"
+    shutil.copy(matchers_confs.WEIGHTS / file.name, file)
+    if change == "truncated":
+        file.write_bytes(file.read_bytes()[:-100])
+        message = "The weights of lightglue for xfeat_sv32.* are broken"
+    elif change == "other":
+        tensors = load_file(file) | {"input_proj.weight": torch.zeros(7, 32)}
+        made_from = json.dumps({})
+        save_file(tensors, file, {"network": "xfeat", "made_from": made_from})
+        message = "The weights of lightglue for xfeat_sv32 are those of another network"
+    else:
+        file.unlink()
+        message = "lightglue has no weights for xfeat_sv32, only for"
+    with pytest.raises(InputError, match=message):
+        LightGlue({"features": "xfeat_sv32"})
+
+
+def test_weights_that_are_missing_or_broken(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(
+        downloads, "urlopen", lambda *_, **__: (_ for _ in ()).throw(OSError("no network"))
+    )
+    with pytest.raises(InputError, match="The weights of lightglue for xfeat are missing and can"):
+        LightGlue({"features": "xfeat"})
+    file = downloads.cache() / LIGHTGLUE["xfeat"].file
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"PK")
+    with pytest.raises(InputError, match="their sha256 is not"):
+        LightGlue({"features": "xfeat"})
