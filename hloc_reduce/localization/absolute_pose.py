@@ -24,7 +24,7 @@ RIVAL_SAMPLE = 500  # matches, at most, from which a rival is estimated
 # The lens of the map's photos has probably taken a photo if the confidence with it is at least this
 # multiple of that with estimated intrinsics, and its focal length is within this many standard
 # deviations of the estimated one or within this share of it, or the inliers fit better.
-CONFIDENCE_RATIO, DEVIATIONS, SHARE = 0.98, 2.0, 0.025
+CONFIDENCE_RATIO, FOCAL_DEVIATIONS, FOCAL_SHARE = 0.98, 2.0, 0.025
 
 
 def estimate(
@@ -147,7 +147,7 @@ def _with_typical_lens(matches: Matches, pose: Pose) -> Pose:
     # an estimated focal length may be off by more if it makes up for a distortion, or for points
     # whose errors are alike
     is_better = (its_errors**2).sum() <= (errors**2).sum()
-    if not (is_better or abs(np.log(ratio)) <= max(DEVIATIONS * deviation, SHARE)):
+    if not (is_better or abs(np.log(ratio)) <= max(FOCAL_DEVIATIONS * deviation, FOCAL_SHARE)):
         return pose
     number, value = typical.num_inliers, typical.confidence
     return replace(typical, measures=replace(pose.measures, num_inliers=number, confidence=value))

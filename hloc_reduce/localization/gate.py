@@ -31,7 +31,7 @@ class Tolerance(NamedTuple):
     rotation: float
 
 
-ALIKE = Tolerance(0.06, 2.4)  # a focal length 5 % off, as many listed ones are, moves it by 5 %
+SAME_POSE = Tolerance(0.06, 2.4)  # a focal length 5 % off, as many listed ones are, moves it by 5 %
 RIVALS = Tolerance(0.25, 10.0)  # of poses by other matches
 # standard deviations of a pose; one error in ten is more than 1.9 times as large
 PRECISE = Tolerance(0.03, 2.0)
@@ -59,7 +59,7 @@ class Limit(NamedTuple):
 
     ratio: float
     reason: str
-    tolerance: Tolerance = ALIKE
+    tolerance: Tolerance = SAME_POSE
 
 
 ALTERNATIVES = {
@@ -403,7 +403,7 @@ RULES = (
         _another_pose,
         "not be contradicted by another pose that is nearly as likely: with other intrinsics, by "
         "other matches (a rival), or by other images, as of another floor",
-        f"farther apart than {_words(ALIKE)} ({_words(RIVALS)} by other matches or images), with a "
+        f"farther apart than {_words(SAME_POSE)} ({_words(RIVALS)} by other matches or images), with a "
         "confidence above "
         + ", ".join(
             f"{100 * limit.ratio:g} % ({kind.replace('_', ' ')})"

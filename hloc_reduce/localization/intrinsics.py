@@ -19,7 +19,7 @@ from .pose import OF_SIZE
 
 # A lens is typical of photos whose cameras have a `PLAIN` model, if the logarithms of their focal
 # lengths, their distortions and principal points differ by at most this.
-ALIKE = 0.05, 0.1, 0.02, 0.02
+LIKE_ONE_LENS = 0.05, 0.1, 0.02, 0.02
 GUESSED_FOCAL = 1.2  # times the longer side, as in COLMAP
 MOST_LENSES = 8  # that are tried
 UNKNOWN_LENS = (
@@ -241,7 +241,7 @@ def _typical(cameras: Sequence[pycolmap.Camera]) -> Lens | None:
     spread[0] = max(np.ptp(np.log(lenses[:, 0])), *ratios)
     lens = Lens(*np.median(lenses, axis=0).tolist())
     low, high = FOCAL_LENGTHS
-    return lens if (spread <= ALIKE).all() and low <= lens.focal_length <= high else None
+    return lens if (spread <= LIKE_ONE_LENS).all() and low <= lens.focal_length <= high else None
 
 
 def of_map(

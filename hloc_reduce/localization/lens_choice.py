@@ -57,7 +57,7 @@ def estimate(
         for other in poses
         if other is not best and other.cam_from_world is not None
     ]
-    found = [one for one in found if gates.differ(one, gates.ALIKE)]
+    found = [one for one in found if gates.differ(one, gates.SAME_POSE)]
     if not found:
         return best
     others = {**best.measures.alternatives, "lens": max(found)}

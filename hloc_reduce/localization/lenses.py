@@ -21,8 +21,10 @@ PLAIN = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL"
 # The largest error that the best such camera may have, in longer sides: half of RANSAC's threshold.
 # Lenses with 0.5 to 1 % move synthetic queries by up to 2 %, those with 2 % by 6 % and more.
 BENT = MAX_ERROR / DETECTED / 2
-ALIKE = 0.002  # two lenses that project no ray farther apart, in longer sides, count as one
-SHARE = 0.1  # of the photos of a map, or WELL_KNOWN ones: a lens of fewer may be a failed estimate
+SAME_LENS = 0.002  # two lenses that project no ray farther apart, in longer sides, count as one
+LENS_SHARE = (
+    0.1  # of the photos of a map, or WELL_KNOWN ones: a lens of fewer may be a failed estimate
+)
 GRID = 12  # points of an image across and down at which a lens is judged
 SAME = 0.01  # pixels between a point and its ray, projected again, unless the lens has no such ray
 
@@ -83,7 +85,7 @@ def split(
     for key, _ in number.most_common():
         if is_bent(camera := one[key]):
             rays = np.nan_to_num(_rays(camera)[1])
-            apart = ALIKE * max(camera.width, camera.height) / camera.mean_focal_length()
+            apart = SAME_LENS * max(camera.width, camera.height) / camera.mean_focal_length()
             alike = groups.setdefault((camera.width, camera.height), [])
             for others, same in alike:
                 if np.linalg.norm(others - rays, axis=1).max() <= apart:
@@ -96,7 +98,7 @@ def split(
     for size, alike in groups.items():
         taken = [(sum(number[key] for key in same), same) for _, same in alike]
         for photos, same in sorted(taken, key=lambda lens: -lens[0]):
-            if photos >= min(WELL_KNOWN, SHARE * len(cameras)):
+            if photos >= min(WELL_KNOWN, LENS_SHARE * len(cameras)):
                 lenses.setdefault(size, []).append(copy.deepcopy(one[same[0]]))
                 bent.update(same)
     return [camera for key, camera in zip(keys, cameras, strict=True) if key not in bent], lenses

@@ -16,13 +16,13 @@ from .projection import ALL, ASPECT, POSE, RADIAL, SKEW, photo_scale, project, r
 # aspect ratio, the principal point in focal lengths, and the skew as a tangent. They are wide, and
 # only keep parameters that few matches do not determine near their start.
 PRIOR = np.array([0.5, 0.25, 0.25, 0.25, 0.25, 0.25])
-ROUNDS = 10  # of refinement, each from the inliers of the one before
-NOISE = 2.0  # pixels, scale of the Cauchy loss
+REFINEMENTS = 10  # of refinement, each from the inliers of the one before
+NOISE_PIXELS = 2.0  # pixels, scale of the Cauchy loss
 EVALUATIONS = 100  # of the residuals in each round
 DAMPING = 1e-3  # of the first step
 TINY = 1e-9  # least diagonal of the damping
-ENOUGH = 1e-6  # relative gain of the last step
-FAR = 1e6  # pixels
+CONVERGED = 1e-6  # relative gain of the last step
+FAR_PIXELS = 1e6  # pixels
 BEHIND = 1e6  # the square of a point behind the camera, in units of the noise
 # The search for all parameters: in a sample of SAMPLE matches with errors up to NEAR thresholds, it
 # starts with principal points in the middle and CORNER of width and height away from it.
@@ -63,12 +63,12 @@ def undistort(points2D: np.ndarray, camera: pycolmap.Camera) -> tuple[np.ndarray
         camera: intrinsics.
 
     Returns:
-        The points (M, 2) in a camera without distortion, clipped to FAR pixels, and that camera,
+        The points (M, 2) in a camera without distortion, clipped to FAR_PIXELS pixels, and that camera,
         PINHOLE.
     """
     (fx, _, cx), (_, fy, cy), _ = camera.calibration_matrix()
     image = cam_from_img(camera, points2D) * [fx, fy] + [cx, cy]
-    return np.clip(image, -FAR, FAR), _camera(camera, "PINHOLE", fx, fy, cx, cy)
+    return np.clip(image, -FAR_PIXELS, FAR_PIXELS), _camera(camera, "PINHOLE", fx, fy, cx, cy)
 
 
 def _camera(photo: pycolmap.Camera, model: str, *params: float) -> pycolmap.Camera:
@@ -102,8 +102,8 @@ def resect(
     if chosen is None:
         chosen = reprojection_errors(points2D, points3D, cam_from_world, camera)[0] <= max_error
     start = view = _Parameters.of(cam_from_world, camera)
-    noise, found = NOISE * photo_scale(camera), None
-    for _ in range(ROUNDS):
+    noise, found = NOISE_PIXELS * photo_scale(camera), None
+    for _ in range(REFINEMENTS):
         if chosen.sum() < degrees_of_freedom:
             break
         view = _fit(points2D[chosen], points3D[chosen], view, start, degrees_of_freedom, noise)
@@ -171,7 +171,7 @@ def _search(
 
     def loss(refined: Resection) -> float:
         errors, _ = reprojection_errors(*sample, refined.cam_from_world, refined.camera)
-        return float(np.log1p((errors / (NOISE * photo_scale(camera))) ** 2).sum())
+        return float(np.log1p((errors / (NOISE_PIXELS * photo_scale(camera))) ** 2).sum())
 
     tried = [resect(*sample, *start, max_error, ALL, everything) for start in starts]
     refined = min((one for one in tried if one is not None), key=loss, default=None)
@@ -217,7 +217,7 @@ def linear(
     projections = _projections(image[drawn], world[drawn])
     best = projections[inliers(projections, sample).sum(axis=1).argmax()]
     everything = np.arange(len(image))
-    for _ in range(ROUNDS // 2):
+    for _ in range(REFINEMENTS // 2):
         agree = inliers(best, everything)
         if agree.sum() < 2 * SIX:
             return None
@@ -378,7 +378,7 @@ def _fit(
         loss = np.log1p(squares).sum() + (change**2).sum()
         if loss < least:
             gain, least, view, damping = least - loss, loss, trial, damping / 10
-            if gain < ENOUGH * loss:
+            if gain < CONVERGED * loss:
                 break
             jacobian = np.concatenate(derivatives[:, :degrees_of_freedom], axis=1)
             weighted = jacobian * np.tile(front, 2) / (1 + squares) / noise**2

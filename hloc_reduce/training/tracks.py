@@ -283,7 +283,10 @@ def save(path: Path, made_from: dict, names: list[str]) -> Path:
     order = np.argsort(track, kind="stable")
     tracks = Tracks(descriptors, track, image, xy, matched).only(order)
     with replacing(path) as temporary:
-        save_file(vars(tracks), temporary)
+        # which would write arrays in column order wrongly
+        save_file(
+            {key: np.ascontiguousarray(part) for key, part in vars(tracks).items()}, temporary
+        )
     provenance.write(path.with_suffix(".json"), made_from)
     logger.info("%d observations of %d points: %s", len(track), tracks.num_tracks, path)
     parts_of(path).unlink()

@@ -8,7 +8,7 @@ import pytest
 from test_intrinsics import write_photo
 
 from hloc_reduce.localization import intrinsics, lens_choice, mirrored
-from hloc_reduce.localization.gate import ALIKE, DEFAULT_GATE
+from hloc_reduce.localization.gate import SAME_POSE, DEFAULT_GATE
 from hloc_reduce.localization.intrinsics import infer, of_cameras, refinement
 from hloc_reduce.localization.lenses import is_bent, split
 from hloc_reduce.localization.pose import Pose
@@ -110,7 +110,7 @@ def test_another_lens_of_the_size_is_not_localized_wrongly(of_map, camera):
     """Nor is a photo by a normal lens, which has the size by chance."""
     lens, other = camera_of(of_map, BENT[of_map]), camera_of(camera, {**MILD, **BENT}[camera])
     found, position, rotation = localize(other, of_cameras(3 * [lens]))
-    is_right = position < ALIKE.position and rotation < ALIKE.rotation
+    is_right = position < SAME_POSE.position and rotation < SAME_POSE.rotation
     assert found.refusal is not None or is_right
 
 

@@ -7,11 +7,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from command import outcome
 from kornia.feature import LightGlue as KorniaLightGlue
 from safetensors.torch import load_file, save_file
 from torch.nn.functional import normalize
 
-from hloc_reduce import extract_features, extractors, matchers, projections
+from hloc_reduce import Localizer, compact, extract_features, extractors, matchers, projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.matchers import lightglue
@@ -19,6 +20,10 @@ from hloc_reduce.matchers.lightglue import LightGlue
 from hloc_reduce.networks import LIGHTGLUE
 from hloc_reduce.utils import downloads
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.parsers import parse_query_list
+from pipelines import localize
+
+PIPELINE = localize
 
 SIZE = torch.tensor([640.0, 480.0])
 
@@ -212,3 +217,26 @@ def test_weights_that_are_missing_or_broken(tmp_path, monkeypatch):
     file.write_bytes(b"PK")
     with pytest.raises(InputError, match="their sha256 is not"):
         LightGlue({"features": "xfeat"})
+
+
+def test_photos_are_localized_by_it(base_weights, place, aachen_layout, run, refused, tmp_path):
+    """In files, in memory, and in a compact map; a feature without weights before any work."""
+    base_weights("xfeat+lightglue")
+    model = {"name": "lightglue", "max_keypoints": 512}
+    monkeypatch.setitem(matchers_confs.confs["lightglue"], "model", model)
+    build, images, outputs = place
+    listed = aachen_layout / "queries/day_time_queries_with_intrinsics.txt"
+    given = ("--matcher", "lightglue", "--query_images", images, "--queries", listed)
+    run(*build, *given, "--feature", "mini32", "--storage", "uint2")
+    _, rows = outcome(outputs / f"queries-{listed.stem}")
+    name, camera = parse_query_list(listed)[0]
+    row = rows[name]
+    assert row["status"] == "localized" and int(row["num_inliers"]) > 100
+    pose, info = Localizer(outputs / "map").localize(images / name, camera)
+    assert pose is not None and info["num_matches"] == int(row["num_matches"])
+    compact.main(tmp_path / "place.hlm", outputs / "map")
+    pose, info = Localizer(tmp_path / "place.hlm").localize(images / name, camera)
+    assert pose is not None and info["num_inliers"] > 50
+    message = refused(*build[:-1], tmp_path / "o", *given, "--feature", "colmap_sift_sv32")
+    assert message.startswith("lightglue has no weights for colmap_sift_sv32, only for aliked, ")
+    assert not list((tmp_path / "o").rglob("*.h5"))
