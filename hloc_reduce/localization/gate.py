@@ -403,8 +403,8 @@ RULES = (
         _another_pose,
         "not be contradicted by another pose that is nearly as likely: with other intrinsics, by "
         "other matches (a rival), or by other images, as of another floor",
-        f"farther apart than {_words(SAME_POSE)} ({_words(RIVALS)} by other matches or images), with a "
-        "confidence above "
+        f"farther apart than {_words(SAME_POSE)} ({_words(RIVALS)} by other matches or images), "
+        "with a confidence above "
         + ", ".join(
             f"{100 * limit.ratio:g} % ({kind.replace('_', ' ')})"
             for kind, limit in ALTERNATIVES.items()

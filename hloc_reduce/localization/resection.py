@@ -63,7 +63,7 @@ def undistort(points2D: np.ndarray, camera: pycolmap.Camera) -> tuple[np.ndarray
         camera: intrinsics.
 
     Returns:
-        The points (M, 2) in a camera without distortion, clipped to FAR_PIXELS pixels, and that camera,
+        The points (M, 2) in a camera without distortion, clipped to FAR_PIXELS, and that camera,
         PINHOLE.
     """
     (fx, _, cx), (_, fy, cy), _ = camera.calibration_matrix()

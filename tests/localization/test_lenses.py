@@ -8,7 +8,7 @@ import pytest
 from test_intrinsics import write_photo
 
 from hloc_reduce.localization import intrinsics, lens_choice, mirrored
-from hloc_reduce.localization.gate import SAME_POSE, DEFAULT_GATE
+from hloc_reduce.localization.gate import DEFAULT_GATE, SAME_POSE
 from hloc_reduce.localization.intrinsics import infer, of_cameras, refinement
 from hloc_reduce.localization.lenses import is_bent, split
 from hloc_reduce.localization.pose import Pose

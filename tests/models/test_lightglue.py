@@ -219,7 +219,9 @@ def test_weights_that_are_missing_or_broken(tmp_path, monkeypatch):
         LightGlue({"features": "xfeat"})
 
 
-def test_photos_are_localized_by_it(base_weights, place, aachen_layout, run, refused, tmp_path):
+def test_photos_are_localized_by_it(
+    base_weights, place, aachen_layout, run, refused, tmp_path, monkeypatch
+):
     """In files, in memory, and in a compact map; a feature without weights before any work."""
     base_weights("xfeat+lightglue")
     model = {"name": "lightglue", "max_keypoints": 512}
