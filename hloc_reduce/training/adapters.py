@@ -95,9 +95,11 @@ def _describe(feature: str, paths: list[Path]) -> Iterator[Described]:
 
 
 @torch.no_grad()
-def at_keypoints(teacher: extractors.Extractor, path: Path, conf: dict, found: dict) -> np.ndarray:
+def at_keypoints(
+    teacher: extractors.Extractor, image: Path | np.ndarray, conf: dict, found: dict
+) -> np.ndarray:
     """Return XFeat's descriptors (N, 64) at the keypoints of other features of a photo."""
-    pixels, size = extractors.load_image(path, conf["preprocessing"])
+    pixels, size = extractors.load_image(image, conf["preprocessing"])
     sides = [side // STRIDE * STRIDE for side in pixels.shape[2:]]
     network: Any = teacher.model
     dense = normalize(network.net(interpolate(pixels, sides, mode="bilinear"))[0], dim=1)
