@@ -6,9 +6,10 @@ without, its own also with a wrong focal length. Its own are also tried cropped,
 enlarged, squeezed, and warped as a photo of a print is, without intrinsics. In a COLMAP model,
 every third photo is held out. Keypoints and maps are the same for all features of one base. Another
 --seed holds out other photos, builds other maps, and draws other photos of other places. Each trial
-is a row of results/trials/FEATURE-SEED.csv, with its outcome (true, near, wrong, none) and all
-`Measures`, whatever the gate says; `benchmarks.fit_gate` and the tables of the documentation read
-these files. An interrupted run resumes with the next place.
+is a row of results/trials/FEATURE-SEED.csv, or with a --matcher FEATURE+MATCHER-SEED.csv, with its
+outcome (true, near, wrong, none) and all `Measures`, whatever the gate says; `benchmarks.fit_gate`
+and the tables of the documentation read these files. An interrupted run resumes with the next
+place.
 """
 
 import argparse
@@ -28,9 +29,9 @@ import torch
 from scipy.linalg import rq
 
 from benchmarks.darken_place import darken
-from benchmarks.rows import how
+from benchmarks.rows import add_again_option, how
 from benchmarks.trial_rows import COLUMNS, RESHAPED, TRIALS, to_row
-from hloc_reduce import extract_features, localize_inloc, maps, projections
+from hloc_reduce import extract_features, localize_inloc, maps, matchers, projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.datasets import scans, true_poses
@@ -42,7 +43,6 @@ from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.localization.query import merged
 from hloc_reduce.localization.references import Reference, ScanMap, SfmMap
 from hloc_reduce.localize_sfm import RANSAC_THRESH
-from hloc_reduce.matchers.nearest_neighbor import mutual_nearest
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.codes import FLOATS, restore, store
@@ -50,6 +50,7 @@ from hloc_reduce.utils.feature_files import (
     get_blur,
     get_colmap_keypoints,
     get_descriptors,
+    get_features,
     get_image_size,
 )
 from hloc_reduce.utils.files import replacing, write_csv
@@ -293,32 +294,37 @@ def run(
 ) -> list[dict]:
     """Try a map with all photos, and return the rows of trials.csv."""
     model = matchers_confs.confs[matcher]["model"]
-    ratio_threshold = model.get("ratio_threshold")
+    made_from = extract_features.provenance(features_confs.get(feature.partition(":")[0])[1])
+    matching = matchers.load(model, made_from)
+    others_keys = [key for key in matching.keys() if key != "descriptors"]  # noqa: SIM118
     tried = list(trials(place, others, output, number, seed))
     describe = Described(feature)
     shown, rows = {}, []
+
+    def features_of(file: h5py.File, name: str, is_query: bool = False) -> dict:
+        features = get_features(file, name, others_keys)
+        found = {key: torch.from_numpy(value) for key, value in features.items()}
+        return {**found, "descriptors": describe(file, name, is_query).T}
+
     with open_h5(place.features) as file:
-        described = {name: describe(file, name) for name in place.names}
-    for name, descriptors in described.items():
-        ids, _ = place.reference.lift(name, np.arange(len(descriptors)))
+        described = {name: features_of(file, name) for name in place.names}
+    for name, features in described.items():
+        ids, _ = place.reference.lift(name, np.arange(features["descriptors"].shape[1]))
         shown[name] = torch.from_numpy(np.flatnonzero(ids >= 0))
-    dim = described[place.names[0]].shape[1]
+    dim = len(described[place.names[0]]["descriptors"])
     gate = DEFAULT_GATE.of_matches(model, dim)
     labels = {"feature": feature, "matcher": gate.match_kind, "dim": dim}
     labels["commit"] = how()["commit"]
 
     def match(path: Path, name: str) -> tuple[np.ndarray, dict, float]:
         with open_h5(path) as file:
-            query = describe(file, name, is_query=True)
+            query = features_of(file, name, is_query=True)
             keypoints = get_colmap_keypoints(file, name)[0]
             blur = get_blur(file, name)
-        matches = {}
-        for other in place.names:
-            rows_of = shown[other]
-            found, cosine = mutual_nearest(described[other], query, ratio_threshold, rows_of)
-            matched = torch.nonzero(found >= 0)[:, 0]
-            matched = matched[cosine[matched].argsort(descending=True)]
-            matches[other] = torch.stack([found[matched], rows_of[matched]], 1).numpy()
+        matches = {
+            other: matching.match_rows(query, described[other], shown[other]).numpy()
+            for other in place.names
+        }
         return keypoints, matches, blur
 
     for source, name, camera, truth, path, kind in progress(tried, place.name, "photo"):
@@ -454,10 +460,16 @@ def _main() -> None:
         "--seed", type=int, default=0, help="seed of the maps and of the drawn photos"
     )
     parser.add_argument("--output", type=Path, default=Path("outputs/trials"))
+    add_again_option(parser)
     args = parser.parse_args()
     torch.set_num_threads(1)
+    matcher = f"+{args.matcher}" if args.matcher else ""
+    file = TRIALS / f"{args.feature.replace(':', '-')}{matcher}-{args.seed}.csv"
+    tried = {root.name for root in args.dataset} | set(parse_maps(args.map))
+    if file.exists() and not args.again and tried <= {row["map"] for row in _read(file)}:
+        print(f"All maps have rows in {file}.")
+        return
     rows = _trials_of_all(args)
-    file = TRIALS / f"{args.feature.replace(':', '-')}-{args.seed}.csv"
     write_csv(rows, file, COLUMNS)
     outcomes = Counter(row["outcome"] for row in rows)
     print(f"{len(rows):,} trials: {dict(outcomes)}. They are in {file}.")
@@ -483,10 +495,14 @@ def _trials_of_all(args: argparse.Namespace) -> list[dict]:
         if not file.exists():
             options = args.feature, args.trials, matcher, args.seed
             write_csv(run(place, others, folder, *options), file, COLUMNS)
-        with file.open(newline="") as opened:
-            rows += csv.DictReader(opened)
+        rows += _read(file)
         print(f"{name}: {len(rows):,} trials", flush=True)
     return rows
+
+
+def _read(file: Path) -> list[dict]:
+    with file.open(newline="") as opened:
+        return list(csv.DictReader(opened))
 
 
 def _strangers(folder: Path, output: Path, base: str) -> Place:

@@ -149,9 +149,10 @@ MATCH_KINDS = {
     "ratio": MatchKind(Evidence(4.13, 17.45), -17.21, 0.8, 0.4),
     "few": MatchKind(Evidence(2.72, 14.71), -8.2, 0.8, 0.4),
     "mutual": MatchKind(Evidence(4.01, 11.42), -8.89, 0.3, 0.8),
+    "lightglue": MatchKind(Evidence(4.01, 11.42), -8.89, 0.3, 0.8),
 }
 NEAREST_NEIGHBOR = "nearest_neighbor"  # whose kind its ratio test tells
-KINDS_OF_MATCHERS = dict.fromkeys(("adalam", "lightglue", "superglue"), "mutual")
+KINDS_OF_MATCHERS = {"adalam": "mutual", "lightglue": "lightglue", "superglue": "lightglue"}
 # probability from which on mirror images are not tried; the wrong pose of a mirrored photo of a
 # castle has 0.986
 SURE = 0.99
@@ -168,7 +169,7 @@ class Gate:
         min_probability: minimum probability of a localized query, see `gate.probability`; default:
             0.8 with a strict ratio test, else 0.3.
         match_kind: what the limits are for: mutual nearest neighbours with a strict ratio test,
-            the same with few dimensions, or without; default: that of the matcher.
+            the same with few dimensions, or without; or those of LightGlue; default: the matcher's.
 
     Raises:
         InputError: for a confidence that is not finite, a negative number of inliers, a probability
