@@ -295,7 +295,7 @@ def run(
     """Try a map with all photos, and return the rows of trials.csv."""
     model = matchers_confs.confs[matcher]["model"]
     made_from = extract_features.provenance(features_confs.get(feature.partition(":")[0])[1])
-    matching = matchers.load(model, made_from)
+    matching = matchers.load(matchers_confs.for_features(model, made_from))
     others_keys = [key for key in matching.keys() if key != "descriptors"]  # noqa: SIM118
     tried = list(trials(place, others, output, number, seed))
     describe = Described(feature)

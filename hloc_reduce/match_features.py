@@ -149,7 +149,7 @@ def check_model(conf: dict, made_from: dict) -> None:
     """
     from . import matchers
 
-    matchers.load(conf["model"], made_from)
+    matchers.load(matchers_confs.for_features(conf["model"], made_from))
 
 
 def provenance(conf: dict, *feature_files: h5py.File) -> dict:
@@ -192,7 +192,8 @@ def _match(
     size, workers = (1, parallel.cores()) if device == "cpu" else (PAIRS_ON_GPU, 1)
     with open_h5(feature_paths[0]) as file0, open_h5(feature_paths[1]) as file1:
         made_from = get_conf(file0) or get_conf(file1)
-        matcher = matchers.load(conf["model"], made_from).eval().to(device)
+        model = matchers_confs.for_features(conf["model"], made_from)
+        matcher = matchers.load(model).eval().to(device)
         match = partial(_match_batch, matcher, device, gpu_bytes or GPU_BYTES)
         for file in (file0, file1):
             _check_features(file, matcher.keys(), conf["model"]["name"])

@@ -22,6 +22,7 @@ from scipy.io import savemat
 from hloc_reduce import networks
 from hloc_reduce.confs import features
 from hloc_reduce.descriptors import DESCRIPTORS, weights
+from hloc_reduce.networks import lightglue
 from hloc_reduce.utils import cli, colmap, downloads
 from pipelines import batch, localize
 
@@ -130,7 +131,7 @@ def base_weights(monkeypatch, tmp_path_factory) -> Callable[[str], None]:
 
     def need(name: str) -> None:
         if name.endswith("+lightglue"):
-            file = networks.LIGHTGLUE[name.removesuffix("+lightglue")].file
+            file = lightglue.LIGHTGLUE[name.removesuffix("+lightglue")].file
             if not (downloads.cache() / file).is_file():
                 pytest.skip(f"the weights {file} are not on this machine")
             return

@@ -23,6 +23,7 @@ from hloc_reduce import (
     retrieval,
 )
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import listing
 from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.evaluation.poses import pose_error
@@ -78,7 +79,7 @@ def test_a_toy_extractor_and_a_toy_matcher(tmp_path):
 def test_a_toy_extractor_is_listed(monkeypatch):
     conf = features_confs.feature("corners", {"name": "corners"})
     monkeypatch.setitem(features_confs.confs, "corners", conf)
-    rows = [line.split(" | ") for line in features_confs.table().splitlines()]
+    rows = [line.split(" | ") for line in listing.table().splitlines()]
     listed = {name.strip(): [cell.strip() for cell in cells] for name, *cells in rows}
     assert listed["corners"] == ["", "", "NN-ratio", "see extractors/corners.py"]
     assert listed["colmap_sift"][:2] == ["128", "256"]

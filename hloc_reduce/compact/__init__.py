@@ -124,7 +124,8 @@ def write(
     matcher = matcher or matcher_of(source.matcher)
     check_matcher(matcher)
     if not is_integer_matcher(model := matchers_confs.confs[matcher]["model"]):
-        matchers.load(model, extract_features.provenance(source.conf))
+        made_from = extract_features.provenance(source.conf)
+        matchers.load(matchers_confs.for_features(model, made_from))
     conf = {**source.conf, "storage": _storage(source.conf, storage)}
     source = replace(source, matcher=matcher, conf=conf)
     everything = points.collect(source.model, features)

@@ -13,13 +13,10 @@ from .. import projections
 from ..descriptors import BASE_DESCRIPTORS, COLMAP_SIFT, DESCRIPTORS, DIM
 from ..detectors.dog import HLOC_OPTIONS, KEYPOINT_SETTINGS
 from ..networks import ALIKED, EDGEPOINT2, MINI, NETWORKS
-from ..projections.released import WEIGHT_FILES as RELEASED
 from ..utils.cli import InputError, choose
 from ..utils.codes import CODED, STORAGES
 from ..utils.parsers import read_yaml
-from ..utils.tables import aligned
 
-DOWNLOADED = "downloaded on first use"
 RECOMMENDED = "colmap_sift_sv64"  # needs no download (docs/features.md)
 DIMS = (64, 32, 24, 16)
 # the schemes and dimensions of the projections of each base descriptor; and who has a nested one
@@ -112,37 +109,6 @@ def dimension(name: str) -> int | None:
         return DIM if descriptor_of(confs[name]["model"]) else None
     digits = re.search(r"\d+$", projection)
     return int(digits[0]) if digits else DIMS[0]
-
-
-def table() -> str:
-    """Format the features with the size of their descriptors, as float16, and their weights."""
-    from .matchers import all_of
-
-    lines = [("feature", "dim", "bytes", "matchers", "weights")]
-    for name, conf in confs.items():
-        dim = dimension(name)
-        numbers = (str(dim), str(2 * dim)) if dim else ("", "")
-        lines.append((name, *numbers, ", ".join(all_of(conf)), _weights(conf["model"])))
-    return aligned(lines, left=5)
-
-
-def _weights(model: dict) -> str:
-    """Say where the weights of a model come from."""
-    projection = model.get("projection")
-    if projection is None:
-        if network := network_of(model):
-            is_downloaded = network not in NETWORKS or NETWORKS[network].urls
-            return DOWNLOADED if is_downloaded else "shipped"
-        descriptor = DESCRIPTORS.get(descriptor_of(model) or "")
-        if descriptor is None and model["name"] != "dog":
-            return f"see extractors/{model['name']}.py"
-        return DOWNLOADED if descriptor and descriptor.urls else "none needed"
-    if projections.split_prefix(projection)[0] in projections.names():
-        base_weights = _weights(base_of(model))
-        return f"shipped; base: {DOWNLOADED}" if base_weights == DOWNLOADED else "shipped"
-    if projection in RELEASED:
-        return f"{DOWNLOADED}, released by the paper's authors"
-    return "to be trained: docs/training.md"
 
 
 def get(

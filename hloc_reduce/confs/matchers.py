@@ -3,20 +3,15 @@
 from pathlib import Path
 
 from .. import projections
-from ..networks import LIGHTGLUE
+from ..networks import lightglue as weights_of
+from ..networks.lightglue import LIGHTGLUE
+from ..utils.cli import InputError
 from .features import base_of, matcher_of, network_of
-
-WEIGHTS = Path(__file__).parents[1] / "matchers/weights"
-
-
-def lightglue_weights() -> list[str]:
-    """List the features that this package has weights of LightGlue for."""
-    return sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
 
 
 def all_of(feature: dict) -> list[str]:
     """Return the matchers that suit the configuration of a feature, the default first."""
-    has_weights = features_of(feature["model"]) in {*LIGHTGLUE, *lightglue_weights()}
+    has_weights = features_of(feature["model"]) in weights_of.known()
     return [matcher_of(feature), *(["lightglue"] if has_weights else [])]
 
 
@@ -38,6 +33,31 @@ def features_of(model: dict) -> str | None:
     base = base_of(model)
     name = network_of(model) or base.get("descriptor") or str(base.get("name"))
     return name.removeprefix("hloc.").removesuffix("-n16")
+
+
+def for_features(model: dict, made_from: dict) -> dict:
+    """Return the configuration of a matcher for some features: LightGlue's weights depend on them.
+
+    Args:
+        model: of the matcher, as in `confs`.
+        made_from: what the features are made from, see `extract_features.provenance`; {} if that is
+            unknown.
+
+    Raises:
+        InputError: for features that LightGlue has no weights for.
+    """
+    if model["name"] != "lightglue" or model.get("features"):
+        return model
+    name = features_of(made_from.get("model", {}))
+    if name not in weights_of.known():
+        raise weights_of.unknown(name or "features of unknown origin")
+    trained_for = {} if name in LIGHTGLUE else weights_of.metadata_of(name)["made_from"]
+    if any(made_from.get(key) != value for key, value in trained_for.items()):
+        raise InputError(
+            f"The weights of lightglue for {name} are for the {name} that ships with this package, "
+            "not for this one."
+        )
+    return {**model, "features": name}
 
 
 def _ratio(threshold: float) -> dict:

@@ -10,6 +10,7 @@ from packaging.version import Version
 from .. import logger
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
+from ..networks import lightglue
 from ..utils.cli import InputError
 from ..utils.hloc import MIN_PYCOLMAP, extractors_package, import_module, parse_version
 
@@ -47,7 +48,7 @@ def register(features: Iterable[Path] | Path = ()) -> list[str]:
 def _matchers() -> dict[str, dict]:
     """Return the matchers for hloc: of LightGlue, one for each projection with an adapter."""
     confs = {key: conf for key, conf in matchers_confs.confs.items() if key != "lightglue"}
-    for features in matchers_confs.lightglue_weights():
+    for features in lightglue.shipped():
         conf = matchers_confs.lightglue(features)
         model = {**conf["model"], "name": "reduced_lightglue"}
         confs.setdefault(f"{features}+lightglue", {**conf, "model": model})

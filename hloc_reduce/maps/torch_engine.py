@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from .. import extractors, matchers
+from ..confs.matchers import for_features
 from ..matchers.base import Matcher
 from ..matchers.integers import is_worthwhile
 from ..runtime import parallel
@@ -36,7 +37,7 @@ class TorchEngine:
         self.matching: Matching = (
             IntegerMatching(matcher)
             if by_integers and is_integer_matcher(matcher)
-            else TorchMatching(matchers.load(matcher, made_from), self._device)
+            else TorchMatching(matchers.load(for_features(matcher, made_from)), self._device)
         )
 
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:

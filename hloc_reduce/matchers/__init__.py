@@ -9,20 +9,14 @@ if TYPE_CHECKING:
 HELPERS = ("base", "integers")  # modules that are no matchers
 
 
-def load(conf: dict, made_from: dict | None = None) -> "Matcher":
+def load(conf: dict) -> "Matcher":
     """Make the matcher of a model configuration, whose `name` is a module of this package.
 
-    Args:
-        conf: the configuration.
-        made_from: the features that it will match, see `Matcher.for_features`; default: unknown.
-
     Raises:
-        InputError: when there is no such matcher, its configuration is wrong, or it cannot match
-            these features.
+        InputError: when there is no such matcher, or its configuration is wrong.
     """
-    kind = find(conf)
-    conf = {key: value for key, value in conf.items() if key != "match_kind"}  # of the gate
-    return kind(kind.for_features(conf, made_from or {}))
+    kept = {key: value for key, value in conf.items() if key != "match_kind"}  # of the gate
+    return find(conf)(kept)
 
 
 def find(conf: dict) -> "type[Matcher]":

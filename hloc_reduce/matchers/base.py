@@ -37,20 +37,6 @@ class Matcher(BaseModel):
     required_inputs: tuple[str, ...] = ("descriptors0", "descriptors1")
 
     @classmethod
-    def for_features(cls, conf: dict, made_from: dict) -> dict:
-        """Return the configuration for some features; a subclass may choose weights by them.
-
-        Args:
-            conf: of the matcher.
-            made_from: what the features are made from, see `extract_features.provenance`; empty if
-                that is unknown.
-
-        Raises:
-            InputError: when it cannot match such features.
-        """
-        return conf
-
-    @classmethod
     def keys(cls) -> tuple[str, ...]:
         """Return what it needs of the features of an image, such as descriptors."""
         return tuple(dict.fromkeys(name.rstrip("01") for name in cls.required_inputs))

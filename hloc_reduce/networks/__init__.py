@@ -58,34 +58,6 @@ MINI_SIZE = "L"  # of EdgePoint2's architecture
 BETWEEN_PIXELS = 1  # the version with keypoints between pixels
 WEIGHTS = Path(__file__).parent / "weights"
 
-# LightGlue's weights, by the features that they match, as hloc and kornia call them
-LIGHTGLUE = {
-    name: Network(
-        dim,
-        f"{name}_lightglue_v0-1_arxiv-pth",
-        (
-            f"https://huggingface.co/kornia/lightglue/resolve/main/{name}_lightglue.pth",
-            f"https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/{name}_lightglue.pth",
-        ),
-        sha256,
-    )
-    for name, dim, sha256 in (
-        ("aliked", 128, "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503"),
-        ("disk", 128, "b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335"),
-        ("superpoint", 256, None),
-    )
-} | {
-    "xfeat": Network(
-        64,
-        "xfeat-lighterglue.pt",
-        (
-            "https://huggingface.co/kornia/lightglue/resolve/main/xfeat-lighterglue.pt",
-            "https://github.com/verlab/accelerated_features/raw/main/weights/xfeat-lighterglue.pt",
-        ),
-        "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
-    )
-}
-
 NETWORKS = (
     {
         model: Network(

@@ -19,9 +19,8 @@ from torch.nn.functional import grid_sample, interpolate, normalize
 from .. import extract_features, extractors, logger, projections
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
-from ..confs.matchers import WEIGHTS
 from ..matchers import lightglue
-from ..networks import LIGHTGLUE
+from ..networks.lightglue import LIGHTGLUE, WEIGHTS, identity
 from ..runtime.versions import versions
 from ..utils import cli, options
 from ..utils.cli import InputError
@@ -109,7 +108,7 @@ def at_keypoints(
 
 
 def _network(feature: str) -> str:
-    """Return the key of `networks.LIGHTGLUE` that an adapter of a feature is for."""
+    """Return the key of `LIGHTGLUE` that an adapter of a feature is for."""
     base = matchers_confs.features_of(
         features_confs.base_of(features_confs.confs[feature]["model"])
     )
@@ -135,7 +134,7 @@ def _fit(feature: str, described: list[Described], photos: int, output: Path) ->
     adapter = {"weight": weight @ decoder, "bias": weight @ offset + bias}
     metadata = {
         "network": network,
-        "made_from": json.dumps(lightglue.identity(extract_features.provenance(conf))),
+        "made_from": json.dumps(identity(extract_features.provenance(conf))),
         "photos": str(photos),
         "cosine": json.dumps(
             {kind: round(1 - part, 4) for kind, part in zip(STORAGES, unlike, strict=True)}

@@ -26,8 +26,9 @@ from torch import nn
 from .. import extract_features, extractors, logger
 from ..confs import features as features_confs
 from ..mapping.epipolar import epipolar_errors
-from ..matchers.lightglue import LightGlue, identity
+from ..matchers.lightglue import LightGlue
 from ..networks import MINI
+from ..networks.lightglue import identity
 from ..pairs_from_covisibility import covisible
 from ..runtime.versions import versions
 from ..utils import cli, colmap, options

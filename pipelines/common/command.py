@@ -7,6 +7,7 @@ from typing import Any
 
 from hloc_reduce import logger
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import listing
 from hloc_reduce.evaluation.summaries import recall_table
 from hloc_reduce.runtime import trace
 from hloc_reduce.utils.options import Parser
@@ -54,7 +55,7 @@ def read(parser: Parser) -> dict[str, Any]:
     """
     values = parser.read()
     if values["list_features"]:
-        print(features_confs.table())
+        print(listing.table())
         print(f"\nDefault: {features_confs.RECOMMENDED}. Which to choose: docs/features.md")
         raise SystemExit(0)
     if values.get("retrieval") is not None:

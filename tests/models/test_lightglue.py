@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,9 +16,9 @@ from torch.nn.functional import normalize
 from hloc_reduce import Localizer, compact, extract_features, extractors, matchers, projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
-from hloc_reduce.matchers import lightglue
 from hloc_reduce.matchers.lightglue import LightGlue
-from hloc_reduce.networks import LIGHTGLUE
+from hloc_reduce.networks import lightglue
+from hloc_reduce.networks.lightglue import LIGHTGLUE
 from hloc_reduce.utils import downloads
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.parsers import parse_query_list
@@ -25,6 +26,7 @@ from pipelines import localize
 
 PIPELINE = localize
 
+CONF = {"name": "lightglue"}
 SIZE = torch.tensor([640.0, 480.0])
 
 
@@ -120,17 +122,17 @@ def test_the_features_of_a_file_choose_the_weights(base_weights):
     base_weights("xfeat+lightglue")
     for feature in ("xfeat", "xfeat_sv32", "xfeat_nested@16", "mini32"):
         made_from = extract_features.provenance(features_confs.confs[feature])
-        model = matchers.load(matchers_confs.confs["lightglue"]["model"], made_from)
+        model = matchers.load(matchers_confs.for_features(CONF, made_from))
         assert model.conf["features"] == feature
     moved = json.loads(json.dumps(made_from))  # as a file has it
-    assert matchers.load({"name": "lightglue"}, moved).conf["features"] == "mini32"
+    assert matchers.load(matchers_confs.for_features(CONF, moved)).conf["features"] == "mini32"
 
 
 def test_every_projection_of_its_networks_has_an_adapter(base_weights):
     for base in ("aliked", "xfeat"):
         base_weights(base)
     named = {name for base in ("aliked", "xfeat") for name in features_confs.names(base)}
-    assert {*named, "mini32", "mini64"} == set(matchers_confs.lightglue_weights())
+    assert {*named, "mini32", "mini64"} == set(lightglue.shipped())
     for name in named:
         made_from = extract_features.provenance(features_confs.confs[name])
         assert lightglue.metadata_of(name)["made_from"] == lightglue.identity(made_from)
@@ -140,9 +142,9 @@ def test_features_without_weights_are_refused():
     made_from = extract_features.provenance(features_confs.confs["colmap_sift_sv64"])
     message = "lightglue has no weights for colmap_sift_sv64, only for aliked, aliked_nested, "
     with pytest.raises(InputError, match=message):
-        matchers.load({"name": "lightglue"}, made_from)
+        matchers_confs.for_features(CONF, made_from)
     with pytest.raises(InputError, match="no weights for features of unknown origin, only for"):
-        matchers.load({"name": "lightglue"}, {})
+        matchers_confs.for_features(CONF, {})
     with pytest.raises(InputError, match="no weights for ../../secret, only for"):
         matchers.load({"name": "lightglue", "features": "../../secret"})
 
@@ -152,13 +154,12 @@ def test_an_adapter_of_another_projection_is_refused(base_weights, tmp_path):
     made_from = extract_features.provenance(features_confs.confs["xfeat_sv32"])
     other = made_from | {"projection_sha256": "0" * 64}
     with pytest.raises(InputError, match="are for the xfeat_sv32 that ships .*, not for this one"):
-        matchers.load({"name": "lightglue"}, other)
+        matchers_confs.for_features(CONF, other)
     # a file of the same name and contents is the same
     file = shutil.copy(projections.find("xfeat_sv32"), tmp_path)
     conf = features_confs.get("xfeat", projection=file)[1]
-    assert LightGlue.for_features({}, extract_features.provenance(conf)) == {
-        "features": "xfeat_sv32"
-    }
+    found = matchers_confs.for_features(CONF, extract_features.provenance(conf))
+    assert found == {**CONF, "features": "xfeat_sv32"}
 
 
 @pytest.mark.parametrize(
@@ -187,9 +188,8 @@ def test_keypoints_beyond_the_border(base_weights):
 @pytest.mark.parametrize("change", ["truncated", "other", "missing"])
 def test_broken_adapters(base_weights, change, tmp_path, monkeypatch):
     base_weights("xfeat+lightglue")
+    file = Path(shutil.copy(lightglue.file_of("xfeat_sv32"), tmp_path))
     monkeypatch.setattr(lightglue, "WEIGHTS", tmp_path)
-    file = tmp_path / "xfeat_sv32.safetensors"
-    shutil.copy(matchers_confs.WEIGHTS / file.name, file)
     if change == "truncated":
         file.write_bytes(file.read_bytes()[:-100])
         message = "The weights of lightglue for xfeat_sv32.* are broken"

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from hloc_reduce.matchers.lightglue import LightGlue, metadata_of
+from hloc_reduce.matchers.lightglue import LightGlue
+from hloc_reduce.networks.lightglue import metadata_of
 from hloc_reduce.training import lightglue as training
 from hloc_reduce.training.lightglue import CROPS, SIDE, Labels
 from hloc_reduce.utils import colmap
@@ -97,7 +98,7 @@ def test_a_training_lowers_the_loss_and_its_weights_match(labels, tmp_path, plan
     draw = labels.draw
     monkeypatch.setattr(labels, "draw", lambda _: draw(np.random.default_rng((0, 0))))
     training.main(maps, output, "mini32", steps=4, lr=3e-4)
-    monkeypatch.setattr("hloc_reduce.matchers.lightglue.WEIGHTS", tmp_path)
+    monkeypatch.setattr("hloc_reduce.networks.lightglue.WEIGHTS", tmp_path)
     trained = LightGlue({"features": "mini32", **training.WHOLE})
     assert training.loss(trained.net, labels, 1, 0, 0).item() < 0.95 * before
     assert metadata_of("mini32")["network"] == "xfeat"

@@ -1,0 +1,93 @@
+"""LightGlue's weights: those that are published, and adapters and networks that ship."""
+
+import json
+from pathlib import Path
+
+from ..utils.cli import InputError
+from . import WEIGHTS as OF_NETWORKS
+from . import Network
+
+# LightGlue's weights, by the features that they match, as hloc and kornia call them
+LIGHTGLUE = {
+    name: Network(
+        dim,
+        f"{name}_lightglue_v0-1_arxiv-pth",
+        (
+            f"https://huggingface.co/kornia/lightglue/resolve/main/{name}_lightglue.pth",
+            f"https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/{name}_lightglue.pth",
+        ),
+        sha256,
+    )
+    for name, dim, sha256 in (
+        ("aliked", 128, "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503"),
+        ("disk", 128, "b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335"),
+        ("superpoint", 256, None),
+    )
+} | {
+    "xfeat": Network(
+        64,
+        "xfeat-lighterglue.pt",
+        (
+            "https://huggingface.co/kornia/lightglue/resolve/main/xfeat-lighterglue.pt",
+            "https://github.com/verlab/accelerated_features/raw/main/weights/xfeat-lighterglue.pt",
+        ),
+        "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
+    )
+}
+
+WEIGHTS = OF_NETWORKS / "lightglue"  # that ship, by the features that they are for
+CHECKSUMS = ("projection_sha256", "weights_sha256")  # in the provenance of features
+
+
+def shipped() -> list[str]:
+    """List the features that have a file in `WEIGHTS`."""
+    return sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
+
+
+def known() -> list[str]:
+    """List the features that there are weights for."""
+    return sorted({*LIGHTGLUE, *shipped()})
+
+
+def file_of(features: str) -> Path:
+    """Return the file in `WEIGHTS` of some features."""
+    return WEIGHTS / f"{Path(features).name}.safetensors"
+
+
+def what(features: str) -> str:
+    """Name the weights for some features in messages."""
+    return f"The weights of lightglue for {features}"
+
+
+def unknown(features: str) -> InputError:
+    """Return the error for features without weights."""
+    return InputError(
+        f"lightglue has no weights for {features}, only for {', '.join(known())}: choose another "
+        "matcher or feature."
+    )
+
+
+def identity(made_from: dict) -> dict:
+    """Return what of a provenance tells features of one name apart: checksums of weights."""
+    return {key: value for key, value in made_from.items() if key in CHECKSUMS}
+
+
+def metadata_of(features: str) -> dict:
+    """Return the metadata of a file in `WEIGHTS`.
+
+    Returns:
+        `network`, a key of `LIGHTGLUE`, and `made_from`, the `identity` of its features.
+
+    Raises:
+        InputError: when there is no such file, or it is broken.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(file_of(features), "np") as file:
+            metadata = file.metadata() or {}
+        return {"network": metadata["network"], "made_from": json.loads(metadata["made_from"])}
+    except FileNotFoundError:
+        raise unknown(features) from None
+    except (OSError, SafetensorError, KeyError, ValueError):
+        raise InputError(f"{what(features)} are broken.") from None
