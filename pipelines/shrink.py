@@ -20,6 +20,7 @@ from hloc_reduce.evaluation.summaries import map_bytes
 from hloc_reduce.hlm.reader import SUFFIX
 from hloc_reduce.localization.records import pose_of
 from hloc_reduce.localization.stage import read_queries
+from hloc_reduce.networks import lightglue
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, RunFolder
 from hloc_reduce.utils import cli, colmap
@@ -96,8 +97,10 @@ def main(
     given, matcher = matcher, matcher or features_confs.matcher_of({"model": model})
     of_hloc = matcher  # hloc's files do not say what their features are
     if matcher == "lightglue":
-        of_hloc = f"{matchers_confs.features_of(features_confs.base_of(model))}+lightglue"
-        cli.choose("matcher", of_hloc, matchers_confs.confs)
+        base = matchers_confs.features_of(features_confs.base_of(model))
+        of_hloc = f"{base}+lightglue"
+        if of_hloc not in matchers_confs.confs:
+            raise lightglue.unknown(feature)
     paths = {"hloc_outputs": hloc_outputs, "features": features, "sfm": sfm, "queries": queries}
     conf: dict[str, object] = {name: path and str(path.resolve()) for name, path in paths.items()}
     conf |= {"feature": feature, "storage": storage, "num_loc": num_loc, "max_mb": max_mb}

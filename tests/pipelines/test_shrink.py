@@ -8,7 +8,7 @@ import pytest
 from command import state, table
 from small_map import build
 
-from hloc_reduce import Localizer
+from hloc_reduce import Localizer, maps
 from hloc_reduce.utils.h5 import list_h5_names
 from pipelines import shrink
 
@@ -128,3 +128,12 @@ def test_a_folder_of_features_only(finished, tmp_path, refused):
     there_are = "feats-sift.h5, feats-sift_matches.h5, pairs-db.txt"
     assert f"it has no model of the keypoints in feats-sift.h5, only {there_are}." in said
     assert said.endswith("Give the right one, or --sfm.")
+
+
+def test_another_matcher(finished, run, refused):
+    given = ("--hloc_outputs", finished.folder, "--queries", finished.queries)
+    run(*given, "--outputs", finished.root / "small", "--matcher", "NN-mutual")
+    assert maps.Map(finished.root / "small/map").matcher == "NN-mutual"
+    message = refused(*given, "--outputs", finished.root / "other", "--matcher", "lightglue")
+    assert message.startswith("lightglue has no weights for colmap_sift_sv32, only for aliked, ")
+    assert not (finished.root / "other").exists()

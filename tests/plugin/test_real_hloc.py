@@ -20,12 +20,15 @@ from torch.nn.functional import normalize
 import hloc_reduce
 from hloc_reduce import extractors, localize_sfm, match_features, triangulation
 from hloc_reduce import hloc as plugin
+from hloc_reduce import matchers as matchers_package
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs.features import matcher_of
 from hloc_reduce.confs.matchers import confs as matchers
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.matchers.nearest_neighbor import NearestNeighbor
-from hloc_reduce.utils import parsers
+from hloc_reduce.networks.lightglue import LIGHTGLUE
+from hloc_reduce.networks.loading import read_weights
+from hloc_reduce.utils import downloads, parsers
 from hloc_reduce.utils.cli import InputError
 
 pytestmark = pytest.mark.hloc
@@ -205,6 +208,30 @@ def test_an_extractor_of_the_real_hlocs_is_a_base(
     torch.testing.assert_close(found["descriptors"].norm(dim=1), torch.ones(1, number))
     with pytest.raises(InputError, match="for sift, not for hloc"):
         extractors.load({"name": "reduced", "base": base, "projection": "sift_sv64"})
+
+
+@pytest.mark.parametrize("pruned", [True, False])
+def test_lightglue_is_hlocs(registered, base_weights, pruned, monkeypatch):
+    """Its `matches0` on the same features, and projected ones in hloc."""
+    pytest.importorskip("lightglue")
+    base_weights("aliked+lightglue")
+    file = downloads.cache() / LIGHTGLUE["aliked"].file
+    load = importlib.import_module("lightglue.lightglue").torch.hub
+    monkeypatch.setattr(load, "load_state_dict_from_url", lambda *_, **__: read_weights(file, ""))
+    options = {} if pruned else {"depth_confidence": -1, "width_confidence": -1}
+    conf = {**matchers["aliked+lightglue"]["model"], **options}
+    module = importlib.import_module("hloc.matchers.lightglue")
+    data, generator = {}, torch.Generator().manual_seed(0)
+    descriptors = normalize(torch.randn(1, 128, 200, generator=generator), dim=1)
+    for i in (0, 1):
+        data[f"keypoints{i}"] = 480 * torch.rand(1, 200, 2, generator=generator)
+        data[f"descriptors{i}"] = descriptors.flip(2) if i else descriptors
+        data[f"image_size{i}"] = torch.tensor([[640.0, 480.0]])
+        data[f"image{i}"] = torch.empty(1, 1, 480, 640)
+    own = matchers_package.load(conf)({k: v for k, v in data.items() if k[:-1] != "image"})
+    with torch.no_grad():
+        found = module.LightGlue(dict(conf)).eval()(dict(data))
+    assert torch.equal(own["matches0"], found["matches0"])
 
 
 def test_hlocs_inloc_reads_features_and_matches(registered, tmp_path):
