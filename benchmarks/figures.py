@@ -99,8 +99,8 @@ def draw_maps() -> list[Callable]:
         partial(
             panel,
             place="demo_town-400",
-            measure=lambda rows: percent(rows, "within_finest"),
-            label="within the finest limits, town [%]",
+            measure=lambda rows: percent(rows, "within_25cm"),
+            label="within 25 cm, town [%]",
         ),
     ]
 

@@ -21,7 +21,7 @@ from hloc_reduce.utils.files import replacing
 RESULTS = Path("results")
 WHAT = ("place", "list", "feature", "storage", "matcher", "variant")
 MAP = ("bytes", "photos", "points", "mb")
-HOW = ("seconds", "machine", "commit", "command", "source")
+HOW = ("seconds", "machine", "commit", "command")
 CENTIMETRES = (1, 2, 5, 25)  # position errors that are counted, with at most 2 degrees
 DEGREES = 2.0
 

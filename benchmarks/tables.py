@@ -84,7 +84,6 @@ FAMILIES: dict[str, list[Choice]] = {
         for base in ("edgepoint2_m", "mini")
     },
 }
-ALL = "all places"
 SIZES = (256, 128, 64, 32, 16, 8)
 MAPS: list[Choice] = [
     ("colmap_sift_sv32", "uint4"),
@@ -99,12 +98,6 @@ PAPER_DIMS = (64, 32, 24, 16)
 SCHEMES = ("sv", "ss", "us", "pca")
 
 
-def counted(rows: list[Row], measure: str) -> list[Row]:
-    """Return the rows to count a measure in: those of each place, or the one of all places."""
-    listed = [row for row in rows if row["place"] != ALL]
-    return listed if all(row[measure] for row in listed) else select(rows, place=ALL)
-
-
 def percent(rows: list[Row], measure: str) -> float:
     """Return the share of all queries that a measure counts, in percent."""
     return 100 * total(rows, measure) / total(rows, "queries")
@@ -112,7 +105,7 @@ def percent(rows: list[Row], measure: str) -> float:
 
 def total(rows: list[Row], measure: str) -> float:
     """Return the sum of a measure."""
-    return sum(float(row[measure]) for row in counted(rows, measure))
+    return sum(float(row[measure]) for row in rows)
 
 
 def inliers(rows: list[Row], place: str, part: str) -> str:
@@ -259,18 +252,6 @@ def extraction_table() -> Table:
     return table
 
 
-def gpu_table() -> Table:
-    """Show how long features of a photo take with a GPU and some cores of a CPU."""
-    rows = [row for row in read("extraction") if "NVIDIA" in row["variant"]]
-    cores = sorted({row["variant"] for row in rows})
-    table = [["feature", *(variant.partition(" and ")[0] for variant in cores)]]
-    for feature in dict.fromkeys(row["feature"] for row in rows):
-        found = select(rows, feature=feature)
-        cells = [select(found, variant=variant)[0]["ms"] for variant in cores]
-        table.append([f"`{feature}`", *(f"{float(cell):.0f}" for cell in cells)])
-    return table
-
-
 def scale_table() -> Table:
     """Show what all pairs of Aachen Day-Night cost, extrapolated."""
     rows = select(read("scale"), list="whole", variant="8000 keypoints")
@@ -391,7 +372,6 @@ TABLES: dict[str, Callable[[], Table]] = {
     "map_limits": map_limits_table,
     "runs": runs_table,
     "extraction": extraction_table,
-    "gpu": gpu_table,
     "scale": scale_table,
     "compact_scale": compact_scale_table,
     "matching": matching_table,

@@ -11,6 +11,7 @@ run() { echo "benchmarks.$*"; name=$1; shift; "$python" -m "benchmarks.$name" "$
 # places
 [ -e $data/demo_town/queries/ground_truth_poses.txt ] ||
     "$python" -c 'from pathlib import Path; from hloc_reduce import demo; demo.main(Path("datasets/demo_town"))'
+[ -e $data/redkitchen ] || run scan_frames --sequence $data/7-scenes-redkitchen --output $data/redkitchen
 for place in fountain-P11 sceaux; do
     [ -e $data/dark-$place ] || run darken_place --map "$(scene $place)" --output $data/dark-$place
     [ -e $data/dusk-$place ] || run darken_place --map "$(scene $place)" --output $data/dusk-$place --gain 0.3 0.5
@@ -37,15 +38,18 @@ for place in fox kitchen liberty-statue south-building; do
 done
 
 run strangers --output $data/strangers
-maps=
-for place in bronze-statue cyprus entry-P10 fountain-P11 fox kitchen liberty-statue monstree sceaux south-building; do
-    maps="$maps --map $(scene $place)"
-done
-tried="--same entry-P10 fountain-P11 herz-jesus --trials 60 --strangers $data/strangers"
-for feature in colmap_sift_sv64 xfeat_sv32; do
-    run trials $maps --dataset $data/herz-jesus $tried --feature $feature
-done
-run trials $maps $tried --feature colmap_sift_sv64 --seed 1
+# fox and south-building, whose images are all matched with each photo, only with the default feature
+small="bronze-statue cyprus entry-P10 fountain-P11 kitchen liberty-statue monstree sceaux"
+tried() { # maps of PLACES, features and other options
+    maps=
+    for place in $1; do maps="$maps --map $(scene "$place")"; done
+    shift
+    run trials $maps --same entry-P10 fountain-P11 herz-jesus --trials 60 --strangers $data/strangers "$@"
+}
+tried "$small fox south-building" --dataset $data/herz-jesus --feature colmap_sift_sv64
+tried "$small" --dataset $data/herz-jesus --feature xfeat_sv32
+tried "$small" --dataset $data/herz-jesus --feature colmap_sift_sv64 --seed 1
+tried "bronze-statue cyprus entry-P10 fountain-P11 kitchen" --dataset $data/herz-jesus --feature colmap_sift_sv16
 
 # how fast?
 run extraction --dataset $data/herz-jesus "$@" \
