@@ -23,20 +23,18 @@ run matching_ap --map "$(scene fountain-P11)" --map "$(scene sceaux)" --map "$(s
     --map $data/herz-jesus/images_upright:$data/herz-jesus/3D-models/aachen_v_1_1 "$@"
 
 # how small a map?
-run small_maps --dataset $data/herz-jesus --feature colmap_sift_sv32 xfeat_sv32 mini32 --storage uint4 uint2 \
-    --max_mb 0.02 0.03 0.06 0.1 "$@"
+small_maps() { # PLACE, FEATURE, STORAGE and sizes
+    place=$1 feature=$2 storage=$3
+    shift 3
+    run small_maps --dataset $data/$place --feature $feature --storage $storage --max_mb "$@"
+}
+small_maps herz-jesus colmap_sift_sv32 uint4 0.02 0.03 0.06 0.1 "$@"
+small_maps herz-jesus xfeat_sv32 uint2 0.02 0.03 0.06 0.1 "$@"
+small_maps herz-jesus mini32 uint2 0.02 0.03 0.06 0.1 "$@"
 [ -e $data/demo_town-400 ] || "$python" -m pipelines.aachen --demo --demo_photos 400
-run small_maps --dataset $data/demo_town-400 --feature colmap_sift_sv32 --storage uint4 uint2 \
-    --max_mb 0.1 0.25 0.5 1 "$@"
+small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.25 0.5 1 "$@"
 
 # how often wrong?
-for place in bronze-statue cyprus entry-P10 fountain-P11 fox kitchen liberty-statue monstree sceaux south-building; do
-    run photos_alone --map "$(scene $place)" "$@"
-done
-for place in fox kitchen liberty-statue south-building; do
-    run photos_alone --map "$(scene $place)" --subset 10 --subsets 3 "$@"
-done
-
 run strangers --output $data/strangers
 # fox and south-building, whose images are all matched with each photo, only with the default feature
 small="bronze-statue cyprus entry-P10 fountain-P11 kitchen liberty-statue monstree sceaux"
