@@ -28,7 +28,7 @@ import torch
 from scipy.linalg import rq
 
 from benchmarks.darken_place import darken
-from benchmarks.rows import how
+from benchmarks.rows import add_again_option, how
 from benchmarks.trial_rows import COLUMNS, RESHAPED, TRIALS, to_row
 from hloc_reduce import extract_features, localize_inloc, maps, projections
 from hloc_reduce.confs import features as features_confs
@@ -454,10 +454,15 @@ def _main() -> None:
         "--seed", type=int, default=0, help="seed of the maps and of the drawn photos"
     )
     parser.add_argument("--output", type=Path, default=Path("outputs/trials"))
+    add_again_option(parser)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    rows = _trials_of_all(args)
     file = TRIALS / f"{args.feature.replace(':', '-')}-{args.seed}.csv"
+    tried = {root.name for root in args.dataset} | set(parse_maps(args.map))
+    if file.exists() and not args.again and tried <= {row["map"] for row in _read(file)}:
+        print(f"All maps have rows in {file}.")
+        return
+    rows = _trials_of_all(args)
     write_csv(rows, file, COLUMNS)
     outcomes = Counter(row["outcome"] for row in rows)
     print(f"{len(rows):,} trials: {dict(outcomes)}. They are in {file}.")
@@ -483,10 +488,14 @@ def _trials_of_all(args: argparse.Namespace) -> list[dict]:
         if not file.exists():
             options = args.feature, args.trials, matcher, args.seed
             write_csv(run(place, others, folder, *options), file, COLUMNS)
-        with file.open(newline="") as opened:
-            rows += csv.DictReader(opened)
+        rows += _read(file)
         print(f"{name}: {len(rows):,} trials", flush=True)
     return rows
+
+
+def _read(file: Path) -> list[dict]:
+    with file.open(newline="") as opened:
+        return list(csv.DictReader(opened))
 
 
 def _strangers(folder: Path, output: Path, base: str) -> Place:
