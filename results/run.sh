@@ -44,10 +44,10 @@ tried() { # maps of PLACES, features and other options
     shift
     run trials $maps --same entry-P10 fountain-P11 herz-jesus --trials 60 --strangers $data/strangers "$@"
 }
-tried "$small fox south-building" --dataset $data/herz-jesus --feature colmap_sift_sv64
-tried "$small" --dataset $data/herz-jesus --feature xfeat_sv32
-tried "$small" --dataset $data/herz-jesus --feature colmap_sift_sv64 --seed 1
-tried "bronze-statue cyprus entry-P10 fountain-P11 kitchen" --dataset $data/herz-jesus --feature colmap_sift_sv16
+tried "$small fox south-building" --dataset $data/herz-jesus --feature colmap_sift_sv64 "$@"
+tried "$small" --dataset $data/herz-jesus --feature xfeat_sv32 "$@"
+tried "$small" --dataset $data/herz-jesus --feature colmap_sift_sv64 --seed 1 "$@"
+tried "bronze-statue cyprus entry-P10 fountain-P11 kitchen" --dataset $data/herz-jesus --feature colmap_sift_sv16 "$@"
 
 # how fast?
 run extraction --dataset $data/herz-jesus "$@" \
