@@ -19,6 +19,7 @@ done
 
 # which feature? how many bytes?
 run accuracy results/accuracy.yaml "$@"
+run accuracy results/paper.yaml "$@"
 run matching_ap --map "$(scene fountain-P11)" --map "$(scene sceaux)" --map "$(scene kitchen)" \
     --map $data/herz-jesus/images_upright:$data/herz-jesus/3D-models/aachen_v_1_1 "$@"
 
