@@ -226,7 +226,7 @@ def _main() -> None:
         return
     cells = {"place": args.data.name, "feature": f"{args.dim} numbers", "storage": args.storage}
     cells |= {"variant": f"{args.keypoints} keypoints"}
-    known = rows.select(rows.read(NAME), **cells)
+    known = rows.select(rows.measured(NAME), **cells)
     if not args.again and rows.select(known, list="whole"):
         return
     fractions = []

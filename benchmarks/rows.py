@@ -37,6 +37,11 @@ def read(name: str) -> list[Row]:
         return list(csv.DictReader(file))
 
 
+def measured(name: str) -> list[Row]:
+    """Return the rows of `results/<name>.csv` that the present command measured."""
+    return [row for row in read(name) if not row.get("source")]
+
+
 def select(rows: Iterable[Row], **cells: object) -> list[Row]:
     """Return the rows that have all given cells."""
     return [row for row in rows if all(row[key] == str(cell) for key, cell in cells.items())]

@@ -259,18 +259,6 @@ def extraction_table() -> Table:
     return table
 
 
-def gpu_table() -> Table:
-    """Show how long features of a photo take with a GPU and some cores of a CPU."""
-    rows = [row for row in read("extraction") if "NVIDIA" in row["variant"]]
-    cores = sorted({row["variant"] for row in rows})
-    table = [["feature", *(variant.partition(" and ")[0] for variant in cores)]]
-    for feature in dict.fromkeys(row["feature"] for row in rows):
-        found = select(rows, feature=feature)
-        cells = [select(found, variant=variant)[0]["ms"] for variant in cores]
-        table.append([f"`{feature}`", *(f"{float(cell):.0f}" for cell in cells)])
-    return table
-
-
 def scale_table() -> Table:
     """Show what all pairs of Aachen Day-Night cost, extrapolated."""
     rows = select(read("scale"), list="whole", variant="8000 keypoints")
@@ -391,7 +379,6 @@ TABLES: dict[str, Callable[[], Table]] = {
     "map_limits": map_limits_table,
     "runs": runs_table,
     "extraction": extraction_table,
-    "gpu": gpu_table,
     "scale": scale_table,
     "compact_scale": compact_scale_table,
     "matching": matching_table,

@@ -11,6 +11,7 @@ run() { echo "benchmarks.$*"; name=$1; shift; "$python" -m "benchmarks.$name" "$
 # places
 [ -e $data/demo_town/queries/ground_truth_poses.txt ] ||
     "$python" -c 'from pathlib import Path; from hloc_reduce import demo; demo.main(Path("datasets/demo_town"))'
+[ -e $data/redkitchen ] || run scan_frames --sequence $data/7-scenes-redkitchen --output $data/redkitchen
 for place in fountain-P11 sceaux; do
     [ -e $data/dark-$place ] || run darken_place --map "$(scene $place)" --output $data/dark-$place
     [ -e $data/dusk-$place ] || run darken_place --map "$(scene $place)" --output $data/dusk-$place --gain 0.3 0.5
@@ -18,34 +19,36 @@ done
 
 # which feature? how many bytes?
 run accuracy results/accuracy.yaml "$@"
+run accuracy results/paper.yaml "$@"
 run matching_ap --map "$(scene fountain-P11)" --map "$(scene sceaux)" --map "$(scene kitchen)" \
     --map $data/herz-jesus/images_upright:$data/herz-jesus/3D-models/aachen_v_1_1 "$@"
 
 # how small a map?
-run small_maps --dataset $data/herz-jesus --feature colmap_sift_sv32 xfeat_sv32 mini32 --storage uint4 uint2 \
-    --max_mb 0.02 0.03 0.06 0.1 "$@"
+small_maps() { # PLACE, FEATURE, STORAGE and sizes
+    place=$1 feature=$2 storage=$3
+    shift 3
+    run small_maps --dataset $data/$place --feature $feature --storage $storage --max_mb "$@"
+}
+small_maps herz-jesus colmap_sift_sv32 uint4 0.02 0.03 0.06 0.1 "$@"
+small_maps herz-jesus xfeat_sv32 uint2 0.02 0.03 0.06 0.1 "$@"
+small_maps herz-jesus mini32 uint2 0.02 0.03 0.06 0.1 "$@"
 [ -e $data/demo_town-400 ] || "$python" -m pipelines.aachen --demo --demo_photos 400
-run small_maps --dataset $data/demo_town-400 --feature colmap_sift_sv32 --storage uint4 uint2 \
-    --max_mb 0.1 0.25 0.5 1 "$@"
+small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.25 0.5 1 "$@"
 
 # how often wrong?
-for place in bronze-statue cyprus entry-P10 fountain-P11 fox kitchen liberty-statue monstree sceaux south-building; do
-    run photos_alone --map "$(scene $place)" "$@"
-done
-for place in fox kitchen liberty-statue south-building; do
-    run photos_alone --map "$(scene $place)" --subset 10 --subsets 3 "$@"
-done
-
-run strangers --output $data/strangers
-maps=
-for place in bronze-statue cyprus entry-P10 fountain-P11 fox kitchen liberty-statue monstree sceaux south-building; do
-    maps="$maps --map $(scene $place)"
-done
-tried="--same entry-P10 fountain-P11 herz-jesus --trials 60 --strangers $data/strangers"
-for feature in colmap_sift_sv64 xfeat_sv32; do
-    run trials $maps --dataset $data/herz-jesus $tried --feature $feature
-done
-run trials $maps $tried --feature colmap_sift_sv64 --seed 1
+[ -e $data/strangers ] || run strangers --output $data/strangers || true # from GitHub
+# fox and south-building, whose images are all matched with each photo, only with the default feature
+small="bronze-statue cyprus entry-P10 fountain-P11 kitchen liberty-statue monstree sceaux"
+tried() { # maps of PLACES, features and other options
+    maps=
+    for place in $1; do maps="$maps --map $(scene "$place")"; done
+    shift
+    run trials $maps --same entry-P10 fountain-P11 herz-jesus --trials 60 --strangers $data/strangers "$@"
+}
+tried "$small fox south-building" --dataset $data/herz-jesus --feature colmap_sift_sv64 "$@"
+tried "$small" --dataset $data/herz-jesus --feature xfeat_sv32 "$@"
+tried "$small" --dataset $data/herz-jesus --feature colmap_sift_sv64 --seed 1 "$@"
+tried "bronze-statue cyprus entry-P10 fountain-P11 kitchen" --dataset $data/herz-jesus --feature colmap_sift_sv16 "$@"
 
 # how fast?
 run extraction --dataset $data/herz-jesus "$@" \

@@ -56,7 +56,7 @@ def mirror_images(outputs):
     ],
 )
 def test_poses_like_those_of_mirrored_photos_are_doubtful(kind, agreement, confidence, expected):
-    gate = Gate(matches=kind)
+    gate = Gate(match_kind=kind)
     measures = Measures(agreement=agreement, confidence=confidence)
     assert gates.may_be_mirrored(measures, gate) == expected
     assert not gates.may_be_mirrored(replace(measures, is_camera_given=True), gate)

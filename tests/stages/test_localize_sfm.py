@@ -222,7 +222,7 @@ def test_the_command_line_of_localization(built, monkeypatch):
         ("NN-mutual", None, "mutual"),
         (None, "feats-sift_matches-NN-mutual-ratio.8_pairs-query-netvlad20.h5", "ratio"),
         (None, "feats-sift_matches-NN-mutual_pairs-query-netvlad20.h5", "mutual"),
-        (None, "feats-sift_matches-superglue_pairs-query-netvlad20.h5", "mutual"),
+        (None, "feats-sift_matches-superglue_pairs-query-netvlad20.h5", "lightglue"),
     ],
 )
 def test_the_gate_knows_the_matcher_by_its_file(built, conf, name, kind, monkeypatch):
