@@ -296,13 +296,13 @@ def run(
     model = matchers_confs.confs[matcher]["model"]
     made_from = extract_features.provenance(features_confs.get(feature.partition(":")[0])[1])
     matching = matchers.load(matchers_confs.for_features(model, made_from))
-    others_keys = [key for key in matching.keys() if key != "descriptors"]  # noqa: SIM118
+    other_keys = [key for key in matching.feature_keys() if key != "descriptors"]
     tried = list(trials(place, others, output, number, seed))
     describe = Described(feature)
     shown, rows = {}, []
 
     def features_of(file: h5py.File, name: str, is_query: bool = False) -> dict:
-        features = get_features(file, name, others_keys)
+        features = get_features(file, name, other_keys)
         found = {key: torch.from_numpy(value) for key, value in features.items()}
         return {**found, "descriptors": describe(file, name, is_query).T}
 

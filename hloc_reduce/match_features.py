@@ -196,8 +196,8 @@ def _match(
         matcher = matchers.load(model).eval().to(device)
         match = partial(_match_batch, matcher, device, gpu_bytes or GPU_BYTES)
         for file in (file0, file1):
-            _check_features(file, matcher.keys(), conf["model"]["name"])
-        cache = FeatureCache(CACHE_BYTES, matcher.keys())
+            _check_features(file, matcher.feature_keys(), conf["model"]["name"])
+        cache = FeatureCache(CACHE_BYTES, matcher.feature_keys())
         read = map(partial(_read, cache, file0, file1), pairs)
         batches = iter(lambda: list(islice(read, size)), [])
         with closing(parallel.ordered("match", match, batches, workers)) as matched:

@@ -162,7 +162,7 @@ def check_matcher(matcher: str) -> None:
     cli.choose("matcher", matcher, matchers_confs.confs)
     model = matchers_confs.confs[matcher]["model"]
     if not is_integer_matcher(model):  # the others need torch
-        check_feature_keys(matcher, matchers.find(model).keys())
+        check_feature_keys(matcher, matchers.find(model).feature_keys())
 
 
 def matcher_of(matcher: str) -> str:

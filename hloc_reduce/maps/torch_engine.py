@@ -55,7 +55,7 @@ class TorchMatching:
 
     def __init__(self, matcher: Matcher, device: str):
         self._matcher, self._device = matcher.eval().to(device), device
-        self.feature_keys, self.takes_codes = matcher.keys(), matcher.takes_codes
+        self.feature_keys, self.takes_codes = matcher.feature_keys(), matcher.takes_codes
 
     def prepare(self, features: Features) -> Tensors:
         """Return what the matcher needs of the features of an image."""

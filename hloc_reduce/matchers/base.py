@@ -37,7 +37,7 @@ class Matcher(BaseModel):
     required_inputs: tuple[str, ...] = ("descriptors0", "descriptors1")
 
     @classmethod
-    def keys(cls) -> tuple[str, ...]:
+    def feature_keys(cls) -> tuple[str, ...]:
         """Return what it needs of the features of an image, such as descriptors."""
         return tuple(dict.fromkeys(name.rstrip("01") for name in cls.required_inputs))
 
@@ -48,7 +48,7 @@ class Matcher(BaseModel):
         """Match several pairs; a subclass may match them at once.
 
         Args:
-            pairs: the features of both images, at least those that `keys` names: as in
+            pairs: the features of both images, at least those that `feature_keys` names: as in
                 `_forward`, without the batch dimension, all on one device.
             gpu_bytes: GPU memory to use at once.
 

@@ -20,7 +20,7 @@ from .. import extract_features, extractors, logger, projections
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..matchers import lightglue
-from ..networks.lightglue import LIGHTGLUE, WEIGHTS, identity
+from ..networks.lightglue import LIGHTGLUE, identity
 from ..runtime.versions import versions
 from ..utils import cli, options
 from ..utils.cli import InputError
@@ -43,7 +43,7 @@ Described = tuple[np.ndarray, np.ndarray]  # descriptors (N, D), and those that 
 def main(
     feature: Annotated[Sequence[str], Option("feature", features_confs.confs)],
     images: Iterable[Path],
-    output: Path = WEIGHTS,
+    output: Path = Path("outputs/training"),
     photos: Annotated[int, Option(least=1)] = 60,
 ) -> list[Path]:
     """Fit adapters.
