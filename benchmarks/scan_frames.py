@@ -58,7 +58,7 @@ def main(sequence: Path, output: Path, scanned: range, queried: range) -> None:
         sequence: folder of camera-intrinsics.txt and frames.
         output: new folder of the place.
         scanned: numbers of the frames that become scans; those that do not exist are left out.
-        queried: numbers of the frames that become queries, likewise.
+        queried: numbers of the frames that become queries; the same holds for these.
 
     Raises:
         InputError: if there is no such frame.

@@ -149,8 +149,8 @@ MATCH_KINDS = {
     "ratio": MatchKind(Evidence(4.13, 17.45), -17.21, 0.8, 0.4),
     "few": MatchKind(Evidence(2.72, 14.71), -8.2, 0.8, 0.4),
     "mutual": MatchKind(Evidence(4.01, 11.42), -8.89, 0.3, 0.8),
-    "lightglue": MatchKind(Evidence(4.01, 11.42), -8.89, 0.3, 0.8),
 }
+MATCH_KINDS["lightglue"] = MATCH_KINDS["mutual"]  # until there are trials of it
 NEAREST_NEIGHBOR = "nearest_neighbor"  # whose kind its ratio test tells
 KINDS_OF_MATCHERS = {"adalam": "mutual", "lightglue": "lightglue", "superglue": "lightglue"}
 # probability from which on mirror images are not tried; the wrong pose of a mirrored photo of a

@@ -61,9 +61,10 @@ def what(features: str) -> str:
 
 def unknown(features: str) -> InputError:
     """Return the error for features without weights."""
+    bases = ", ".join(sorted({name.partition("_")[0] for name in known()}))
     return InputError(
-        f"lightglue has no weights for {features}, only for {', '.join(known())}: choose another "
-        "matcher or feature."
+        f"lightglue has no weights for {features}, only for {bases} and projections of them, see "
+        "--list_features: choose another matcher or feature."
     )
 
 

@@ -109,9 +109,10 @@ def at_keypoints(
 
 def _network(feature: str) -> str:
     """Return the key of `LIGHTGLUE` that an adapter of a feature is for."""
-    base = matchers_confs.features_of(
-        features_confs.base_of(features_confs.confs[feature]["model"])
-    )
+    model = features_confs.confs[feature]["model"]
+    base = matchers_confs.features_of(features_confs.base_of(model))
+    if base in LIGHTGLUE and model.get("projection") is None:
+        raise InputError(f"{feature} needs no adapter: LightGlue has weights for it.")
     if base in LIGHTGLUE:
         return base
     if base in features_confs.MODELS:
@@ -163,7 +164,7 @@ def least_squares(kinds: Sequence[np.ndarray], taken: np.ndarray) -> tuple[np.nd
 
     Args:
         kinds: descriptors (N, D) of the same keypoints, in different storages.
-        taken: (N, E), what each of them is to be mapped to.
+        taken: (N, E) the target of each.
 
     Returns:
         The map (E, D) and the offset (E,).

@@ -243,8 +243,8 @@ def loss(student: nn.Module, labels: Labels, batch: int, seed: int, step: int) -
 
 @strings_as_paths
 def main(
-    maps: dict[str, tuple[Path, Path]],
     output: Path,
+    map: Annotated[Sequence[str], tracks.MAP_OPTION],
     feature: Annotated[str, Option("feature", MINI)] = MINI[0],
     steps: int = 4000,
     batch: Annotated[int, Option(least=1)] = 1,
@@ -254,8 +254,8 @@ def main(
     """Tune LighterGlue.
 
     Args:
-        maps: from the name of each map to the folders of its images and its COLMAP model.
         output: file of the weights, .safetensors.
+        map: maps to learn from.
         feature: the mini, whose adapter the training starts from.
         steps: number of training steps.
         batch: pairs of views of a step.
@@ -266,12 +266,14 @@ def main(
         The file.
 
     Raises:
-        InputError: when no photos share points, or the learning rate is not above 0.
+        InputError: when a map cannot be used, no photos share points, or the learning rate is not
+            above 0.
     """
     if output.suffix != ".safetensors":
         raise InputError(f"--output {output}: it must end in .safetensors.")
     if not 0 < lr < math.inf:
         raise InputError(f"--lr {lr:g}: it must be a number above 0.")
+    maps = tracks.parse_maps(map)
     photos, pairs, places = read(maps)
     if not pairs:
         raise InputError("No photos of the maps share points.")
@@ -307,32 +309,9 @@ def main(
     return output
 
 
-def of_maps(
-    output: Path,
-    map: Annotated[Sequence[str], tracks.MAP_OPTION],
-    feature: Annotated[str, Option("feature", MINI)] = MINI[0],
-    steps: int = 4000,
-    batch: Annotated[int, Option(least=1)] = 1,
-    lr: float = 1e-4,
-    seed: int = 0,
-) -> None:
-    """Tune LighterGlue.
-
-    Args:
-        output: file of the weights, .safetensors.
-        map: maps to learn from.
-        feature: the mini, whose adapter the training starts from.
-        steps: number of training steps.
-        batch: pairs of views of a step.
-        lr: learning rate of Adam, which falls linearly to 0.
-        seed: seed of everything random.
-    """
-    main(tracks.parse_maps(map), output, feature, steps, batch, lr, seed)
-
-
 def _main() -> None:
     example = "--map fox/images:fox/sparse --output weights/mini32.safetensors"
-    options.call(of_maps, __doc__, example)
+    options.call(main, __doc__, example)
 
 
 if __name__ == "__main__":

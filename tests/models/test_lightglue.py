@@ -19,6 +19,7 @@ from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.matchers.lightglue import LightGlue
 from hloc_reduce.networks import lightglue
 from hloc_reduce.networks.lightglue import LIGHTGLUE
+from hloc_reduce.training import adapters
 from hloc_reduce.utils import downloads
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.parsers import parse_query_list
@@ -99,15 +100,13 @@ def test_keypoints_match_by_place_and_descriptor(base_weights):
 @pytest.mark.parametrize("storage", ["float16", "uint4"])
 def test_projected_descriptors_match_as_they_are(base_weights, described, feature, storage):
     """By an adapter, which takes codes, too."""
-    from hloc_reduce.training.adapters import rounded
-
     base_weights("xfeat+lightglue")
     first, second, right = photos(described)
     ((expected, _),) = LightGlue({"features": "xfeat"}).match([(first, second)])
     project = projections.load(feature)
     pair = []
     for one in (first, second):
-        small = rounded(project(one["descriptors"].T).numpy(), feature, storage)
+        small = adapters.rounded(project(one["descriptors"].T).numpy(), feature, storage)
         pair.append(one | {"descriptors": torch.from_numpy(small).T})
     matcher = LightGlue({"features": feature})
     assert matcher.net.input_proj.in_features == 32
@@ -140,7 +139,7 @@ def test_every_projection_of_its_networks_has_an_adapter(base_weights):
 
 def test_features_without_weights_are_refused():
     made_from = extract_features.provenance(features_confs.confs["colmap_sift_sv64"])
-    message = "lightglue has no weights for colmap_sift_sv64, only for aliked, aliked_nested, "
+    message = "lightglue has no weights for colmap_sift_sv64, only for aliked, disk, mini32, "
     with pytest.raises(InputError, match=message):
         matchers_confs.for_features(CONF, made_from)
     with pytest.raises(InputError, match="no weights for features of unknown origin, only for"):
@@ -242,3 +241,12 @@ def test_photos_are_localized_by_it(
     message = refused(*build[:-1], tmp_path / "o", *given, "--feature", "colmap_sift_sv32")
     assert message.startswith("lightglue has no weights for colmap_sift_sv32, only for aliked, ")
     assert not list((tmp_path / "o").rglob("*.h5"))
+
+
+def test_only_projections_and_minis_need_adapters(base_weights, tmp_path):
+    base_weights("xfeat")
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((64, 64, 3), np.uint8))
+    with pytest.raises(InputError, match="xfeat needs no adapter: LightGlue has weights for it"):
+        adapters.main(["xfeat"], [tmp_path], tmp_path)
+    with pytest.raises(InputError, match="no weights for the base of sift_sv64, sift"):
+        adapters.main(["sift_sv64"], [tmp_path], tmp_path)

@@ -93,11 +93,11 @@ def test_a_training_lowers_the_loss_and_its_weights_match(labels, tmp_path, plan
     student = LightGlue({"features": "mini32", **training.WHOLE}).net
     before = training.loss(student, labels, 1, 0, 0).item()
     output = tmp_path / "mini32.safetensors"
-    maps = {"plane": (plane / "images", plane / "model")}
+    maps = [f"{plane / 'images'}:{plane / 'model'}"]
     monkeypatch.setattr(training, "Labels", lambda *_: labels)
     draw = labels.draw
     monkeypatch.setattr(labels, "draw", lambda _: draw(np.random.default_rng((0, 0))))
-    training.main(maps, output, "mini32", steps=4, lr=3e-4)
+    training.main(output, maps, "mini32", steps=4, lr=3e-4)
     monkeypatch.setattr("hloc_reduce.networks.lightglue.WEIGHTS", tmp_path)
     trained = LightGlue({"features": "mini32", **training.WHOLE})
     assert training.loss(trained.net, labels, 1, 0, 0).item() < 0.95 * before
@@ -107,8 +107,8 @@ def test_a_training_lowers_the_loss_and_its_weights_match(labels, tmp_path, plan
 
 
 def test_wrong_options(tmp_path, plane):
-    maps = {"plane": (plane / "images", plane / "model")}
+    maps = [f"{plane / 'images'}:{plane / 'model'}"]
     with pytest.raises(InputError, match="must end in .safetensors"):
-        training.main(maps, tmp_path / "mini32.pth")
+        training.main(tmp_path / "mini32.pth", maps)
     with pytest.raises(InputError, match="--lr 0: it must be a number above 0"):
-        training.main(maps, tmp_path / "mini32.safetensors", lr=0)
+        training.main(tmp_path / "mini32.safetensors", maps, lr=0)
