@@ -36,7 +36,7 @@ def what(job: Job) -> dict[str, str]:
         "matcher": str(job.matcher),
     }
     # the name of a job tells further options that are not the default
-    parts = job.name.split("+")[1:]
+    parts = job.name.replace(f"+{job.matcher}", "").split("+")[1:]
     return given | {"variant": " ".join(part for part in parts if part not in given.values())}
 
 

@@ -46,6 +46,7 @@ def main(
     executor: Executor = SERIAL,
     points: Annotated[Path, HIDDEN] | None = None,
     gate: Gate = DEFAULT_GATE,
+    again: stage.Try | None = None,
 ) -> dict[str, dict]:
     """Localize queries in a data set of InLoc's layout.
 
@@ -69,6 +70,7 @@ def main(
         points: file of the points that keypoints of cutouts show, for later runs and for other
             features with the same keypoints; default: `points_file(features)`.
         gate: what a pose must have for the query to be called localized.
+        again: how queries that are not localized are matched once more.
 
     Returns:
         A record for each query, as `localization.stage.main` returns it. A query that is not
@@ -110,6 +112,7 @@ def main(
         skip_matches=skip_matches or 0,
         executor=executor,
         gate=gate,
+        again=again,
     )
 
 

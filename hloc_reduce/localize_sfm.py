@@ -41,6 +41,7 @@ def main(
     executor: Executor = SERIAL,
     gate: Gate = DEFAULT_GATE,
     mirror_images: MirrorImages | None = None,
+    again: stage.Try | None = None,
 ) -> dict[str, dict]:
     """Localize queries in a COLMAP model.
 
@@ -66,6 +67,7 @@ def main(
         executor: runs the localization; with a reconstruction in memory, this process does.
         gate: what a pose must have for the query to be called localized.
         mirror_images: extracts and matches mirror images of queries, see `localization.stage.main`.
+        again: how queries that are not localized are matched once more.
 
     Returns:
         A record for each query, as `localization.stage.main` returns it and keeps it in
@@ -113,6 +115,7 @@ def main(
             executor=executor,
             gate=gate,
             mirror_images=mirror_images,
+            again=again,
         )
     finally:
         _load.cache_clear()  # a map may be large

@@ -67,7 +67,7 @@ def main(
         with run.stage("pairs_from_covisibility"):
             pairs_from_covisibility.main(reference, sfm_pairs, given.num_covis)
         sfm_matches = run.match("match_map", sfm_pairs, features)
-        sfm = outputs / f"sfm_{run.feature}+{run.matcher}"
+        sfm = outputs / f"sfm_{run.feature}+{run.steps[0]}"
         with run.stage("triangulation"):
             reconstruction = triangulation.main(
                 sfm, reference, place.images, sfm_pairs, features, sfm_matches
@@ -89,6 +89,7 @@ def main(
                 full_names=place.full_names,
                 executor=given.executor,
                 gate=given.gate,
+                again=run.again(loc_pairs, features),
             )
         sizes = {"map_points3D": reconstruction.num_points3D(), "map_bytes": run.map_bytes(sfm)}
         return run.finish_dataset(lists, limits, records, poses, loc_matches, sfm, **sizes)

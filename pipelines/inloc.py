@@ -70,6 +70,7 @@ def main(
                 executor=given.executor,
                 points=points,
                 gate=given.gate,
+                again=run.again(pairs, features),
             )
         source = "list" if place.query_list.is_file() else "iphone7"
         limits = dict.fromkeys(lists, INLOC_THRESHOLDS)

@@ -13,11 +13,14 @@ from typing import Annotated, Any
 
 from hloc_reduce import compact, extract_features, localize_sfm, logger, maps
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.confs import retrieval as retrieval_confs
+from hloc_reduce.confs.matchers import NN_LIGHTGLUE
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
+from hloc_reduce.match_features import check_model
 from hloc_reduce.runtime import trace
 from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
@@ -65,7 +68,8 @@ def open_map(
         feature: local feature, see `list_features`, or a YAML file with its configuration; default:
             colmap_sift_sv64.
         projection: projection file to use with the base descriptor of `feature`.
-        matcher: matcher; default: the feature's, see `list_features`.
+        matcher: matcher of a new map and of queries; default: the feature's, see `list_features`,
+            or that of a map that was built.
         num_covis: other images that each map image is matched with.
         overwrite: recompute existing results.
         storage: storage of the descriptors of map images (those of queries stay floats); default:
@@ -97,7 +101,7 @@ def open_map(
     new: dict[str, Any] = {
         "feature": feature or features_confs.RECOMMENDED,
         "projection": projection,
-        "matcher": matcher,
+        "matcher": None if matcher == NN_LIGHTGLUE else matcher,
         "overwrite": overwrite,
         "storage": storage or STORAGES[0],
         "keypoints": keypoints or KEYPOINT_SETTINGS[0],
@@ -118,7 +122,7 @@ def open_map(
     built = _open(model_or_map, folder, overwrite)
     if feature or projection:
         built.check_feature(feature or features_confs.RECOMMENDED, projection)
-    given = {"storage": storage, "keypoints": keypoints, "matcher": matcher, "retrieval": named}
+    given = {"storage": storage, "keypoints": keypoints, "retrieval": named}
     for option, value in given.items():
         if value not in (None, getattr(built, option)):
             raise InputError(
@@ -151,6 +155,7 @@ def main(
     strict: bool = False,
     gate: Gate = DEFAULT_GATE,
     retrieval: Retrieval | None = None,
+    matcher: Matcher | None = None,
 ) -> dict:
     """Localize queries in a map and return the summary, as in summary.json.
 
@@ -166,6 +171,7 @@ def main(
         strict: fail at an unreadable query photo instead of recording it as not localized.
         gate: what a pose must have for the query to be called localized.
         retrieval: hloc's text file of pairs or h5 file of global descriptors; default: the map's.
+        matcher: matcher of queries; default: the map's.
 
     Raises:
         InputError: when something is missing or wrong.
@@ -177,7 +183,14 @@ def main(
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
     photos = Photos(outputs / MADE_FROM, built, query_images, names)
+    matcher = matcher or built.matcher
+    is_fast = built.matcher != "lightglue"
+    fast = built.matcher if is_fast else features_confs.matcher_of(built.conf)
+    steps = matchers_confs.steps_of(matcher, fast)
+    for step in {*steps} - {built.matcher}:
+        check_model(matchers_confs.confs[step], extract_features.provenance(built.conf))
     conf = {"map": built.place, **identity(outputs, query_images, queries), "num_loc": num_loc}
+    conf |= {"matcher": matcher} if matcher != built.matcher else {}
     retrieval = built.retrieval if retrieval is None else retrieval
     retrieved = f"{retrieval_name(retrieval)}{num_loc}"
     loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
@@ -191,7 +204,7 @@ def main(
         f"--map {built.folder} --overwrite."
     )
     folder = RunFolder(outputs, conf, overwrite, inputs, bool(photos.changed), remedy=remedy)
-    with Run(folder, built.feature, built.matcher) as run:
+    with Run(folder, built.feature, matcher, steps) as run:
         photos.write()
         listed = queries or wanted.write(outputs / LISTED)
         wanted.log()
@@ -212,7 +225,10 @@ def main(
             else:
                 retrieve(retrieval, features, *wanted_pairs)
         matches = run.match("match_queries", loc_pairs, features, built.features)
-        poses = outputs / f"poses_hloc_{built.feature}+{built.matcher}_{retrieved}.txt"
+        poses = outputs / f"poses_hloc_{built.feature}+{matcher}_{retrieved}.txt"
+        mirror_images = run.mirror_images(
+            built.conf, query_images, loc_pairs, features, built.features
+        )
         with run.stage("localization"):
             records = localize_sfm.main(
                 built.sfm,
@@ -224,9 +240,8 @@ def main(
                 refinements=wanted.refinements,
                 full_names=True,
                 gate=gate,
-                mirror_images=run.mirror_images(
-                    built.conf, query_images, loc_pairs, features, built.features
-                ),
+                mirror_images=mirror_images(steps[0]),
+                again=run.again(loc_pairs, features, built.features, mirror_images),
             )
         limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
         summary = {
@@ -283,9 +298,12 @@ def _check(given: dict, is_changed: bool) -> None:
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
+    is_built = given["map_images"] is None and given["database"] is None
+    if given["matcher"] is not None and given["query_images"] is None and is_built:
+        raise InputError("--matcher is for a new map or for queries: give --query_images, or none.")
     if given["compact"] is not None:
         compact.check_output(given["compact"])
-        if given["matcher"] is not None:
+        if given["matcher"] and given["matcher"] != NN_LIGHTGLUE:
             compact.check_matcher(given["matcher"])
         if (folder := given["model_or_map"]) is not None and maps.is_compact(folder):
             raise InputError(f"--map {folder} is a compact map: leave out --compact.")

@@ -7,6 +7,7 @@ hloc's features, with the reduced ones, and in the small map. hloc's folder is n
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pycolmap
@@ -29,12 +30,11 @@ from hloc_reduce.utils.codes import Storage
 from hloc_reduce.utils.feature_files import get_keypoints
 from hloc_reduce.utils.files import MEGABYTE, write_csv
 from hloc_reduce.utils.h5 import iterate_h5_names, list_h5_names, open_h5
-from hloc_reduce.utils.options import Parser
+from hloc_reduce.utils.options import Option, Parser
 from hloc_reduce.utils.paths import strings_as_paths
 from hloc_reduce.utils.tables import aligned
 
 from .common import retrieval
-from .common.options import Matcher
 
 FEATURE, STORAGE, NUM_LOC = "colmap_sift_sv32", "uint4", 50
 TABLE = "shrink.csv"
@@ -55,7 +55,7 @@ def main(
     ground_truth: Path | None = None,
     num_loc: int = NUM_LOC,
     max_mb: float | None = None,
-    matcher: Matcher | None = None,
+    matcher: Annotated[str, Option("matcher", matchers_confs.confs)] | None = None,
     overwrite: bool = False,
 ) -> list[dict]:
     """Reduce the features and the map of an outputs folder of hloc, and compare.

@@ -9,6 +9,16 @@ from ..utils.cli import InputError
 from .features import base_of, matcher_of, network_of
 
 
+def steps_of(matcher: str, fast: str) -> tuple[str, ...]:
+    """Return the matchers that queries are tried with, one after the other, keys of `confs`.
+
+    Args:
+        matcher: one of `names`.
+        fast: the first matcher of NN+lightglue.
+    """
+    return (fast, "lightglue") if matcher == NN_LIGHTGLUE else (matcher,)
+
+
 def all_of(feature: dict) -> list[str]:
     """Return the matchers that suit the configuration of a feature, the default first."""
     has_weights = features_of(feature["model"]) in weights_of.known()
@@ -84,6 +94,10 @@ confs: dict[str, dict] = {
     },
     **{f"{name}+lightglue": lightglue(name) for name in LIGHTGLUE},
 }
+
+# the feature's own matcher, and lightglue for queries that it does not localize
+NN_LIGHTGLUE = "NN+lightglue"
+names = (*confs, NN_LIGHTGLUE)  # that pipelines take
 
 # the models of other matches of hloc, by what it calls their files
 OF_HLOC = {

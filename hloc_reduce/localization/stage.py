@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -40,6 +41,23 @@ from .references import Reference
 CHUNK = 8  # queries
 SHOWN = 3  # queries whose reasons a message gives
 
+Task = tuple[str, pycolmap.Camera | None, list[str]]  # a query, and the images retrieved for it
+
+
+class Try(NamedTuple):
+    """How queries are matched.
+
+    Args:
+        match: matches queries, given their names, with the map images retrieved for them, and
+            returns the match file.
+        mirror_images: extracts and matches mirror images of queries whose intrinsics are not
+            given: if the poses of these are nearly as likely, their own are refused; None: no query
+            is tested.
+    """
+
+    match: Callable[[list[str]], Path]
+    mirror_images: MirrorImages | None = None
+
 
 def main(
     load_reference: Callable[[], Reference],
@@ -56,6 +74,7 @@ def main(
     executor: Executor = SERIAL,
     gate: Gate = DEFAULT_GATE,
     mirror_images: MirrorImages | None = None,
+    again: Try | None = None,
 ) -> dict[str, dict]:
     """Localize queries by the files of their features and matches.
 
@@ -78,51 +97,35 @@ def main(
         executor: does the work; `load_reference` and `config` are pickled for other processes.
         gate: what a pose must have for the query to be called localized; what is not given is that
             for the matcher and the dimension in the files.
-        mirror_images: extracts and matches mirror images of queries whose intrinsics are not
-            given: if the poses of these are nearly as likely, their own are refused; default: no
-            query is tested.
+        mirror_images: see `Try`.
+        again: how queries that are not localized are matched once more; default: they are not.
 
     Returns:
         A record for each query: `localized`; `reason`, why it is not localized, None if it is;
-        `confidence` and `agreement`; the written pose as `qvec` (w, x, y, z) and `tvec`, the
-        fallback if the query is not localized, None if there is none; `camera`, the model, width,
-        height and parameters in a list, None if not known; `max_error`, RANSAC's inlier threshold
-        in pixels, None for pycolmap's default; `measures`, see `Measures`; and the numbers and `db`
-        of `localize`.
+        `again`, whether it is of the second try; `confidence` and `agreement`; the written pose as
+        `qvec` (w, x, y, z) and `tvec`, the fallback if the query is not localized, None if there is
+        none; `camera`, the model, width, height and parameters in a list, None if not known;
+        `max_error`, RANSAC's inlier threshold in pixels, None for pycolmap's default; `measures`,
+        see `Measures`; and the numbers and `db` of `localize`.
     """
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
-    if mirror_images:
-        header["mirror_images"] = True
-    solve = partial(localize_all, load_reference, config, skip_matches, gate, executor)
+    header |= {"mirror_images": True} if mirror_images else {}
+    header |= {"again": True} if again else {}
     with Log(log_file(results), header, overwrite) as log:
-        todo = [(name, camera) for name, camera in queries if name not in log.records]
-        for name, record in _refuse(load_reference, features, todo, retrieved):
-            log.add(name, record)
-        tasks = [
-            (name, camera, retrieved.get(name, []))
-            for name, camera in todo
-            if name not in log.records
-        ]
-        if tasks:
+        all_tasks = [(name, camera, retrieved.get(name, [])) for name, camera in queries]
+        reasons = _reasons(features, queries)
+        refuse = [task for task in all_tasks if task[0] in reasons.keys() - log.records.keys()]
+        for name, record in _refuse(load_reference, refuse, reasons):
+            log.add(name, {**record, "again": False})
+        tasks = [task for task in all_tasks if task[0] not in reasons]
+        if any(name not in log.records for name, _, _ in tasks):
             _check_some_matched(matches, [name for name, _ in queries], retrieved)
-            for name, record in solve(features, matches, tasks, True, "Localizing"):
-                log.add(name, record)
-        tasks = []
-        if mirror_images and any(log.records[name]["localized"] for name, _ in queries):
-            gate = _of_matches(gate, features, matches)
-            tasks = [
-                (name, mirror(camera), retrieved.get(name, []))
-                for name, camera in queries
-                if camera and _may_be_mirrored(log.records[name], gate)
-            ]
-        if mirror_images and tasks:
-            files, reference = mirror_images([name for name, _, _ in tasks]), load_reference()
-            config = partial(_mirrored, config)
-            solve = partial(localize_all, load_reference, config, skip_matches, gate, executor)
-            for name, record in solve(*files, tasks, False, "Trying mirror images"):
-                names = [other for other in retrieved.get(name, []) if other in reference]
-                before = log.records[name]
-                log.add(name, with_mirror_image(before, record, reference, names, gate))
+        localizing = _Localizing(
+            log, load_reference, features, config, skip_matches, gate, executor
+        )
+        localizing.run(Try(lambda _: matches, mirror_images), tasks, False)
+        if again:
+            localizing.run(again, tasks, True)
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose_of(record) for name, record in records.items()}
     submitted = {name: known for name, known in poses.items() if known is not None}
@@ -131,6 +134,85 @@ def main(
     localized = sum(record["localized"] for record in records.values())
     logger.info("Localized %d of %d queries: %s", localized, len(records), results)
     return records
+
+
+@dataclass(frozen=True)
+class _Localizing:
+    """Localizes the queries of `main` and logs their records."""
+
+    log: Log
+    load_reference: Callable[[], Reference]
+    features: Path
+    config: Callable[[str, pycolmap.Camera], dict]
+    skip_matches: int
+    gate: Gate
+    executor: Executor
+
+    def run(self, given: Try, tasks: list[Task], is_again: bool) -> None:
+        """Localize queries that have no record, or is_again those that are not localized yet.
+
+        Queries that an interrupted run has localized in the same try are only tested for being
+        mirrored.
+        """
+        records = self.log.records
+        before = {name: records[name] for name, _, _ in tasks if name in records}
+        done = {name for name, record in before.items() if record["again"] == is_again}
+        wanted = [name for name, _, _ in tasks if name not in before]
+        if is_again:
+            wanted = [name for name, record in before.items() if not record["localized"]]
+        of_try = [task for task in tasks if task[0] in done.union(wanted)]
+        if not of_try:
+            return
+        todo = [task for task in of_try if task[0] not in done]
+        files = self.features, given.match([name for name, _, _ in of_try])
+        for name, record in self._solve(self.config, files, todo, True, "Localizing"):
+            self.log.add(name, {**record, "again": is_again})
+        if given.mirror_images:
+            self._try_mirror_images(given.mirror_images, files, of_try)
+
+    def _try_mirror_images(
+        self, mirror_images: MirrorImages, files: tuple[Path, Path], tasks: list[Task]
+    ) -> None:
+        """Refuse localized queries whose mirror images are nearly as likely."""
+        records = self.log.records
+        if not any(records[name]["localized"] for name, _, _ in tasks):
+            return
+        gate = _of_matches(self.gate, *files)
+        flipped: list[Task] = [
+            (name, mirror(camera), names)
+            for name, camera, names in tasks
+            if camera and _may_be_mirrored(records[name], gate)
+        ]
+        if not flipped:
+            return
+        reference, config = self.load_reference(), partial(_mirrored, self.config)
+        mirrored = mirror_images([name for name, _, _ in flipped])
+        retrieved = {name: names for name, _, names in flipped}
+        for name, record in self._solve(config, mirrored, flipped, False, "Trying mirror images"):
+            names = [other for other in retrieved[name] if other in reference]
+            before = records[name]
+            self.log.add(name, with_mirror_image(before, record, reference, names, gate))
+
+    def _solve(
+        self,
+        config: Callable[[str, pycolmap.Camera], dict],
+        files: tuple[Path, Path],
+        tasks: list[Task],
+        thorough: bool,
+        said: str,
+    ) -> Iterator[tuple[str, dict]]:
+        """Yield the names and the records of queries, see `localize_all`."""
+        return localize_all(
+            self.load_reference,
+            config,
+            self.skip_matches,
+            self.gate,
+            self.executor,
+            *files,
+            tasks,
+            thorough,
+            said,
+        )
 
 
 def _report(records: dict[str, dict], unreadable: Mapping[str, str], log_path: Path) -> None:
@@ -149,19 +231,23 @@ def _report(records: dict[str, dict], unreadable: Mapping[str, str], log_path: P
 
 
 def _refuse(
-    load_reference: Callable[[], Reference],
-    features: Path,
-    queries: Sequence[tuple[str, pycolmap.Camera | None]],
-    retrieved: Mapping[str, list[str]],
+    load_reference: Callable[[], Reference], tasks: list[Task], reasons: Mapping[str, str]
 ) -> Iterator[tuple[str, dict]]:
-    """Yield the names and the records of the queries that are not to be localized."""
+    """Yield the names and the records of queries that are not to be localized."""
+    if tasks:
+        reference = load_reference()
+        for name, camera, retrieved in tasks:
+            names = [other for other in retrieved if other in reference]
+            yield name, refused(reference, names, camera, reasons[name])
+
+
+def _reasons(
+    features: Path, queries: Sequence[tuple[str, pycolmap.Camera | None]]
+) -> dict[str, str]:
+    """Return why queries are not to be localized, without those that are."""
     with open_h5(features) as file:
-        reasons = [_reason(file, name, camera) for name, camera in queries]
-    reference = load_reference() if any(reasons) else None
-    for (name, camera), reason in zip(queries, reasons, strict=True):
-        if reference is not None and reason:
-            names = [other for other in retrieved.get(name, []) if other in reference]
-            yield name, refused(reference, names, camera, reason)
+        reasons = {name: _reason(file, name, camera) for name, camera in queries}
+    return {name: reason for name, reason in reasons.items() if reason}
 
 
 def _reason(feature_file: h5py.File, name: str, camera: pycolmap.Camera | None) -> str | None:
@@ -216,7 +302,7 @@ def localize_all(
     executor: Executor,
     features: Path,
     matches: Path,
-    tasks: list[tuple[str, pycolmap.Camera | None, list[str]]],
+    tasks: list[Task],
     thorough: bool,
     said: str,
 ) -> Iterator[tuple[str, dict]]:
@@ -273,7 +359,7 @@ def _localize_chunk(
     skip_matches: int,
     gate: Gate,
     thorough: bool,
-    queries: Iterable[tuple[str, pycolmap.Camera | None, list[str]]],
+    queries: Iterable[Task],
 ) -> Generator[tuple[str, dict], None, None]:
     """Yield the names and the records of queries with their intrinsics and retrieved images."""
     reference = load_reference()

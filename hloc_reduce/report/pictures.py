@@ -43,7 +43,7 @@ def matched(run: Run, query: str) -> dict | None:
     with open_h5(run.files["features"]) as file:
         keypoints, _ = get_keypoints(file, query)
     found = []
-    with open_h5(run.files["matches"]) as file:
+    with open_h5(run.files["matches_again" if record["again"] else "matches"]) as file:
         for name in names:
             sizes = len(keypoints), run.reference.num_keypoints(name)
             matches, _ = get_matches(file, query, name, sizes)

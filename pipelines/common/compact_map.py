@@ -5,6 +5,7 @@ from pathlib import Path
 
 from hloc_reduce import compact, localize_sfm, logger, maps
 from hloc_reduce.aggregate_features import vocabulary_if_any
+from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.datasets import ModelPlace
 from hloc_reduce.hlm.reader import SUFFIX
@@ -32,7 +33,7 @@ def check(is_compact: bool, max_mb: float | None, retrieval: str, matcher: str |
             "Images of a compact map are retrieved by what is in it: leave out --retrieval, or "
             f"choose one of {', '.join(retrieval_confs.confs)}."
         )
-    if is_compact and matcher is not None:
+    if is_compact and matcher and matcher != matchers_confs.NN_LIGHTGLUE:
         compact.check_matcher(matcher)
 
 
@@ -73,8 +74,9 @@ def main(
     if stale := is_old and not provenance.is_current(outputs / provenance.MADE_FROM, made_from):
         logger.info("Results in %s are stale, as the map has changed.", outputs)
     results = RunFolder(outputs, {"max_mb": max_mb}, overwrite=False, stale=stale)
-    matcher = compact.matcher_of(run.matcher)
-    with Run(results, run.feature, matcher, run.executor, run.folder) as part:
+    steps = compact.matcher_of(run.steps[0]), *run.steps[1:]
+    matcher = run.matcher if run.steps[1:] else steps[0]
+    with Run(results, run.feature, matcher, steps, run.executor, run.folder) as part:
         provenance.write(outputs / provenance.MADE_FROM, made_from)
         built = _pack(run, part, place, sfm, max_mb)
         features, num_loc = run.features, run.options.num_loc
@@ -96,6 +98,7 @@ def main(
                 full_names=place.full_names,
                 executor=run.executor,
                 gate=run.options.gate,
+                again=part.again(pairs, features, built.features),
             )
         files = run.files(built.features, built.sfm, pairs, matches)
         summary = run.summary(
@@ -118,7 +121,7 @@ def _pack(run: DatasetRun, part: Run, place: ModelPlace, sfm: Path, max_mb: floa
                 model,
                 run.feature,
                 run.conf,
-                run.matcher,
+                run.steps[0],
                 run.global_descriptors,
                 vocabulary_if_any(retrieval_confs.get(retrieval), run.global_descriptors),
                 intrinsics.of_map(model, place.images),

@@ -44,7 +44,9 @@ class DatasetRun(Run):
 
     def __init__(self, place: Place, outputs: Path, options: DatasetOptions):
         feature, self.conf = options.configured_feature()
-        matcher = options.matcher or features_confs.matcher_of(self.conf)
+        fast = features_confs.matcher_of(self.conf)
+        matcher = options.matcher or fast
+        steps = matchers_confs.steps_of(matcher, fast)
         self.place, self.options = place, options
         retrieved = f"{retrieval_name(options.retrieval)}{options.num_loc}"
         self.label = f"{feature}+{matcher}_{retrieved}"
@@ -66,18 +68,20 @@ class DatasetRun(Run):
             else place.true_poses()
         )
         self.features = options.features or outputs / f"{self.conf['output']}.h5"
-        super().__init__(self._claim(outputs, matcher), feature, matcher, options.executor)
+        super().__init__(self._claim(outputs, steps), feature, matcher, steps, options.executor)
 
-    def _claim(self, outputs: Path, matcher: str) -> RunFolder:
+    def _claim(self, outputs: Path, steps: tuple[str, ...]) -> RunFolder:
         """Claim the outputs folder. Results of given features are stale if these were redone."""
         options = self.options
         conf = {
             "dataset": str(self.place.root.resolve()),
             "feature": extract_features.provenance(self.conf),
-            "matcher": matchers_confs.confs[matcher]["model"],
+            "matcher": matchers_confs.confs[steps[0]]["model"],
             "retrieval": options.retrieval,
             **options.numbers,
         }
+        if steps[1:]:
+            conf["again"] = matchers_confs.confs[steps[1]]["model"]
         is_file = options.retrieval not in retrieval_confs.confs
         inputs = [Path(options.retrieval)] if is_file else []
         if inputs and outputs.resolve().parent in inputs[0].resolve().parents:
@@ -91,7 +95,8 @@ class DatasetRun(Run):
             overwrite |= redone and {**before, "features": conf["features"]} == conf
         elif overwrite or not (outputs / CONF).exists():
             extract_features.check_model(self.conf)
-            match_features.check_model(matchers_confs.confs[matcher], conf["feature"])
+            for step in steps:
+                match_features.check_model(matchers_confs.confs[step], conf["feature"])
             check_model(options.retrieval)
         return RunFolder(outputs, conf, overwrite, inputs)
 

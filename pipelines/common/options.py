@@ -14,7 +14,7 @@ from hloc_reduce.utils.codes import STORAGES, Storage
 from hloc_reduce.utils.options import HIDDEN, POSITIVE, Checked, Option
 
 Positive = Annotated[int, POSITIVE]
-Matcher = Annotated[str, Option("matcher", matchers_confs.confs)]
+Matcher = Annotated[str, Option("matcher", matchers_confs.names)]
 Retrieval = Annotated[str, Option(metavar="|".join([*retrieval_confs.confs, "FILE"]))]
 
 

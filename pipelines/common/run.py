@@ -1,7 +1,7 @@
 """A run of a pipeline: its outputs folder, matching, and the summary at its end."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Self
@@ -17,6 +17,7 @@ from hloc_reduce.evaluation.summaries import (
     write_summary,
 )
 from hloc_reduce.localization.mirrored import MirrorImages
+from hloc_reduce.localization.stage import Try
 from hloc_reduce.maps.mirror_images import mirror_images
 from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.runtime.group_writer import failures
@@ -25,7 +26,7 @@ from hloc_reduce.runtime.versions import versions
 from hloc_reduce.utils.files import write_csv
 from hloc_reduce.utils.images import list_images, with_reasons
 from hloc_reduce.utils.match_files import check_distinct
-from hloc_reduce.utils.parsers import parse_pairs
+from hloc_reduce.utils.parsers import parse_pairs, parse_retrieval, write_pairs
 
 Thresholds = Mapping[str, tuple[tuple[float, float], ...]]  # of each query list, metres and degrees
 
@@ -36,7 +37,8 @@ class Run:
     Args:
         folder: the outputs folder.
         feature: name of the feature.
-        matcher: name of the matcher.
+        matcher: one of `confs.matchers.names`.
+        steps: the matchers that it stands for, see `confs.matchers.steps_of`.
         executor: where the work is done.
         earlier: an outputs folder whose stages this run continues: the summary counts them, but
             for those that this run repeats. Features of mirror images are kept there.
@@ -47,11 +49,13 @@ class Run:
         folder: RunFolder,
         feature: str,
         matcher: str,
+        steps: tuple[str, ...],
         executor: Executor = SERIAL,
         earlier: RunFolder | None = None,
     ):
-        self.folder, self.feature, self.matcher = folder, feature, matcher
+        self.folder, self.feature, self.matcher, self.steps = folder, feature, matcher, steps
         self.executor = executor
+        self._matches_again: Path | None = None
         self._folders = [folder] if earlier is None else [earlier, folder]
 
     def __enter__(self) -> Self:
@@ -77,10 +81,10 @@ class Run:
             features_ref: feature file of the second images; default: `features`.
         """
         with self.stage(stage):
-            return self._match(pairs, features, features_ref)
+            return self._match(self.steps[0], pairs, features, features_ref)
 
-    def _match(self, pairs: Path, features: Path, features_ref: Path | None) -> Path:
-        conf = matchers_confs.confs[self.matcher]
+    def _match(self, matcher: str, pairs: Path, features: Path, features_ref: Path | None) -> Path:
+        conf = matchers_confs.confs[matcher]
         matches = self.folder.path / f"{features.stem}_{conf['output']}_{pairs.stem}.h5"
         if next(parse_pairs(pairs), None) is not None:  # else no query could be read
             match_features.main(
@@ -93,10 +97,37 @@ class Run:
             )
         return matches
 
+    def again(
+        self,
+        pairs: Path,
+        features: Path,
+        features_ref: Path | None = None,
+        mirror_images: Callable[[str], MirrorImages] | None = None,
+    ) -> Try | None:
+        """Return how queries that are not localized are matched by a second matcher, if any.
+
+        Args:
+            pairs: pairs of all queries and map images; those of the queries go beside it.
+            features: feature file.
+            features_ref: feature file of the map images; default: `features`.
+            mirror_images: returns the `mirror_images` of a matcher.
+        """
+        if len(self.steps) == 1:
+            return None
+        matcher = self.steps[1]
+
+        def match(names: list[str]) -> Path:
+            listed, retrieved = pairs.with_name(f"{pairs.stem}-again.txt"), parse_retrieval(pairs)
+            write_pairs([(name, other) for name in names for other in retrieved[name]], listed)
+            self._matches_again = self._match(matcher, listed, features, features_ref)
+            return self._matches_again
+
+        return Try(match, mirror_images(matcher) if mirror_images else None)
+
     def mirror_images(
         self, conf: dict, image_dir: Path, pairs: Path, features: Path, map_features: Path
-    ) -> MirrorImages:
-        """Return what extracts and matches mirror images of queries, for a localization stage.
+    ) -> Callable[[str], MirrorImages]:
+        """Return what a matcher needs to match mirror images of queries in a localization stage.
 
         Args:
             conf: configuration of the feature.
@@ -105,12 +136,15 @@ class Run:
             features: feature file of all queries.
             map_features: feature file of the map images.
         """
-
-        def match(listed: Path, mirrored: Path) -> Path:
-            return self._match(listed, mirrored, map_features)
-
         mirrored = self._folders[0].path / f"{features.stem}-mirrored.h5"
-        return mirror_images(conf, image_dir, pairs, mirrored, match, self.executor)
+
+        def of_matcher(matcher: str) -> MirrorImages:
+            def match(listed: Path, mirrored: Path) -> Path:
+                return self._match(matcher, listed, mirrored, map_features)
+
+            return mirror_images(conf, image_dir, pairs, mirrored, match, self.executor)
+
+        return of_matcher
 
     def finish(
         self,
@@ -170,7 +204,11 @@ class Run:
             "poses": poses.name,
             "files": {
                 key: None if path is None else relative(path, outputs)
-                for key, path in {"features": features, **files}.items()
+                for key, path in {
+                    "features": features,
+                    "matches_again": self._matches_again,
+                    **files,
+                }.items()
             },
         }
         write_summary(summary, outputs / "summary.json")

@@ -16,6 +16,7 @@ from hloc_reduce.localization import query, stage
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.localization.records import log_file, pose_of, read_records
 from hloc_reduce.localization.references import SfmMap
+from hloc_reduce.runtime.group_writer import FAILURE
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.feature_files import dimension
@@ -265,3 +266,39 @@ def test_images_without_descriptors_are_skipped(built):
         for name in list_h5_names(built.features):
             file[name].pop("descriptors", None)
     assert dimension(built.features) == 0
+
+
+def test_queries_that_are_not_localized_are_matched_once_more(built):
+    """The first matches of one query are lost, and another photo could not be read."""
+    expected = built.localize()
+    with h5py.File(built.loc_matches, "a") as file:
+        for i in range(6):
+            file[f"query-6.jpg/db-{i}.jpg/matches0"][:] = -1
+    with built.loc_pairs.open("a") as file:
+        file.write("query/8.jpg db/3.jpg\n")
+    with h5py.File(built.features, "a") as file:
+        file.create_group("query/8.jpg").attrs[FAILURE] = "cannot be read"
+    with built.queries.open("a") as file:
+        file.write("query/8.jpg SIMPLE_RADIAL 640 480 500 320 240 0.02\n")
+    asked = []
+
+    def match(names):
+        asked.append(names)
+        pairs = small_map.all_pairs(built.root / "pairs-again.txt", names)
+        matches = built.root / "matches-again.h5"
+        return match_features.main(MATCHER, pairs, built.features, matches=matches)
+
+    again = stage.Try(match)
+    alone = built.localize()
+    assert not alone["query/6.jpg"]["localized"]
+    records = built.localize(again=again)
+    assert asked == [["query/6.jpg"]]
+    assert records["query/6.jpg"] == {**expected["query/6.jpg"], "again": True}
+    assert records["query/7.jpg"] == expected["query/7.jpg"]
+    assert records["query/8.jpg"]["reason"] == "cannot be read"
+    log = log_file(built.root / "poses.txt")
+    lines = log.read_text().splitlines(keepends=True)
+    assert built.localize(again=again) == records
+    assert log.read_text().splitlines(keepends=True) == lines
+    log.write_text("".join(line for line in lines if '"again": true' not in line))  # killed
+    assert built.localize(again=again) == records
