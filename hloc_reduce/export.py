@@ -1,8 +1,9 @@
-"""Write a network's features, or the projection of any feature, as an ONNX file.
+"""Write a network's features, a projection, or LightGlue for a feature, as an ONNX file.
 
 Programs without Python run it by ONNX Runtime or TensorRT: docs/export.md.
 """
 
+import json
 import logging
 import warnings
 from collections.abc import Iterator
@@ -14,6 +15,8 @@ from typing import TYPE_CHECKING
 
 from . import __version__, logger, projections
 from .confs import features as features_confs
+from .confs import matchers as matchers_confs
+from .networks.lightglue import identity
 from .utils import cli, options
 from .utils.cli import InputError
 from .utils.files import replacing
@@ -27,6 +30,7 @@ ONNX_TOLERANCE = 1e-4  # between ONNX Runtime and torch
 PACKAGES = ("onnx", "onnxruntime", "onnxscript")
 # images of these sides, in strides, make the graph and check it
 MADE_WITH, CHECKED_WITH = (3, 4), (8, 11)
+SIZE = (640.0, 480.0)  # of the photos that check a matcher
 
 
 @dataclass(frozen=True)
@@ -34,27 +38,33 @@ class Content:
     """What a file holds, and what it is checked with.
 
     Args:
-        module: computes the outputs from the input.
-        shapes: of the input and of the outputs by name; strings are dynamic.
-        stride: what the dynamic sides of the input are multiples of.
-        made_with: an input to trace the module with.
-        checked_with: an input of another size.
+        module: computes the outputs from the inputs.
+        inputs: their shapes by name; strings are dynamic.
+        outputs: the same of the outputs.
+        stride: what the dynamic sides of the inputs are multiples of.
+        made_with: inputs to trace the module with.
+        checked_with: inputs of another size.
         expected: the outputs for `checked_with`.
         metadata: of the file.
     """
 
     module: "torch.nn.Module"
-    shapes: dict[str, tuple[int | str, ...]]
+    inputs: dict[str, tuple[int | str, ...]]
+    outputs: dict[str, tuple[int | str, ...]]
     stride: int
-    made_with: "torch.Tensor"
-    checked_with: "torch.Tensor"
+    made_with: "tuple[torch.Tensor, ...]"
+    checked_with: "tuple[torch.Tensor, ...]"
     expected: "tuple[torch.Tensor, ...]"
     metadata: dict[str, str]
 
 
 @strings_as_paths
 def main(
-    feature: str, output: Path, projection: Path | None = None, projection_only: bool = False
+    feature: str,
+    output: Path,
+    projection: Path | None = None,
+    projection_only: bool = False,
+    matcher: bool = False,
 ) -> Path:
     """Write an ONNX file and check that ONNX Runtime computes the same with it as torch.
 
@@ -64,6 +74,7 @@ def main(
         projection: file of another projection of the feature's descriptors.
         projection_only: write the projection alone, from descriptors to fewer dimensions, which
             every feature that has one can do.
+        matcher: write LightGlue for the feature instead.
 
     Returns:
         `output`.
@@ -80,19 +91,19 @@ def main(
             f"An export needs {', '.join(missing)}: pip install 'hloc-reduce[export]'."
         )
     name, conf = features_confs.get(feature, projection)
-    content = (_projection if projection_only else _network)(name, conf)
+    if matcher and projection_only:
+        raise InputError("Give --matcher or --projection_only, not both.")
+    content = (_matcher if matcher else _projection if projection_only else _network)(name, conf)
     content.metadata.update(feature=name, hloc_reduce=__version__)
     with replacing(output) as temporary:
         _write(content, temporary)
         difference = _check(content, temporary)
-    number, dim = content.expected[-1].shape
     logger.info(
-        "Wrote %s (%.1f MB). ONNX Runtime and torch agree on %d descriptors of %d numbers: at most "
-        "%.0e apart.",
+        "Wrote %s (%.1f MB). ONNX Runtime and torch agree on %d %s: at most %.0e apart.",
         output,
         output.stat().st_size / 1e6,
-        number,
-        dim,
+        len(content.expected[-1]),
+        "scores of matches" if matcher else "descriptors",
         difference,
     )
     return output
@@ -117,10 +128,11 @@ def _projection(name: str, conf: dict) -> Content:
     )
     return Content(
         project,
-        {"descriptors": ("N", project.sizes[0]), "reduced": ("N", project.dim)},
+        {"descriptors": ("N", project.sizes[0])},
+        {"reduced": ("N", project.dim)},
         1,
-        made_with,
-        checked_with,
+        (made_with,),
+        (checked_with,),
         (project(checked_with),),
         {"dim": str(project.dim), "left_out": "keypoints and their descriptors before projection"},
     )
@@ -158,21 +170,74 @@ def _network(name: str, conf: dict) -> Content:
         raise InputError(f"{name} finds no keypoints to check the file with: lower its threshold.")
     return Content(
         extractors.Graph(extractor),
+        {"image": (1, 3, "height", "width")},
         {
-            "image": (1, 3, "height", "width"),
             "keypoints": ("N", 2),
             "scores": ("N",),
             "descriptors": ("N", extractor.dim),
         },
         stride,
-        _image(*(side * stride for side in MADE_WITH)),
-        image,
+        (_image(*(side * stride for side in MADE_WITH)),),
+        (image,),
         (features["keypoints"][0], features["scores"][0], features["descriptors"][0].T),
         {
             "dim": str(extractor.dim),
             "stride": str(stride),
             "max_keypoints": str(number),
             "left_out": ", ".join(left_out),
+        },
+    )
+
+
+def _matcher(name: str, conf: dict) -> Content:
+    """Return the content of the file of LightGlue for a feature."""
+    import torch
+
+    from . import extract_features
+    from .matchers.lightglue import Graph, LightGlue
+
+    made_from = extract_features.provenance(conf)
+    model = matchers_confs.for_features({"name": "lightglue"}, made_from)
+    graph = Graph(LightGlue(model).eval())
+    dim, generator = graph.dim, torch.Generator().manual_seed(0)
+
+    def inputs(*numbers: int) -> tuple[torch.Tensor, ...]:
+        """Return the features of two photos of the same keypoints, and others of their own."""
+        described = torch.randn(sum(numbers), dim, generator=generator)
+        described = torch.nn.functional.normalize(described, dim=1)
+        places = torch.rand(sum(numbers), 2, generator=generator) * torch.tensor(SIZE)
+        size = torch.tensor(SIZE)
+        return tuple(
+            part
+            for keep in (slice(numbers[0]), slice(numbers[1], None))
+            for part in (places[keep], described[keep], size)
+        )
+
+    checked_with = inputs(300, 200)
+    with torch.no_grad():
+        expected = graph(*checked_with)
+    assert (expected[0] >= 0).any()  # the same keypoints
+    return Content(
+        graph,
+        {
+            f"{key}{i}": shape
+            for i in (0, 1)
+            for key, shape in (
+                ("keypoints", (f"N{i}", 2)),
+                ("descriptors", (f"N{i}", dim)),
+                ("image_size", (2,)),
+            )
+        },
+        {"matches0": ("N0",), "matching_scores0": ("N0",)},
+        1,
+        inputs(20, 30),
+        checked_with,
+        expected,
+        {
+            "matcher": "lightglue",
+            "dim": str(dim),
+            "made_from": json.dumps(identity(made_from)),
+            "left_out": "early exit and pruning",
         },
     )
 
@@ -197,25 +262,31 @@ def _write(content: Content, path: Path) -> None:
 
     from .projections.network import Projection
 
-    shape = next(iter(content.shapes.values()))
-    sides = {
-        axis: content.stride * torch.export.Dim(f"{side}_in_strides")
-        for axis, side in enumerate(shape)
+    named = {
+        side: content.stride * torch.export.Dim(f"{side}_in_strides")
+        for shape in content.inputs.values()
+        for side in shape
         if isinstance(side, str)
     }
+    sides = tuple(
+        {axis: named[side] for axis, side in enumerate(shape) if isinstance(side, str)}
+        for shape in content.inputs.values()
+    )
     for module in content.module.modules():
         if isinstance(module, Projection):
             module.exact = False
     with _quiet(), torch.no_grad():
         traced = torch.export.export(
-            content.module, (content.made_with,), dynamic_shapes=(sides,), strict=False
+            content.module, content.made_with, dynamic_shapes=sides, strict=False
         )
         program = torch.onnx.export(traced, dynamo=True, opset_version=OPSET, verbose=False)
     assert program is not None  # it is only without dynamo
     model = program.model
     ClearMetadataAndDocStringPass()(model)  # stack traces, with names of folders
     values = (*model.graph.inputs, *model.graph.outputs)
-    for value, (name, shape) in zip(values, content.shapes.items(), strict=True):
+    for value, (name, shape) in zip(
+        values, (content.inputs | content.outputs).items(), strict=True
+    ):
         value.name, value.shape = name, Shape(shape)
     model.producer_name, model.producer_version = "hloc-reduce", __version__
     model.metadata_props.update(content.metadata)
@@ -232,8 +303,10 @@ def _check(content: Content, path: Path) -> float:
     import torch
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    name, *names = content.shapes
-    found = [torch.from_numpy(x) for x in session.run(names, {name: content.checked_with.numpy()})]
+    names = list(content.outputs)
+    given = zip(content.inputs, content.checked_with, strict=True)
+    outputs = session.run(names, {name: tensor.numpy() for name, tensor in given})
+    found = [torch.from_numpy(x) for x in outputs]
     difference = float("inf")
     if [x.shape for x in found] == [x.shape for x in content.expected]:
         if "keypoints" in names:  # those of equal scores are in any order

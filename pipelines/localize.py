@@ -184,9 +184,7 @@ def main(
 
     photos = Photos(outputs / MADE_FROM, built, query_images, names)
     matcher = matcher or built.matcher
-    is_fast = built.matcher != "lightglue"
-    fast = built.matcher if is_fast else features_confs.matcher_of(built.conf)
-    steps = matchers_confs.steps_of(matcher, fast)
+    steps = matchers_confs.steps_of(matcher, matchers_confs.fast_of(built.matcher, built.conf))
     for step in {*steps} - {built.matcher}:
         check_model(matchers_confs.confs[step], extract_features.provenance(built.conf))
     conf = {"map": built.place, **identity(outputs, query_images, queries), "num_loc": num_loc}

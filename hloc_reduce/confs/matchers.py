@@ -9,6 +9,16 @@ from ..utils.cli import InputError
 from .features import base_of, matcher_of, network_of
 
 
+def fast_of(matcher: str, feature: dict) -> str:
+    """Return the first matcher of NN+lightglue in a map.
+
+    Args:
+        matcher: of the map.
+        feature: the configuration of its feature.
+    """
+    return matcher_of(feature) if matcher == "lightglue" else matcher
+
+
 def steps_of(matcher: str, fast: str) -> tuple[str, ...]:
     """Return the matchers that queries are tried with, one after the other, keys of `confs`.
 

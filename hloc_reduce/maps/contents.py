@@ -18,7 +18,7 @@ from ..retrieval import load as load_retrieval
 from ..retrieval.ranking import read_global, similarity
 from ..retrieval.vlad import read_vocabulary
 from ..runtime import parallel
-from ..utils import colmap
+from ..utils import cli, colmap
 from ..utils.arrays import distinct
 from ..utils.cli import InputError, naming
 from ..utils.feature_files import dimension, get_features, read_descriptors
@@ -27,16 +27,34 @@ from .map import Map
 from .matching import Features, Matching, is_integer_matcher
 from .numpy_engine import NumpyEngine, is_colmap_sift
 from .numpy_features import ColmapSift, Extract, OnnxNetwork
+from .onnx_files import OnnxLightGlue
 
 
 class Engine(Protocol):
     """Computes for a map, see `numpy_engine.NumpyEngine` and `torch_engine.TorchEngine`."""
 
-    matching: Matching
     rotation_invariant: bool  # of its extractor, see `extractors.Extractor`
 
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
         """Extract the features of a photo, see `extractors.extract`."""
+
+    def matching(self, matcher: dict) -> Matching:
+        """Return what matches as a matcher with a configuration does."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A matcher that photos are tried with.
+
+    Args:
+        matcher: configuration of its model.
+        match: matches the features of a photo, at least those that the matcher needs, with images;
+            returns for each of these names the rows (M, 2) int64 of the photo's and of the image's
+            keypoints.
+    """
+
+    matcher: dict
+    match: Callable[[Features, list[str]], dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -44,11 +62,11 @@ class Contents:
     """A map in memory.
 
     Args:
-        engine: extracts and matches features.
+        engine: extracts features.
+        steps: the matchers that photos are tried with, one after the other.
         preprocessing: of photos.
         storage: of its descriptors.
         dim: of its descriptors.
-        matcher: configuration of the matcher's model.
         cameras: what it tells about the intrinsics of other photos.
         doubts: why it may be wrong, see `Map.doubts`.
         reference: its points.
@@ -56,42 +74,50 @@ class Contents:
         describe: returns the global descriptor (G,) float32 of a photo, rounded as in files, given
             its features and its file or pixels.
         similarity: returns the similarity (I,) of a global descriptor (G,) to those of its images.
-        match: matches the features of a photo, at least those that the matcher needs, with images;
-            returns for each of these names the rows (M, 2) int64 of the photo's and of the image's
-            keypoints.
     """
 
     engine: Engine
+    steps: list[Step]
     preprocessing: dict
     storage: str
     dim: int
-    matcher: dict
     cameras: intrinsics.MapCameras
     doubts: list[str]
     reference: Reference
     names: list[str]
     describe: Callable[[dict, Path | np.ndarray], np.ndarray]
     similarity: Callable[[np.ndarray], np.ndarray]
-    match: Callable[[Features, list[str]], dict[str, np.ndarray]]
 
 
-def read(path: Path, onnx: Path | None = None) -> Contents:
+def read(
+    path: Path,
+    onnx: Path | None = None,
+    matcher: str | None = None,
+    matcher_onnx: Path | None = None,
+) -> Contents:
     """Read a map.
 
     Args:
         path: folder of a map of `maps.main`, or file of `hloc_reduce.compact`.
         onnx: file of its feature from `hloc_reduce.export`, in which features are extracted from
             photos; only for a file.
+        matcher: one of `confs.matchers.names`; default: the map's.
+        matcher_onnx: file of LightGlue from `hloc_reduce.export`; only with `onnx`.
 
     Raises:
-        InputError: if it is neither, or broken, or the ONNX file is of another feature.
+        InputError: if it is neither, or broken, a matcher does not suit it, or an ONNX file is of
+            another feature.
     """
+    if matcher is not None:
+        cli.choose("matcher", matcher, matchers_confs.names)
+    if matcher_onnx is not None and onnx is None:
+        raise InputError("An ONNX file of LightGlue needs one of the feature, too.")
     if is_compact(path):
-        return _of_file(path, onnx)
+        return _of_file(path, onnx, matcher, matcher_onnx)
     if onnx is not None:
         raise InputError(f"An ONNX file needs a compact map, a file; {path} is none.")
     _check_torch(path, "a map folder")
-    return _of_folder(path)
+    return _of_folder(path, matcher)
 
 
 def _check_torch(path: Path, kind: str) -> None:
@@ -105,29 +131,64 @@ def _check_torch(path: Path, kind: str) -> None:
         ) from None
 
 
-def _of_folder(path: Path) -> Contents:
+def _of_folder(path: Path, matcher: str | None) -> Contents:
     from .. import extract_features, extractors
     from .torch_engine import TorchEngine
 
     built = Map(path)
-    matcher = matchers_confs.confs[built.matcher]["model"]
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)
     made_from = extract_features.provenance(built.conf)
-    engine = TorchEngine(extractors.load(built.conf["model"]), matcher, built.storage, made_from)
-    matching, levels, prepared = engine.matching, built.levels(), {}
+    engine = TorchEngine(extractors.load(built.conf["model"]), built.storage, made_from)
+    shown = {name: np.flatnonzero(reference.point_rows(name) >= 0) for name in names}
+    models = [
+        matchers_confs.confs[step]["model"] for step in _steps(matcher, built.matcher, built.conf)
+    ]
+    steps = [Step(model, _match_images(built, engine.matching(model), shown)) for model in models]
+    global_descriptors = read_global(built.descriptors, names)
+    vocabulary = None if built.vocabulary is None else read_vocabulary(built.vocabulary)
+
+    return Contents(
+        engine=engine,
+        steps=steps,
+        preprocessing=built.conf["preprocessing"],
+        storage=built.storage,
+        dim=dimension(built.features),
+        cameras=built.cameras,
+        doubts=built.doubts,
+        reference=reference,
+        names=names,
+        describe=_describe(built.retrieval, vocabulary),
+        similarity=lambda descriptor: similarity(descriptor[None], global_descriptors)[0],
+    )
+
+
+def _steps(matcher: str | None, of_map: str, conf: dict) -> tuple[str, ...]:
+    """Return the matchers that photos are tried with, keys of `confs.matchers.confs`."""
+    fast = matchers_confs.fast_of(of_map, conf)
+    return matchers_confs.steps_of(matcher or of_map, fast)
+
+
+def _match_images(
+    built: Map, matching: Matching, shown: dict[str, np.ndarray]
+) -> Callable[[Features, list[str]], dict[str, np.ndarray]]:
+    """Return `Step.match` of a map in a folder, whose features it reads.
+
+    Args:
+        built: the map.
+        matching: matches.
+        shown: rows of the keypoints of each image that show a point.
+    """
+    levels, prepared = built.levels(), {}
     others = [key for key in matching.feature_keys if key != "descriptors"]
     with open_h5(built.features) as file:
-        for name in names:
+        for name in shown:
             features = get_features(file, name, others)
             if "descriptors" in matching.feature_keys:
                 stored = read_descriptors(file, name)
                 levels.check(stored)
                 features["descriptors"] = stored.restore(unbiased=matching.takes_codes).T
             prepared[name] = matching.prepare(features)
-    shown = {name: np.flatnonzero(reference.point_rows(name) >= 0) for name in names}
-    global_descriptors = read_global(built.descriptors, names)
-    vocabulary = None if built.vocabulary is None else read_vocabulary(built.vocabulary)
 
     def match(features: Features, names: list[str]) -> dict[str, np.ndarray]:
         query = matching.prepare(features)
@@ -137,31 +198,43 @@ def _of_folder(path: Path) -> Contents:
 
         return dict(zip(names, parallel.ordered("match", match_image, names), strict=True))
 
-    return Contents(
-        engine=engine,
-        preprocessing=built.conf["preprocessing"],
-        storage=built.storage,
-        dim=dimension(built.features),
-        matcher=matcher,
-        cameras=built.cameras,
-        doubts=built.doubts,
-        reference=reference,
-        names=names,
-        describe=_describe(built.retrieval, vocabulary),
-        similarity=lambda descriptor: similarity(descriptor[None], global_descriptors)[0],
-        match=match,
-    )
+    return match
 
 
-def _of_file(path: Path, onnx: Path | None) -> Contents:
+def _of_file(
+    path: Path, onnx: Path | None, matcher: str | None, matcher_onnx: Path | None
+) -> Contents:
     compact = CompactMap(path)
     if retrieval_confs.get(compact.retrieval)["model"]["name"] == "hloc":
         _check_torch(path, f"a map with the retrieval {compact.retrieval}")
-    matcher = matchers_confs.confs[compact.matcher]["model"]
-    engine = _numpy_engine(compact, matcher, onnx) or _torch_engine(compact, matcher)
-    matching = engine.matching
-    with naming(path):
-        check_feature_keys(compact.matcher, matching.feature_keys)
+    names = _steps(matcher, compact.matcher, compact.conf)
+    models = [matchers_confs.confs[name]["model"] for name in names]
+    engine = _numpy_engine(compact, models, onnx, matcher_onnx) or _torch_engine(compact)
+    steps = []
+    for name, model in zip(names, models, strict=True):
+        with naming(path):
+            matching = engine.matching(model)
+            check_feature_keys(name, matching.feature_keys)
+        steps.append(Step(model, _match_points(compact, matching)))
+    return Contents(
+        engine=engine,
+        steps=steps,
+        preprocessing=compact.conf["preprocessing"],
+        storage=compact.storage,
+        dim=compact.dim,
+        cameras=compact.cameras,
+        doubts=compact.doubts,
+        reference=compact,
+        names=compact.names,
+        describe=_describe(compact.retrieval, compact.vocabulary),
+        similarity=compact.similarity,
+    )
+
+
+def _match_points(
+    compact: CompactMap, matching: Matching
+) -> Callable[[Features, list[str]], dict[str, np.ndarray]]:
+    """Return `Step.match` of a compact map."""
     others = [key for key in matching.feature_keys if key != "descriptors"]
 
     def match(features: Features, names: list[str]) -> dict[str, np.ndarray]:
@@ -175,30 +248,27 @@ def _of_file(path: Path, onnx: Path | None) -> Contents:
         found = matching.match_points(matching.prepare(features), described, images)
         return dict(zip(names, found, strict=True))
 
-    return Contents(
-        engine=engine,
-        preprocessing=compact.conf["preprocessing"],
-        storage=compact.storage,
-        dim=compact.dim,
-        matcher=matcher,
-        cameras=compact.cameras,
-        doubts=compact.doubts,
-        reference=compact,
-        names=compact.names,
-        describe=_describe(compact.retrieval, compact.vocabulary),
-        similarity=compact.similarity,
-        match=match,
-    )
+    return match
 
 
-def _numpy_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engine | None:
-    """Return an engine without torch, None if the map's feature or matcher needs torch."""
+def _numpy_engine(
+    compact: CompactMap, models: list[dict], onnx: Path | None, matcher_onnx: Path | None
+) -> Engine | None:
+    """Return an engine without torch, None if the map's feature or a matcher needs torch."""
     base = features_confs.base_of(compact.conf["model"])
     extract: Extract
-    if onnx is not None and not is_integer_matcher(matcher):
-        raise InputError(f"{compact.path} has the matcher {compact.matcher}, which needs torch.")
-    if not is_integer_matcher(matcher):
+    others = [model for model in models if not is_integer_matcher(model)]
+    if others and onnx is None:
         return None
+    lightglue = None
+    for model in others:
+        if model["name"] != "lightglue" or matcher_onnx is None:
+            raise InputError(
+                f"The matcher {model['name']} needs torch or, if it is lightglue, an ONNX file of "
+                "its own, matcher_onnx, from hloc_reduce.export --matcher."
+            )
+        number = model.get("max_keypoints")
+        lightglue = OnnxLightGlue(matcher_onnx, compact.feature, compact.projection, number)
     if onnx is not None:
         extract = OnnxNetwork(onnx, compact.feature, base.get("denoise", True))
     elif is_colmap_sift(base) and not compact.is_pickled:
@@ -206,10 +276,10 @@ def _numpy_engine(compact: CompactMap, matcher: dict, onnx: Path | None) -> Engi
             extract = ColmapSift(base, compact.layers())
     else:
         return None
-    return NumpyEngine(extract, matcher)
+    return NumpyEngine(extract, lightglue)
 
 
-def _torch_engine(compact: CompactMap, matcher: dict) -> Engine:
+def _torch_engine(compact: CompactMap) -> Engine:
     _check_torch(compact.path, f"a map with the feature {compact.feature}")
     from .. import extract_features, extractors
     from .torch_engine import TorchEngine
@@ -219,7 +289,7 @@ def _torch_engine(compact: CompactMap, matcher: dict) -> Engine:
         with naming(compact.path):
             extractor = extractors.load(conf["model"])
             made_from = extract_features.provenance(conf)
-            return TorchEngine(extractor, matcher, compact.storage, made_from)
+            return TorchEngine(extractor, compact.storage, made_from)
 
 
 def _describe(

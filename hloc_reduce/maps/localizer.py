@@ -34,10 +34,13 @@ class Localizer:
         gate: what a pose must have to be trusted.
         onnx: with a file from `hloc_reduce.compact`, the ONNX file of its feature from
             `hloc_reduce.export`: features are extracted by ONNX Runtime instead of torch.
+        matcher: one of `confs.matchers.names`; default: the map's.
+        matcher_onnx: with `onnx`, the ONNX file of LightGlue from `hloc_reduce.export`, for a map
+            or a `matcher` that needs it.
 
     Raises:
-        InputError: if it is not a map, an ONNX file is of another feature, or a number is too
-            small.
+        InputError: if it is not a map, a matcher does not suit it, an ONNX file is of another
+            feature, or a number is too small.
 
     Example:
         >>> localizer = Localizer("outputs/map")  # doctest: +SKIP
@@ -51,22 +54,29 @@ class Localizer:
         ransac_thresh: float = RANSAC_THRESH,
         gate: Gate = DEFAULT_GATE,
         onnx: Path | str | None = None,
+        matcher: str | None = None,
+        matcher_onnx: Path | str | None = None,
     ):
         if num_loc < 1:
             raise InputError(f"num_loc is {num_loc}: at least 1.")
         stage.check_threshold(ransac_thresh)
-        contents = read(Path(map_dir), None if onnx is None else Path(onnx))
+        feature_file, matcher_file = (
+            None if path is None else Path(path) for path in (onnx, matcher_onnx)
+        )
+        contents = read(Path(map_dir), feature_file, matcher, matcher_file)
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.workers = parallel.cores()
         self.preprocessing, self.cameras = contents.preprocessing, contents.cameras
         self.doubts = contents.doubts
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
-        self.gate = gate.of_matches(contents.matcher, contents.dim)
+        # the matchers that photos are tried with, and what each needs to trust a pose
+        self.steps = [
+            (step.match, gate.of_matches(step.matcher, contents.dim)) for step in contents.steps
+        ]
         self.engine, self.reference = contents.engine, contents.reference
         self.names = contents.names
         self._describe, self._similarity = contents.describe, contents.similarity
-        self._match = contents.match
 
     def localize(
         self, image: Path | str | np.ndarray, camera: pycolmap.Camera | None = None
@@ -82,7 +92,8 @@ class Localizer:
         Returns:
             The pose, camera from world, in the units of the map, or None if the photo cannot be
             localized, for the `reason` in info; and info as from `localization.query.localize`,
-            with `points2D` (M, 2) in COLMAP's pixels, `retrieved`, names of map images, best first,
+            with `points2D` (M, 2) in COLMAP's pixels, `again`, whether its matches are those of a
+            second matcher, `retrieved`, names of map images, best first,
             `intrinsics`, "given" or their source (`intrinsics.infer`), `map_doubts`, why the map,
             and the pose with it, may be wrong, in a few words each, and `seconds` by stage.
 
@@ -95,7 +106,8 @@ class Localizer:
         start = time.perf_counter()
 
         def lap(stage: str) -> None:
-            seconds[stage] = time.perf_counter() - start - sum(seconds.values())
+            now = time.perf_counter() - start - sum(seconds.values())
+            seconds[stage] = seconds.get(stage, 0.0) + now
 
         source, refinement = "given", {}
         if camera is None:
@@ -113,19 +125,22 @@ class Localizer:
         lap("extraction")
         retrieved = self._retrieve(features, image)
         lap("retrieval")
-        matches = self._match(features, retrieved)
-        lap("matching")
-        cam_from_world, info = self._estimate(features, matches, camera, refinement)
-        lap("pose")
-        if info["reason"] is None and gates.may_be_mirrored(info["measures"], self.gate):
-            flipped = self._extract(image, flip=True)
-            matches = self._match(flipped, retrieved)
-            camera = mirrored.mirror(camera)
-            refinement = mirrored.mirror_options(refinement)
-            _, other = self._estimate(flipped, matches, camera, refinement, thorough=False)
-            measures = replace(info["measures"], mirror_image=other["confidence"])
-            info |= gates.verdict(measures, self.gate)
-            lap("mirror_image")
+        for i, (match, gate) in enumerate(self.steps):
+            matches = match(features, retrieved)
+            lap("matching")
+            cam_from_world, info = self._estimate(features, matches, camera, refinement, gate)
+            lap("pose")
+            if info["reason"] is None and gates.may_be_mirrored(info["measures"], gate):
+                flipped = self._extract(image, flip=True)
+                given = mirrored.mirror(camera), mirrored.mirror_options(refinement), gate
+                matches = match(flipped, retrieved)
+                _, other = self._estimate(flipped, matches, *given, thorough=False)
+                measures = replace(info["measures"], mirror_image=other["confidence"])
+                info |= gates.verdict(measures, gate)
+                lap("mirror_image")
+            info["again"] = i > 0
+            if info["reason"] is None:
+                break
         info |= {
             "points2D": to_colmap(features["keypoints"][info["keypoints"]]),
             "retrieved": retrieved,
@@ -150,6 +165,7 @@ class Localizer:
         matches: dict[str, np.ndarray],
         camera: pycolmap.Camera,
         refinement: dict,
+        gate: Gate,
         thorough: bool = True,
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Estimate the pose of a photo from its matches, see `localization.query.localize`."""
@@ -159,7 +175,7 @@ class Localizer:
             camera,
             matches,
             config=merged(ransac_options(self.ransac_thresh, camera), refinement),
-            gate=self.gate,
+            gate=gate,
             thorough=thorough,
             workers=self.workers,
         )

@@ -7,7 +7,7 @@ import numpy as np
 from ..descriptors import COLMAP_SIFT
 from ..detectors import dog
 from ..utils.images import in_original, resized
-from .matching import IntegerMatching, Matching
+from .matching import IntegerMatching, Matching, is_integer_matcher
 from .numpy_features import Extract
 
 
@@ -21,13 +21,19 @@ class NumpyEngine:
 
     Args:
         extract: of the map's feature.
-        matcher: a configuration that `matching.is_integer_matcher`.
+        lightglue: matches as LightGlue does, None if that is not needed.
     """
 
-    def __init__(self, extract: Extract, matcher: dict):
-        self._extract = extract
-        self.matching: Matching = IntegerMatching(matcher)
+    def __init__(self, extract: Extract, lightglue: Matching | None = None):
+        self._extract, self._lightglue = extract, lightglue
         self.rotation_invariant = extract.rotation_invariant
+
+    def matching(self, matcher: dict) -> Matching:
+        """Return what matches as a matcher with a configuration does."""
+        if is_integer_matcher(matcher):
+            return IntegerMatching(matcher)
+        assert self._lightglue is not None
+        return self._lightglue
 
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
         """Extract the features of a photo, see `extractors.extract`.

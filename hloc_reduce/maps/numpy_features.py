@@ -11,6 +11,7 @@ from ..detectors import dog
 from ..networks.noise import reduce_noise
 from ..projections import layers as frozen
 from ..utils.cli import InputError
+from . import onnx_files
 
 
 class Extract(Protocol):
@@ -72,22 +73,10 @@ class OnnxNetwork:
     rotation_invariant = False
 
     def __init__(self, path: Path, feature: str, denoise: bool):
-        try:
-            import onnxruntime
-        except ImportError:
-            raise InputError("ONNX files need: pip install onnxruntime.") from None
-        if not path.is_file():
-            raise InputError(f"There is no file {path}.")
-        try:
-            session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-            known = session.get_modelmeta().custom_metadata_map
-            stride, name = int(known["stride"]), known["feature"]
-        except Exception as error:  # ONNX Runtime raises RuntimeError and others of its own
-            reason = str(error).splitlines()[0][:200]
-            raise InputError(f"{path} is not a feature of hloc_reduce.export ({reason}).") from None
-        if name != feature:
+        self._session, metadata = onnx_files.read(path, "feature", ("stride", "feature"))
+        if (name := metadata["feature"]) != feature:
             raise InputError(f"{path} has the feature {name}, the map has {feature}.")
-        self._session, self._stride, self._denoise = session, stride, denoise
+        self._stride, self._denoise = int(metadata["stride"]), denoise
 
     def __call__(self, image: np.ndarray) -> dict:
         """Return the features of an image (H, W, 3)."""

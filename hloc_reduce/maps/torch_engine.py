@@ -22,23 +22,23 @@ class TorchEngine:
 
     Args:
         extractor: of the map's feature.
-        matcher: configuration of the matcher.
         storage: of the map's descriptors.
         made_from: of the map's features, see `extract_features.provenance`.
     """
 
-    def __init__(
-        self, extractor: extractors.Extractor, matcher: dict, storage: str, made_from: dict
-    ):
+    def __init__(self, extractor: extractors.Extractor, storage: str, made_from: dict):
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._extractor = extractor.eval().to(self._device)
         self.rotation_invariant = extractor.rotation_invariant
-        by_integers = self._device == "cpu" and is_worthwhile(coded=storage not in FLOATS)
-        self.matching: Matching = (
-            IntegerMatching(matcher)
-            if by_integers and is_integer_matcher(matcher)
-            else TorchMatching(matchers.load(for_features(matcher, made_from)), self._device)
-        )
+        self._by_integers = self._device == "cpu" and is_worthwhile(coded=storage not in FLOATS)
+        self._made_from = made_from
+
+    def matching(self, matcher: dict) -> Matching:
+        """Return what matches as a matcher with a configuration does."""
+        if self._by_integers and is_integer_matcher(matcher):
+            return IntegerMatching(matcher)
+        model = for_features(matcher, self._made_from)
+        return TorchMatching(matchers.load(model), self._device)
 
     def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
         """Extract the features of a photo, see `extractors.extract`."""

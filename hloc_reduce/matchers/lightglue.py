@@ -79,6 +79,58 @@ class LightGlue(Matcher):
         }
 
 
+class Graph(torch.nn.Module):
+    """LightGlue in a traced graph: all layers, all keypoints.
+
+    Attributes:
+        dim: of the descriptors.
+    """
+
+    def __init__(self, matcher: LightGlue):
+        super().__init__()
+        self.net = matcher.net
+        layer = self.net.input_proj
+        self.dim: int = getattr(layer, "in_features", self.net.conf.descriptor_dim)
+
+    def forward(
+        self,
+        keypoints0: torch.Tensor,
+        descriptors0: torch.Tensor,
+        image_size0: torch.Tensor,
+        keypoints1: torch.Tensor,
+        descriptors1: torch.Tensor,
+        image_size1: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Match two images.
+
+        Args:
+            keypoints0: (N, 2) x, y in pixels, centres at integers.
+            descriptors0: (N, D) of unit norm.
+            image_size0: (2,) width, height.
+            keypoints1: (M, 2).
+            descriptors1: (M, D).
+            image_size1: (2,).
+
+        Returns:
+            matches0 (N,) int64, the index in 1 or -1, and matching_scores0 (N,).
+        """
+        from kornia.feature.lightglue import filter_matches, normalize_keypoints
+
+        tokens, encodings = [], []
+        for keypoints, descriptors, size in (
+            (keypoints0, descriptors0, image_size0),
+            (keypoints1, descriptors1, image_size1),
+        ):
+            inside = torch.minimum(keypoints.clamp(min=0), size)
+            encodings.append(self.net.posenc(normalize_keypoints(inside[None], size[None])))
+            tokens.append(self.net.input_proj(descriptors[None]))
+        for layer in self.net.transformers:
+            tokens = layer(*tokens, *encodings)
+        assignment, _ = self.net.log_assignment[-1](*tokens)
+        matches, _, scores, _ = filter_matches(assignment, self.net.conf.filter_threshold)
+        return matches[0], scores[0]
+
+
 def published(network: str) -> dict[str, torch.Tensor]:
     """Return the published weights of a key of `LIGHTGLUE`, by kornia's names.
 

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 from .. import logger
+from ..confs import matchers as matchers_confs
 from ..utils import cli, options
 from ..utils.cli import InputError
-from ..utils.options import ABOVE_0, POSITIVE
+from ..utils.options import ABOVE_0, POSITIVE, Option
 from . import MAX_MB, QUEUE, __doc__, make_app
 
 MAX_PORT = 65_535
@@ -18,6 +19,8 @@ UPLOADS = 32  # connections beside those that wait
 def serve(
     map: Path,
     onnx: Path | None = None,
+    matcher: Annotated[str, Option("matcher", matchers_confs.names)] | None = None,
+    matcher_onnx: Path | None = None,
     host: str = "127.0.0.1",
     port: Annotated[int, POSITIVE] = 8000,
     num_loc: Annotated[int, POSITIVE] = 50,
@@ -29,6 +32,8 @@ def serve(
     Args:
         map: map folder, or file of hloc_reduce.compact.
         onnx: the map's feature, from hloc_reduce.export: needs no torch.
+        matcher: matcher of photos; default: the map's.
+        matcher_onnx: with `onnx`, lightglue, from hloc_reduce.export --matcher.
         host: address to listen on; 0.0.0.0 for all networks.
         port: port to listen on.
         num_loc: retrieved map images per photo.
@@ -44,7 +49,7 @@ def serve(
     from ..maps.localizer import Localizer
 
     check_address(host, port)  # before the map is loaded
-    localizer = Localizer(map, num_loc, onnx=onnx)
+    localizer = Localizer(map, num_loc, onnx=onnx, matcher=matcher, matcher_onnx=matcher_onnx)
     logger.info("Serving %s at http://%s:%d.", map, host, port)
     app = make_app(localizer, max_mb, queue)
     # photos that are being uploaded are in memory, too

@@ -85,7 +85,8 @@ def test_queries_called_as_map_photos(place, tmp_path, run):
     localizer = Localizer(outputs / "map")
     if not torch.cuda.is_available():
         features = {"descriptors": np.zeros((64, 3), np.float32)}
-        assert localizer.engine.matching.prepare(features).dtype == np.int16
+        matching = localizer.engine.matching({"name": "nearest_neighbor"})
+        assert matching.prepare(features).dtype == np.int16
     pose, info = localizer.localize(new / "1.png")
     assert (
         info["num_matches"] == int(rows["db/1.png"]["num_matches"]) and len(info["retrieved"]) == 4

@@ -151,7 +151,7 @@ def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
     both = light, heavy
     described = light.describe({"descriptors": query.T}, photo)
     np.testing.assert_array_equal(*(one.similarity(described) for one in both))
-    matched = [one.match({"descriptors": query.T}, one.names) for one in both]
+    matched = [one.steps[0].match({"descriptors": query.T}, one.names) for one in both]
     for name in light.names:
         np.testing.assert_array_equal(*(pairs[name] for pairs in matched))
     assert any(len(pairs) > 50 for pairs in matched[0].values())
@@ -237,6 +237,48 @@ def test_networks_run_by_onnx_runtime(feature, place, run, tmp_path):
         assert str(error.value).count("\n") == 0
     with pytest.raises(InputError, match="needs a compact map"):
         Localizer(path.parent / "outputs/map", onnx=onnx)
+
+
+def test_lightglue_run_by_onnx_runtime(place, run, tmp_path, base_weights, monkeypatch):
+    """In a map that was matched by nearest neighbours, for a photo that these do not localize."""
+    base_weights("xfeat+lightglue")
+    build, images, outputs = place
+    run(*build, "--feature", "mini32", "--storage", "uint2")
+    path, photo = tmp_path / "place.hlm", images / "query/day/a.png"
+    compact.main(path, outputs / "map")
+    onnx = export.main("mini32", tmp_path / "mini32.onnx")
+    lightglue = export.main("mini32", tmp_path / "lightglue.onnx", matcher=True)
+    files = {"onnx": onnx, "matcher_onnx": lightglue}
+    found, expected = (
+        Localizer(path, matcher="lightglue", **given) for given in (files, {"onnx": None})
+    )
+    assert type(found.engine).__name__ == "NumpyEngine"
+    assert type(expected.engine).__name__ == "TorchEngine"
+    camera = found.reference.camera_of[found.names[0]]
+    (pose, info), (other, its_info) = (one.localize(photo, camera) for one in (found, expected))
+    assert info["num_inliers"] > 0.9 * its_info["num_inliers"] > 50 and not info["again"]
+    assert pose_error(pose, other)[1] < 1
+    both = Localizer(path, matcher="NN+lightglue", **files)
+    assert not both.localize(photo, camera)[1]["again"]
+    (nearest, gate), second = both.steps
+    nothing = {name: np.zeros((0, 2), np.int64) for name in both.names}
+    monkeypatch.setattr(both, "steps", [(lambda *_: nothing, gate), second])
+    again, its_info = both.localize(photo, camera)
+    assert its_info["again"] and its_info["num_inliers"] == info["num_inliers"]
+    np.testing.assert_array_equal(again.matrix(), pose.matrix())
+    black = np.zeros((240, 320, 3), np.uint8)
+    assert found.localize(black)[0] is None
+    other_feature = export.main("mini64", tmp_path / "mini64.onnx", matcher=True)
+    for wrong, message in (
+        ({**files, "matcher_onnx": onnx}, "is not a matcher of hloc_reduce.export"),
+        ({**files, "matcher_onnx": other_feature}, "matches mini64, the map has mini32"),
+        ({"onnx": onnx}, "needs torch or, if it is lightglue, an ONNX file of its own"),
+        ({"matcher_onnx": lightglue}, "needs one of the feature, too"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Localizer(path, matcher="lightglue", **wrong)
+    with pytest.raises(InputError, match="Unknown matcher 'glue'"):
+        Localizer(path, matcher="glue")
 
 
 NAMES = ["sift_sv64", "mkd_us16", "colmap_sift_sv32", "xfeat_pca24", "sift_nested@24"]

@@ -7,16 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 import hloc_reduce
 from hloc_reduce import export, extractors, projections
 from hloc_reduce.confs import features
+from hloc_reduce.matchers.lightglue import LightGlue
 from hloc_reduce.projections import network
 from hloc_reduce.utils.cli import InputError
 
 pytestmark = pytest.mark.check
 
 PIPELINE = export
+WHOLE = {"depth_confidence": -1, "width_confidence": -1}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -149,6 +152,33 @@ def test_a_file_that_computes_something_else_is_not_kept(refused, tmp_path, monk
     assert path.read_text() == "before" and list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("name", ["xfeat_sv32", pytest.param("aliked", marks=pytest.mark.long)])
+def test_lightglue(name, onnx, run, base_weights, tmp_path):
+    """It computes what the matcher does with all layers and keypoints."""
+    base_weights(name.partition("_")[0])
+    base_weights(f"{name.partition('_')[0]}+lightglue")
+    path = tmp_path / "lightglue.onnx"
+    run("--feature", name, "--matcher", "--output", path)
+    loaded, matcher = session(path), LightGlue({"features": name, **WHOLE})
+    dim, generator = features.dimension(name), torch.Generator().manual_seed(0)
+    size = torch.tensor([480.0, 640.0])
+    for number0, number1 in ((150, 90), (1, 2)):
+        described = normalize(torch.randn(150, dim, generator=generator), dim=1)
+        places = torch.rand(150, 2, generator=generator) * 500 - 5  # some are outside
+        given, pair = {}, {}
+        for i, number in enumerate((number0, number1)):
+            one = {"keypoints": places[:number], "descriptors": described[:number]}
+            given |= {f"{key}{i}": part.numpy() for key, part in one.items()}
+            given[f"image_size{i}"] = size.numpy()
+            pair |= {f"keypoints{i}": one["keypoints"][None], f"image_size{i}": size[None]}
+            pair[f"descriptors{i}"] = one["descriptors"].T[None]
+        matches, scores = loaded.run(["matches0", "matching_scores0"], given)
+        expected = matcher(pair)
+        np.testing.assert_array_equal(matches, expected["matches0"][0])
+        np.testing.assert_allclose(scores, expected["matching_scores0"][0], atol=1e-4)
+        assert (matches >= 0).sum() > 0.5 * number1 or number0 == 1
+
+
 @pytest.mark.parametrize(
     "options, message",
     [
@@ -160,6 +190,8 @@ def test_a_file_that_computes_something_else_is_not_kept(refused, tmp_path, monk
         ),
         (("--feature", "few.yaml"), "few.yaml"),
         (("--feature", "sift", "--projection_only"), "sift has no projection"),
+        (("--feature", "sift_sv64", "--matcher"), "lightglue has no weights for sift_sv64"),
+        (("--feature", "mini32", "--matcher", "--projection_only"), "not both"),
         (("--feature", "xfeat", "--projection", "no.safetensors"), "no projection file no"),
         (("--feature", "hardnet_pca64", "--projection_only"), "hardnet_pca64 does not ship"),
     ],
