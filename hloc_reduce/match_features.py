@@ -154,7 +154,8 @@ def check_model(conf: dict, made_from: dict) -> None:
 
 def provenance(conf: dict, *feature_files: h5py.File) -> dict:
     """Return what determines the matches: the configurations of matcher and features."""
-    made_from = {"model": conf["model"]}
+    known = next(filter(None, map(get_conf, feature_files)), {})
+    made_from = {"model": conf["model"], **matchers_confs.provenance(conf["model"], known)}
     for i, file in enumerate(feature_files):
         made_from[f"features{i}"] = file_provenance(file)
     return made_from

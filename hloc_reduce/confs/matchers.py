@@ -6,6 +6,7 @@ from .. import projections
 from ..networks import lightglue as weights_of
 from ..networks.lightglue import LIGHTGLUE
 from ..utils.cli import InputError
+from ..utils.files import file_sha256
 from .features import base_of, matcher_of, network_of
 
 
@@ -78,6 +79,25 @@ def for_features(model: dict, made_from: dict) -> dict:
             "not for this one."
         )
     return {**model, "features": name}
+
+
+def provenance(model: dict, made_from: dict) -> dict:
+    """Return what determines the matches of some features beside the configuration of a matcher.
+
+    Args:
+        model: as in `for_features`.
+        made_from: as in `for_features`.
+
+    Returns:
+        `weights_sha256` of LightGlue's weights that ship, else {}.
+
+    Raises:
+        InputError: for features that LightGlue has no weights for.
+    """
+    features = for_features(model, made_from).get("features")
+    if model["name"] != "lightglue" or features not in weights_of.shipped():
+        return {}
+    return {"weights_sha256": file_sha256(weights_of.file_of(features))}
 
 
 def _ratio(threshold: float) -> dict:

@@ -114,6 +114,7 @@ def main(
         made_from |= {"pairs": f"retrieval, {PAIR_ROUNDS} rounds of verification"}
     made_from |= {"normalized": True} if normalized else {}
     made_from |= retrieval_confs.provenance(retrieval)
+    made_from |= matchers_confs.provenance(made_from["matcher"], made_from["feature"])
     with claim(map_dir, made_from, overwrite, image_dir, model, projection) as folder:
         if not (map_dir / FINISHED).exists():
             begin(map_dir, fingerprints)

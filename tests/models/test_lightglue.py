@@ -137,6 +137,18 @@ def test_every_projection_of_its_networks_has_an_adapter(base_weights):
         assert lightglue.metadata_of(name)["made_from"] == lightglue.identity(made_from)
 
 
+def test_matches_are_stale_if_the_adapter_has_changed(tmp_path, monkeypatch):
+    made_from = extract_features.provenance(features_confs.confs["mini32"])
+    known = {name: matchers_confs.provenance(CONF, made_from) for name in ("before", "again")}
+    assert known["before"] == known["again"] != {}
+    file = Path(shutil.copy(lightglue.file_of("mini32"), tmp_path))
+    monkeypatch.setattr(lightglue, "WEIGHTS", tmp_path)
+    tensors = {key: 2 * tensor for key, tensor in load_file(file).items()}
+    save_file(tensors, file, {"network": "xfeat", "made_from": json.dumps({})})
+    assert matchers_confs.provenance(CONF, made_from) != known["before"]
+    assert not matchers_confs.provenance({"name": "nearest_neighbor"}, made_from)
+
+
 def test_features_without_weights_are_refused():
     made_from = extract_features.provenance(features_confs.confs["colmap_sift_sv64"])
     message = "lightglue has no weights for colmap_sift_sv64, only for aliked, disk, mini32, "
