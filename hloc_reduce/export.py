@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from . import __version__, logger, projections
 from .confs import features as features_confs
@@ -20,6 +20,7 @@ from .networks.lightglue import identity
 from .utils import cli, options
 from .utils.cli import InputError
 from .utils.files import replacing
+from .utils.options import Option
 from .utils.paths import strings_as_paths
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ ONNX_TOLERANCE = 1e-4  # between ONNX Runtime and torch
 PACKAGES = ("onnx", "onnxruntime", "onnxscript")
 # images of these sides, in strides, make the graph and check it
 MADE_WITH, CHECKED_WITH = (3, 4), (8, 11)
+MATCHERS = ("lightglue",)
 SIZE = (640.0, 480.0)  # of the photos that check a matcher
 
 
@@ -64,7 +66,7 @@ def main(
     output: Path,
     projection: Path | None = None,
     projection_only: bool = False,
-    matcher: bool = False,
+    matcher: Annotated[str, Option("matcher", MATCHERS)] | None = None,
 ) -> Path:
     """Write an ONNX file and check that ONNX Runtime computes the same with it as torch.
 
@@ -74,7 +76,7 @@ def main(
         projection: file of another projection of the feature's descriptors.
         projection_only: write the projection alone, from descriptors to fewer dimensions, which
             every feature that has one can do.
-        matcher: write LightGlue for the feature instead.
+        matcher: write this matcher for the feature instead.
 
     Returns:
         `output`.
@@ -197,7 +199,7 @@ def _matcher(name: str, conf: dict) -> Content:
     from .matchers.lightglue import Graph, LightGlue
 
     made_from = extract_features.provenance(conf)
-    model = matchers_confs.for_features({"name": "lightglue"}, made_from)
+    model = matchers_confs.for_features(matchers_confs.confs["lightglue"]["model"], made_from)
     graph = Graph(LightGlue(model).eval())
     dim, generator = graph.dim, torch.Generator().manual_seed(0)
 
@@ -237,6 +239,7 @@ def _matcher(name: str, conf: dict) -> Content:
             "matcher": "lightglue",
             "dim": str(dim),
             "made_from": json.dumps(identity(made_from)),
+            "max_keypoints": str(model["max_keypoints"]),
             "left_out": "early exit and pruning",
         },
     )
@@ -318,7 +321,7 @@ def _check(content: Content, path: Path) -> float:
         difference = max((float(error.max()) for error in errors if error.numel()), default=0.0)
     if not difference <= ONNX_TOLERANCE:
         raise InputError(
-            f"ONNX Runtime does not compute the features of torch: they differ by {difference:.0e} "
+            f"ONNX Runtime does not compute what torch computes: they differ by {difference:.0e} "
             f"instead of at most {ONNX_TOLERANCE:.0e}. No file was written. Try the versions of "
             "onnx, onnxruntime, onnxscript and torch in constraints.txt."
         )

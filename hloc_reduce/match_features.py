@@ -152,6 +152,20 @@ def check_model(conf: dict, made_from: dict) -> None:
     matchers.load(matchers_confs.for_features(conf["model"], made_from))
 
 
+def check_features(features: Path, conf: dict) -> None:
+    """Fail on features without what a matcher needs before any work.
+
+    Args:
+        features: feature file.
+        conf: the matcher, an entry of confs.matchers.
+
+    Raises:
+        InputError: when something is missing.
+    """
+    with open_h5(features) as file:
+        _check_keys(file, conf)
+
+
 def provenance(conf: dict, *feature_files: h5py.File) -> dict:
     """Return what determines the matches: the configurations of matcher and features."""
     known = next(filter(None, map(get_conf, feature_files)), {})
@@ -197,7 +211,7 @@ def _match(
         matcher = matchers.load(model).eval().to(device)
         match = partial(_match_batch, matcher, device, gpu_bytes or GPU_BYTES)
         for file in (file0, file1):
-            _check_features(file, matcher.feature_keys(), conf["model"]["name"])
+            _check_keys(file, conf)
         cache = FeatureCache(CACHE_BYTES, matcher.feature_keys())
         read = map(partial(_read, cache, file0, file1), pairs)
         batches = iter(lambda: list(islice(read, size)), [])
@@ -206,9 +220,12 @@ def _match(
                 yield from groups
 
 
-def _check_features(file: h5py.File, keys: Iterable[str], matcher: str) -> None:
+def _check_keys(file: h5py.File, conf: dict) -> None:
     """Raise an InputError if the first image of a feature file lacks what a matcher needs."""
-    name = next(iterate_h5_names(file.id), None)
+    from . import matchers
+
+    matcher, name = conf["model"]["name"], next(iterate_h5_names(file.id), None)
+    keys = matchers.find(conf["model"]).feature_keys()
     needed = [key for key in keys if key != "descriptors"]  # there are several kinds of these
     if missing := [key for key in needed if name is not None and key not in file[name]]:
         raise InputError(

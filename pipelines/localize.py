@@ -20,7 +20,7 @@ from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
-from hloc_reduce.match_features import check_model
+from hloc_reduce.match_features import check_features, check_model
 from hloc_reduce.runtime import trace
 from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
@@ -68,8 +68,9 @@ def open_map(
         feature: local feature, see `list_features`, or a YAML file with its configuration; default:
             colmap_sift_sv64.
         projection: projection file to use with the base descriptor of `feature`.
-        matcher: matcher of a new map and of queries; default: the feature's, see `list_features`,
-            or that of a map that was built.
+        matcher: matcher of a new map and of queries; NN+lightglue matches queries that nearest
+            neighbours do not localize by LightGlue; default: the feature's, see `list_features`, or
+            that of a map that was built.
         num_covis: other images that each map image is matched with.
         overwrite: recompute existing results.
         storage: storage of the descriptors of map images (those of queries stay floats); default:
@@ -107,6 +108,9 @@ def open_map(
         "keypoints": keypoints or KEYPOINT_SETTINGS[0],
         "retrieval": named or retrieval_confs.VLAD,
     }
+    if matcher == NN_LIGHTGLUE and not is_built:  # the map needs only the first of both
+        _, conf = features_confs.get(new["feature"], projection)
+        check_model(matchers_confs.confs["lightglue"], extract_features.provenance(conf))
     folder = outputs / "map"
     if database is not None:
         if model_or_map is None:
@@ -186,7 +190,9 @@ def main(
     matcher = matcher or built.matcher
     steps = matchers_confs.steps_of(matcher, matchers_confs.fast_of(built.matcher, built.conf))
     for step in {*steps} - {built.matcher}:
-        check_model(matchers_confs.confs[step], extract_features.provenance(built.conf))
+        conf = matchers_confs.confs[step]
+        check_model(conf, extract_features.provenance(built.conf))
+        check_features(built.features, conf)
     conf = {"map": built.place, **identity(outputs, query_images, queries), "num_loc": num_loc}
     conf |= {"matcher": matcher} if matcher != built.matcher else {}
     retrieval = built.retrieval if retrieval is None else retrieval
@@ -296,13 +302,14 @@ def _check(given: dict, is_changed: bool) -> None:
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
-    is_built = given["map_images"] is None and given["database"] is None
-    if given["matcher"] is not None and given["query_images"] is None and is_built:
-        raise InputError("--matcher is for a new map or for queries: give --query_images, or none.")
+    matcher, is_built = given["matcher"], given["map_images"] is None and given["database"] is None
+    if matcher and given["query_images"] is None and (is_built or matcher == NN_LIGHTGLUE):
+        what = f"--matcher {matcher} is for queries"
+        raise InputError(f"{what}: give --query_images, or leave out --matcher.")
     if given["compact"] is not None:
         compact.check_output(given["compact"])
-        if given["matcher"] and given["matcher"] != NN_LIGHTGLUE:
-            compact.check_matcher(given["matcher"])
+        if matcher and matcher != NN_LIGHTGLUE and not is_built:
+            compact.check_matcher(matcher)
         if (folder := given["model_or_map"]) is not None and maps.is_compact(folder):
             raise InputError(f"--map {folder} is a compact map: leave out --compact.")
 

@@ -17,7 +17,8 @@ def fast_of(matcher: str, feature: dict) -> str:
         matcher: of the map.
         feature: the configuration of its feature.
     """
-    return matcher_of(feature) if matcher == "lightglue" else matcher
+    is_lightglue = confs[matcher]["model"]["name"] == "lightglue"
+    return matcher_of(feature) if is_lightglue else matcher
 
 
 def steps_of(matcher: str, fast: str) -> tuple[str, ...]:
@@ -33,7 +34,7 @@ def steps_of(matcher: str, fast: str) -> tuple[str, ...]:
 def all_of(feature: dict) -> list[str]:
     """Return the matchers that suit the configuration of a feature, the default first."""
     has_weights = features_of(feature["model"]) in weights_of.known()
-    return [matcher_of(feature), *(["lightglue"] if has_weights else [])]
+    return [matcher_of(feature), *(["lightglue", NN_LIGHTGLUE] if has_weights else [])]
 
 
 def lightglue(features: str) -> dict:
@@ -67,9 +68,13 @@ def for_features(model: dict, made_from: dict) -> dict:
     Raises:
         InputError: for features that LightGlue has no weights for.
     """
-    if model["name"] != "lightglue" or model.get("features"):
+    if model["name"] != "lightglue":
         return model
-    name = features_of(made_from.get("model", {}))
+    name, given = features_of(made_from.get("model", {})), model.get("features")
+    if given and name not in (None, given):
+        raise InputError(f"The matcher {given}+lightglue is not for {name}: choose lightglue.")
+    if given:
+        return model
     if name not in weights_of.known():
         raise weights_of.unknown(name or "features of unknown origin")
     trained_for = {} if name in LIGHTGLUE else weights_of.metadata_of(name)["made_from"]
@@ -125,7 +130,7 @@ confs: dict[str, dict] = {
     **{f"{name}+lightglue": lightglue(name) for name in LIGHTGLUE},
 }
 
-# the feature's own matcher, and lightglue for queries that it does not localize
+# the matcher of the map, or the feature's own, and lightglue for queries that it does not localize
 NN_LIGHTGLUE = "NN+lightglue"
 names = (*confs, NN_LIGHTGLUE)  # that pipelines take
 

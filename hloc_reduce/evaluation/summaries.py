@@ -48,6 +48,7 @@ def _query_row(
         "query": name,
         "list": list_name,
         "status": status(pose, record["localized"]),
+        "again": record["again"],
         "num_matches": record["num_matches"],
         "num_without_point": record["num_without_point"],
         "num_correspondences": correspondences,

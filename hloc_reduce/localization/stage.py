@@ -53,10 +53,12 @@ class Try(NamedTuple):
         mirror_images: extracts and matches mirror images of queries whose intrinsics are not
             given: if the poses of these are nearly as likely, their own are refused; None: no query
             is tested.
+        made_from: what determines the matches beside the features.
     """
 
     match: Callable[[list[str]], Path]
     mirror_images: MirrorImages | None = None
+    made_from: dict | None = None
 
 
 def main(
@@ -110,7 +112,7 @@ def main(
     """
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
     header |= {"mirror_images": True} if mirror_images else {}
-    header |= {"again": True} if again else {}
+    header |= {"again": again.made_from} if again else {}
     with Log(log_file(results), header, overwrite) as log:
         all_tasks = [(name, camera, retrieved.get(name, [])) for name, camera in queries]
         reasons = _reasons(features, queries)
@@ -149,12 +151,14 @@ class _Localizing:
     executor: Executor
 
     def run(self, given: Try, tasks: list[Task], is_again: bool) -> None:
-        """Localize queries that have no record, or is_again those that are not localized yet.
+        """Localize queries that have no record or, if `is_again`, those that are not localized.
 
         Queries that an interrupted run has localized in the same try are only tested for being
         mirrored.
         """
         records = self.log.records
+        if is_again:  # the others have nothing to be matched with
+            tasks = [task for task in tasks if task[2]]
         before = {name: records[name] for name, _, _ in tasks if name in records}
         done = {name for name, record in before.items() if record["again"] == is_again}
         wanted = [name for name, _, _ in tasks if name not in before]

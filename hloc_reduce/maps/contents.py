@@ -261,6 +261,11 @@ def _numpy_engine(
     if others and onnx is None:
         return None
     lightglue = None
+    if matcher_onnx is not None and not others:
+        raise InputError(
+            f"The matcher {compact.matcher} needs no {matcher_onnx}: give the matcher "
+            f"{matchers_confs.NN_LIGHTGLUE} or lightglue, too."
+        )
     for model in others:
         if model["name"] != "lightglue" or matcher_onnx is None:
             raise InputError(

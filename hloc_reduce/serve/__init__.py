@@ -181,6 +181,7 @@ def answer(
         "agreement": info["agreement"],
         "probability": info["probability"],
         "num_inliers": info["num_inliers"],
+        "again": info["again"],
         "camera": to_list(info["camera"]),
         "intrinsics": info["intrinsics"],
         "map_doubts": info["map_doubts"],

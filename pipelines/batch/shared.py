@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from hloc_reduce import extract_features, logger
+from hloc_reduce import extract_features, logger, match_features
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.confs.retrieval import confs
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.layouts import layout_of
@@ -88,7 +89,10 @@ class Shared:
                 true_poses(self.query_names, job.ground_truth, True)
             self._truths.add(job.ground_truth)
         _, conf = features_confs.get(job.feature, None, job.storage, job.keypoints)
-        extract_features.provenance(conf)
+        made_from = extract_features.provenance(conf)
+        fast = features_confs.matcher_of(conf)
+        for step in matchers_confs.steps_of(job.matcher or fast, fast):
+            match_features.check_model(matchers_confs.confs[step], made_from)
         model = extractors.load(conf["model"])
         stored = "" if job.storage == STORAGES[0] else f"-{job.storage}"
         found = "" if job.keypoints == KEYPOINT_SETTINGS[0] else f"-keypoints_{job.keypoints}"

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from hloc_reduce import extract_features, match_features
 from hloc_reduce.aggregate_features import output_of
@@ -73,15 +74,14 @@ class DatasetRun(Run):
     def _claim(self, outputs: Path, steps: tuple[str, ...]) -> RunFolder:
         """Claim the outputs folder. Results of given features are stale if these were redone."""
         options = self.options
-        conf = {
+        models = [matchers_confs.confs[step]["model"] for step in steps]
+        conf: dict[str, Any] = {
             "dataset": str(self.place.root.resolve()),
             "feature": extract_features.provenance(self.conf),
-            "matcher": matchers_confs.confs[steps[0]]["model"],
+            "matcher": models if steps[1:] else models[0],
             "retrieval": options.retrieval,
             **options.numbers,
         }
-        if steps[1:]:
-            conf["again"] = matchers_confs.confs[steps[1]]["model"]
         is_file = options.retrieval not in retrieval_confs.confs
         inputs = [Path(options.retrieval)] if is_file else []
         if inputs and outputs.resolve().parent in inputs[0].resolve().parents:

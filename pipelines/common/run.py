@@ -24,6 +24,7 @@ from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.runtime.versions import versions
 from hloc_reduce.utils.files import write_csv
+from hloc_reduce.utils.h5 import get_conf, open_h5
 from hloc_reduce.utils.images import list_images, with_reasons
 from hloc_reduce.utils.match_files import check_distinct
 from hloc_reduce.utils.parsers import parse_pairs, parse_retrieval, write_pairs
@@ -122,7 +123,10 @@ class Run:
             self._matches_again = self._match(matcher, listed, features, features_ref)
             return self._matches_again
 
-        return Try(match, mirror_images(matcher) if mirror_images else None)
+        model = matchers_confs.confs[matcher]["model"]
+        with open_h5(features) as file:
+            made_from = {"model": model, **matchers_confs.provenance(model, get_conf(file))}
+        return Try(match, mirror_images(matcher) if mirror_images else None, made_from)
 
     def mirror_images(
         self, conf: dict, image_dir: Path, pairs: Path, features: Path, map_features: Path
@@ -192,6 +196,7 @@ class Run:
             **summary,
             "queries": len(rows),
             "queries_localized": sum(row["status"] == "localized" for row in rows),
+            "queries_matched_again": sum(row["again"] for row in rows),
             "queries_unreadable": len(failed),
             "lists": {
                 name: summarize_list([row for row in rows if row["list"] == name], thresholds[name])

@@ -31,7 +31,7 @@ def use(path):
     of_map.points.all()
     of_map.global_descriptors()
     found.similarity(np.ones(of_map.vocabulary.size, np.float32))
-    found.match({"descriptors": np.eye(found.dim, 5, dtype=np.float32)}, names)
+    found.steps[0].match({"descriptors": np.eye(found.dim, 5, dtype=np.float32)}, names)
     return found
 
 

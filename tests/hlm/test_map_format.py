@@ -168,7 +168,7 @@ def check_matches(path, described, norms, shown):
     query /= np.linalg.norm(query, axis=1, keepdims=True)
     query = query.astype(np.float16).astype(np.float32)
     names = list(shown)[:2]
-    found = contents.read(path).match({"descriptors": query.T}, names)
+    found = contents.read(path).steps[0].match({"descriptors": query.T}, names)
     if norms is not None:
         used = np.unique(np.concatenate([shown[name] for name in names]))
         described = described / norms[used].mean().clip(0.75, 1)

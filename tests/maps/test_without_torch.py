@@ -247,7 +247,7 @@ def test_lightglue_run_by_onnx_runtime(place, run, tmp_path, base_weights, monke
     path, photo = tmp_path / "place.hlm", images / "query/day/a.png"
     compact.main(path, outputs / "map")
     onnx = export.main("mini32", tmp_path / "mini32.onnx")
-    lightglue = export.main("mini32", tmp_path / "lightglue.onnx", matcher=True)
+    lightglue = export.main("mini32", tmp_path / "lightglue.onnx", matcher="lightglue")
     files = {"onnx": onnx, "matcher_onnx": lightglue}
     found, expected = (
         Localizer(path, matcher="lightglue", **given) for given in (files, {"onnx": None})
@@ -268,15 +268,16 @@ def test_lightglue_run_by_onnx_runtime(place, run, tmp_path, base_weights, monke
     np.testing.assert_array_equal(again.matrix(), pose.matrix())
     black = np.zeros((240, 320, 3), np.uint8)
     assert found.localize(black)[0] is None
-    other_feature = export.main("mini64", tmp_path / "mini64.onnx", matcher=True)
+    other_feature = export.main("mini64", tmp_path / "mini64.onnx", matcher="lightglue")
     for wrong, message in (
         ({**files, "matcher_onnx": onnx}, "is not a matcher of hloc_reduce.export"),
         ({**files, "matcher_onnx": other_feature}, "matches mini64, the map has mini32"),
         ({"onnx": onnx}, "needs torch or, if it is lightglue, an ONNX file of its own"),
         ({"matcher_onnx": lightglue}, "needs one of the feature, too"),
+        ({**files, "matcher": "NN-mutual"}, "needs no .*lightglue.onnx: give the matcher"),
     ):
         with pytest.raises(InputError, match=message):
-            Localizer(path, matcher="lightglue", **wrong)
+            Localizer(path, **{"matcher": "lightglue", **wrong})
     with pytest.raises(InputError, match="Unknown matcher 'glue'"):
         Localizer(path, matcher="glue")
 

@@ -158,7 +158,7 @@ def test_lightglue(name, onnx, run, base_weights, tmp_path):
     base_weights(name.partition("_")[0])
     base_weights(f"{name.partition('_')[0]}+lightglue")
     path = tmp_path / "lightglue.onnx"
-    run("--feature", name, "--matcher", "--output", path)
+    run("--feature", name, "--matcher", "lightglue", "--output", path)
     loaded, matcher = session(path), LightGlue({"features": name, **WHOLE})
     dim, generator = features.dimension(name), torch.Generator().manual_seed(0)
     size = torch.tensor([480.0, 640.0])
@@ -190,8 +190,11 @@ def test_lightglue(name, onnx, run, base_weights, tmp_path):
         ),
         (("--feature", "few.yaml"), "few.yaml"),
         (("--feature", "sift", "--projection_only"), "sift has no projection"),
-        (("--feature", "sift_sv64", "--matcher"), "lightglue has no weights for sift_sv64"),
-        (("--feature", "mini32", "--matcher", "--projection_only"), "not both"),
+        (
+            ("--feature", "sift_sv64", "--matcher", "lightglue"),
+            "lightglue has no weights for sift_sv64",
+        ),
+        (("--feature", "mini32", "--matcher", "lightglue", "--projection_only"), "not both"),
         (("--feature", "xfeat", "--projection", "no.safetensors"), "no projection file no"),
         (("--feature", "hardnet_pca64", "--projection_only"), "hardnet_pca64 does not ship"),
     ],

@@ -1,5 +1,6 @@
 """Queries of a scene whose poses are known."""
 
+import json
 import shutil
 import sys
 
@@ -269,7 +270,7 @@ def test_images_without_descriptors_are_skipped(built):
 
 
 def test_queries_that_are_not_localized_are_matched_once_more(built):
-    """The first matches of one query are lost, and another photo could not be read."""
+    """The first matches of one query are lost, and others cannot be matched."""
     expected = built.localize()
     with h5py.File(built.loc_matches, "a") as file:
         for i in range(6):
@@ -278,8 +279,10 @@ def test_queries_that_are_not_localized_are_matched_once_more(built):
         file.write("query/8.jpg db/3.jpg\n")
     with h5py.File(built.features, "a") as file:
         file.create_group("query/8.jpg").attrs[FAILURE] = "cannot be read"
+        file.copy("query/7.jpg", "query/9.jpg")  # nothing is retrieved for it
     with built.queries.open("a") as file:
-        file.write("query/8.jpg SIMPLE_RADIAL 640 480 500 320 240 0.02\n")
+        for i in (8, 9):
+            file.write(f"query/{i}.jpg SIMPLE_RADIAL 640 480 500 320 240 0.02\n")
     asked = []
 
     def match(names):
@@ -296,9 +299,18 @@ def test_queries_that_are_not_localized_are_matched_once_more(built):
     assert records["query/6.jpg"] == {**expected["query/6.jpg"], "again": True}
     assert records["query/7.jpg"] == expected["query/7.jpg"]
     assert records["query/8.jpg"]["reason"] == "cannot be read"
+    assert records["query/9.jpg"]["reason"] == "no map image was retrieved"
     log = log_file(built.root / "poses.txt")
     lines = log.read_text().splitlines(keepends=True)
     assert built.localize(again=again) == records
     assert log.read_text().splitlines(keepends=True) == lines
-    log.write_text("".join(line for line in lines if '"again": true' not in line))  # killed
-    assert built.localize(again=again) == records
+    before = log_file(built.root / "poses.txt").read_text()
+    first_try = json.dumps(["query/6.jpg", alone["query/6.jpg"]]) + "\n"
+    # killed in the second try, between the tries, and in the first one
+    for kept in (lines, [first_try if "query/6" in line else line for line in lines], lines[:1]):
+        log.write_text("".join(kept))
+        assert built.localize(again=again) == records
+        assert {*log.read_text().splitlines()} == {*before.splitlines()}
+    # another second matcher
+    other = stage.Try(lambda names: built.loc_matches, None, {"model": "other"})
+    assert not built.localize(again=other)["query/6.jpg"]["localized"]
