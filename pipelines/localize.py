@@ -68,9 +68,9 @@ def open_map(
         feature: local feature, see `list_features`, or a YAML file with its configuration; default:
             colmap_sift_sv64.
         projection: projection file to use with the base descriptor of `feature`.
-        matcher: matcher of a new map and of queries; NN+lightglue matches queries that nearest
-            neighbours do not localize by LightGlue; default: the feature's, see `list_features`, or
-            that of a map that was built.
+        matcher: matcher of a new map and of queries; with NN+lightglue, queries that nearest
+            neighbours do not localize are matched by LightGlue; default: the feature's, see
+            `list_features`, or that of a map that was built.
         num_covis: other images that each map image is matched with.
         overwrite: recompute existing results.
         storage: storage of the descriptors of map images (those of queries stay floats); default:

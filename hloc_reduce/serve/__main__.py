@@ -33,7 +33,7 @@ def serve(
         map: map folder, or file of hloc_reduce.compact.
         onnx: the map's feature, from hloc_reduce.export: needs no torch.
         matcher: matcher of photos; default: the map's.
-        matcher_onnx: with `onnx`, lightglue, from hloc_reduce.export --matcher.
+        matcher_onnx: LightGlue, with `onnx`, from hloc_reduce.export --matcher lightglue.
         host: address to listen on; 0.0.0.0 for all networks.
         port: port to listen on.
         num_loc: retrieved map images per photo.

@@ -26,8 +26,8 @@ class Method(Checked):
         feature: local feature, see `list_features`, or a YAML file with its configuration.
         storage: storage of the descriptors of map images (those of queries stay floats).
         keypoints: settings of the DoG detector.
-        matcher: matcher; NN+lightglue matches queries that nearest neighbours do not localize by
-            LightGlue; default: the feature's, see `list_features`.
+        matcher: matcher; with NN+lightglue, queries that nearest neighbours do not localize are
+            matched by LightGlue; default: the feature's, see `list_features`.
         retrieval: a name (those of networks need an installed hloc), or hloc's text file of pairs
             or h5 file of global descriptors.
         ground_truth: true poses of the queries; default: those of the data set.
