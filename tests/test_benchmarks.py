@@ -141,8 +141,7 @@ def trials():
     return found
 
 
-# there are no trials yet of lightglue, which has the weights of mutual neighbours
-@pytest.mark.parametrize("kind", [kind for kind in gate.MATCH_KINDS if kind != "lightglue"])
+@pytest.mark.parametrize("kind", gate.MATCH_KINDS)
 def test_the_weights_of_the_gate_are_those_of_the_trials(trials, kind):
     poses = [row for row in trials if row["matcher"] == kind and "measures" in row]
     weights, bias, *_ = gate.MATCH_KINDS[kind]

@@ -127,7 +127,8 @@ class MatchKind(NamedTuple):
         default_min_probability: the least of a pose that is trusted. With a strict ratio test,
             wrong poses at copies of repeated structures may come near it. Without, right poses in
             the dark have less; wrong ones of mirrored photos, which have more, are refuted by
-            `max_mirrored`.
+            `max_mirrored`. Of the matches of LightGlue, which filters them, more agree: in right
+            poses 0.76 or more, in wrong ones of mirrored photos up to 0.66.
         max_mirrored: the largest confidence of the mirror image, as a share of its own. Right poses
             by networks on symmetric facades have up to 0.73. Wrong ones of seven mirrored photos of
             a castle by SIFT have 0.47 to 0.97.
@@ -143,14 +144,14 @@ MOST_TELLING = 20.0  # confidence: more does not count
 BEST = Evidence(float(np.log10(MOST_TELLING)), 1.0)
 STRICT = 0.8  # the largest ratio of a strict ratio test
 FEW = 32  # dimensions of descriptors: with fewer, fewer matches are right
-# with a strict ratio test, also of few dimensions, and without; weights and biases by
-# `python -m benchmarks.fit_gate`
+# with a strict ratio test, also of few dimensions, and without; and of LightGlue; weights and
+# biases by `python -m benchmarks.fit_gate`
 MATCH_KINDS = {
     "ratio": MatchKind(Evidence(4.13, 17.45), -17.21, 0.8, 0.4),
     "few": MatchKind(Evidence(2.72, 14.71), -8.2, 0.8, 0.4),
     "mutual": MatchKind(Evidence(4.01, 11.42), -8.89, 0.3, 0.8),
+    "lightglue": MatchKind(Evidence(5.84, 28.02), -27.23, 0.5, 0.8),
 }
-MATCH_KINDS["lightglue"] = MATCH_KINDS["mutual"]  # until there are trials of it
 NEAREST_NEIGHBOR = "nearest_neighbor"  # whose kind its ratio test tells
 KINDS_OF_MATCHERS = {"adalam": "mutual", "lightglue": "lightglue", "superglue": "lightglue"}
 # probability from which on mirror images are not tried; the wrong pose of a mirrored photo of a
@@ -167,7 +168,7 @@ class Gate:
             as many inliers that are expected by chance.
         min_inliers: minimum number of RANSAC's inliers of a localized query.
         min_probability: minimum probability of a localized query, see `gate.probability`; default:
-            0.8 with a strict ratio test, else 0.3.
+            0.8 with a strict ratio test, 0.5 for LightGlue, else 0.3.
         match_kind: what the limits are for: mutual nearest neighbours with a strict ratio test,
             the same with few dimensions, or without; or those of LightGlue; default: the matcher's.
 
@@ -423,7 +424,8 @@ RULES = (
         _improbable,
         "be by the right matches: `probability`, by its confidence and its `agreement`, the "
         "largest share of a map image's matches that are inliers, less a standard deviation",
-        f"{MATCH_KINDS['ratio'].default_min_probability:g} with a strict ratio test, else "
+        f"{MATCH_KINDS['ratio'].default_min_probability:g} with a strict ratio test, "
+        f"{MATCH_KINDS['lightglue'].default_min_probability:g} for LightGlue, else "
         f"{MATCH_KINDS['mutual'].default_min_probability:g} (`--min_probability`)",
     ),
     Rule(
