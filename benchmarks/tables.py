@@ -92,7 +92,6 @@ MAPS: list[Choice] = [
     ("mini32", "uint2"),
 ]
 MAP_SIZES = (0.06, 0.03)
-LIGHTGLUE = "mini32"
 ONE_CORE = "1 core"
 STAGES = ("extraction", "matching", "triangulation", "localization")
 PAPER = ("sift", "mkd", "tfeat")
@@ -185,39 +184,6 @@ def bytes_table() -> Table:
             cells[int(rows[0]["bytes"])] = f"{localized:.0f}, {recall:.0f} %"
         table.append([f"`{family}`", *cells.values()])
     return table
-
-
-def lightglue_table() -> Table:
-    """Compare LightGlue with nearest neighbours, on the darkened places."""
-    table = [["map by", "queries by", "keypoints", "localized", "inliers", "median [cm]"]]
-    table[0] += ["largest error [cm]", "seconds a query"]
-    rows = select(read("lightglue"), feature=LIGHTGLUE)
-    for of_map, matcher, number in dict.fromkeys(map(_matchers, rows)):
-        found = [row for row in rows if _matchers(row) == (of_map, matcher, number)]
-        queries = total(found, "queries")
-        mean = {
-            key: sum(float(row[key]) * float(row["queries"]) for row in found) / queries
-            for key in ("inliers", "median_cm", "seconds")
-        }
-        table.append(
-            [
-                f"`{of_map}`",
-                f"`{matcher}`",
-                number or "all",
-                f"{total(found, 'localized'):.0f} of {queries:.0f}",
-                f"{mean['inliers']:,.0f}",
-                f"{mean['median_cm']:.2f}",
-                f"{max(float(row['largest_cm']) for row in found):.1f}",
-                f"{mean['seconds']:.1f}",
-            ]
-        )
-    return table
-
-
-def _matchers(row: Row) -> tuple[str, str, str]:
-    """Return what matched the map and the queries of a row, and with how many keypoints."""
-    of_map, _, number = row["variant"].removeprefix("map by ").partition(", ")
-    return of_map, row["matcher"], number.removesuffix(" keypoints")
 
 
 def schemes_table() -> Table:
