@@ -1,5 +1,6 @@
 """Matchers, by hloc's names."""
 
+from collections import ChainMap
 from pathlib import Path
 
 from .. import projections
@@ -132,7 +133,7 @@ confs: dict[str, dict] = {
 
 # the matcher of the map, or the feature's own, and lightglue for queries that it does not localize
 NN_LIGHTGLUE = "NN+lightglue"
-names = (*confs, NN_LIGHTGLUE)  # that pipelines take
+names = ChainMap(confs, {NN_LIGHTGLUE: {}})  # that pipelines take; others may be added to confs
 
 # the models of other matches of hloc, by what it calls their files
 OF_HLOC = {

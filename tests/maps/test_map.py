@@ -49,8 +49,10 @@ def test_a_map_is_built_once(place, capsys, caplog, run, refused):
     assert outcome(outputs / "queries-day")[0]["map"] == str(moved)
     message = refused(*given, "--feature", "sift_sv32")
     assert "is of --feature colmap_sift_sv64." in message
+    message = refused(*given, "--storage", "uint8")
+    assert "was built with --storage float16." in message
     message = refused(*given, "--matcher", "NN-mutual")
-    assert "was built with --matcher NN-ratio." in message
+    assert "--matcher NN-mutual is for queries" in message
     message = refused("--map", moved, "--outputs", outputs, "--map_images", images)
     assert "leave out --map_images" in message
 
