@@ -120,7 +120,7 @@ def test_a_network_with_options_and_a_projection(run, base_weights, tmp_path):
         (keypoints, scores, -descriptors),
         (keypoints[1:], scores[1:], descriptors[1:]),
     ):
-        with pytest.raises(InputError, match="does not compute the features of torch"):
+        with pytest.raises(InputError, match="does not compute what torch computes"):
             export._check(replace(content, expected=expected), path)
 
 
@@ -148,7 +148,7 @@ def test_a_file_that_computes_something_else_is_not_kept(refused, tmp_path, monk
 
     monkeypatch.setattr(export, "_write", write_another)
     options = ("--feature", "sift_sv64", "--projection_only", "--output", path)
-    assert "does not compute the features of torch" in refused(*options)
+    assert "does not compute what torch computes" in refused(*options)
     assert path.read_text() == "before" and list(tmp_path.iterdir()) == [path]
 
 
