@@ -188,7 +188,7 @@ def main(
 
     photos = Photos(outputs / MADE_FROM, built, query_images, names)
     matcher = matcher or built.matcher
-    steps = matchers_confs.steps_of(matcher, matchers_confs.fast_of(built.matcher, built.conf))
+    steps = matchers_confs.steps_in(built.matcher, built.conf, matcher)
     for step in {*steps} - {built.matcher}:
         conf = matchers_confs.confs[step]
         check_model(conf, extract_features.provenance(built.conf))

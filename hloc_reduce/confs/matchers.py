@@ -32,6 +32,17 @@ def steps_of(matcher: str, fast: str) -> tuple[str, ...]:
     return (fast, "lightglue") if matcher == NN_LIGHTGLUE else (matcher,)
 
 
+def steps_in(of_map: str, feature: dict, matcher: str | None = None) -> tuple[str, ...]:
+    """Return the matchers that queries are tried with in a map, keys of `confs`.
+
+    Args:
+        of_map: the matcher of the map.
+        feature: the configuration of its feature.
+        matcher: one of `names`; default: that of the map.
+    """
+    return steps_of(matcher or of_map, fast_of(of_map, feature))
+
+
 def all_of(feature: dict) -> list[str]:
     """Return the matchers that suit the configuration of a feature, the default first."""
     has_weights = features_of(feature["model"]) in weights_of.known()

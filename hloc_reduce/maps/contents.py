@@ -142,7 +142,8 @@ def _of_folder(path: Path, matcher: str | None) -> Contents:
     engine = TorchEngine(extractors.load(built.conf["model"]), built.storage, made_from)
     shown = {name: np.flatnonzero(reference.point_rows(name) >= 0) for name in names}
     models = [
-        matchers_confs.confs[step]["model"] for step in _steps(matcher, built.matcher, built.conf)
+        matchers_confs.confs[step]["model"]
+        for step in matchers_confs.steps_in(built.matcher, built.conf, matcher)
     ]
     steps = [Step(model, _match_images(built, engine.matching(model), shown)) for model in models]
     global_descriptors = read_global(built.descriptors, names)
@@ -161,12 +162,6 @@ def _of_folder(path: Path, matcher: str | None) -> Contents:
         describe=_describe(built.retrieval, vocabulary),
         similarity=lambda descriptor: similarity(descriptor[None], global_descriptors)[0],
     )
-
-
-def _steps(matcher: str | None, of_map: str, conf: dict) -> tuple[str, ...]:
-    """Return the matchers that photos are tried with, keys of `confs.matchers.confs`."""
-    fast = matchers_confs.fast_of(of_map, conf)
-    return matchers_confs.steps_of(matcher or of_map, fast)
 
 
 def _match_images(
@@ -207,7 +202,7 @@ def _of_file(
     compact = CompactMap(path)
     if retrieval_confs.get(compact.retrieval)["model"]["name"] == "hloc":
         _check_torch(path, f"a map with the retrieval {compact.retrieval}")
-    names = _steps(matcher, compact.matcher, compact.conf)
+    names = matchers_confs.steps_in(compact.matcher, compact.conf, matcher)
     models = [matchers_confs.confs[name]["model"] for name in names]
     engine = _numpy_engine(compact, models, onnx, matcher_onnx) or _torch_engine(compact)
     steps = []
