@@ -198,13 +198,13 @@ def levels(conf: dict) -> np.ndarray | None:
 def level_file(conf: dict) -> str | None:
     """Return the projection that has the levels of a feature, if any.
 
-    The levels of a base without a projection ship as a projection of its name.
+    The levels of a network's own descriptors ship as a projection of its name.
     """
     model = conf["model"]
     if projection := model.get("projection"):
         return projection
-    shipped = (name for name in projections.names() if name in confs)
-    return next((name for name in shipped if confs[name]["model"] == model), None)
+    shipped = (name for name in projections.names() if name in MODELS)
+    return next((name for name in shipped if network_of(MODELS[name]) == network_of(model)), None)
 
 
 def of_patches(name: str) -> tuple[str, str | None]:

@@ -71,7 +71,10 @@ def test_descriptors_without_a_projection_have_levels_in_a_file_of_their_own(tmp
     torch.testing.assert_close(projections.load(path)(descriptors), descriptors)
     _, conf = features_confs.get("edgepoint2_t32", storage="uint2")
     assert conf["model"] == {"name": "edgepoint2", "model_name": "T32"}
-    np.testing.assert_array_equal(features_confs.levels(conf), projections.levels(path, "uint2"))
+    fewer = {**conf, "model": {**conf["model"], "max_keypoints": 500}}  # of a file of the user
+    for each in (conf, fewer):
+        found = features_confs.levels(each)
+        np.testing.assert_array_equal(found, projections.levels(path, "uint2"))
     _, other = features_confs.get("edgepoint2_t48", storage="uint2")
     with pytest.raises(InputError, match="edgepoint2_t48 has no projection, but --storage uint2"):
         features_confs.levels(other)
