@@ -6,7 +6,7 @@ from pathlib import Path
 from .. import extract_features
 from ..localization.mirrored import MirrorImages
 from ..runtime.executors import SERIAL, Executor
-from ..utils.parsers import parse_retrieval, write_pairs
+from ..utils.parsers import write_pairs_of
 
 
 def mirror_images(
@@ -30,9 +30,7 @@ def mirror_images(
     """
 
     def main(names: list[str]) -> tuple[Path, Path]:
-        listed = pairs.with_name(f"{pairs.stem}-mirrored.txt")
-        retrieved = parse_retrieval(pairs)
-        write_pairs([(name, other) for name in names for other in retrieved[name]], listed)
+        listed = write_pairs_of(names, pairs, "mirrored")
         mirrored = extract(conf, image_dir, names, features, executor)
         return mirrored, match(listed, mirrored)
 

@@ -277,6 +277,13 @@ def write_pairs(pairs: Iterable[tuple[str, str]], path: Path) -> int:
     return number
 
 
+def write_pairs_of(names: Iterable[str], pairs: Path, suffix: str) -> Path:
+    """Write the pairs of some queries beside all pairs, and return the file."""
+    path, retrieved = pairs.with_name(f"{pairs.stem}-{suffix}.txt"), parse_retrieval(pairs)
+    write_pairs([(name, other) for name in names for other in retrieved[name]], path)
+    return path
+
+
 def parse_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
     """Read poses, one `name qw qx qy qz tx ty tz` (camera from world, metres) a line.
 

@@ -27,7 +27,7 @@ from hloc_reduce.utils.files import write_csv
 from hloc_reduce.utils.h5 import get_conf, open_h5
 from hloc_reduce.utils.images import list_images, with_reasons
 from hloc_reduce.utils.match_files import check_distinct
-from hloc_reduce.utils.parsers import parse_pairs, parse_retrieval, write_pairs
+from hloc_reduce.utils.parsers import parse_pairs, write_pairs_of
 
 Thresholds = Mapping[str, tuple[tuple[float, float], ...]]  # of each query list, metres and degrees
 
@@ -118,8 +118,7 @@ class Run:
         matcher = self.steps[1]
 
         def match(names: list[str]) -> Path:
-            listed, retrieved = pairs.with_name(f"{pairs.stem}-again.txt"), parse_retrieval(pairs)
-            write_pairs([(name, other) for name in names for other in retrieved[name]], listed)
+            listed = write_pairs_of(names, pairs, "again")
             self._matches_again = self._match(matcher, listed, features, features_ref)
             return self._matches_again
 
