@@ -46,6 +46,7 @@ def _main() -> None:
         help=f"of queries: {FAST}, lightglue, {matchers_confs.NN_LIGHTGLUE}",
     )
     add("--keypoints", nargs="+", type=int, default=[512, 1024, 2048, 4096], help="of a photo")
+    add("--num_loc", type=int, default=10, help="map images that a query is matched with")
     add("--outputs", type=Path, default=Path("outputs/lightglue"))
     rows.add_again_option(parser)
     args = parser.parse_args()
@@ -76,8 +77,9 @@ def _main() -> None:
                 storage=storage,
             )
             size = sum(path.stat().st_size for path in (built.features, *built.sfm.glob("*.bin")))
-            found = small_maps.measured(Localizer(built.folder, matcher=matcher), place, size)
+            localizer = Localizer(built.folder, num_loc=args.num_loc, matcher=matcher)
             cells["bytes"] = descriptor_bytes(dimension(built.features), storage)
+            found = small_maps.measured(localizer, place, size)
             rows.add(NAME, [cells | each for each in found])
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 from benchmarks.rows import Row, read, select
 from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs.features import matcher_of
 from hloc_reduce.localization.exif import WELL_KNOWN
 from hloc_reduce.localization.gate import DEFAULT_GATE, FOCAL_LENGTHS, REFINED, RULES
 from hloc_reduce.mapping.adjustment import GAIN_OF_FREE, MAX_ADJUSTED_IMAGES
@@ -121,8 +123,9 @@ def inliers(rows: list[Row], place: str, part: str) -> str:
 
 
 def chosen(feature: str, storage: str) -> list[Row]:
-    """Return the accuracy of a feature on all places."""
+    """Return the accuracy of a feature, matched by its own matcher, on all places."""
     rows = select(read("accuracy"), feature=feature, storage=storage, variant="")
+    rows = select(rows, matcher=matcher_of(features_confs.confs[feature]))
     if not rows:
         raise InputError(f"results/accuracy.csv has no rows of {feature}, {storage}.")
     return rows
