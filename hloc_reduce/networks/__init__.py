@@ -92,6 +92,7 @@ NETWORKS = (
             "xfeat.pt",
             ("https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",),
             computes=(0.1010, 1.8716, -3.7967, 4.9643, 0.0824, 0.0246),
+            version=BETWEEN_PIXELS,
         )
     }
 )
