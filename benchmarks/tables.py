@@ -86,7 +86,6 @@ FAMILIES: dict[str, list[Choice]] = {
         for base in ("edgepoint2_m", "mini")
     },
 }
-ALL = "all places"
 SIZES = (256, 128, 64, 32, 16, 8)
 MAPS: list[Choice] = [
     ("colmap_sift_sv32", "uint4"),
@@ -101,12 +100,6 @@ PAPER_DIMS = (64, 32, 24, 16)
 SCHEMES = ("sv", "ss", "us", "pca")
 
 
-def counted(rows: list[Row], measure: str) -> list[Row]:
-    """Return the rows to count a measure in: those of each place, or the one of all places."""
-    listed = [row for row in rows if row["place"] != ALL]
-    return listed if all(row[measure] for row in listed) else select(rows, place=ALL)
-
-
 def percent(rows: list[Row], measure: str) -> float:
     """Return the share of all queries that a measure counts, in percent."""
     return 100 * total(rows, measure) / total(rows, "queries")
@@ -114,7 +107,7 @@ def percent(rows: list[Row], measure: str) -> float:
 
 def total(rows: list[Row], measure: str) -> float:
     """Return the sum of a measure."""
-    return sum(float(row[measure]) for row in counted(rows, measure))
+    return sum(float(row[measure]) for row in rows)
 
 
 def inliers(rows: list[Row], place: str, part: str) -> str:
