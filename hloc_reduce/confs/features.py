@@ -198,11 +198,14 @@ def levels(conf: dict) -> np.ndarray | None:
 def level_file(conf: dict) -> str | None:
     """Return the projection that has the levels of a feature, if any.
 
-    The levels of a network's own descriptors ship as a projection of its name.
+    The levels of a network's own descriptors ship as a projection of its name, those of weights of
+    the user do not.
     """
     model = conf["model"]
     if projection := model.get("projection"):
         return projection
+    if model.get("weights"):
+        return None
     shipped = (name for name in projections.names() if name in MODELS)
     return next((name for name in shipped if network_of(MODELS[name]) == network_of(model)), None)
 

@@ -78,6 +78,9 @@ def test_descriptors_without_a_projection_have_levels_in_a_file_of_their_own(tmp
     _, other = features_confs.get("edgepoint2_t48", storage="uint2")
     with pytest.raises(InputError, match="edgepoint2_t48 has no projection, but --storage uint2"):
         features_confs.levels(other)
+    trained = {**conf, "model": {**conf["model"], "weights": "own.safetensors"}}
+    with pytest.raises(InputError, match="edgepoint2_t32 has no projection, but --storage uint2"):
+        features_confs.levels(trained)
 
 
 def test_features_are_stored_as_codes_and_queries_as_floats(projection, textured, tmp_path):
