@@ -34,7 +34,7 @@ class XFeat(NetworkExtractor):
     def _init(self, conf: dict) -> None:
         from kornia.feature import XFeat as KorniaXFeat
 
-        self.model = KorniaXFeat(detection_threshold=conf["detection_threshold"])
+        self.model = KorniaXFeat()
         load_weights(self.model.net, "xfeat")
         self.model.eval()
 
@@ -43,7 +43,6 @@ class XFeat(NetworkExtractor):
         resized = interpolate(image, (height, width), mode="bilinear", align_corners=False)
         found = self._compute(resized, self._strongest)
         size = image.new_tensor(image.shape[:1:-1])
-        # kornia scales keypoints about the corner of the first pixel, not about its centre
         scale = size / size.new_tensor([width, height])
         return {**found, "keypoints": (found["keypoints"] + 0.5) * scale - 0.5}
 
@@ -87,6 +86,5 @@ class XFeat(NetworkExtractor):
 
     def _grid(self, pixels: torch.Tensor, heatmap: torch.Tensor) -> torch.Tensor:
         """Return where kornia samples maps at pixels (..., 2) x, y of an image."""
-        return self.model.interpolator.normgrid(pixels.to(heatmap.dtype), *heatmap.shape)[
-            None, None
-        ]
+        grid = self.model.interpolator.normgrid(pixels.to(heatmap.dtype), *heatmap.shape)
+        return grid[None, None]

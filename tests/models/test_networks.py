@@ -318,6 +318,22 @@ def test_features_are_kornias(name, base_weights, textured):
     torch.testing.assert_close(found["descriptors"][0].T[near], descriptors, atol=1e-4, rtol=0)
 
 
+def test_keypoints_of_xfeat_lie_between_pixels(base_weights, textured):
+    base_weights("xfeat")
+    photo = in_colour(cv2.resize(textured, (480, 320), interpolation=cv2.INTER_CUBIC))
+    image = torch.from_numpy(photo.transpose(2, 0, 1).astype(np.float32) / 255)[None]
+    model = features.confs["xfeat"]["model"]
+    between, whole = (
+        extractors.load({**model, "subpixel": subpixel}).eval()({"image": image})
+        for subpixel in (True, False)
+    )
+    shift = between["keypoints"] - whole["keypoints"]
+    assert shift.abs().max() <= 0.5 + 1e-3 and shift.abs().mean() > 0.05
+    torch.testing.assert_close(between["descriptors"], whole["descriptors"])
+    with pytest.raises(InputError, match="subpixl"):
+        extractors.load({**model, "subpixl": True})
+
+
 @pytest.mark.parametrize("model_name", EDGEPOINT2)
 def test_edgepoint2_agrees_with_the_authors_code(model_name, base_weights, textured, monkeypatch):
     """EDGEPOINT2 is the folder of a clone of github.com/HITCSC/EdgePoint2."""
