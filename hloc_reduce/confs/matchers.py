@@ -91,9 +91,10 @@ def for_features(model: dict, made_from: dict) -> dict:
         raise weights_of.unknown(name or "features of unknown origin")
     trained_for = {} if name in LIGHTGLUE else weights_of.metadata_of(name)["made_from"]
     if any(made_from.get(key) != value for key, value in trained_for.items()):
+        is_own = weights_of.file_of(name).parent == weights_of.own()
         raise InputError(
-            f"The weights of lightglue for {name} are for the {name} that ships with this package, "
-            "not for this one."
+            f"The weights of lightglue for {name} are for the {name} that "
+            f"{'they were fitted to' if is_own else 'ships with this package'}, not for this one."
         )
     return {**model, "features": name}
 
@@ -106,13 +107,13 @@ def provenance(model: dict, made_from: dict) -> dict:
         made_from: as in `for_features`.
 
     Returns:
-        `weights_sha256` of LightGlue's weights that ship, else {}.
+        `weights_sha256` of an adapter or a network for a mini, else {}.
 
     Raises:
         InputError: for features that LightGlue has no weights for.
     """
     features = for_features(model, made_from).get("features")
-    if model["name"] != "lightglue" or features not in weights_of.shipped():
+    if model["name"] != "lightglue" or features not in weights_of.fitted():
         return {}
     return {"weights_sha256": file_sha256(weights_of.file_of(features))}
 

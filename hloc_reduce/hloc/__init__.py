@@ -48,7 +48,7 @@ def register(features: Iterable[Path] | Path = ()) -> list[str]:
 def _matchers() -> dict[str, dict]:
     """Return the matchers for hloc: of LightGlue, one for each projection with an adapter."""
     confs = {key: conf for key, conf in matchers_confs.confs.items() if key != "lightglue"}
-    for features in lightglue.shipped():
+    for features in lightglue.fitted():
         conf = matchers_confs.lightglue(features)
         model = {**conf["model"], "name": "reduced_lightglue"}
         confs.setdefault(f"{features}+lightglue", {**conf, "model": model})

@@ -1,9 +1,10 @@
-"""LightGlue's weights: those that are published, and adapters and networks that ship."""
+"""LightGlue's weights: published ones, and adapters and networks that ship or a user fitted."""
 
 import json
 from pathlib import Path
 
 from ..utils.cli import InputError
+from ..utils.downloads import cache
 from . import WEIGHTS as OF_NETWORKS
 from . import Network
 
@@ -36,22 +37,32 @@ LIGHTGLUE = {
 }
 
 WEIGHTS = OF_NETWORKS / "lightglue"  # that ship, by the features that they are for
+SUFFIX = ".safetensors"
 CHECKSUMS = ("projection_sha256", "weights_sha256")  # in the provenance of features
 
 
-def shipped() -> list[str]:
-    """List the features that have a file in `WEIGHTS`."""
-    return sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
+def own() -> Path:
+    """Return the folder of the adapters that a user fitted."""
+    return cache() / "lightglue"
+
+
+def fitted() -> list[str]:
+    """List the features that have a file, which ships or is in `own`."""
+    return sorted({file.stem for folder in (WEIGHTS, own()) for file in folder.glob(f"*{SUFFIX}")})
 
 
 def known() -> list[str]:
     """List the features that there are weights for."""
-    return sorted({*LIGHTGLUE, *shipped()})
+    return sorted({*LIGHTGLUE, *fitted()})
 
 
 def file_of(features: str) -> Path:
-    """Return the file in `WEIGHTS` of some features."""
-    return WEIGHTS / f"{Path(features).name}.safetensors"
+    """Return the file of some features in `WEIGHTS` or `own`, or the given file."""
+    path = Path(features)
+    if path.suffix == SUFFIX:
+        return path
+    name = f"{path.name}{SUFFIX}"
+    return WEIGHTS / name if (WEIGHTS / name).exists() else own() / name
 
 
 def what(features: str) -> str:
@@ -74,7 +85,7 @@ def identity(made_from: dict) -> dict:
 
 
 def metadata_of(features: str) -> dict:
-    """Return the metadata of a file in `WEIGHTS`.
+    """Return the metadata of a file of `file_of`.
 
     Returns:
         `network`, a key of `LIGHTGLUE`, and `made_from`, the `identity` of its features.

@@ -20,7 +20,8 @@ from .. import extract_features, extractors, logger, projections
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..matchers import lightglue
-from ..networks.lightglue import LIGHTGLUE, identity
+from ..networks import lightglue as weights_of
+from ..networks.lightglue import LIGHTGLUE, SUFFIX, identity
 from ..runtime.versions import versions
 from ..utils import cli, options
 from ..utils.cli import InputError
@@ -41,52 +42,57 @@ Described = tuple[np.ndarray, np.ndarray]  # descriptors (N, D), and those that 
 
 @strings_as_paths
 def main(
-    feature: Annotated[Sequence[str], Option("feature", features_confs.confs)],
+    feature: Sequence[str],
     images: Iterable[Path],
-    output: Path = Path("outputs/training"),
+    output: Path | None = None,
     photos: Annotated[int, Option(least=1)] = 60,
 ) -> list[Path]:
     """Fit adapters.
 
     Args:
-        feature: features with a projection, or of a mini.
+        feature: features with a projection, or of a mini; or their YAML files.
         images: folders of photos.
-        output: folder for `<feature>.safetensors`.
+        output: folder for `<feature>.safetensors`; default: `lightglue` in the folder of downloaded
+            weights, where the matcher lightglue finds the adapters for projections of your own.
         photos: how many photos of the folders are used, evenly.
 
     Returns:
         The files.
 
     Raises:
-        InputError: when there are no photos, or LightGlue has no weights for the base of a feature.
+        InputError: when there are no photos or keypoints, or LightGlue has no weights for the base
+            of a feature.
     """
     paths = [folder / name for folder in images for name in list_images(folder)]
     if not paths:
         raise InputError("Give photos, --images.")
     paths = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, photos).astype(int))]
-    groups: dict[str, list[str]] = {}
-    for name in feature:
-        base = features_confs.base_of(features_confs.confs[name]["model"])
-        groups.setdefault(json.dumps(base), []).append(name)
+    groups: dict[str, list[dict]] = {}
+    for given in feature:
+        conf = features_confs.get(given)[1]
+        _network(conf)
+        base = features_confs.base_of(conf["model"]), conf["preprocessing"]
+        groups.setdefault(json.dumps(base), []).append(conf)
     files = []
-    for names in groups.values():
-        described = list(_describe(names[0], paths))
-        files += [_fit(name, described, len(paths), output) for name in names]
+    for confs in groups.values():
+        described = list(_describe(confs[0], paths))
+        if not sum(len(own) for own, _ in described):
+            raise InputError("The photos have no keypoints.")
+        files += [_fit(conf, described, len(paths), output or weights_of.own()) for conf in confs]
     return files
 
 
-def _describe(feature: str, paths: list[Path]) -> Iterator[Described]:
+def _describe(conf: dict, paths: list[Path]) -> Iterator[Described]:
     """Yield the descriptors of each photo by the base of a feature, and those that LightGlue takes.
 
     Both are the same unless the base has no LightGlue of its own.
     """
-    conf = features_confs.confs[feature]
     base = features_confs.base_of(conf["model"])
     extractor = extractors.load(base).eval()
-    teacher = None
-    if _network(feature) != matchers_confs.features_of(base):
+    teacher, name = None, matchers_confs.features_of(base)
+    if _network(conf) != name:
         teacher = extractors.load(features_confs.confs[TEACHER]["model"]).eval()
-    for path in progress(paths, f"Describing for {feature}", "photo", len(paths)):
+    for path in progress(paths, f"Describing by {name}", "photo", len(paths)):
         found = extractors.extract(extractor, path, conf["preprocessing"])
         own = np.asarray(found["descriptors"], np.float32).T
         taken = own if teacher is None else at_keypoints(teacher, path, conf, found)
@@ -107,27 +113,28 @@ def at_keypoints(
     return normalize(sampled, dim=0).T.numpy()
 
 
-def _network(feature: str) -> str:
+def _network(conf: dict) -> str:
     """Return the key of `LIGHTGLUE` that an adapter of a feature is for."""
-    model = features_confs.confs[feature]["model"]
+    model = conf["model"]
+    name = matchers_confs.features_of(model)
     base = matchers_confs.features_of(features_confs.base_of(model))
     if base in LIGHTGLUE and model.get("projection") is None:
-        raise InputError(f"{feature} needs no adapter: LightGlue has weights for it.")
+        raise InputError(f"{name} needs no adapter: LightGlue has weights for it.")
     if base in LIGHTGLUE:
         return base
     if base in features_confs.MODELS:
         return TEACHER
-    raise InputError(f"LightGlue has no weights for the base of {feature}, {base}.")
+    raise InputError(f"LightGlue has no weights for the base of {name}, {base}.")
 
 
-def _fit(feature: str, described: list[Described], photos: int, output: Path) -> Path:
+def _fit(conf: dict, described: list[Described], photos: int, output: Path) -> Path:
     """Fit the adapter of a feature and write it."""
-    conf, network = features_confs.confs[feature], _network(feature)
+    network, name = _network(conf), matchers_confs.features_of(conf["model"])
     projection = conf["model"].get("projection")
     project = projections.load(projection) if projection else torch.nn.Identity()
     taken = np.concatenate([taken for _, taken in described]).astype(np.float64)
     own = project(torch.from_numpy(np.concatenate([own for own, _ in described]))).numpy()
-    kinds = [rounded(own, feature, storage).astype(np.float64) for storage in STORAGES]
+    kinds = [rounded(own, conf, storage).astype(np.float64) for storage in STORAGES]
     decoder, offset = least_squares(kinds, taken)
     unlike = [1 - _cosine(kind @ decoder.T + offset, taken) for kind in kinds]
     layer = lightglue.published(network)
@@ -142,20 +149,20 @@ def _fit(feature: str, described: list[Described], photos: int, output: Path) ->
         ),
         "versions": json.dumps(versions()),
     }
-    path = output / f"{feature}.safetensors"
+    path = output / f"{name}{SUFFIX}"
     tensors = {
         f"input_proj.{key}": torch.from_numpy(np.ascontiguousarray(value)).half()
         for key, value in adapter.items()
     }
     with replacing(path) as temporary:
         save_file(tensors, temporary, metadata)
-    logger.info("%s: cosine %s. It is in %s.", feature, metadata["cosine"], path)
+    logger.info("%s: cosine %s. It is in %s.", name, metadata["cosine"], path)
     return path
 
 
-def rounded(own: np.ndarray, feature: str, storage: str) -> np.ndarray:
-    """Return descriptors (N, D) as a file of a storage has them."""
-    levels = features_confs.levels({**features_confs.confs[feature], "storage": storage})
+def rounded(own: np.ndarray, conf: dict, storage: str) -> np.ndarray:
+    """Return descriptors (N, D) of a feature as a file of a storage has them."""
+    levels = features_confs.levels({**conf, "storage": storage})
     return restore(*store({"descriptors": own.T}, storage, levels))
 
 

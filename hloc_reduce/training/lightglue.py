@@ -28,12 +28,12 @@ from ..confs import features as features_confs
 from ..mapping.epipolar import epipolar_errors
 from ..matchers.lightglue import LightGlue
 from ..networks import MINI
-from ..networks.lightglue import identity
+from ..networks.lightglue import SUFFIX, identity, metadata_of
 from ..pairs_from_covisibility import covisible
 from ..runtime.versions import versions
 from ..utils import cli, colmap, options
 from ..utils.cli import InputError
-from ..utils.files import replacing
+from ..utils.files import file_sha256, replacing
 from ..utils.images import read_image
 from ..utils.options import Option
 from ..utils.paths import strings_as_paths
@@ -135,7 +135,7 @@ class Labels(nn.Module):
         self, feature: str, photos: list[Photo], pairs: list[tuple[int, int]], places: np.ndarray
     ):
         super().__init__()
-        self.feature, self.photos, self.pairs, self.places = feature, photos, pairs, places
+        self.photos, self.pairs, self.places = photos, pairs, places
         self.conf = features_confs.confs[feature]
         model = {**self.conf["model"], "max_keypoints": NUM_KEYPOINTS}
         self.extractor = extractors.load(model).eval()
@@ -167,7 +167,7 @@ class Labels(nn.Module):
         ]
         storage = str(rng.choice(STORAGES))
         own = [one["descriptors"].T.astype(np.float32) for one in found]
-        own[1] = rounded(own[1], self.feature, storage)
+        own[1] = rounded(own[1], self.conf, storage)
         keypoints = [one["keypoints"] for one in found]
         student, teacher = (
             [of_view(*both) for both in zip(keypoints, described, strict=True)]
@@ -246,6 +246,7 @@ def main(
     output: Path,
     map: Annotated[Sequence[str], tracks.MAP_OPTION],
     feature: Annotated[str, Option("feature", MINI)] = MINI[0],
+    start: Path | None = None,
     steps: int = 4000,
     batch: Annotated[int, Option(least=1)] = 1,
     lr: float = 1e-4,
@@ -256,7 +257,9 @@ def main(
     Args:
         output: file of the weights, .safetensors.
         map: maps to learn from.
-        feature: the mini, whose adapter the training starts from.
+        feature: the mini.
+        start: file of hloc_reduce.training.adapters, or of this module, that the training starts
+            from; default: what ships for the mini.
         steps: number of training steps.
         batch: pairs of views of a step.
         lr: learning rate of Adam, which falls linearly to 0.
@@ -269,17 +272,24 @@ def main(
         InputError: when a map cannot be used, no photos share points, or the learning rate is not
             above 0.
     """
-    if output.suffix != ".safetensors":
-        raise InputError(f"--output {output}: it must end in .safetensors.")
+    if output.suffix != SUFFIX:
+        raise InputError(f"--output {output}: it must end in {SUFFIX}.")
     if not 0 < lr < math.inf:
         raise InputError(f"--lr {lr:g}: it must be a number above 0.")
     maps = tracks.parse_maps(map)
+    made_from = identity(extract_features.provenance(features_confs.confs[feature]))
+    if start:
+        if start.suffix != SUFFIX or not start.is_file():
+            raise InputError(f"--start {start}: there is no such {SUFFIX} file.")
+        if metadata_of(str(start))["made_from"] != made_from:
+            raise InputError(f"--start {start}: these are not weights for {feature}.")
     photos, pairs, places = read(maps)
     if not pairs:
         raise InputError("No photos of the maps share points.")
     torch.manual_seed(seed)
     labels = Labels(feature, photos, pairs, places)
-    student = LightGlue({"features": feature, **WHOLE}).net.requires_grad_(True).to(device())
+    student = LightGlue({"features": str(start or feature), **WHOLE}).net
+    student = student.requires_grad_(True).to(device())
     recipe = {"lr": lr, **RECIPE}
     metadata: dict[str, Any] = {
         "maps": {name: len(np.flatnonzero(places == i)) for i, name in enumerate(maps)},
@@ -290,8 +300,8 @@ def main(
     }
     checkpoint = output.with_suffix(".checkpoint")
     step_loss = partial(loss, student, labels, batch, seed)
+    metadata["start"] = start and file_sha256(start)
     fit(student, step_loss, steps, recipe, checkpoint, json.dumps({**metadata, "of": feature}))
-    made_from = identity(extract_features.provenance(features_confs.confs[feature]))
     header = {
         "network": TEACHER,
         "made_from": json.dumps(made_from),

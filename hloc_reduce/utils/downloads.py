@@ -1,6 +1,7 @@
 """Files that are downloaded once and checked by their sha256."""
 
 import hashlib
+import os
 from collections.abc import Iterable
 from http.client import HTTPException
 from pathlib import Path
@@ -14,10 +15,9 @@ TORCH_FILE = b"PK"  # torch.save writes zip files
 
 
 def cache() -> Path:
-    """Return torch's folder for downloaded files."""
-    import torch
-
-    return Path(torch.hub.get_dir()) / "checkpoints"
+    """Return torch's folder for downloaded files, as `torch.hub` chooses it."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache"))
+    return Path(os.environ.get("TORCH_HOME", caches / "torch")).expanduser() / "hub/checkpoints"
 
 
 def fetch(path: Path, urls: Iterable[str], sha256: str | None, what: str, otherwise: str) -> Path:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import yaml
 from command import outcome
 from kornia.feature import LightGlue as KorniaLightGlue
 from safetensors.torch import load_file, save_file
@@ -103,10 +104,10 @@ def test_projected_descriptors_match_as_they_are(base_weights, described, featur
     base_weights("xfeat+lightglue")
     first, second, right = photos(described)
     ((expected, _),) = LightGlue({"features": "xfeat"}).match([(first, second)])
-    project = projections.load(feature)
+    project, conf = projections.load(feature), features_confs.confs[feature]
     pair = []
     for one in (first, second):
-        small = adapters.rounded(project(one["descriptors"].T).numpy(), feature, storage)
+        small = adapters.rounded(project(one["descriptors"].T).numpy(), conf, storage)
         pair.append(one | {"descriptors": torch.from_numpy(small).T})
     matcher = LightGlue({"features": feature})
     assert matcher.net.input_proj.in_features == 32
@@ -131,7 +132,7 @@ def test_every_projection_of_its_networks_has_an_adapter(base_weights):
     for base in ("aliked", "xfeat"):
         base_weights(base)
     named = {name for base in ("aliked", "xfeat") for name in features_confs.names(base)}
-    assert {*named, "mini32", "mini64"} == set(lightglue.shipped())
+    assert {*named, "mini32", "mini64"} == set(lightglue.fitted())
     for name in named:
         made_from = extract_features.provenance(features_confs.confs[name])
         assert lightglue.metadata_of(name)["made_from"] == lightglue.identity(made_from)
@@ -262,3 +263,46 @@ def test_only_projections_and_minis_need_adapters(base_weights, tmp_path):
         adapters.main(["xfeat"], [tmp_path], tmp_path)
     with pytest.raises(InputError, match="no weights for the base of sift_sv64, sift"):
         adapters.main(["sift_sv64"], [tmp_path], tmp_path)
+
+
+def test_an_adapter_of_a_projection_of_the_user(base_weights, tmp_path, monkeypatch):
+    base_weights("xfeat")
+    base_weights("xfeat+lightglue")
+    home = tmp_path / "hub/checkpoints"
+    home.mkdir(parents=True)
+    for file in downloads.cache().iterdir():
+        (home / file.name).symlink_to(file)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    photo = tmp_path / "photos/a.png"
+    photo.parent.mkdir()
+    cv2.imwrite(str(photo), np.zeros((64, 64, 3), np.uint8))
+    shutil.copy(projections.find("xfeat_sv32"), tmp_path / "own.safetensors")
+    file = tmp_path / "feature.yaml"
+    model = {"name": "reduced", "base": {"name": "xfeat"}}
+    model["projection"] = str(tmp_path / "own.safetensors")
+    file.write_text(yaml.safe_dump({"model": model}))
+    conf = features_confs.get(str(file))[1]
+    made_from = extract_features.provenance(conf)
+    assert matchers_confs.all_of(conf) == ["NN-mutual"]
+    with pytest.raises(InputError, match="no weights for own, only for"):
+        matchers_confs.for_features(CONF, made_from)
+    with pytest.raises(InputError, match="The photos have no keypoints"):
+        adapters.main([str(file)], [photo.parent])
+    noise = np.random.default_rng(0).integers(256, size=(40, 40, 3), dtype=np.uint8)
+    cv2.imwrite(str(photo), cv2.resize(noise, (320, 320), interpolation=cv2.INTER_CUBIC))
+    assert adapters.main([str(file)], [photo.parent]) == [home / "lightglue/own.safetensors"]
+    assert matchers_confs.all_of(conf) == ["NN-mutual", "lightglue", "NN+lightglue"]
+    chosen = matchers_confs.for_features(CONF, made_from)
+    assert matchers.load(chosen).net.input_proj.in_features == 32
+    assert matchers_confs.provenance(CONF, made_from)["weights_sha256"]
+    other = made_from | {"projection_sha256": "0" * 64}
+    with pytest.raises(InputError, match="for own are for the own that they were fitted to, not"):
+        matchers_confs.for_features(CONF, other)
+
+
+def test_the_folder_of_weights_is_that_of_torch(monkeypatch):
+    for name, value in (("TORCH_HOME", "~/weights"), ("XDG_CACHE_HOME", "/caches"), ("HOME", "/a")):
+        assert downloads.cache() == Path(torch.hub.get_dir()) / "checkpoints"
+        monkeypatch.delenv("TORCH_HOME", raising=False)
+        monkeypatch.setenv(name, value)
+    assert downloads.cache() == Path(torch.hub.get_dir()) / "checkpoints"

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hloc_reduce.matchers.lightglue import LightGlue
-from hloc_reduce.networks.lightglue import metadata_of
+from hloc_reduce.networks.lightglue import file_of, metadata_of
 from hloc_reduce.training import lightglue as training
 from hloc_reduce.training.lightglue import CROPS, SIDE, Labels
 from hloc_reduce.utils import colmap
@@ -112,3 +112,7 @@ def test_wrong_options(tmp_path, plane):
         training.main(tmp_path / "mini32.pth", maps)
     with pytest.raises(InputError, match="--lr 0: it must be a number above 0"):
         training.main(tmp_path / "mini32.safetensors", maps, lr=0)
+    with pytest.raises(InputError, match="--start .*none.safetensors: there is no such"):
+        training.main(tmp_path / "o.safetensors", maps, start=tmp_path / "none.safetensors")
+    with pytest.raises(InputError, match="--start .*mini64.*: these are not weights for mini32"):
+        training.main(tmp_path / "o.safetensors", maps, "mini32", start=file_of("mini64"))
