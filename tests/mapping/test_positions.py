@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 
 from hloc_reduce.mapping import findings
+from hloc_reduce.mapping.adjustment import focal_length_deviations
 from hloc_reduce.mapping.checks import Inputs, positions
 from hloc_reduce.utils import colmap
 
@@ -74,6 +75,16 @@ def test_photos_that_see_little_do_not_make_others_uncertain():
     assert "4.jpg (at least 100 %)" in found.message
     content = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert findings.Finding.from_json(content) == found
+
+
+def test_a_photo_that_makes_the_adjustment_singular_is_named_alone(monkeypatch):
+    """In a map of tourists' photos one by a long lens made all 42 uncertain."""
+    monkeypatch.setattr(positions, "VAGUE_FOCAL_SHARE", 1)
+    model = seen_from([4, 4, 4, 4, 4, 4, 40], 1)
+    for i in range(40, 200):
+        model.delete_observation(7, i)
+    assert np.isinf(list(focal_length_deviations(model).values())).all()
+    assert positions.measure(model) == {"6.jpg": 1}
 
 
 def test_given_intrinsics_are_known():

@@ -3,6 +3,7 @@
 import copy
 from collections import Counter
 
+import numpy as np
 import pycolmap
 
 from ...localization import intrinsics
@@ -88,7 +89,8 @@ def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
     A distant photo of a nearly flat scene hardly tells a longer focal length from a larger
     distance; and neither do all photos of such a scene together, if each has its own camera. So a
     photo is tested with its points taken for known, and with nothing taken for known. If its camera
-    took several photos, only the first test is made, with known intrinsics.
+    took several photos, only the first test is made, with known intrinsics. One photo that tells
+    too little makes the second test fail for all, so that it is made without those that tell least.
 
     Args:
         sfm: the map, whose intrinsics were estimated with its poses.
@@ -100,7 +102,7 @@ def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     taken = Counter(image.camera_id for image in images)
     several = {camera_id for camera_id, number in taken.items() if number >= WELL_KNOWN}
-    found, vague = {}, []
+    found, focal_lengths = {}, {}
     for image in images:
         points2D, points3D = colmap.observed(sfm, image)
         camera = sfm.cameras[image.camera_id]
@@ -109,16 +111,44 @@ def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
             points2D, points3D, image.cam_from_world(), camera, freedom, INDEPENDENT_IF_BENT
         )
         found[image.name] = own.position
-        if not (own.position < 1 and own.focal_length < VAGUE_FOCAL_SHARE):
-            vague.append(image.name)
-    if len(images) - len(vague) > 1 and len(images) <= MAX_ADJUSTED_IMAGES:
-        deviations = focal_length_deviations(_without(sfm, vague))
+        focal_lengths[image.name] = own.focal_length if own.position < 1 else np.inf
+    if len(images) <= MAX_ADJUSTED_IMAGES:
+        deviations = _deviations(sfm, focal_lengths)
         for image in images:
-            if image.camera_id in deviations and image.camera_id not in several:
-                together = BENT_TOGETHER * deviations[image.camera_id]
+            if image.name in deviations and image.camera_id not in several:
+                together = BENT_TOGETHER * deviations[image.name]
                 found[image.name] = max(found[image.name], together)
     uncertain = {name: min(share, 1.0) for name, share in found.items() if share > MAX_DEVIATION}
     return dict(sorted(uncertain.items(), key=lambda item: -item[1]))
+
+
+def _deviations(sfm: pycolmap.Reconstruction, alone: dict[str, float]) -> dict[str, float]:
+    """Return how precisely an adjustment determines focal lengths, see `focal_length_deviations`.
+
+    Args:
+        sfm: the map.
+        alone: the same by the points of each photo, taken for known.
+
+    Returns:
+        From name to the deviation, infinite for photos that make the adjustment singular; without
+        those that are vague alone, and those whose cameras are known.
+    """
+    vaguest = sorted(alone, key=lambda name: -alone[name])
+    vague = sum(not alone[name] < VAGUE_FOCAL_SHARE for name in vaguest)
+    left_out, found = vague, {}
+    while len(vaguest) - left_out > 1:
+        rest = _without(sfm, vaguest[:left_out])
+        deviations = focal_length_deviations(rest)
+        images = [rest.images[i] for i in rest.reg_image_ids()]
+        found = {
+            image.name: deviations[image.camera_id]
+            for image in images
+            if image.camera_id in deviations
+        }
+        if not (found and np.isinf([*found.values()]).all()):
+            break
+        left_out = 2 * left_out or 1
+    return dict.fromkeys(vaguest[vague:left_out], np.inf) | found
 
 
 def _without(sfm: pycolmap.Reconstruction, names: list[str]) -> pycolmap.Reconstruction:
