@@ -53,7 +53,7 @@ MIN_KEYPOINTS = 10  # so that at least one shows a landmark
 WHOLE = {"photos": 6697 + 1015, "pairs": 20 * 6697 + 50 * 1015}
 # columns that are proportional to the number of images, or of pairs
 GROWING = {
-    "photos": ("features_s", "feature_mb"),
+    "photos": ("feature_mb",),
     "pairs": ("matching_s", "match_mb"),
 }
 
@@ -226,7 +226,7 @@ def _main() -> None:
         return
     cells = {"place": args.data.name, "feature": f"{args.dim} numbers", "storage": args.storage}
     cells |= {"variant": f"{args.keypoints} keypoints"}
-    known = rows.select(rows.measured(NAME), **cells)
+    known = rows.select(rows.read(NAME), **cells)
     if not args.again and rows.select(known, list="whole"):
         return
     fractions = []

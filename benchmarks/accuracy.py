@@ -70,7 +70,7 @@ def _main() -> None:
     parser.add_argument("--outputs", type=Path, default=Path("outputs/accuracy"))
     rows.add_again_option(parser)
     args = parser.parse_args()
-    known = [] if args.again else rows.measured(NAME)
+    known = [] if args.again else rows.read(NAME)
     missing = [job for job in jobs.read(args.job_file)[1] if not rows.select(known, **what(job))]
     if not missing:
         logger.info("All jobs of %s have rows.", args.job_file)

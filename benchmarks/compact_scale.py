@@ -229,7 +229,7 @@ def _main() -> None:
     for share in args.share:
         cells: dict = {"place": args.data.name, "list": f"share {share:g}", "feature": FEATURE}
         cells |= {"storage": "uint4"}
-        if not args.again and rows.select(rows.measured(NAME), **cells):
+        if not args.again and rows.select(rows.read(NAME), **cells):
             continue
         with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as folder:
             for stage in ("synthesize", "build", "localize"):

@@ -61,7 +61,7 @@ def _main() -> None:
     args = parser.parse_args()
     cli.check_positive(args, "rounds")
     place = Aachen(args.dataset)
-    known = [] if args.again else rows.measured(NAME)
+    known = [] if args.again else rows.read(NAME)
     device = f" and {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
     for cores in args.cores:
         torch.set_num_threads(cores)

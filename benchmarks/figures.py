@@ -79,7 +79,7 @@ def draw_maps() -> list[Callable]:
     def panel(axis, place: str, measure: Callable[[list[Row]], float], label: str) -> None:
         for colour, (feature, storage) in zip(plots.COLOURS, MAPS, strict=False):
             sizes: dict[float, list[Row]] = {}
-            for row in select(read("maps"), place=place, feature=feature):
+            for row in select(read("maps"), place=place, feature=feature, matcher=""):
                 if row["storage"] == storage or row["variant"] == "whole map":
                     sizes.setdefault(float(row["mb"]), []).append(row)
             values = [measure(sizes[size]) for size in sorted(sizes)]

@@ -46,12 +46,12 @@ def _main() -> None:
         help=f"of queries: {FAST}, lightglue, {matchers_confs.NN_LIGHTGLUE}",
     )
     add("--keypoints", nargs="+", type=int, default=[512, 1024, 2048, 4096], help="of a photo")
-    add("--num_loc", type=int, default=10, help="map images that a query is matched with")
+    add("--num_loc", nargs="+", type=int, default=[10], help="map images for a query")
     add("--outputs", type=Path, default=Path("outputs/lightglue"))
     rows.add_again_option(parser)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    known = [] if args.again else rows.measured(NAME)
+    known = [] if args.again else rows.read(NAME)
     for root, given, number in product(args.dataset, args.feature, args.keypoints):
         feature, _, storage = given.partition(":")
         storage = storage or "float16"
@@ -62,10 +62,11 @@ def _main() -> None:
         file = folder / f"{feature}.yaml"
         file.write_text(yaml.safe_dump({**conf, "model": limited(conf["model"], number)}))
         matchers_confs.confs["lightglue"]["model"]["max_keypoints"] = number
-        for of_map, matcher in product(args.map_matcher, args.matcher):
+        for of_map, matcher, num_loc in product(args.map_matcher, args.matcher, args.num_loc):
             of_map, matcher = names.get(of_map, of_map), names.get(matcher, matcher)
             cells = {"place": place.root.name, "feature": feature, "storage": storage}
-            cells |= {"matcher": matcher, "variant": f"map by {of_map}, {number} keypoints"}
+            variant = f"map by {of_map}, {number} keypoints, {num_loc} images"
+            cells |= {"matcher": matcher, "variant": variant}
             if rows.select(known, **cells):
                 continue
             built = maps.main(
@@ -77,7 +78,7 @@ def _main() -> None:
                 storage=storage,
             )
             size = sum(path.stat().st_size for path in (built.features, *built.sfm.glob("*.bin")))
-            localizer = Localizer(built.folder, num_loc=args.num_loc, matcher=matcher)
+            localizer = Localizer(built.folder, num_loc=num_loc, matcher=matcher)
             cells["bytes"] = descriptor_bytes(dimension(built.features), storage)
             found = small_maps.measured(localizer, place, size)
             rows.add(NAME, [cells | each for each in found])

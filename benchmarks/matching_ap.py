@@ -124,7 +124,7 @@ def _main() -> None:
         cli.choose("descriptor", descriptor, features_confs.BASES)
     for storage in args.storage:
         cli.choose("storage", storage, STORAGES)
-    known = [] if args.again else rows.measured(NAME)
+    known = [] if args.again else rows.read(NAME)
     maps = parse_maps(args.map)
     places = ", ".join(maps)
     for descriptor in args.descriptor:

@@ -139,7 +139,7 @@ def _main() -> None:
     add("--subsets", type=int, default=1, help="subsets of each place")
     rows.add_again_option(parser)
     args = parser.parse_args()
-    known = [] if args.again else rows.measured(NAME)
+    known = [] if args.again else rows.read(NAME)
     for place, (images, model) in parse_maps(args.map).items():
         reference = colmap.read_model(model)
         names = sorted(image.name for image in reference.images.values())

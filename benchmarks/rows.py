@@ -21,7 +21,7 @@ from hloc_reduce.utils.files import replacing
 RESULTS = Path("results")
 WHAT = ("place", "list", "feature", "storage", "matcher", "variant")
 MAP = ("bytes", "photos", "points", "mb")
-HOW = ("seconds", "machine", "commit", "command", "source")
+HOW = ("seconds", "machine", "commit", "command")
 CENTIMETRES = (1, 2, 5, 25)  # position errors that are counted, with at most 2 degrees
 DEGREES = 2.0
 
@@ -35,11 +35,6 @@ def read(name: str) -> list[Row]:
         return []
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-def measured(name: str) -> list[Row]:
-    """Return the rows of `results/<name>.csv` that the present command measured."""
-    return [row for row in read(name) if not row.get("source")]
 
 
 def select(rows: Iterable[Row], **cells: object) -> list[Row]:

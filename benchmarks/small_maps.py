@@ -60,7 +60,7 @@ def _main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     place = Aachen(args.dataset)
-    known = [] if args.again else rows.measured(NAME)
+    known = [] if args.again else rows.read(NAME)
 
     for feature in args.feature:
         base = {"place": place.root.name, "feature": feature, "matcher": args.matcher}

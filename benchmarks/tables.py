@@ -198,7 +198,7 @@ def maps_table() -> Table:
     """Compare compact maps with the whole map of each feature."""
     table = [["feature", "map", "KB", "points", "day", "cm", "inliers", "night", "cm", "inliers"]]
     for feature, storage in MAPS:
-        rows = select(read("maps"), place="herz-jesus", feature=feature)
+        rows = select(read("maps"), place="herz-jesus", feature=feature, matcher="")
         for variant in ("whole map", "all points", *(f"at most {size} MB" for size in MAP_SIZES)):
             found = select(rows, variant=variant)
             label = variant
@@ -283,13 +283,16 @@ def compact_scale_table() -> Table:
 
 def matching_table() -> Table:
     """Show how long a pair of images takes to match, by dimensions and storage."""
-    rows, table = read("matching"), [["numbers", "hloc", "floats", "`uint8`", "`uint4`"]]
+    rows, storages = read("matching"), ("float32", "uint8", "uint4")
+    table = [["numbers", "hloc", "torch, floats", *(f"`{storage}`" for storage in storages)]]
     for dim in (128, 64, 32, 24, 16):
-        chosen = select(rows, feature=f"{dim} numbers")
-        hloc = select(chosen, variant="hloc") or select(chosen, variant="torch")
-        found = [*hloc, *select(chosen, variant="ours, run")]
-        found += [row for size in ("uint8", "uint4") for row in select(chosen, storage=size)]
-        table.append([str(dim), *(f"{float(row['ms']):.0f}" for row in found)])
+        found = select(rows, feature=f"{dim} numbers")
+        cells = select(found, variant="hloc") or select(found, variant="torch")
+        cells += select(found, variant="ours, run")
+        for storage in storages:
+            by_integers = (row for row in found if row["variant"].startswith(f"{storage} by "))
+            cells.append(next(by_integers))
+        table.append([str(dim), *(f"{float(row['ms']):.0f}" for row in cells)])
     return table
 
 

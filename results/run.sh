@@ -9,8 +9,12 @@ run() { echo "benchmarks.$*"; name=$1; shift; "$python" -m "benchmarks.$name" "$
 [ "${1:-}" = "" ] || [ "$1" = --again ] || { echo "usage: results/run.sh [--again]" >&2; exit 2; }
 
 # places
-[ -e $data/demo_town/queries/ground_truth_poses.txt ] ||
-    "$python" -c 'from pathlib import Path; from hloc_reduce import demo; demo.main(Path("datasets/demo_town"))'
+town() { # FOLDER and number of photos
+    [ -e "$1/queries/ground_truth_poses.txt" ] || "$python" -c \
+        'import sys; from hloc_reduce import demo; demo.main(sys.argv[1], num_photos=int(sys.argv[2]))' "$@"
+}
+town $data/demo_town 32
+town $data/demo_town-400 400
 [ -e $data/redkitchen ] || run scan_frames --sequence $data/7-scenes-redkitchen --output $data/redkitchen
 for place in fountain-P11 sceaux; do
     [ -e $data/dark-$place ] || run darken_place --map "$(scene $place)" --output $data/dark-$place
@@ -32,7 +36,6 @@ small_maps() { # PLACE, FEATURE, STORAGE and sizes
 small_maps herz-jesus colmap_sift_sv32 uint4 0.02 0.03 0.06 0.1 "$@"
 small_maps herz-jesus xfeat_sv32 uint2 0.02 0.03 0.06 0.1 "$@"
 small_maps herz-jesus mini32 uint2 0.02 0.03 0.06 0.1 "$@"
-[ -e $data/demo_town-400 ] || "$python" -m pipelines.aachen --demo --demo_photos 400
 small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.25 0.5 1 "$@"
 
 # how often wrong?
