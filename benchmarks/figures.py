@@ -74,7 +74,7 @@ def draw_bytes() -> list[Callable]:
 
 
 def draw_maps() -> list[Callable]:
-    """Draw inliers on Herz-Jesus and recall in the town against the size of the map."""
+    """Draw inliers on Herz-Jesus, and recall in the town, against the size of the map."""
 
     def panel(axis, place: str, measure: Callable[[list[Row]], float], label: str) -> None:
         for colour, (feature, storage) in zip(plots.COLOURS, MAPS, strict=False):
@@ -99,8 +99,8 @@ def draw_maps() -> list[Callable]:
         partial(
             panel,
             place="demo_town-400",
-            measure=lambda rows: percent(rows, "within_finest"),
-            label="within the finest limits, town [%]",
+            measure=lambda rows: percent(rows, "within_25cm"),
+            label="queries within 25 cm, town [%]",
         ),
     ]
 

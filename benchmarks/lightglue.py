@@ -1,9 +1,10 @@
 """Localize the queries of a place by nearest neighbours and by LightGlue, of few or many keypoints.
 
 The place is in the layout of Aachen. With each number of --keypoints of a photo, its map is matched
-by each --map_matcher and its queries by each --matcher. Adds a row for each query list to
-results/lightglue.csv, leaving out what has rows unless --again is given. Features and maps are kept
-in the outputs folder. Seconds are those of matching and pose estimation of a query on one core.
+by each --map_matcher, and its queries by each --matcher, with the most similar --num_loc of the map
+images. Adds a row for each query list to results/lightglue.csv, leaving out what has rows unless
+--again is given. Features and maps are kept in the outputs folder. Seconds are those of matching
+and pose estimation of a query on one core.
 """
 
 import os
@@ -19,6 +20,7 @@ from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import descriptor_bytes
 from hloc_reduce.utils.feature_files import dimension
 
@@ -50,6 +52,8 @@ def _main() -> None:
     add("--outputs", type=Path, default=Path("outputs/lightglue"))
     rows.add_again_option(parser)
     args = parser.parse_args()
+    if min(*args.keypoints, *args.num_loc) < 1:
+        raise InputError("--keypoints and --num_loc: at least 1.")
     torch.set_num_threads(1)
     known = [] if args.again else rows.read(NAME)
     for root, given, number in product(args.dataset, args.feature, args.keypoints):

@@ -290,8 +290,10 @@ def matching_table() -> Table:
         cells = select(found, variant="hloc") or select(found, variant="torch")
         cells += select(found, variant="ours, run")
         for storage in storages:
-            by_integers = (row for row in found if row["variant"].startswith(f"{storage} by "))
-            cells.append(next(by_integers))
+            by_integers = select(found, storage=storage, commit=cells[0]["commit"])
+            cells += [row for row in by_integers if row["variant"].startswith(f"{storage} by ")]
+        if len(cells) != 2 + len(storages):
+            raise InputError(f"results/matching.csv lacks rows of {dim} numbers.")
         table.append([str(dim), *(f"{float(row['ms']):.0f}" for row in cells)])
     return table
 

@@ -91,10 +91,15 @@ def for_features(model: dict, made_from: dict) -> dict:
         raise weights_of.unknown(name or "features of unknown origin")
     trained_for = {} if name in LIGHTGLUE else weights_of.metadata_of(name)["made_from"]
     if any(made_from.get(key) != value for key, value in trained_for.items()):
-        is_own = weights_of.file_of(name).parent == weights_of.own()
+        file = weights_of.file_of(name)
+        if file.parent == weights_of.own():
+            raise InputError(
+                f"{file} was fitted to another {name}: fit it again with "
+                "python -m hloc_reduce.training.adapters."
+            )
         raise InputError(
-            f"The weights of lightglue for {name} are for the {name} that "
-            f"{'they were fitted to' if is_own else 'ships with this package'}, not for this one."
+            f"The weights of lightglue for {name} are for the {name} that ships with this package, "
+            "not for this one."
         )
     return {**model, "features": name}
 

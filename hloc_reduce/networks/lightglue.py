@@ -5,8 +5,8 @@ from pathlib import Path
 
 from ..utils.cli import InputError
 from ..utils.downloads import cache
+from . import MINI, Network
 from . import WEIGHTS as OF_NETWORKS
-from . import Network
 
 # LightGlue's weights, by the features that they match, as hloc and kornia call them
 LIGHTGLUE = {
@@ -72,10 +72,11 @@ def what(features: str) -> str:
 
 def unknown(features: str) -> InputError:
     """Return the error for features without weights."""
-    bases = ", ".join(sorted({name.partition("_")[0] for name in known()}))
+    bases = ", ".join(sorted({*LIGHTGLUE, *MINI}))
     return InputError(
         f"lightglue has no weights for {features}, only for {bases} and projections of them, see "
-        "--list_features: choose another matcher or feature."
+        "--list_features: choose another matcher or feature, or, for a projection of your own, fit "
+        "an adapter with python -m hloc_reduce.training.adapters."
     )
 
 

@@ -1,4 +1,4 @@
-"""Fit LightGlue to projected descriptors: adapters, first layers that ship.
+"""Fit LightGlue to projected descriptors: adapters, first layers.
 
 LightGlue's first layer takes the descriptors that it was trained for. An adapter is that layer
 after the linear map from projected descriptors, floats and codes alike, back to these, which has
@@ -52,8 +52,8 @@ def main(
     Args:
         feature: features with a projection, or of a mini; or their YAML files.
         images: folders of photos.
-        output: folder for `<feature>.safetensors`; default: `lightglue` in the folder of downloaded
-            weights, where the matcher lightglue finds the adapters for projections of your own.
+        output: folder for `<feature>.safetensors`; default: among the downloaded weights, where the
+            matcher lightglue finds the adapters for projections of your own.
         photos: how many photos of the folders are used, evenly.
 
     Returns:
@@ -70,7 +70,7 @@ def main(
     groups: dict[str, list[dict]] = {}
     for given in feature:
         conf = features_confs.get(given)[1]
-        _network(conf)
+        _check(conf, output)
         base = features_confs.base_of(conf["model"]), conf["preprocessing"]
         groups.setdefault(json.dumps(base), []).append(conf)
     files = []
@@ -113,6 +113,20 @@ def at_keypoints(
     return normalize(sampled, dim=0).T.numpy()
 
 
+def _check(conf: dict, output: Path | None) -> None:
+    """Raise an InputError for a feature without an adapter, or whose adapter would not be found."""
+    name = matchers_confs.features_of(conf["model"])
+    _network(conf)
+    if name in LIGHTGLUE or (output is None and (weights_of.WEIGHTS / f"{name}{SUFFIX}").exists()):
+        raise InputError(
+            f"LightGlue has weights for another {name}: rename the projection, or give --output to "
+            "fit what ships anew."
+        )
+    extractors.load(conf["model"])
+    for storage in STORAGES:
+        features_confs.levels({**conf, "storage": storage})
+
+
 def _network(conf: dict) -> str:
     """Return the key of `LIGHTGLUE` that an adapter of a feature is for."""
     model = conf["model"]
@@ -137,8 +151,11 @@ def _fit(conf: dict, described: list[Described], photos: int, output: Path) -> P
     kinds = [rounded(own, conf, storage).astype(np.float64) for storage in STORAGES]
     decoder, offset = least_squares(kinds, taken)
     unlike = [1 - _cosine(kind @ decoder.T + offset, taken) for kind in kinds]
-    layer = lightglue.published(network)
-    weight, bias = (layer[f"input_proj.{part}"].double().numpy() for part in ("weight", "bias"))
+    layers = lightglue.published(network)
+    weight, bias = np.eye(len(decoder)), np.zeros(len(decoder))
+    if "input_proj.weight" in layers:  # LightGlue takes SuperPoint's descriptors as they are
+        weight = layers["input_proj.weight"].double().numpy()
+        bias = layers["input_proj.bias"].double().numpy()
     adapter = {"weight": weight @ decoder, "bias": weight @ offset + bias}
     metadata = {
         "network": network,

@@ -4,8 +4,8 @@ XFeat's LighterGlue sees XFeat's descriptors at the keypoints of the mini in two
 labels their matches: those near the epipolar lines of the known poses are right, and keypoints that
 it finds no match for have none. The student learns these from the descriptors of the mini, where
 the first view may be dark, noisy and blurred, and those of the second are floats or codes of 4 or 2
-bits, as in a map. It starts from LighterGlue and the adapter of the mini. An interrupted training
-resumes.
+bits, as in a map. It starts from LighterGlue and the adapter of the mini, or from given weights. An
+interrupted training resumes.
 """
 
 import json
@@ -269,8 +269,8 @@ def main(
         The file.
 
     Raises:
-        InputError: when a map cannot be used, no photos share points, or the learning rate is not
-            above 0.
+        InputError: when a map, the output or the start cannot be used, no photos share points, or
+            the learning rate is not above 0.
     """
     if output.suffix != SUFFIX:
         raise InputError(f"--output {output}: it must end in {SUFFIX}.")
@@ -297,10 +297,10 @@ def main(
         "batch": batch,
         "recipe": recipe,
         "seed": seed,
+        "start": start and file_sha256(start),
     }
     checkpoint = output.with_suffix(".checkpoint")
     step_loss = partial(loss, student, labels, batch, seed)
-    metadata["start"] = start and file_sha256(start)
     fit(student, step_loss, steps, recipe, checkpoint, json.dumps({**metadata, "of": feature}))
     header = {
         "network": TEACHER,

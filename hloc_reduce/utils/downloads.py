@@ -15,9 +15,10 @@ TORCH_FILE = b"PK"  # torch.save writes zip files
 
 
 def cache() -> Path:
-    """Return torch's folder for downloaded files, as `torch.hub` chooses it."""
-    caches = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache"))
-    return Path(os.environ.get("TORCH_HOME", caches / "torch")).expanduser() / "hub/checkpoints"
+    """Return torch's folder for downloaded files, as `torch.hub` does by the environment."""
+    caches = os.environ.get("XDG_CACHE_HOME", "~/.cache")
+    home = os.environ.get("TORCH_HOME", f"{caches}/torch")
+    return Path(os.path.expanduser(home)) / "hub/checkpoints"
 
 
 def fetch(path: Path, urls: Iterable[str], sha256: str | None, what: str, otherwise: str) -> Path:

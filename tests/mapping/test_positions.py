@@ -77,25 +77,32 @@ def test_photos_that_see_little_do_not_make_others_uncertain():
     assert findings.Finding.from_json(content) == found
 
 
-def test_a_photo_that_makes_the_adjustment_singular_is_named_alone(monkeypatch):
+def with_given_camera(model, camera_id):
+    focal_length, *centre = model.cameras[camera_id].params
+    params = [focal_length, focal_length, *centre, *8 * [0.0]]
+    model.cameras[camera_id] = pycolmap.Camera(
+        model="FULL_OPENCV", width=1000, height=800, params=params, camera_id=camera_id
+    )
+
+
+@pytest.mark.parametrize("far", [1, 3])
+def test_photos_that_make_the_adjustment_singular_are_named_alone(far, monkeypatch):
     """In a map of tourists' photos one by a long lens made all 42 uncertain."""
     monkeypatch.setattr(positions, "VAGUE_FOCAL_SHARE", 1)
-    model = seen_from([4, 4, 4, 4, 4, 4, 40], 1)
-    for i in range(40, 200):
-        model.delete_observation(7, i)
+    model = seen_from([4, 4, 4, 4, 4, 4, *far * [40]], 1)
+    for image_id in range(7, 7 + far):
+        for i in range(40, 200):
+            model.delete_observation(image_id, i)
+    with_given_camera(model, 1)
     assert np.isinf(list(focal_length_deviations(model).values())).all()
-    assert positions.measure(model) == {"6.jpg": 1}
+    found = positions.measure(model)
+    assert found.keys() == {f"{6 + i}.jpg" for i in range(far)} and found["6.jpg"] == 1
 
 
 def test_given_intrinsics_are_known():
     """Such as those of a photo that was added with them: their models may be degenerate."""
     model = seen_from([4, 4, 4, 4, 4, 4], 1)
-    camera = model.cameras[6]
-    focal_length, *centre = camera.params
-    params = [focal_length, focal_length, *centre, *8 * [0.0]]
-    model.cameras[6] = pycolmap.Camera(
-        model="FULL_OPENCV", width=1000, height=800, params=params, camera_id=6
-    )
+    with_given_camera(model, 6)
     assert positions.find(Inputs(model)) == []
 
 

@@ -288,6 +288,13 @@ def test_an_adapter_of_a_projection_of_the_user(base_weights, tmp_path, monkeypa
         matchers_confs.for_features(CONF, made_from)
     with pytest.raises(InputError, match="The photos have no keypoints"):
         adapters.main([str(file)], [photo.parent])
+    wrong = tmp_path / "wrong.yaml"
+    projection = str(projections.find("aliked_sv32"))
+    wrong.write_text(yaml.safe_dump({"model": model | {"projection": projection}}))
+    with pytest.raises(InputError, match="is for aliked, not for xfeat"):
+        adapters.main([str(wrong)], [photo.parent], tmp_path)
+    with pytest.raises(InputError, match="weights for another xfeat_sv32: rename the projection"):
+        adapters.main(["xfeat_sv32"], [photo.parent])
     noise = np.random.default_rng(0).integers(256, size=(40, 40, 3), dtype=np.uint8)
     cv2.imwrite(str(photo), cv2.resize(noise, (320, 320), interpolation=cv2.INTER_CUBIC))
     assert adapters.main([str(file)], [photo.parent]) == [home / "lightglue/own.safetensors"]
@@ -296,13 +303,13 @@ def test_an_adapter_of_a_projection_of_the_user(base_weights, tmp_path, monkeypa
     assert matchers.load(chosen).net.input_proj.in_features == 32
     assert matchers_confs.provenance(CONF, made_from)["weights_sha256"]
     other = made_from | {"projection_sha256": "0" * 64}
-    with pytest.raises(InputError, match="for own are for the own that they were fitted to, not"):
+    with pytest.raises(InputError, match="own.safetensors was fitted to another own: fit it again"):
         matchers_confs.for_features(CONF, other)
 
 
 def test_the_folder_of_weights_is_that_of_torch(monkeypatch):
     for name, value in (("TORCH_HOME", "~/weights"), ("XDG_CACHE_HOME", "/caches"), ("HOME", "/a")):
-        assert downloads.cache() == Path(torch.hub.get_dir()) / "checkpoints"
-        monkeypatch.delenv("TORCH_HOME", raising=False)
+        for other in ("TORCH_HOME", "XDG_CACHE_HOME"):
+            monkeypatch.delenv(other, raising=False)
         monkeypatch.setenv(name, value)
-    assert downloads.cache() == Path(torch.hub.get_dir()) / "checkpoints"
+        assert downloads.cache() == Path(torch.hub.get_dir()) / "checkpoints"

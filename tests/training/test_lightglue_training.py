@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from hloc_reduce.matchers.lightglue import LightGlue
 from hloc_reduce.networks.lightglue import file_of, metadata_of
@@ -80,7 +81,7 @@ def test_labels_are_true_matches(labels, monkeypatch):
 
 def test_photos_of_different_places_have_no_matches(labels, monkeypatch):
     monkeypatch.setattr(training, "APART", 1)
-    labels.places = np.arange(5)
+    monkeypatch.setattr(labels, "places", np.arange(5))
     first, second, matches, unmatched = labels.draw(np.random.default_rng(0))
     assert not len(matches)
     assert [len(part) for part in unmatched] == [
@@ -97,13 +98,16 @@ def test_a_training_lowers_the_loss_and_its_weights_match(labels, tmp_path, plan
     monkeypatch.setattr(training, "Labels", lambda *_: labels)
     draw = labels.draw
     monkeypatch.setattr(labels, "draw", lambda _: draw(np.random.default_rng((0, 0))))
-    training.main(output, maps, "mini32", steps=4, lr=3e-4)
+    training.main(output, maps, "mini32", steps=4)
     monkeypatch.setattr("hloc_reduce.networks.lightglue.WEIGHTS", tmp_path)
     trained = LightGlue({"features": "mini32", **training.WHOLE})
     assert training.loss(trained.net, labels, 1, 0, 0).item() < 0.95 * before
     assert metadata_of("mini32")["network"] == "xfeat"
     assert all(torch.isfinite(part).all() for part in trained.parameters())
     assert not output.with_suffix(".checkpoint").exists()
+    again = training.main(tmp_path / "again.safetensors", maps, "mini32", output, steps=0)
+    for name, weights in load_file(output).items():
+        torch.testing.assert_close(load_file(again)[name], weights)
 
 
 def test_wrong_options(tmp_path, plane):

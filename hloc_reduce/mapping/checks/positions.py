@@ -11,7 +11,7 @@ from ...localization.exif import WELL_KNOWN
 from ...localization.measures import INDEPENDENT_IF_BENT, uncertainty
 from ...localization.projection import FOCAL, POSE
 from ...utils import cli, colmap
-from ..adjustment import MAX_ADJUSTED_IMAGES, focal_length_deviations
+from ..adjustment import ESTIMATED_MODELS, MAX_ADJUSTED_IMAGES, focal_length_deviations
 from ..findings import PHOTOS_NAMED, Finding
 from .inputs import Inputs
 
@@ -19,6 +19,7 @@ from .inputs import Inputs
 # map err together, so that its photos are off by a multiple of what independent errors explain.
 BENT_TOGETHER = 2.5
 MAX_DEVIATION = 0.05  # of a position, as a share of the distance
+MOST_SINGULAR = 5  # photos that are left out because the adjustment is singular with them
 VAGUE_FOCAL_SHARE = 0.1  # photos whose points tell it less are not tried with others
 # Share of the photos: a map with at least as many uncertain ones is refused. Of 28 photos localized
 # in maps of tourists' photos with a fifth of them 8 were wrong, of 24 in those with a tenth 1, and
@@ -89,8 +90,8 @@ def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
     A distant photo of a nearly flat scene hardly tells a longer focal length from a larger
     distance; and neither do all photos of such a scene together, if each has its own camera. So a
     photo is tested with its points taken for known, and with nothing taken for known. If its camera
-    took several photos, only the first test is made, with known intrinsics. One photo that tells
-    too little makes the second test fail for all, so that it is made without those that tell least.
+    took several photos, only the first test is made, with known intrinsics. A single photo can make
+    the adjustment singular; the second test is then repeated without the least certain photos.
 
     Args:
         sfm: the map, whose intrinsics were estimated with its poses.
@@ -127,28 +128,26 @@ def _deviations(sfm: pycolmap.Reconstruction, alone: dict[str, float]) -> dict[s
 
     Args:
         sfm: the map.
-        alone: the same by the points of each photo, taken for known.
+        alone: the deviation of the focal length of each photo, with its points known.
 
     Returns:
         From name to the deviation, infinite for photos that make the adjustment singular; without
         those that are vague alone, and those whose cameras are known.
     """
-    vaguest = sorted(alone, key=lambda name: -alone[name])
-    vague = sum(not alone[name] < VAGUE_FOCAL_SHARE for name in vaguest)
-    left_out, found = vague, {}
-    while len(vaguest) - left_out > 1:
-        rest = _without(sfm, vaguest[:left_out])
-        deviations = focal_length_deviations(rest)
-        images = [rest.images[i] for i in rest.reg_image_ids()]
-        found = {
-            image.name: deviations[image.camera_id]
-            for image in images
-            if image.camera_id in deviations
-        }
-        if not (found and np.isinf([*found.values()]).all()):
-            break
-        left_out = 2 * left_out or 1
-    return dict.fromkeys(vaguest[vague:left_out], np.inf) | found
+    cameras = {
+        image.name: image.camera_id
+        for image in sfm.images.values()
+        if sfm.cameras[image.camera_id].model in ESTIMATED_MODELS
+    }
+    vague = [name for name in alone if not alone[name] < VAGUE_FOCAL_SHARE]
+    others = sorted(alone.keys() - {*vague}, key=lambda name: (-alone[name], name))
+    uncertain = [name for name in others if name in cameras]
+    for number in range(min(MOST_SINGULAR + 1, len(uncertain) + 1, len(others) - 1)):
+        deviations = focal_length_deviations(_without(sfm, vague + uncertain[:number]))
+        if not (deviations and np.isinf([*deviations.values()]).all()):
+            found = {name: deviations[cameras[name]] for name in uncertain[number:]}
+            return dict.fromkeys(uncertain[:number], np.inf) | found
+    return dict.fromkeys(uncertain, np.inf) if len(others) > 1 else {}
 
 
 def _without(sfm: pycolmap.Reconstruction, names: list[str]) -> pycolmap.Reconstruction:
