@@ -187,7 +187,7 @@ def test_released_networks_are_downloaded_once_and_checked(tmp_path, monkeypatch
     buffer = io.BytesIO()
     torch.save(released_state((128, 96, 24)).state_dict(), buffer)
     content, asked = buffer.getvalue(), []
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setattr(
         downloads, "urlopen", lambda url, timeout: asked.append(url) or io.BytesIO(content)
     )
