@@ -119,8 +119,8 @@ def _check(conf: dict, output: Path | None) -> None:
     _network(conf)
     if name in LIGHTGLUE or (output is None and (weights_of.WEIGHTS / f"{name}{SUFFIX}").exists()):
         raise InputError(
-            f"LightGlue has weights for another {name}: rename the projection, or give --output to "
-            "fit what ships anew."
+            f"LightGlue has weights for {name} already: rename your projection, or give --output "
+            "to fit anew what ships."
         )
     extractors.load(conf["model"])
     for storage in STORAGES:
@@ -210,7 +210,7 @@ def _cosine(found: np.ndarray, taken: np.ndarray) -> float:
 
 
 def _main() -> None:
-    example = "--feature aliked_sv32 --images scenes/fox/images"
+    example = "--feature disk_sv32.yaml --images photos"
     options.call(main, __doc__, example)
 
 

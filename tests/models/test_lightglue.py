@@ -293,7 +293,7 @@ def test_an_adapter_of_a_projection_of_the_user(base_weights, tmp_path, monkeypa
     wrong.write_text(yaml.safe_dump({"model": model | {"projection": projection}}))
     with pytest.raises(InputError, match="is for aliked, not for xfeat"):
         adapters.main([str(wrong)], [photo.parent], tmp_path)
-    with pytest.raises(InputError, match="weights for another xfeat_sv32: rename the projection"):
+    with pytest.raises(InputError, match="weights for xfeat_sv32 already: rename your projection"):
         adapters.main(["xfeat_sv32"], [photo.parent])
     noise = np.random.default_rng(0).integers(256, size=(40, 40, 3), dtype=np.uint8)
     cv2.imwrite(str(photo), cv2.resize(noise, (320, 320), interpolation=cv2.INTER_CUBIC))

@@ -19,7 +19,9 @@ from .inputs import Inputs
 # map err together, so that its photos are off by a multiple of what independent errors explain.
 BENT_TOGETHER = 2.5
 MAX_DEVIATION = 0.05  # of a position, as a share of the distance
-MOST_SINGULAR = 5  # photos that are left out because the adjustment is singular with them
+# The adjustment is repeated without up to so many photos; if it stays singular, all are uncertain.
+# A bound on work: of ten public maps one is singular, by one photo.
+MOST_SINGULAR = 5
 VAGUE_FOCAL_SHARE = 0.1  # photos whose points tell it less are not tried with others
 # Share of the photos: a map with at least as many uncertain ones is refused. Of 28 photos localized
 # in maps of tourists' photos with a fifth of them 8 were wrong, of 24 in those with a tenth 1, and
