@@ -28,8 +28,8 @@ import pycolmap
 import torch
 from scipy.linalg import rq
 
-from benchmarks.darken_place import darken
 from benchmarks.rows import add_again_option, how
+from benchmarks.split_place import darken
 from benchmarks.trial_rows import COLUMNS, RESHAPED, TRIALS, to_row
 from hloc_reduce import extract_features, localize_inloc, maps, matchers, projections
 from hloc_reduce.confs import features as features_confs

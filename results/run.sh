@@ -16,9 +16,17 @@ town() { # FOLDER and number of photos
 town $data/demo_town 32
 town $data/demo_town-400 400
 [ -e $data/redkitchen ] || run scan_frames --sequence $data/7-scenes-redkitchen --output $data/redkitchen
+split() { # PLACE, KIND and options
+    place=$1 kind=$2
+    shift 2
+    [ -e "$data/$kind-$place" ] || run split_place --map "$(scene "$place")" --output "$data/$kind-$place" "$@"
+}
 for place in fountain-P11 sceaux; do
-    [ -e $data/dark-$place ] || run darken_place --map "$(scene $place)" --output $data/dark-$place
-    [ -e $data/dusk-$place ] || run darken_place --map "$(scene $place)" --output $data/dusk-$place --gain 0.3 0.5
+    split $place dark --gain 0.06 0.12
+    split $place dusk --gain 0.3 0.5
+done
+for place in fountain-P11 sceaux kitchen; do
+    split $place sparse --map_every 4
 done
 
 # which feature? how many bytes?
