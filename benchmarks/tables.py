@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from operator import mul
 from pathlib import Path
 
 from benchmarks.rows import Row, read, select
@@ -93,6 +94,20 @@ MAPS: list[Choice] = [
     ("mini32", "uint2"),
 ]
 MAP_SIZES = (0.06, 0.03)
+# of LightGlue: features, and the numbers of keypoints that are matched
+LIGHTGLUE: list[tuple[str, str, int]] = [
+    ("aliked", "float16", 1024),
+    ("aliked_sv32", "uint4", 1024),
+    ("aliked_sv32", "uint2", 1024),
+    ("xfeat", "float16", 2048),
+    ("xfeat_sv32", "uint4", 2048),
+    ("xfeat_sv32", "uint2", 2048),
+    ("mini64", "uint2", 2048),
+    ("mini32", "uint2", 2048),
+]
+RETRIEVED = 10  # map images of a query there
+DARK = "dark-fountain-P11", "dark-sceaux"
+SPARSE = "sparse-fountain-P11", "sparse-sceaux", "sparse-kitchen"
 ONE_CORE = "1 core"
 STAGES = ("extraction", "matching", "triangulation", "localization")
 PAPER = ("sift", "mkd", "tfeat")
@@ -230,6 +245,46 @@ def false_accepts_table() -> Table:
             cells.append(f"{found} of {len(rows):,}")
         table.append([f"`{feature}`", *cells])
     return table
+
+
+def lightglue_table() -> Table:
+    """Compare LightGlue with nearest neighbours."""
+    columns = "herz-jesus, day", "night", "darkened", "sparse"
+    table = [["feature", "bytes", "map", "queries", *columns, "town, night", "pair [s]"]]
+    for feature, storage, number in LIGHTGLUE:
+        fast = matcher_of(features_confs.confs[feature])
+        of_feature = select(read("lightglue"), feature=feature, storage=storage)
+        for of_map, matcher in ((fast, fast), (fast, "lightglue"), ("lightglue", "lightglue")):
+            variant = f"map by {of_map}, {number} keypoints, {RETRIEVED} images"
+            rows = select(of_feature, matcher=matcher, variant=variant)
+            parts = (
+                select(rows, place="herz-jesus", list="day"),
+                select(rows, place="herz-jesus", list="night"),
+                [row for row in rows if row["place"] in DARK],
+                [row for row in rows if row["place"] in SPARSE],
+            )
+            town = select(rows, place="demo_town", list="night")
+            table.append(
+                [
+                    f"`{feature}`, `{storage}`",
+                    rows[0]["bytes"],
+                    "NN" if of_map == fast else of_map,
+                    "NN" if matcher == fast else matcher,
+                    *map(accuracy, parts),
+                    f"{town[0]['localized']} of {town[0]['queries']}" if town else "",
+                    f"{float(parts[0][0]['seconds']) / RETRIEVED:.2f}",
+                ]
+            )
+    return table
+
+
+def accuracy(rows: list[Row]) -> str:
+    """Format the queries within 1 and 5 cm and the mean inliers of query lists."""
+    near = (f"{total(rows, f'within_{limit}cm'):.0f}" for limit in (1, 5))
+    queries = [float(row["queries"]) for row in rows]
+    found = [float(row["inliers"]) for row in rows]
+    mean = sum(map(mul, queries, found)) / sum(queries)
+    return f"{' / '.join(near)} of {sum(queries):.0f}, {mean:,.0f}"
 
 
 def runs_table() -> Table:
@@ -378,6 +433,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "false_accepts": false_accepts_table,
     "limits": limits_table,
     "map_limits": map_limits_table,
+    "lightglue": lightglue_table,
     "runs": runs_table,
     "extraction": extraction_table,
     "scale": scale_table,
