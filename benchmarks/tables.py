@@ -99,15 +99,18 @@ LIGHTGLUE: list[tuple[str, str, int]] = [
     ("aliked", "float16", 1024),
     ("aliked_sv32", "uint4", 1024),
     ("aliked_sv32", "uint2", 1024),
-    ("xfeat", "float16", 2048),
-    ("xfeat_sv32", "uint4", 2048),
-    ("xfeat_sv32", "uint2", 2048),
-    ("mini64", "uint2", 2048),
+    ("xfeat", "float16", 1024),
+    ("xfeat_sv32", "uint4", 1024),
+    ("xfeat_sv32", "uint2", 1024),
+    ("mini64", "uint2", 1024),
+    ("mini32", "uint2", 1024),
     ("mini32", "uint2", 2048),
 ]
 RETRIEVED = 10  # map images of a query there
-DARK = "dark-fountain-P11", "dark-sceaux"
-SPARSE = "sparse-fountain-P11", "sparse-sceaux", "sparse-kitchen"
+LIGHTGLUE_PLACES = (
+    *("herz-jesus", "dark-fountain-P11", "dark-sceaux"),
+    *(f"sparse-{place}" for place in ("herz-jesus", "fountain-P11", "sceaux")),
+)
 ONE_CORE = "1 core"
 STAGES = ("extraction", "matching", "triangulation", "localization")
 PAPER = ("sift", "mkd", "tfeat")
@@ -251,43 +254,32 @@ def false_accepts_table() -> Table:
 
 
 def lightglue_table() -> Table:
-    """Compare LightGlue with nearest neighbours."""
-    columns = "herz-jesus, day", "night", "darkened", "sparse"
-    table = [["feature", "bytes", "map", "queries", *columns, "town, night", "pair [s]"]]
+    """Compare maps and queries that are matched by nearest neighbours and by LightGlue."""
+    columns = {f"{a} map, {b} queries": (a, b) for a in ("NN", "LG") for b in ("NN", "LG")}
+    table = [["feature", "bytes", "keypoints", *columns, "LG, pair [s]"]]
     for feature, storage, number in LIGHTGLUE:
         fast = matcher_of(features_confs.confs[feature])
+        names = {"NN": fast, "LG": "lightglue"}
         of_feature = select(read("lightglue"), feature=feature, storage=storage)
-        for of_map, matcher in ((fast, fast), (fast, "lightglue"), ("lightglue", "lightglue")):
-            variant = f"map by {of_map}, {number} keypoints, {RETRIEVED} images"
-            rows = select(of_feature, matcher=matcher, variant=variant)
-            parts = (
-                select(rows, place="herz-jesus", list="day"),
-                select(rows, place="herz-jesus", list="night"),
-                [row for row in rows if row["place"] in DARK],
-                [row for row in rows if row["place"] in SPARSE],
-            )
-            town = select(rows, place="demo_town", list="night")
-            table.append(
-                [
-                    f"`{feature}`, `{storage}`",
-                    rows[0]["bytes"],
-                    "NN" if of_map == fast else of_map,
-                    "NN" if matcher == fast else matcher,
-                    *map(accuracy, parts),
-                    f"{town[0]['localized']} of {town[0]['queries']}" if town else "",
-                    f"{float(parts[0][0]['seconds']) / RETRIEVED:.2f}",
-                ]
-            )
+        cells = []
+        for of_map, matcher in columns.values():
+            variant = f"map by {names[of_map]}, {number} keypoints, {RETRIEVED} images"
+            rows = select(of_feature, matcher=names[matcher], variant=variant)
+            rows = [row for row in rows if row["place"] in LIGHTGLUE_PLACES]
+            cells.append(accuracy(rows))
+        pair = sum(map(float, (row["seconds"] for row in rows))) / len(rows) / RETRIEVED
+        bytes_ = rows[0]["bytes"]
+        table.append([f"`{feature}`, `{storage}`", bytes_, f"{number:,}", *cells, f"{pair:.1f}"])
     return table
 
 
 def accuracy(rows: list[Row]) -> str:
-    """Format the queries within 1 and 5 cm and the mean inliers of query lists."""
+    """Format the queries within 1 and 5 cm, and the mean inliers, of query lists."""
     near = (f"{total(rows, f'within_{limit}cm'):.0f}" for limit in (1, 5))
     queries = [float(row["queries"]) for row in rows]
-    found = [float(row["inliers"]) for row in rows]
-    mean = sum(map(mul, queries, found)) / sum(queries)
-    return f"{' / '.join(near)} of {sum(queries):.0f}, {mean:,.0f}"
+    inliers_of = [float(row["inliers"]) for row in rows]
+    mean = sum(map(mul, queries, inliers_of)) / sum(queries)
+    return f"{' / '.join(near)} of {sum(queries):.0f}; {mean:,.0f}"
 
 
 def runs_table() -> Table:

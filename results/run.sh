@@ -16,24 +16,24 @@ town() { # FOLDER and number of photos
 town $data/demo_town 32
 town $data/demo_town-400 400
 [ -e $data/redkitchen ] || run scan_frames --sequence $data/7-scenes-redkitchen --output $data/redkitchen
-split() { # PLACE, KIND and options
-    place=$1 kind=$2
-    shift 2
-    [ -e "$data/$kind-$place" ] || run split_place --map "$(scene "$place")" --output "$data/$kind-$place" "$@"
+split() { # KIND, PLACE, its map and options
+    folder=$data/$1-$2 map=$3
+    shift 3
+    [ -e "$folder" ] || run split_place --map "$map" --output "$folder" "$@"
 }
 for place in fountain-P11 sceaux; do
-    split $place dark --gain 0.06 0.12
-    split $place dusk --gain 0.3 0.5
+    split dark $place "$(scene $place)" --gain 0.06 0.12
+    split dusk $place "$(scene $place)" --gain 0.3 0.5
+    split sparse $place "$(scene $place)" --map_every 4
 done
-for place in fountain-P11 sceaux kitchen; do
-    split $place sparse --map_every 4
-done
+herz_jesus=$data/herz-jesus/images_upright:$data/herz-jesus/3D-models/aachen_v_1_1
+split sparse herz-jesus $herz_jesus --map_every 4
 
 # which feature? how many bytes?
 run accuracy results/accuracy.yaml "$@"
 run accuracy results/paper.yaml "$@"
 run matching_ap --map "$(scene fountain-P11)" --map "$(scene sceaux)" --map "$(scene kitchen)" \
-    --map $data/herz-jesus/images_upright:$data/herz-jesus/3D-models/aachen_v_1_1 "$@"
+    --map $herz_jesus "$@"
 
 # how small a map?
 small_maps() { # PLACE, FEATURE, STORAGE and sizes
