@@ -4,8 +4,8 @@ XFeat's LighterGlue sees XFeat's descriptors at the keypoints of the mini in two
 labels their matches: those near the epipolar lines of the known poses are right, and keypoints that
 it finds no match for have none. The student learns these from the descriptors of the mini, where
 the first view may be dark, noisy and blurred, and those of the second are floats or codes of 4 or 2
-bits, as in a map. It starts from LighterGlue and the adapter of the mini, or from given weights. An
-interrupted training resumes.
+bits, as in a map. It starts from an adapter of LighterGlue for the mini, or from other weights for
+it. An interrupted training resumes.
 """
 
 import json
