@@ -96,9 +96,6 @@ MAPS: list[Choice] = [
 MAP_SIZES = (0.06, 0.03)
 # of LightGlue: features, and the numbers of keypoints that are matched
 LIGHTGLUE: list[tuple[str, str, int]] = [
-    ("aliked", "float16", 1024),
-    ("aliked_sv32", "uint4", 1024),
-    ("aliked_sv32", "uint2", 1024),
     ("xfeat", "float16", 1024),
     ("xfeat_sv32", "uint4", 1024),
     ("xfeat_sv32", "uint2", 1024),
@@ -256,7 +253,7 @@ def false_accepts_table() -> Table:
 def lightglue_table() -> Table:
     """Compare maps and queries that are matched by nearest neighbours and by LightGlue."""
     columns = {f"{a} map, {b} queries": (a, b) for a in ("NN", "LG") for b in ("NN", "LG")}
-    table = [["feature", "bytes", "keypoints", *columns, "LG, pair [s]"]]
+    table = [["feature", "bytes", "keypoints", *columns]]
     for feature, storage, number in LIGHTGLUE:
         fast = matcher_of(features_confs.confs[feature])
         names = {"NN": fast, "LG": "lightglue"}
@@ -267,9 +264,8 @@ def lightglue_table() -> Table:
             rows = select(of_feature, matcher=names[matcher], variant=variant)
             rows = [row for row in rows if row["place"] in LIGHTGLUE_PLACES]
             cells.append(accuracy(rows))
-        pair = sum(map(float, (row["seconds"] for row in rows))) / len(rows) / RETRIEVED
-        bytes_ = rows[0]["bytes"]
-        table.append([f"`{feature}`, `{storage}`", bytes_, f"{number:,}", *cells, f"{pair:.1f}"])
+        cells = [rows[0]["bytes"], f"{number:,}", *cells]
+        table.append([f"`{feature}`, `{storage}`", *cells])
     return table
 
 

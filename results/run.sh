@@ -35,6 +35,12 @@ run accuracy results/paper.yaml "$@"
 run matching_ap --map "$(scene fountain-P11)" --map "$(scene sceaux)" --map "$(scene kitchen)" \
     --map $herz_jesus "$@"
 
+for place in herz-jesus dark-fountain-P11 dark-sceaux sparse-herz-jesus sparse-fountain-P11 sparse-sceaux; do
+    run lightglue --dataset $data/$place --feature mini32:uint2 --keypoints 1024 2048 "$@"
+    run lightglue --dataset $data/$place --keypoints 1024 "$@" \
+        --feature xfeat:float16 xfeat_sv32:uint4 xfeat_sv32:uint2 mini64:uint2
+done
+
 # how small a map?
 small_maps() { # PLACE, FEATURE, STORAGE and sizes
     place=$1 feature=$2 storage=$3
