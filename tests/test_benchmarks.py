@@ -7,13 +7,26 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 import yaml
 
-from benchmarks import accuracy, against_hloc, fit_gate, render, rows, tables, trial_rows
+from benchmarks import (
+    accuracy,
+    against_hloc,
+    fit_gate,
+    render,
+    rows,
+    split_place,
+    tables,
+    trial_rows,
+)
 from benchmarks import trials as benchmark_trials
+from hloc_reduce.datasets import true_poses
+from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import gate
 from hloc_reduce.utils.cli import InputError
 from pipelines.batch import jobs
@@ -50,6 +63,39 @@ def test_a_row_says_who_measured_it():
     how = rows.how(2.5, cores=2)
     assert how["seconds"] == 2.5 and how["machine"].endswith(", 2 cores")
     assert how["commit"] and how["command"].startswith("python -m ")
+
+
+@pytest.mark.parametrize("map_every, gain", [(None, (0.1, 0.2)), (4, None)])
+def test_a_place_is_split_into_a_map_and_queries(tmp_path, map_every, gain):
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 12
+    options.num_points3D, options.camera_width, options.camera_height = 20, 64, 48
+    model = pycolmap.synthesize_dataset(options)
+    images, sparse, output = (tmp_path / name for name in ("images", "sparse", "place"))
+    sparse.mkdir()
+    model.write(sparse)
+    for image in model.images.values():
+        path = images / image.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), np.full((48, 64, 3), 200, np.uint8))
+
+    split_place.main(images, sparse, output, gain, map_every)
+
+    place = Aachen(output)
+    [(listed, queries)] = place.query_lists().items()
+    names = sorted(image.name for image in model.images.values())
+    kept = names[2::4] if map_every else [name for i, name in enumerate(names) if i % 3 != 1]
+    assert sorted(place.map_names()) == [f"db/{name}" for name in kept]
+    assert len(queries) == len(names) - len(kept)
+    assert listed.startswith("night" if gain else "day")
+    truth = true_poses([name for name, _ in queries], place.ground_truth, True)
+    for name, camera in queries:
+        assert (camera.width, camera.height) == (64, 48)
+        pixels = cv2.imread(str(place.images / name))
+        assert pixels.mean() < 50 if gain else (pixels == 200).all()
+        stem = Path(name).relative_to("query").with_suffix("").as_posix()
+        [known] = [one for one in model.images.values() if Path(one.name).stem == Path(stem).name]
+        assert pose_error(truth[name], known.cam_from_world()) == pytest.approx((0, 0), abs=1e-6)
 
 
 def test_localized_queries_count_by_their_errors():
