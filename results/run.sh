@@ -67,7 +67,7 @@ tried "$small" --dataset $data/herz-jesus --feature xfeat_sv32 "$@"
 tried "$small" --dataset $data/herz-jesus --feature colmap_sift_sv64 --seed 1 "$@"
 tried "bronze-statue cyprus entry-P10 fountain-P11 kitchen" --dataset $data/herz-jesus --feature colmap_sift_sv16 "$@"
 # one core takes a quarter of an hour for each place, and hours for those with more images
-tried "bronze-statue cyprus entry-P10 fountain-P11 sceaux" --feature mini32:uint2 --matcher lightglue --trials 30 "$@"
+tried "fountain-P11 sceaux entry-P10 bronze-statue cyprus" --feature mini32:uint2 --matcher lightglue --trials 30 "$@"
 
 # how fast?
 run extraction --dataset $data/herz-jesus "$@" \
