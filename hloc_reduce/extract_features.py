@@ -221,7 +221,7 @@ def _extract_image(
         logger.warning("Image %s has no keypoints.", name)
     groups = []
     for path, features in zip(paths, extracted, strict=True):
-        measured = {key: features.pop(key) for key in ("uncertainty", "blur")}
+        measured = {key: features.pop(key) for key in ("uncertainty", "blur", "turns")}
         arrays, attrs = stores[path](name, features)
         attrs["keypoints"] = measured
         if failure is not None:

@@ -28,7 +28,7 @@ PROJECTIONS: dict[str, tuple[tuple[str, ...], tuple[int, ...]]] = {
 NESTED = (*DESCRIPTORS, "xfeat", "aliked")
 
 PREPROCESSING = {"grayscale": True, "resize_max": 1600}
-IN_COLOUR = {**PREPROCESSING, "grayscale": False}
+IN_COLOUR = {**PREPROCESSING, "grayscale": False, "upright": True}  # of networks
 
 # the extractors of networks by the names of their features, such as edgepoint2_m32
 MODELS = (
@@ -272,7 +272,7 @@ def check(content: object, path: Path) -> dict:
         raise InputError(f"{path}: preprocessing cannot be {given!r}.")
     # hloc's confs also have an `output`, which is ignored
     unknown = content.keys() - {"model", "preprocessing", "output"}
-    unknown |= given.keys() - {*PREPROCESSING, "resize_force"}
+    unknown |= given.keys() - {*IN_COLOUR, "resize_force"}
     if unknown:
         raise InputError(f"{path}: unknown keys {', '.join(map(str, sorted(unknown, key=str)))}.")
     preprocessing = {**(IN_COLOUR if network_of(model) else PREPROCESSING), **given}

@@ -17,7 +17,7 @@ from ..utils.base_model import BaseModel
 from ..utils.cli import InputError
 from ..utils.configured import dynamic_load
 from ..utils.hloc import is_installed
-from ..utils.images import in_original, resized
+from ..utils.images import Frame, in_original, resized
 
 _gpu = Lock()  # of the thread whose image is in a network
 # from an image (H, W) float32 in [0, 1] to what `utils.colmap.detect_dog` returns
@@ -177,11 +177,11 @@ def _is_ours(name: str) -> bool:
     return name in [module.name for module in pkgutil.iter_modules(__path__)]
 
 
-def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, np.ndarray]:
+def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, Frame]:
     """Return what `utils.images.resized` does, the image as a tensor (1, C, H, W)."""
-    pixels, size = resized(image, preprocessing)
+    pixels, frame = resized(image, preprocessing)
     pixels = np.atleast_3d(pixels).transpose(2, 0, 1)
-    return torch.from_numpy(np.ascontiguousarray(pixels))[None], size
+    return torch.from_numpy(np.ascontiguousarray(pixels))[None], frame
 
 
 def extract(
@@ -199,7 +199,8 @@ def extract(
         keypoints (N, 2) float32 (x, y) in pixels of the original image, centres at integers;
         descriptors (D, N); scores, scales (pixels), oris (degrees) (N,), if the model has them;
         image_size (2,) width, height; the uncertainty of the keypoints, and the blur that reduced
-        the noise, both in pixels.
+        the noise, both in pixels; and the quarter turns, counterclockwise, by which the image was
+        shown to the model.
     """
     return extract_several([model], image, preprocessing, device)[0]
 
@@ -224,7 +225,7 @@ def extract_several(
     Returns:
         What `extract` returns, for each model.
     """
-    pixels, size = load_image(image, preprocessing)
+    pixels, frame = load_image(image, preprocessing)
     data: dict = {"image": pixels.to(device)}
     detect = detect or models[0].detect
     if detect is not None:
@@ -238,5 +239,5 @@ def extract_several(
         found = model.reduce(described[base])
         features = {key: value[0].cpu().numpy() for key, value in found.items()}
         shape = tuple(pixels.shape[2:])
-        extracted.append(in_original(features, shape, size, model.detection_noise))
+        extracted.append(in_original(features, shape, frame, model.detection_noise))
     return extracted

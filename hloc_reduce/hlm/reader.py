@@ -20,7 +20,9 @@ from ..projections.layers import read as read_layers
 from ..retrieval.vlad import VOCABULARY, read_vocabulary
 from ..utils.cli import InputError, choose, naming
 from ..utils.codes import CODED, FLOATS, QUANTIZED, STORAGES, check_levels, restore
+from ..utils.feature_files import upright
 from ..utils.files import file_sha256, replacing
+from ..utils.images import TURNS
 from ..utils.parsers import check_names
 from . import points as points_of_map
 from . import signs
@@ -171,6 +173,9 @@ class CompactMap:
             orientations,
         )
         self.cameras = intrinsics.with_lenses(told, self.camera_of.values())
+        turns = {TURNS.get(one, 0) for one in orientations}
+        is_upright = self.conf["preprocessing"].get("upright") and len(turns) == 1
+        self._turns = turns.pop() if is_upright else 0
 
     def _read_projection(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
         self.projection: bytes | None = None
@@ -291,16 +296,17 @@ class CompactMap:
         Args:
             name: of the image.
             keys: `keypoints` (M, 2), the `projections` with hloc's pixel origin, and `image_size`
-                (2,).
+                (2,). With the last one, keypoints are `feature_files.upright`, if all images are
+                stored turned in the same way.
         """
-        found = {}
+        found: dict[str, np.ndarray] = {}
         for key in keys:
             if key == "keypoints":
                 found[key] = (self.projections(name) - 0.5).astype(np.float32)
             else:
                 camera = self.camera_of[name]
                 found[key] = np.array([camera.width, camera.height], np.float32)
-        return found
+        return upright(found, self._turns)
 
     def projections(self, name: str) -> np.ndarray:
         """Return the projections (M, 2) of the points that an image shows, COLMAP's pixels."""

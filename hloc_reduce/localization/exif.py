@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import pycolmap
 from PIL import Image
 
-MAKE, MODEL, ORIENTATION, EXIF = 0x010F, 0x0110, 0x0112, 0x8769  # EXIF tags
+MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769  # EXIF tags
 ZOOM, FOCAL_35MM, FOCAL_LENGTH = 0xA404, 0xA405, 0x920A
 WIDTH, HEIGHT = 0xA002, 0xA003  # as the camera wrote it
 FOCAL_PLANE, UNIT = 0xA20E, 0xA210  # pixels of the sensor in a unit of length
 UNITS = {2: 25.4, 3: 10.0}  # millimetres
-ORIENTATIONS = range(1, 9)
 ROUNDED = 0.02  # relative difference of zooms, shapes and focal lengths that are the same
 MAX_RATIO = 10.0  # of width and height in EXIF data: others are nonsense
 WELL_KNOWN = 3  # images from which the map knows the intrinsics of their camera
@@ -67,16 +66,6 @@ def exif_camera(image: Path) -> ExifCamera | None:
     name, lens = f"{make} {model}", f"{make} {model} {focal_length:g} mm"
     full_size = (taken[1], _in_pixels(more)) if taken else (0.0, 0.0)
     return ExifCamera(name, lens, size, zoom > 1 + ROUNDED, _is_cropped(size, taken), full_size)
-
-
-def orientation(image: Path) -> int | None:
-    """Return the EXIF orientation of a photo, None if EXIF data do not tell."""
-    try:
-        with Image.open(image) as opened:
-            found = opened.getexif().get(ORIENTATION)
-    except Exception:  # Pillow raises many types for broken data
-        return None
-    return int(found) if found is not None and found in ORIENTATIONS else None
 
 
 def _in_pixels(more: Mapping[int, Any]) -> float:

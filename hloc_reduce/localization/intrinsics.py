@@ -10,9 +10,9 @@ import pycolmap
 
 from ..utils import cli, colmap
 from ..utils.files import replacing
-from ..utils.images import UnreadableImage
+from ..utils.images import UnreadableImage, orientation
 from ..utils.parsers import parse_camera, to_line
-from .exif import WELL_KNOWN, ExifCamera, correct, exif_camera, orientation
+from .exif import WELL_KNOWN, ExifCamera, correct, exif_camera
 from .gate import FOCAL_LENGTHS
 from .lenses import PLAIN, Size, split
 from .pose import OF_SIZE

@@ -21,7 +21,7 @@ from ..runtime import parallel
 from ..utils import cli, colmap
 from ..utils.arrays import distinct
 from ..utils.cli import InputError, naming
-from ..utils.feature_files import dimension, get_features, read_descriptors
+from ..utils.feature_files import dimension, get_features, read_descriptors, upright
 from ..utils.h5 import open_h5
 from .map import Map
 from .matching import Features, Matching, is_integer_matcher
@@ -186,7 +186,7 @@ def _match_images(
             prepared[name] = matching.prepare(features)
 
     def match(features: Features, names: list[str]) -> dict[str, np.ndarray]:
-        query = matching.prepare(features)
+        query = matching.prepare(upright(features, int(features.get("turns", 0))))
 
         def match_image(name: str) -> np.ndarray:
             return matching.match(query, prepared[name], shown[name])
@@ -235,12 +235,13 @@ def _match_points(
     def match(features: Features, names: list[str]) -> dict[str, np.ndarray]:
         visible = [compact.visible(name) for name in names]
         points = distinct(np.concatenate([np.zeros(0, np.int64), *visible]))
+        query = matching.prepare(upright(features, int(features.get("turns", 0))))
         described = compact.descriptors(points, unbiased=matching.takes_codes)
         images = [
             (np.searchsorted(points, part), compact.features(name, others))
             for name, part in zip(names, visible, strict=True)
         ]
-        found = matching.match_points(matching.prepare(features), described, images)
+        found = matching.match_points(query, described, images)
         return dict(zip(names, found, strict=True))
 
     return match

@@ -114,7 +114,7 @@ class Localizer:
             camera, source = intrinsics.infer(image, self.cameras)
             refinement = intrinsics.refinement(camera, source, self.cameras)
         if not self.engine.rotation_invariant:
-            refinement = merged(refinement, turned.options(image, self.cameras))
+            refinement = merged(refinement, turned.options(image, self.cameras, self.preprocessing))
         features = self._extract(image)
         width, height = map(int, features["image_size"])
         if (camera.width, camera.height) != (width, height):

@@ -42,7 +42,7 @@ class NumpyEngine:
             image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
             preprocessing: of the feature's configuration, and `mirrored`, to swap left and right.
         """
-        pixels, size = resized(image, preprocessing)
+        pixels, frame = resized(image, preprocessing)
         return in_original(
-            self._extract(pixels), pixels.shape, size, dog.KEYPOINT_UNCERTAINTY_PIXELS
+            self._extract(pixels), pixels.shape, frame, dog.KEYPOINT_UNCERTAINTY_PIXELS
         )

@@ -27,7 +27,7 @@ from ..utils import cli, options
 from ..utils.cli import InputError
 from ..utils.codes import restore, store
 from ..utils.files import replacing
-from ..utils.images import list_images
+from ..utils.images import list_images, turned
 from ..utils.options import Option
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
@@ -104,11 +104,13 @@ def at_keypoints(
     teacher: extractors.Extractor, image: Path | np.ndarray, conf: dict, found: dict
 ) -> np.ndarray:
     """Return XFeat's descriptors (N, 64) at the keypoints of other features of a photo."""
-    pixels, size = extractors.load_image(image, conf["preprocessing"])
+    pixels, frame = extractors.load_image(image, conf["preprocessing"])
     sides = [side // STRIDE * STRIDE for side in pixels.shape[2:]]
     network: Any = teacher.model
     dense = normalize(network.net(interpolate(pixels, sides, mode="bilinear"))[0], dim=1)
-    grid = ((torch.from_numpy(found["keypoints"]) + 0.5) / torch.tensor(size) * 2 - 1)[None, None]
+    keypoints = turned(found["keypoints"], frame.size, frame.turns)
+    shown = torch.tensor(frame.shown.copy())
+    grid = ((torch.from_numpy(keypoints) + 0.5) / shown * 2 - 1)[None, None]
     sampled = grid_sample(dense, grid.float(), mode="bicubic", align_corners=False)[0, :, 0]
     return normalize(sampled, dim=0).T.numpy()
 

@@ -28,6 +28,7 @@ from ..utils.colmap import point3D_ids
 from ..utils.feature_files import get_colmap_keypoints, get_descriptors
 from ..utils.files import replacing
 from ..utils.h5 import get_dataset, open_h5
+from ..utils.images import turned
 from ..utils.options import Option
 from ..utils.paths import strings_as_paths
 from ..utils.progress import progress
@@ -171,10 +172,11 @@ def _described(
             kept = np.flatnonzero(observed >= 0)
             if not len(kept):
                 continue
-            image, size = extractors.load_image(images / name, conf["preprocessing"])
-            ratio = np.array(image.shape[:1:-1]) / size
+            image, frame = extractors.load_image(images / name, conf["preprocessing"])
+            ratio = np.array(image.shape[:1:-1]) / frame.shown
             scaled = keypoints[name][kept]  # in pixels of the resized image
-            scaled[:, :2] = (scaled[:, :2] + 0.5) * ratio - 0.5
+            shown = turned(scaled[:, :2], frame.size, frame.turns)
+            scaled[:, :2] = (shown + 0.5) * ratio - 0.5
             scaled[:, 2:3] *= ratio.mean()
             known = get_descriptors(file, name)[kept]
             generator = np.random.default_rng([seed, number])

@@ -12,6 +12,7 @@ import numpy as np
 from .cli import InputError
 from .codes import CODED, QUANTIZED, restore
 from .h5 import get_array, get_dataset, get_text, iterate_h5_names, open_h5, reading
+from .images import Frame, turned
 
 
 def get_keypoints(file: h5py.File, name: str) -> tuple[np.ndarray, float]:
@@ -33,6 +34,13 @@ def get_blur(file: h5py.File, name: str) -> float:
     with reading(file.filename):
         blur = get_dataset(file, name, "keypoints").attrs.get("blur", 0.0)
     return float(blur) if isinstance(blur, int | float | np.number) else 0.0
+
+
+def get_turns(file: h5py.File, name: str) -> int:
+    """Read the quarter turns, counterclockwise, by which an extractor saw an image; default: 0."""
+    with reading(file.filename):
+        turns = get_dataset(file, name, "keypoints").attrs.get("turns", 0)
+    return int(turns) % 4 if isinstance(turns, int | np.integer) else 0
 
 
 def get_image_size(file: h5py.File, name: str) -> tuple[int, int]:
@@ -204,6 +212,22 @@ def get_descriptors(file: h5py.File, name: str) -> np.ndarray:
     return read_descriptors(file, name).restore()
 
 
+def upright(features: Mapping[str, np.ndarray], turns: int) -> dict[str, np.ndarray]:
+    """Return features as an extractor saw them, which learned matchers need.
+
+    Args:
+        features: hloc's dictionary, or a part of it; of photos with turns `image_size`, too.
+        turns: quarter turns, counterclockwise, by which the photo was shown to the extractor.
+    """
+    if not turns or "image_size" not in features:
+        return {**features}
+    frame = Frame(features["image_size"], turns)
+    found = {**features, "image_size": frame.shown.copy()}
+    if "keypoints" in features:
+        found["keypoints"] = turned(features["keypoints"], frame.size, turns)
+    return found
+
+
 def get_features(file: h5py.File, name: str, keys: Iterable[str]) -> dict[str, np.ndarray]:
     """Read some of hloc's dictionary of the features of an image, as float32.
 
@@ -211,12 +235,12 @@ def get_features(file: h5py.File, name: str, keys: Iterable[str]) -> dict[str, n
         file: an open feature file.
         name: of the image.
         keys: such as `descriptors` (D, N), `keypoints` (N, 2), `scores`, `scales`, `oris` (N,) and
-            `image_size` (2,).
+            `image_size` (2,). With the last one, keypoints are `upright`.
 
     Raises:
         InputError: when one is missing or broken.
     """
-    found = {}
+    found: dict[str, np.ndarray] = {}
     for key in keys:
         if key == "descriptors":
             found[key] = get_descriptors(file, name).T
@@ -224,4 +248,4 @@ def get_features(file: h5py.File, name: str, keys: Iterable[str]) -> dict[str, n
             found[key] = get_keypoints(file, name)[0].astype(np.float32)
         else:
             found[key] = get_array(file, name, key, (0,)).astype(np.float32)
-    return found
+    return upright(found, get_turns(file, name) if "image_size" in found else 0)

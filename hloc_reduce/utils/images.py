@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -33,6 +34,11 @@ _FORMATS = (
     *((at, found, "JPEG 2000") for at, found in ((4, b"jP  \r\n"), (0, b"\xff\x4f\xff\x51"))),
     *((at, found, "JPEG XL") for at, found in ((4, b"JXL \r\n"), (0, b"\xff\x0a"))),
 )
+ORIENTATION = 0x0112  # EXIF tag
+ORIENTATIONS = range(1, 9)
+# by EXIF orientation, the quarter turns, counterclockwise, that show a photo upright; photos that
+# are stored mirrored stay so
+TURNS = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
 NO_IMAGE = "it is not an image, or it is truncated"
 _PNG, _TIFF = b"\x89PNG\r\n\x1a\n", (b"II*\0", b"MM\0*")
 
@@ -95,6 +101,48 @@ def stored_size(image: Path) -> tuple[int, int] | None:
     return None
 
 
+def orientation(image: Path) -> int | None:
+    """Return the EXIF orientation of a photo, None if EXIF data do not tell."""
+    try:
+        with Image.open(image) as opened:
+            found = opened.getexif().get(ORIENTATION)
+    except Exception:  # Pillow raises many types for broken data
+        return None
+    return int(found) if found is not None and found in ORIENTATIONS else None
+
+
+class Frame(NamedTuple):
+    """How an extractor sees a photo.
+
+    Args:
+        size: (2,) int64 width, height in pixels as it is stored.
+        turns: by which it is shown, quarter turns, counterclockwise.
+    """
+
+    size: np.ndarray
+    turns: int = 0
+
+    @property
+    def shown(self) -> np.ndarray:
+        """The width and height (2,) as it is shown."""
+        return self.size[:: -1 if self.turns % 2 else 1]
+
+
+def turned(keypoints: np.ndarray, size: np.ndarray, turns: int) -> np.ndarray:
+    """Return where the keypoints of a photo are when it is turned.
+
+    Args:
+        keypoints: (N, 2) x, y in pixels, centres at integers.
+        size: (2,) its width and height before.
+        turns: quarter turns, counterclockwise.
+    """
+    for _ in range(turns % 4):
+        x, y = keypoints.T
+        keypoints = np.stack([y, (size[0] - 1).astype(keypoints.dtype) - x], axis=1)
+        size = size[::-1]
+    return keypoints
+
+
 def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
     """Convert pixels (H, W) or (H, W, 3) RGB, uint8, to (H, W) if `grayscale`, else (H, W, 3).
 
@@ -110,19 +158,19 @@ def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 and not grayscale else image
 
 
-def resized(image: Path | np.ndarray, preprocessing: Mapping) -> tuple[np.ndarray, np.ndarray]:
+def resized(image: Path | np.ndarray, preprocessing: Mapping) -> tuple[np.ndarray, Frame]:
     """Read an image and resize its longer side to at most `resize_max` pixels.
 
     With `resize_force` smaller images are enlarged to `resize_max` pixels.
 
     Args:
         image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-        preprocessing: `grayscale`, `resize_max`, `resize_force` of a feature's configuration; and
-            `mirrored`, whether to swap left and right.
+        preprocessing: `grayscale`, `resize_max`, `resize_force` and `upright`, whether EXIF data
+            turn it, of a feature's configuration; and `mirrored`, whether to swap left and right.
 
     Returns:
-        The image, (H, W) if `grayscale`, else (H, W, 3) RGB, float32 in [0, 1], and its original
-        (width, height).
+        The image, (H, W) if `grayscale`, else (H, W, 3) RGB, float32 in [0, 1], and how it is
+        shown.
 
     Raises:
         InputError: when it cannot be read.
@@ -131,10 +179,13 @@ def resized(image: Path | np.ndarray, preprocessing: Mapping) -> tuple[np.ndarra
     pixels = (
         convert(image, grayscale) if isinstance(image, np.ndarray) else read_image(image, grayscale)
     )
+    turns = 0
+    if preprocessing.get("upright") and isinstance(image, Path):
+        turns = TURNS.get(orientation(image) or 0, 0)
     if preprocessing.get("mirrored"):
-        pixels = pixels[:, ::-1]
-    pixels = pixels.astype(np.float32)
-    size = np.array(pixels.shape[1::-1])
+        pixels, turns = pixels[:, ::-1], -turns % 4
+    frame = Frame(np.array(pixels.shape[1::-1]), turns)
+    pixels, size = np.rot90(pixels, turns).astype(np.float32, order="C"), frame.shown
     resize_max = preprocessing.get("resize_max")
     if resize_max and (size.max() > resize_max or preprocessing.get("resize_force")):
         # at least one pixel: a panorama may be a thousand times wider than high
@@ -142,26 +193,31 @@ def resized(image: Path | np.ndarray, preprocessing: Mapping) -> tuple[np.ndarra
         smaller = (new_size <= size).all()
         interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR  # as hloc
         pixels = cv2.resize(pixels, new_size.tolist(), interpolation=interpolation)
-    return pixels / 255, size
+    return pixels / 255, frame
 
 
-def in_original(features: dict, shape: tuple[int, ...], size: np.ndarray, noise: float) -> dict:
-    """Return the features of a resized image in pixels of the original one.
+def in_original(features: dict, shape: tuple[int, ...], frame: Frame, noise: float) -> dict:
+    """Return the features of a resized image in pixels of the original one, as it is stored.
 
     Args:
-        features: `keypoints` (N, 2), and perhaps `scales` (N,) and `blur`, in pixels.
+        features: `keypoints` (N, 2), and perhaps `scales` (N,) and `blur`, in pixels, and `oris`
+            (N,) in degrees.
         shape: height and width of the resized image, and perhaps more.
-        size: original (width, height).
+        frame: how the original one is shown.
         noise: standard deviation of the keypoints in pixels of the resized image.
 
     Returns:
-        All features, with `image_size` (2,), `uncertainty` and `blur`, pixels.
+        All features, with `image_size` (2,), `uncertainty` and `blur`, pixels, and the `turns` of
+        the frame.
     """
-    ratio = (size / np.array(shape[1::-1])).astype(np.float32)
-    features = {**features, "keypoints": (features["keypoints"] + 0.5) * ratio - 0.5}
+    ratio = (frame.shown / np.array(shape[1::-1])).astype(np.float32)
+    keypoints = (features["keypoints"] + 0.5) * ratio - 0.5
+    features = {**features, "keypoints": turned(keypoints, frame.shown, -frame.turns)}
+    if "oris" in features and frame.turns:
+        features["oris"] = (features["oris"] + 90 * frame.turns) % 360
     if "scales" in features:
         features["scales"] = features["scales"] * ratio.mean()
-    features["image_size"] = size
+    features["image_size"], features["turns"] = frame.size, frame.turns
     features["uncertainty"] = noise * ratio.mean()
     features["blur"] = features.get("blur", 0.0) * ratio.mean()
     return features

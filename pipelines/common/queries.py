@@ -111,7 +111,8 @@ def _turned(query_images: Path, names: Iterable[str], built: Map) -> dict[str, d
 
     if extractors.is_rotation_invariant(built.conf["model"]):
         return {}
-    found = {name: turned.options(query_images / name, built.cameras) for name in names}
+    given = built.cameras, built.conf["preprocessing"]
+    found = {name: turned.options(query_images / name, *given) for name in names}
     return {name: options for name, options in found.items() if options}
 
 

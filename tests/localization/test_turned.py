@@ -1,18 +1,23 @@
 """Queries that are stored turned against the photos of a map."""
 
+import h5py
 import numpy as np
 import pycolmap
 import pytest
 from command import outcome, write
 from PIL import Image
 
-from hloc_reduce import Localizer, compact, extractors
+from hloc_reduce import Localizer, compact, extract_features, extractors
 from hloc_reduce.confs import features
+from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import turned
-from hloc_reduce.localization.exif import ORIENTATION
 from hloc_reduce.localization.intrinsics import MapCameras, merged, of_map
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import get_features, get_turns
+from hloc_reduce.utils.images import ORIENTATION
+from hloc_reduce.utils.parsers import parse_query_list
 from pipelines import localize
 
 PIPELINE = localize
@@ -115,6 +120,75 @@ def test_a_feature_of_hloc_is_known_where_hloc_is_not_installed(
     with pytest.raises(InputError, match="hloc is not installed"):
         extractors.load(model)
     assert extractors.is_rotation_invariant(model) == invariant
+
+
+@pytest.mark.parametrize(
+    ("size", "orientation", "sizes", "orientations", "said"),
+    [
+        (LANDSCAPE, 6, {LANDSCAPE}, {1}, None),  # both upright, by EXIF data
+        (LANDSCAPE, 6, {LANDSCAPE}, {6, 8}, None),
+        (LANDSCAPE, None, {LANDSCAPE}, {6, 8}, f"{PERHAPS} (landscape, theirs portrait)"),
+        (PORTRAIT, None, {LANDSCAPE}, {6, 8}, None),
+        (PORTRAIT, None, {LANDSCAPE}, {1, 6}, None),  # there may be both
+        (LANDSCAPE, None, {LANDSCAPE}, {1, 6}, None),
+        (PORTRAIT, None, {LANDSCAPE}, {1, 3}, f"{PERHAPS} (portrait, theirs landscape)"),
+        (LANDSCAPE, 6, {LANDSCAPE}, set(), f"{PERHAPS} (portrait, theirs landscape)"),
+        (PORTRAIT, 6, {LANDSCAPE}, set(), None),
+    ],
+)
+def test_which_upright_photos_are_turned(size, orientation, sizes, orientations, said, tmp_path):
+    save(tmp_path / "a.jpg", np.zeros(size[::-1], np.uint8), orientation)
+    of_map = MapCameras({}, sizes, orientations=orientations)
+    found = turned.reason(tmp_path / "a.jpg", of_map, upright=True)
+    assert found is None if said is None else found.startswith(f"{said}, which this feature")
+
+
+@pytest.mark.parametrize("matcher", ["NN-mutual", "lightglue"])
+def test_a_network_sees_photos_upright(matcher, place, aachen_layout, tmp_path, run, monkeypatch):
+    """A query that is stored turned has the pose of the upright one, turned about its axis."""
+    model = {"name": "lightglue", "max_keypoints": 512}
+    monkeypatch.setitem(matchers_confs.confs["lightglue"], "model", model)
+    build, images, outputs = place
+    for photo in sorted(images.glob("db/*.png")):
+        save(photo, np.array(Image.open(photo)), 1)
+    run(*build, "--feature", "mini32", "--storage", "uint2", "--matcher", matcher)
+    compact.main(tmp_path / "map.hlm", outputs / "map")
+    listed = aachen_layout / "queries/day_time_queries_with_intrinsics.txt"
+    name, camera = parse_query_list(listed)[0]
+    pixels = np.array(Image.open(images / name))
+    focal = camera.focal_length
+    params = [focal, camera.height / 2, camera.width / 2]
+    other = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=camera.height, height=camera.width, params=params
+    )
+    turns = {"upright": (0, 1), "left": (1, 6), "down": (2, 3), "right": (3, 8), "untold": (1, 99)}
+    for one, (number, orientation) in turns.items():
+        save(tmp_path / f"{one}.png", np.rot90(pixels, number), orientation)
+    for path in (outputs / "map", tmp_path / "map.hlm"):
+        localizer = Localizer(path)
+        found = {
+            one: localizer.localize(tmp_path / f"{one}.png", other if number % 2 else camera)
+            for one, (number, _) in turns.items()
+        }
+        expected, told = found["upright"]
+        for one in ("left", "down", "right"):
+            pose, info = found[one]
+            assert info["num_matches"] == told["num_matches"]
+            number = turns[one][0]
+            about_axis = pycolmap.Rotation3d(np.array([0, 0, -number * np.pi / 2]))
+            back = pycolmap.Rigid3d(about_axis, np.zeros(3)) * expected
+            distance, degrees = pose_error(pose, back)
+            assert distance < 1e-3 and degrees < 0.05
+        assert found["untold"][0] is None
+    extract_features.main(
+        features.confs["mini32"], tmp_path, feature_path=tmp_path / "f.h5", image_list=["left.png"]
+    )
+    with h5py.File(tmp_path / "f.h5") as file:
+        assert get_turns(file, "left.png") == 3
+        found = get_features(file, "left.png", ["keypoints", "image_size"])
+        assert found["image_size"].tolist() == [camera.width, camera.height]
+        assert found["keypoints"][:, 0].max() > camera.height  # of the upright photo
+        assert file["left.png/keypoints"][:, 0].max() < camera.height
 
 
 @pytest.mark.fault(11)
