@@ -1,58 +1,113 @@
 """Time this project and hloc stage by stage on a data set in Aachen's layout, all images paired.
 
-hloc extracts `sift` and matches with NN-ratio; this project does the same with each --feature. Each
-run is a new process that starts with an empty folder and ends with poses. The runs take turns, and
-the fastest of several rounds counts. Needs hloc and a pycolmap that it works with. Adds rows to
-results/runs.csv: seconds of each stage, file sizes, and queries within the finest threshold.
+hloc extracts `sift` and matches with NN-ratio; this project does the same with each --feature and
+its matcher. Each run is a new process that starts with an empty folder and ends with poses. Runs
+take turns, and the fastest of several rounds counts. Needs hloc and a pycolmap that it works with.
+Adds rows to results/runs.csv: seconds and CPU seconds of each stage, file sizes, and queries within
+the finest threshold; and the CPU seconds in one thread without which two stages cannot do.
 """
 
 import argparse
 import itertools
 import json
+import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+
+import h5py
 
 from benchmarks import rows
 from hloc_reduce.datasets import thresholds, true_poses
 from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS
 from hloc_reduce.evaluation.poses import pose_error, recall
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.codes import STORAGES
+from hloc_reduce.utils.feature_files import get_descriptors
 from hloc_reduce.utils.files import MEGABYTE
+from hloc_reduce.utils.h5 import list_h5_names
 from hloc_reduce.utils.hloc import extractors_package
-from hloc_reduce.utils.parsers import parse_poses, write_pairs
+from hloc_reduce.utils.parsers import parse_pairs, parse_poses, write_pairs
 
 NAME = "runs"
 HLOC = "hloc"
+KEYS = "feature", "storage"
 
 
-def stages_of(name: str) -> dict[str, Callable]:
+def parted(name: str) -> tuple[str, str]:
+    """Return the feature and the storage of FEATURE or FEATURE:STORAGE."""
+    feature, _, storage = name.partition(":")
+    return feature, storage or STORAGES[0]
+
+
+def stages_of(name: str, keypoints: str, queries: list[str]) -> dict[str, Callable]:
     """Return the stages of hloc or of this project, and the configurations they run with."""
     if name == HLOC:
         extractors_package()  # says what to install where hloc is missing or too old
         from hloc import extract_features, localize_sfm, match_features, triangulation
 
-        conf = extract_features.confs["sift"]
+        conf, matcher, extract = extract_features.confs["sift"], "NN-ratio", extract_features.main
     else:
         from hloc_reduce import extract_features, localize_sfm, match_features, triangulation
         from hloc_reduce.confs import features as features_confs
 
-        _, conf = features_confs.get(name)
+        feature, storage = parted(name)
+        _, conf = features_confs.get(feature, storage=storage, keypoints=keypoints)
+        matcher = features_confs.matcher_of(conf)
+        extract = partial(extract_features.main, queries=queries)
     return {
         "conf": conf,
-        "matcher": match_features.confs["NN-ratio"],
-        "extract": extract_features.main,
+        "matcher": match_features.confs[matcher],
+        "extract": extract,
         "match": match_features.main,
         "triangulate": triangulation.main,
         "localize": localize_sfm.main,
     }
 
 
-def run(name: str, dataset: Path, outputs: Path) -> dict:
+def cpu_seconds() -> float:
+    """Return the CPU seconds of this process, and of those that it waited for."""
+    return sum(os.times()[:4])
+
+
+def limits(conf: dict, images: Path, features: Path, pair_lists: list[Path]) -> dict[str, float]:
+    """Return the CPU seconds of what two stages of a run cannot do without, in one thread.
+
+    These are reading the photos and one pass of the detector or the network; and the products of
+    the descriptors of pairs as float32 matrices.
+    """
+    import torch
+
+    from hloc_reduce import extractors
+
+    torch.set_num_threads(1)
+    model = extractors.load(conf["model"]).eval()
+    seconds, described = dict.fromkeys(("extraction_limit_s", "matching_limit_s"), 0.0), {}
+    with h5py.File(features) as file, torch.no_grad():
+        names = list_h5_names(features)
+        for name in names:
+            start = time.process_time()
+            pixels, _ = extractors.load_image(images / name, conf["preprocessing"])
+            if model.detect is None:
+                model.base({"image": pixels})
+            else:
+                model.detect(pixels[0, 0].numpy())
+            seconds["extraction_limit_s"] += time.process_time() - start
+            described[name] = torch.from_numpy(get_descriptors(file, name))
+        for first, second in itertools.chain(*map(parse_pairs, pair_lists)):
+            start = time.process_time()
+            described[first] @ described[second].T
+            seconds["matching_limit_s"] += time.process_time() - start
+    return seconds
+
+
+def run(name: str, dataset: Path, outputs: Path, keypoints: str) -> dict:
     """Localize the queries of a data set and time each stage."""
     place = Aachen(dataset)
     database = place.map_names()
@@ -61,11 +116,14 @@ def run(name: str, dataset: Path, outputs: Path) -> dict:
     sfm_pairs, loc_pairs = outputs / "pairs-sfm.txt", outputs / "pairs-loc.txt"
     write_pairs(list(itertools.combinations(database, 2)), sfm_pairs)
     write_pairs(list(itertools.product(queries, database)), loc_pairs)
-    used, seconds = stages_of(name), {}
-    start = time.perf_counter()
+    used = stages_of(name, keypoints, queries)
+    seconds: dict[str, float] = {}
+    of_cpu: dict[str, float] = {}
+    start, cpu_start = time.perf_counter(), cpu_seconds()
 
     def lap(stage: str) -> None:
         seconds[stage] = time.perf_counter() - start - sum(seconds.values())
+        of_cpu[stage] = cpu_seconds() - cpu_start - sum(of_cpu.values())
 
     conf = used["conf"]
     features = used["extract"](conf, place.images, outputs, image_list=[*database, *queries])
@@ -93,8 +151,10 @@ def run(name: str, dataset: Path, outputs: Path) -> dict:
         "photos": len(database),
         "points": colmap.read_model(sfm).num_points3D(),
         **{f"{stage}_s": value for stage, value in seconds.items()},
+        **{f"{stage}_cpu_s": value for stage, value in of_cpu.items()},
         "feature_mb": features.stat().st_size / MEGABYTE,
         "match_mb": sum(path.stat().st_size for path in (matches, loc_matches)) / MEGABYTE,
+        **(limits(conf, place.images, features, [sfm_pairs, loc_pairs]) if name != HLOC else {}),
         "queries": len(queries),
         "within_finest": within,
         "seconds": sum(seconds.values()),
@@ -105,26 +165,31 @@ def _main() -> None:
     parser = cli.Parser(__doc__, "--dataset datasets/herz-jesus")
     parser.add_argument("--dataset", type=Path, required=True, help="with true poses of queries")
     parser.add_argument(
-        "--feature", nargs="+", default=["sift_sv64", "colmap_sift_sv64"], help="of this project"
+        "--feature",
+        nargs="+",
+        default=["sift_sv64", "colmap_sift_sv64"],
+        help="of this project, with the storage of its map, such as mini32:uint2",
     )
+    parser.add_argument("--keypoints", choices=KEYPOINT_SETTINGS, default=KEYPOINT_SETTINGS[0])
     parser.add_argument("--rounds", type=int, default=3, help="rounds in which all take turns")
     parser.add_argument("--once", help=argparse.SUPPRESS)
     rows.add_again_option(parser)
     args = parser.parse_args()
     if args.once:
         with tempfile.TemporaryDirectory() as temporary:
-            print("\n" + json.dumps(run(args.once, args.dataset, Path(temporary))))
+            print("\n" + json.dumps(run(args.once, args.dataset, Path(temporary), args.keypoints)))
         return
     cli.check_positive(args, "rounds")
     names = [HLOC, *args.feature]
-    cells = {name: {"place": args.dataset.name, "feature": name} for name in names}
+    place = {"place": args.dataset.name, "variant": f"{args.keypoints} keypoints"}
+    cells = {name: {**place, **dict(zip(KEYS, parted(name), strict=True))} for name in names}
     known = rows.read(NAME)
     if not args.again and all(rows.select(known, **cells[name]) for name in names):
         return  # a run is only compared with those that it took turns with
     best: dict[str, dict] = {}
     for _, name in itertools.product(range(args.rounds), names):
         command = [sys.executable, "-m", "benchmarks.against_hloc", "--once", name]
-        command += ["--dataset", str(args.dataset)]
+        command += ["--dataset", str(args.dataset), "--keypoints", args.keypoints]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
         if done.returncode:
             raise InputError(f"{name} failed.")

@@ -169,7 +169,7 @@ def test_figures_show_what_the_rows_say(name, monkeypatch):
 def test_without_hloc_the_comparison_says_what_to_install(monkeypatch):
     monkeypatch.setattr("hloc_reduce.utils.hloc.is_installed", lambda: False)
     with pytest.raises(InputError, match="hloc is not installed: pip install"):
-        against_hloc.stages_of("hloc")
+        against_hloc.stages_of("hloc", "adaptive", [])
 
 
 def test_jobs_without_rows_are_written_as_they_were_read(tmp_path):
