@@ -16,6 +16,8 @@ from .pose import Matches, Pose, quality
 from .projection import ALL, FOCAL, POSE, reprojection_errors
 
 SEED = 0
+LIKELIEST = 500  # matches that are tried before all
+CERTAIN = 60.0  # confidence of a pose at which no other matches are tried
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
@@ -39,9 +41,11 @@ def estimate(
 ) -> Pose:
     """Estimate an absolute pose and judge it.
 
-    If few of all matches agree with a pose, RANSAC may have missed the right one. So the most
-    similar matches of each image are tried by themselves, too: those of an image that shows the
-    same place agree much more often. The pose with the highest confidence among all matches wins.
+    First from the likeliest matches, of which more are right, so that RANSAC needs fewer trials; if
+    the pose is not certain, also from all. If few of these agree with a pose, RANSAC may have
+    missed the right one. So the most similar matches of each image are tried by themselves, too:
+    those of an image that shows the same place agree much more often. The pose with the highest
+    confidence among all matches wins.
     If it is trusted although its intrinsics were guessed, and the lens of the map's photos fits as
     well, it is estimated with that. If its photo seems to be cropped or stretched, and that lens
     fits about as well with another pose, it is not trusted. All poses are estimated and compared
@@ -63,8 +67,11 @@ def estimate(
     matches = Matches(points2D, colmap.transformed(near_from_world, points3D), camera, config)
     number = len(matches)
     with ThreadPoolExecutor(workers) as pool:
-        poses = [_estimate(matches, np.arange(number))]
-        if thorough and poses[0].num_inliers < CLEAR * number:
+        poses = [_estimate(matches, _likeliest(images, number))]
+        is_certain = poses[0].confidence >= CERTAIN
+        if number > LIKELIEST and not is_certain:
+            poses.insert(0, _estimate(matches, np.arange(number)))
+        if thorough and not is_certain and poses[0].num_inliers < CLEAR * number:
             tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
             poses += pool.map(lambda chosen: _estimate(matches, chosen[:MOST_SIMILAR]), tried)
         first = max(poses, key=quality)
@@ -80,6 +87,22 @@ def estimate(
         return best
     world_from_near = near_from_world.inverse()
     return replace(best, cam_from_world=world_from_near.transform_camera_world(best.cam_from_world))
+
+
+def _likeliest(images: list[np.ndarray], number: int) -> np.ndarray:
+    """Return the indices of those `LIKELIEST` of a number of matches that are right most often.
+
+    These are matches of several images, and then the most similar ones of each image.
+
+    Args:
+        images: of each map image the indices of its matches, the most similar first.
+        number: of all matches.
+    """
+    times, rank = np.zeros(number, np.int64), np.full(number, number)
+    for chosen in images:
+        times[chosen] += 1
+        rank[chosen] = np.minimum(rank[chosen], np.arange(len(chosen)))
+    return np.sort(np.lexsort((rank, -times))[:LIKELIEST])
 
 
 def _measures(

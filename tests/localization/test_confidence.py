@@ -21,6 +21,7 @@ from hloc_reduce.localization.measures import (
     uncertainty,
 )
 from hloc_reduce.localization.projection import reprojection_errors
+from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
 
 CAMERA = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1600, height=1200, params=[1400, 800, 600])
@@ -63,6 +64,39 @@ def test_wrong_matches_are_never_trusted(number, config):
         images = np.array_split(np.arange(number), 5)
         found = solve(*matches(0, number, seed), images, GUESS, config)
         assert found.refusal is not None and found.confidence < 3
+
+
+def test_the_likeliest_matches_are_those_of_several_images_then_the_most_similar(monkeypatch):
+    monkeypatch.setattr(absolute_pose, "LIKELIEST", 4)
+    images = [np.array([5, 0, 1]), np.array([3, 4, 5, 0]), np.array([2, 6])]
+    # 0 and 5 are of two images, and 2 and 3 are the first ones of theirs
+    assert absolute_pose._likeliest(images, 8).tolist() == [0, 2, 3, 5]
+    assert absolute_pose._likeliest([], 3).tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("right", "counts"), [(300, [500]), (30, [500, 4000])])
+def test_all_matches_are_tried_unless_the_likeliest_give_a_certain_pose(right, counts, monkeypatch):
+    """Few of all 4000 matches are right, but these are of two images, of four."""
+    points2D, points3D = matches(right, 4000 - right)
+    estimate, numbers = colmap.estimate_pose, []
+
+    def counted(points2D, *others):
+        numbers.append(len(points2D))
+        return estimate(points2D, *others)
+
+    monkeypatch.setattr(colmap, "estimate_pose", counted)
+    halves = np.array_split(np.arange(right, 4000), 2)
+    images = [np.arange(right), *halves, np.arange(right)]
+    found = absolute_pose.estimate(
+        points2D, points3D, images, CAMERA, {}, DEFAULT_GATE, thorough=False
+    )
+    assert found.refusal is None and found.num_inliers >= 0.95 * right
+    distance = found.cam_from_world.inverse().translation - TRUE.inverse().translation
+    assert np.linalg.norm(distance) < 0.01
+    # the others are inliers, and outliers
+    first = [number for number in numbers if number in (500, 4000)]
+    assert first[: len(counts)] == counts
+    assert (4000 in numbers) == (4000 in counts)
 
 
 @pytest.mark.parametrize(("right", "wrong"), [(9, 0), (12, 20), (40, 300), (200, 1000)])
