@@ -1,8 +1,12 @@
 """Keypoints of a score map."""
 
+from functools import reduce
+
 import torch
-from kornia.geometry.subpix import nms2d
-from torch.nn.functional import max_pool2d, pad
+from torch.nn.functional import pad
+
+# A maximum is above its neighbors by more than this: scores of one colour differ by rounding.
+MARGIN = 1e-6
 
 Keypoints = tuple[torch.Tensor, torch.Tensor]  # x, y (N, 2), and their scores (N,)
 
@@ -21,17 +25,14 @@ def strongest(
         scores: (H, W) float.
         radius: a maximum is above all other scores in the square of side 2 radius + 1 around it.
         min_score: lower ones are dropped.
-        border: number of pixels at each border without keypoints.
+        border: number of pixels at each border without keypoints, at least `radius`.
         max_keypoints: how many are kept; -1 for all.
 
     Returns:
         Keypoints (N, 2) float x, y, and their scores (N,), highest first.
     """
-    side = 2 * radius + 1
-    maxima = nms2d(scores[None, None], (side, side), mask_only=True)[0, 0]
-    inside = torch.zeros_like(maxima)
-    inside[border : scores.shape[0] - border, border : scores.shape[1] - border] = True
-    y, x = torch.nonzero(maxima & inside & (scores > min_score), as_tuple=True)
+    y, x = torch.nonzero(_maxima(scores, radius, min_score, border), as_tuple=True)
+    y, x = y + border, x + border
     found = scores[y, x]
     number = len(found) if max_keypoints < 0 else min(max_keypoints, len(found))
     found, order = found.topk(number)
@@ -61,11 +62,9 @@ def strongest_fixed(
         keypoint have the score -inf, and any position at which a keypoint may be.
     """
     height, width = scores.shape
-    edge = border - radius
-    around = _highest_around(scores[edge : height - edge, edge : width - edge], radius)
     inner = slice(border, height - border), slice(border, width - border)
-    maxima = (scores[inner] > around) & (scores[inner] > min_score)
     weighted = scores if weights is None else scores * weights
+    maxima = _maxima(scores, radius, min_score, border)
     found = torch.where(maxima, weighted[inner], -torch.inf).flatten()
     # small images have fewer pixels than rows
     highest, index = pad(found, (0, number), value=-torch.inf).topk(number)
@@ -94,14 +93,27 @@ def refined(keypoints: torch.Tensor, scores: torch.Tensor) -> torch.Tensor:
     return keypoints + torch.stack(shifts, dim=1).clamp(-0.5, 0.5)
 
 
+def _maxima(scores: torch.Tensor, radius: int, min_score: float, border: int) -> torch.Tensor:
+    """Return which scores are keypoints, (H - 2 border, W - 2 border) bool, see `strongest`."""
+    height, width = scores.shape
+    edge = border - radius
+    around = _highest_around(scores[edge : height - edge, edge : width - edge], radius)
+    inner = scores[border : height - border, border : width - border]
+    return (inner > around + MARGIN) & (inner > min_score)
+
+
 def _highest_around(scores: torch.Tensor, radius: int) -> torch.Tensor:
     """Return the highest score around each one (H - 2 radius, W - 2 radius), itself excluded."""
-    rows = max_pool2d(scores[None], (1, 2 * radius + 1), stride=1)
-    beside = scores[None, radius:-radius]
-    parts = (
-        max_pool2d(rows[:, : -radius - 1], (radius, 1), stride=1),
-        max_pool2d(rows[:, radius + 1 :], (radius, 1), stride=1),
-        max_pool2d(beside[:, :, : -radius - 1], (1, radius), stride=1),
-        max_pool2d(beside[:, :, radius + 1 :], (1, radius), stride=1),
+    rows = _highest(scores, 2 * radius + 1).mT
+    beside = scores[radius:-radius]
+    above, below = _highest(rows[:, : -radius - 1], radius), _highest(rows[:, radius + 1 :], radius)
+    left, right = (
+        _highest(part, radius) for part in (beside[:, : -radius - 1], beside[:, radius + 1 :])
     )
-    return torch.stack(parts).amax(dim=0)[0]
+    return torch.maximum(torch.maximum(above, below).mT, torch.maximum(left, right))
+
+
+def _highest(scores: torch.Tensor, number: int) -> torch.Tensor:
+    """Return the highest one of each number of successive scores of a row (H, W - number + 1)."""
+    width = scores.shape[1] - number + 1
+    return reduce(torch.maximum, (scores[:, i : i + width] for i in range(number)))
