@@ -40,6 +40,13 @@ for place in herz-jesus dark-fountain-P11 dark-sceaux sparse-herz-jesus sparse-f
     run lightglue --dataset $data/$place --keypoints 1024 "$@" \
         --feature xfeat:float16 xfeat_sv32:uint4 xfeat_sv32:uint2 mini64:uint2
 done
+# LightGlue for ALIKED takes a quarter of an hour a place and feature, and the town an hour
+for place in herz-jesus sparse-herz-jesus; do
+    run lightglue --dataset $data/$place --keypoints 1024 --map_matcher lightglue --matcher lightglue "$@" \
+        --feature aliked:float16 aliked_sv32:uint4 aliked_sv32:uint2
+done
+run lightglue --dataset $data/demo_town --feature mini32:uint2 --keypoints 2048 "$@" \
+    --map_matcher lightglue --matcher lightglue
 
 # how small a map?
 small_maps() { # PLACE, FEATURE, STORAGE and sizes
@@ -50,6 +57,9 @@ small_maps() { # PLACE, FEATURE, STORAGE and sizes
 small_maps herz-jesus colmap_sift_sv32 uint4 0.02 0.03 0.06 0.1 "$@"
 small_maps herz-jesus xfeat_sv32 uint2 0.02 0.03 0.06 0.1 "$@"
 small_maps herz-jesus mini32 uint2 0.02 0.03 0.06 0.1 "$@"
+for feature in mini32 xfeat_sv32; do # LightGlue finds fewer points than nearest neighbours of more keypoints
+    small_maps herz-jesus $feature uint2 0.1 --matcher lightglue "$@"
+done
 small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.25 0.5 1 "$@"
 
 # how often wrong?
