@@ -16,6 +16,7 @@ from benchmarks.tables import (
     SIZES,
     STAGES,
     chosen,
+    name_of,
     percent,
     total,
 )
@@ -113,7 +114,7 @@ def draw_runs() -> list[Callable]:
         left = [0.0] * len(runs)
         for colour, stage in zip(plots.COLOURS, STAGES, strict=False):
             seconds = [float(row[f"{stage}_s"]) for row in runs]
-            names = [row["feature"] for row in runs]
+            names = [name_of(row).replace("`", "") for row in runs]
             axis.barh(names, seconds, left=left, color=colour, label=stage)
             left = [sum(pair) for pair in zip(left, seconds, strict=True)]
         axis.set(xlabel="seconds, 33 photos on two cores")

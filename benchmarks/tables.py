@@ -27,6 +27,7 @@ from hloc_reduce.mapping.checks import (
 from hloc_reduce.mapping.plausibility import SAME_VIEWPOINT
 from hloc_reduce.mapping.registration import MIN_VIEWPOINTS
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.codes import FLOATS
 
 # kinds of trials, by what they are called in tables
 OWN = "own", "blurred", "dark"
@@ -288,8 +289,30 @@ def runs_table() -> Table:
         cells += [f"{float(row['seconds']):.1f}"]
         cells += [f"{float(reference['seconds']) / float(row['seconds']):.1f}"]
         cells += [f"{float(row['feature_mb']):.1f}", f"{float(row['match_mb']):.2f}"]
-        table.append([f"`{row['feature']}`", *cells])
+        table.append([name_of(row), *cells])
     return table
+
+
+def name_of(row: Row) -> str:
+    """Name a feature and, unless it is float16, the storage of its map."""
+    storage = row["storage"]
+    return f"`{row['feature']}`" + (f", `{storage}`" if storage not in ("", FLOATS[0]) else "")
+
+
+def runs_cpu_table() -> Table:
+    """Show the CPU seconds of whole runs, and those that no run of the same photos is without."""
+    table = [["CPU seconds", *STAGES, "all", "of one pass of the detector", "of the products"]]
+    for row in sorted(select(read("runs"), place="herz-jesus"), key=lambda row: -cpu_of(row)):
+        cells = [f"{float(row[f'{stage}_cpu_s']):.1f}" for stage in STAGES]
+        limits = [row["extraction_limit_s"], row["matching_limit_s"]]
+        cells += [f"{cpu_of(row):.1f}", *(f"{float(one):.1f}" if one else "" for one in limits)]
+        table.append([name_of(row), *cells])
+    return table
+
+
+def cpu_of(row: Row) -> float:
+    """Return the CPU seconds of a whole run."""
+    return sum(float(row[f"{stage}_cpu_s"]) for stage in STAGES)
 
 
 def extraction_table() -> Table:
@@ -426,6 +449,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "map_limits": map_limits_table,
     "lightglue": lightglue_table,
     "runs": runs_table,
+    "runs_cpu": runs_cpu_table,
     "extraction": extraction_table,
     "scale": scale_table,
     "compact_scale": compact_scale_table,

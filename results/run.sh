@@ -88,7 +88,7 @@ run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 32 --storage 
 run compact_scale --data $data/aachen_v1.1 --share 0.1 1 "$@"
 if "$python" -c "import hloc" 2> /dev/null; then
     run against_hloc --dataset $data/herz-jesus "$@" \
-        --feature sift_sv64 colmap_sift_sv64 colmap_sift colmap_sift_sv16
+        --feature sift_sv64 colmap_sift_sv64 colmap_sift_sv16 xfeat_sv32:uint2 mini32:uint2
 fi
 
 run render

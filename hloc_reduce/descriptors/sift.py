@@ -19,7 +19,7 @@ class SIFT(nn.Module):
         patch_size: side of the patches in pixels.
     """
 
-    angles = 8
+    angles = 8  # a power of 2
     clip = 0.2
     pooling: torch.Tensor
 
@@ -47,6 +47,7 @@ class SIFT(nn.Module):
         upper_share = (orientation - lower) * magnitude
         histogram = magnitude.new_zeros(len(patches), self.angles, magnitude.shape[1])
         for angle, share in ((lower, magnitude - upper_share), (lower + 1, upper_share)):
-            histogram.scatter_(1, (angle % self.angles)[:, None], share[:, None])
+            bins = angle & (self.angles - 1)  # the remainder, faster
+            histogram.scatter_(1, bins[:, None], share[:, None])
         descriptors = nn.functional.normalize((histogram @ self.pooling).flatten(1), dim=1)
         return nn.functional.normalize(descriptors.clamp_(0, self.clip), dim=1)
