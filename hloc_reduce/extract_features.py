@@ -180,7 +180,7 @@ def _extract(
 def _workers(model: "Extractor", device: str, images: int) -> int:
     """Return how many of the images are extracted at once."""
     if model.detect is None:
-        images = min(images, model.gpu_images if device == "cuda" else 1)
+        images = min(images, model.gpu_images if device == "cuda" else model.cpu_images)
     return min(images, parallel.cores())
 
 

@@ -40,6 +40,7 @@ class Extractor(BaseModel):
         rotation_invariant: photos match however they are turned. If that depends on the
             configuration, the subclass writes `is_rotation_invariant`, too.
         gpu_images: how many threads may give images to one extractor on a GPU.
+        cpu_images: the same on a CPU, where each computes in one thread; of 1 image all do.
         stride: what the sides of an image are multiples of in `fixed`.
     """
 
@@ -49,6 +50,7 @@ class Extractor(BaseModel):
     dim = DIM
     rotation_invariant = False
     gpu_images = 1
+    cpu_images = 1
     stride = 1
 
     @property

@@ -26,6 +26,7 @@ class EdgePoint2(NetworkExtractor):
     """
 
     stride = Network.stride
+    cpu_images = 8  # 0.3 GB each
     default_conf = {"model_name": "M32", "max_keypoints": 4096, "denoise": True}
 
     def _init(self, conf: dict) -> None:

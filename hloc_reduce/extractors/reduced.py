@@ -17,7 +17,8 @@ class Reduced(Extractor):
     def _init(self, conf: dict) -> None:
         self.extractor = load(conf["base"])
         self.detect, self.dim = self.base.detect, self.base.dim
-        self.detection_noise, self.gpu_images = self.base.detection_noise, self.base.gpu_images
+        self.detection_noise = self.base.detection_noise
+        self.gpu_images, self.cpu_images = self.base.gpu_images, self.base.cpu_images
         self.rotation_invariant = self.base.rotation_invariant
         self.project = None
         if conf["projection"] is None:

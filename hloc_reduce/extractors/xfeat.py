@@ -30,6 +30,7 @@ class XFeat(NetworkExtractor):
     }
     dim = NETWORKS["xfeat"].dim
     stride = 32
+    cpu_images = 8  # 0.3 GB each
 
     def _init(self, conf: dict) -> None:
         from kornia.feature import XFeat as KorniaXFeat
