@@ -40,17 +40,24 @@ def nearest(
     """
     search = best_two.best_two if best_two.instructions() else best_two_of_blocks
     index, *products = search(descriptors0, descriptors1)
-    cosine, runner_up = (
-        part.astype(np.float32) / np.float32(INTEGER_SCALE**2) for part in products
-    )
-    # squared distances of unit vectors are 2 - 2 * cosine
-    distance = 1 - cosine
-    accepted = np.ones(len(index), bool)
-    if distance_threshold is not None:
-        accepted = 2 * distance <= distance_threshold**2
+    cosine, runner_up = map(_cosine, products)
+    accepted = _is_near(cosine, distance_threshold)
     if ratio_threshold is not None:
-        accepted &= distance <= np.float32(ratio_threshold**2) * (1 - runner_up)
+        accepted &= 1 - cosine <= np.float32(ratio_threshold**2) * (1 - runner_up)
     return np.where(accepted, index, -1).astype(np.int64), cosine
+
+
+def _cosine(product: np.ndarray) -> np.ndarray:
+    """Return the cosines (N,) float32 of products of descriptors as integers (N,)."""
+    return product.astype(np.float32) / np.float32(INTEGER_SCALE**2)
+
+
+def _is_near(cosine: np.ndarray, distance_threshold: float | None) -> np.ndarray:
+    """Return which cosines (N,) are of distances up to a threshold, if there is one."""
+    if distance_threshold is None:
+        return np.ones(len(cosine), bool)
+    # squared distances of unit vectors are 2 - 2 * cosine
+    return 2 * (1 - cosine) <= distance_threshold**2
 
 
 def best_two_of_blocks(
@@ -121,6 +128,11 @@ def mutual_nearest(
     if min(len(descriptors0), len(descriptors1)) == 1:
         ratio_threshold = None
     limits = ratio_threshold, distance_threshold
+    if mutual and rows is None and ratio_threshold is None and best_two.instructions():
+        index, product, back = best_two.best_both(descriptors0, descriptors1)
+        cosine, found = _cosine(product), back[index] == np.arange(len(index))
+        matched = found & _is_near(cosine, distance_threshold)
+        return np.where(matched, index, -1).astype(np.int64), cosine
     forward, cosine = nearest(chosen, descriptors1, *limits)
     if not mutual:
         return forward, cosine

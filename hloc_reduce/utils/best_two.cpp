@@ -1,4 +1,5 @@
-// The two largest dot products of each row of integers with the rows of a second matrix.
+// The two largest dot products of each row of integers with the rows of a second matrix, or the
+// largest of each row of both.
 //
 // Products stay in registers: those of a row of `a` with LANES rows of `b` are summed in the lanes
 // of one vector and compared with the best two of each lane so far. This file includes itself once
@@ -24,8 +25,9 @@ namespace {
 constexpr int ROWS = 4;  // of a at once
 constexpr int32_t NOTHING = -(1 << 30);  // below every product
 
+// With `second`, the two largest of each row of a; with `back`, the largest of each row of both.
 using Search = void (*)(const int16_t* a, int64_t n, const int16_t* b, int64_t m, int64_t dim,
-                        int32_t* index, int32_t* best, int32_t* second);
+                        int32_t* index, int32_t* best, int32_t* second, int32_t* back);
 
 // Each instruction set defines TARGET, an attribute of its functions; LANES, 32-bit sums in a
 // vector; and GROUP numbers of type NUMBER, which `dot` multiplies in each lane by those in the
@@ -85,15 +87,15 @@ bool is_supported() { return true; }
 struct Instructions {
     const char* name;
     bool (*is_supported)();
-    Search search;
+    Search best_two, best_both;
 };
 
 const Instructions ALL[] = {  // fastest first
 #if defined(__x86_64__)
-    {"AVX-512 VNNI", vnni::is_supported, vnni::search},
-    {"AVX2", avx2::is_supported, avx2::search},
+    {"AVX-512 VNNI", vnni::is_supported, vnni::search<false>, vnni::search<true>},
+    {"AVX2", avx2::is_supported, avx2::search<false>, avx2::search<true>},
 #endif
-    {"plain", plain::is_supported, plain::search},
+    {"plain", plain::is_supported, plain::search<false>, plain::search<true>},
 };
 
 }  // namespace
@@ -115,8 +117,15 @@ const char* best_two_name(int instructions) {
 // between -2^30 and 2^30.
 void best_two(int instructions, const int16_t* a, int64_t n, const int16_t* b, int64_t m,
               int64_t dim, int32_t* index, int32_t* best, int32_t* second) {
-    ALL[instructions].search(a, n, b, m, dim, index, best, second);
+    ALL[instructions].best_two(a, n, b, m, dim, index, best, second, nullptr);
     if (m == 1) std::fill(second, second + n, INT32_MIN);
+}
+
+// Search for each row of a (n, dim), n > 0, and each row of b (m, dim), m > 0: the first row of the
+// other one with the largest dot product; and that product for a.
+void best_both(int instructions, const int16_t* a, int64_t n, const int16_t* b, int64_t m,
+               int64_t dim, int32_t* index, int32_t* best, int32_t* back) {
+    ALL[instructions].best_both(a, n, b, m, dim, index, best, nullptr, back);
 }
 }
 
@@ -139,14 +148,17 @@ NUMBER* pack(const int16_t* rows, int64_t count, int64_t dim, int64_t lanes,
     return packed;
 }
 
+template <bool BOTH>
 TARGET void search(const int16_t* a, int64_t n, const int16_t* b, int64_t m, int64_t dim,
-                   int32_t* index, int32_t* best, int32_t* second) {
+                   int32_t* index, int32_t* best, int32_t* second, int32_t* back) {
     std::vector<NUMBER> memory_a, memory_b;
     const NUMBER* packed_a = pack(a, n, dim, 1, memory_a);
     const NUMBER* packed_b = pack(b, m, dim, LANES, memory_b);
     const int64_t groups = (dim + GROUP - 1) / GROUP, blocks = (m + LANES - 1) / LANES;
     Vector missing = {};  // lanes without a row, in the last block
     for (int64_t lane = m - (blocks - 1) * LANES; lane < LANES; ++lane) missing[lane] = NOTHING;
+    // of each row of b, lane by lane: the largest product so far, and its row of a
+    std::vector<int32_t> of_b(BOTH ? blocks * LANES : 0, INT32_MIN), row_of_a(of_b.size());
     for (int64_t i = 0; i < n; i += ROWS) {
         const NUMBER* row[ROWS];
         Vector highest[ROWS], next[ROWS], where[ROWS];
@@ -169,10 +181,23 @@ TARGET void search(const int16_t* a, int64_t n, const int16_t* b, int64_t m, int
                 }
             }
             for (int r = 0; r < ROWS; ++r) {
-                const Vector lower = sum[r] < highest[r] ? sum[r] : highest[r];
-                next[r] = lower > next[r] ? lower : next[r];
+                if constexpr (!BOTH) {
+                    const Vector lower = sum[r] < highest[r] ? sum[r] : highest[r];
+                    next[r] = lower > next[r] ? lower : next[r];
+                }
                 where[r] = sum[r] > highest[r] ? Vector{} + (int32_t)block : where[r];
                 highest[r] = sum[r] > highest[r] ? sum[r] : highest[r];
+            }
+            if constexpr (BOTH) {
+                Vector top, from;
+                std::memcpy(&top, &of_b[block * LANES], sizeof top);
+                std::memcpy(&from, &row_of_a[block * LANES], sizeof from);
+                for (int r = 0; r < ROWS; ++r) {
+                    from = sum[r] > top ? Vector{} + (int32_t)(i + r) : from;
+                    top = sum[r] > top ? sum[r] : top;
+                }
+                std::memcpy(&of_b[block * LANES], &top, sizeof top);
+                std::memcpy(&row_of_a[block * LANES], &from, sizeof from);
             }
         }
         int32_t lanes[ROWS][3][LANES];  // a copy: vectors that are indexed leave the registers
@@ -192,9 +217,10 @@ TARGET void search(const int16_t* a, int64_t n, const int16_t* b, int64_t m, int
             }
             index[i + r] = (int32_t)first;
             best[i + r] = top;
-            second[i + r] = runner_up;
+            if constexpr (!BOTH) second[i + r] = runner_up;
         }
     }
+    if constexpr (BOTH) std::copy_n(row_of_a.begin(), m, back);
 }
 
 #undef TARGET

@@ -1,4 +1,4 @@
-"""The best two products of integers: compiled code, NumPy and the definition agree."""
+"""The best products of integers: compiled code, NumPy and the definition agree."""
 
 import numpy as np
 import pytest
@@ -50,6 +50,19 @@ def test_each_instruction_set_agrees_with_the_definition(kind, instruction_set):
             for values, right in zip(found, by_definition(rows0, rows1), strict=True):
                 assert values.dtype == np.int32
                 np.testing.assert_array_equal(values, right)
+
+
+@compiled
+@pytest.mark.parametrize("instruction_set", best_two.instructions())
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_best_rows_of_both_sides_agree_with_the_definition(kind, instruction_set):
+    for number0, number1 in SIZES[1:]:
+        for dim in DIMS:
+            rows0, rows1 = draw(number0, dim, kind, 0), draw(number1, dim, kind, 1)
+            index, best, back = best_two.best_both(rows0, rows1, instruction_set)
+            right, highest, _ = by_definition(rows0, rows1)
+            assert index.tolist() == right.tolist() and best.tolist() == highest.tolist()
+            assert back.tolist() == by_definition(rows1, rows0)[0].tolist()
 
 
 @pytest.mark.parametrize("kind", KINDS)
