@@ -161,7 +161,7 @@ def test_lightglue(name, onnx, run, base_weights, tmp_path):
     run("--feature", name, "--matcher", "lightglue", "--output", path)
     loaded, matcher = session(path), LightGlue({"features": name, **WHOLE})
     dim, generator = features.dimension(name), torch.Generator().manual_seed(0)
-    size = torch.tensor([480.0, 640.0])
+    sizes = torch.tensor([[480.0, 640.0], [900.0, 520.0]])
     for number0, number1 in ((150, 90), (1, 2)):
         described = normalize(torch.randn(150, dim, generator=generator), dim=1)
         places = torch.rand(150, 2, generator=generator) * 500 - 5  # some are outside
@@ -169,8 +169,8 @@ def test_lightglue(name, onnx, run, base_weights, tmp_path):
         for i, number in enumerate((number0, number1)):
             one = {"keypoints": places[:number], "descriptors": described[:number]}
             given |= {f"{key}{i}": part.numpy() for key, part in one.items()}
-            given[f"image_size{i}"] = size.numpy()
-            pair |= {f"keypoints{i}": one["keypoints"][None], f"image_size{i}": size[None]}
+            given[f"image_size{i}"] = sizes[i].numpy()
+            pair |= {f"keypoints{i}": one["keypoints"][None], f"image_size{i}": sizes[i][None]}
             pair[f"descriptors{i}"] = one["descriptors"].T[None]
         matches, scores = loaded.run(["matches0", "matching_scores0"], given)
         expected = matcher(pair)
