@@ -13,6 +13,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
+
 from . import __version__, logger, projections
 from .confs import features as features_confs
 from .confs import matchers as matchers_confs
@@ -28,13 +30,10 @@ if TYPE_CHECKING:
 
 OPSET = 18
 ONNX_TOLERANCE = 1e-4  # between ONNX Runtime and torch
-# of a matcher: random descriptors are unlike any that it learned from, so that rounding shows
-MATCHER_TOLERANCE = 1e-3
 PACKAGES = ("onnx", "onnxruntime", "onnxscript")
 # images of these sides, in strides, make the graph and check it
 MADE_WITH, CHECKED_WITH = (3, 4), (8, 11)
 MATCHERS = ("lightglue",)
-SIZE = (640.0, 480.0)  # of the photos that check a matcher
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,6 @@ class Content:
         checked_with: inputs of another size.
         expected: the outputs for `checked_with`.
         metadata: of the file.
-        tolerance: greatest difference of the outputs from `expected`.
     """
 
     module: "torch.nn.Module"
@@ -61,7 +59,6 @@ class Content:
     checked_with: "tuple[torch.Tensor, ...]"
     expected: "tuple[torch.Tensor, ...]"
     metadata: dict[str, str]
-    tolerance: float = ONNX_TOLERANCE
 
 
 @strings_as_paths
@@ -199,31 +196,36 @@ def _matcher(name: str, conf: dict) -> Content:
     """Return the content of the file of LightGlue for a feature."""
     import torch
 
-    from . import extract_features
+    from . import extract_features, extractors
     from .matchers.lightglue import Graph, LightGlue
 
     made_from = extract_features.provenance(conf)
     model = matchers_confs.for_features(matchers_confs.confs["lightglue"]["model"], made_from)
     graph = Graph(LightGlue(model).eval())
-    dim, generator = graph.dim, torch.Generator().manual_seed(0)
+    dim, extractor = graph.dim, extractors.load(conf["model"]).eval()
+    picture = (255 * _image(512, 640)[0]).byte().permute(1, 2, 0).numpy()
+    # of two sizes: of equal tensors the export keeps one, for both photos
+    found = [
+        extractors.extract(extractor, np.ascontiguousarray(photo), conf["preprocessing"])
+        for photo in (picture, picture[32:, 64:])
+    ]
 
     def inputs(*numbers: int) -> tuple[torch.Tensor, ...]:
-        """Return the features of two photos of the same keypoints, and others of their own."""
-        described = torch.randn(sum(numbers), dim, generator=generator)
-        described = torch.nn.functional.normalize(described, dim=1)
-        places = torch.rand(sum(numbers), 2, generator=generator) * torch.tensor(SIZE)
-        kept = slice(numbers[0]), slice(numbers[1], None)
+        """Return some features of a picture and of a part of it."""
         return tuple(
-            part
-            # of two sizes: of equal tensors the export keeps one, for both photos
-            for keep, size in zip(kept, (SIZE, SIZE[::-1]), strict=True)
-            for part in (places[keep], described[keep], torch.tensor(size))
+            torch.from_numpy(np.ascontiguousarray(part)).float()
+            for number, one in zip(numbers, found, strict=True)
+            for part in (
+                one["keypoints"][:number],
+                one["descriptors"].T[:number],
+                one["image_size"],
+            )
         )
 
     checked_with = inputs(300, 200)
     with torch.no_grad():
         expected = graph(*checked_with)
-    assert (expected[0] >= 0).any()  # the same keypoints
+    assert (expected[0] >= 0).any()
     return Content(
         graph,
         {
@@ -247,7 +249,6 @@ def _matcher(name: str, conf: dict) -> Content:
             "max_keypoints": str(model["max_keypoints"]),
             "left_out": "early exit and pruning",
         },
-        MATCHER_TOLERANCE,
     )
 
 
@@ -306,7 +307,7 @@ def _check(content: Content, path: Path) -> float:
     """Return the greatest difference between ONNX Runtime and torch; of scores, the relative one.
 
     Raises:
-        InputError: when it is above the tolerance, or the keypoints are others.
+        InputError: when it is above `ONNX_TOLERANCE`, or the keypoints are others.
     """
     import onnxruntime
     import torch
@@ -325,10 +326,10 @@ def _check(content: Content, path: Path) -> float:
         if "scores" in names:  # may be logits of any size
             errors[1] /= 1 + content.expected[1].abs()
         difference = max((float(error.max()) for error in errors if error.numel()), default=0.0)
-    if not difference <= content.tolerance:
+    if not difference <= ONNX_TOLERANCE:
         raise InputError(
             f"ONNX Runtime does not compute what torch computes: they differ by {difference:.0e} "
-            f"instead of at most {content.tolerance:.0e}. No file was written. Try the versions of "
+            f"instead of at most {ONNX_TOLERANCE:.0e}. No file was written. Try the versions of "
             "onnx, onnxruntime, onnxscript and torch in constraints.txt."
         )
     return difference

@@ -27,7 +27,7 @@ from benchmarks import trials as benchmark_trials
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.localization import gate
+from hloc_reduce.localization import absolute_pose, gate
 from hloc_reduce.utils.cli import InputError
 from pipelines.batch import jobs
 from pipelines.batch.jobs import Job
@@ -205,6 +205,15 @@ def test_how_often_the_gate_errs_in_the_trials(trials):
     assert share([row for row in wrong if row["kind"] in trial_rows.STRANGERS]) == 0
     assert share([row for row in wrong if row["intrinsics"] == "off"]) <= 0.05
     assert share([row for row in wrong if row["kind"] in trial_rows.RESHAPED]) <= 0.1
+
+
+def test_no_pose_of_another_place_is_certain_and_most_right_ones_are(trials):
+    poses = [row for row in trials if "measures" in row]
+    elsewhere = [row["measures"].confidence for row in poses if row["kind"] == "other"]
+    assert len(elsewhere) > 1500 and 1.5 * max(elsewhere) < absolute_pose.CERTAIN
+    own = [row for row in poses if row["kind"] in tables.OWN and row["outcome"] == "true"]
+    certain = [row["measures"].confidence >= absolute_pose.CERTAIN for row in own]
+    assert np.mean(certain) > 0.95
 
 
 def test_labels_of_trials():

@@ -16,13 +16,14 @@ from .pose import Matches, Pose, quality
 from .projection import ALL, FOCAL, POSE, reprojection_errors
 
 SEED = 0
-LIKELIEST = 500  # matches that are tried before all
-CERTAIN = 60.0  # confidence of a pose at which no other matches are tried
+SAMPLE = 500  # matches, at most, from which a pose is tried before all, or a rival is estimated
+# confidence of a pose at which no other matches are tried, twice the highest of photos of other
+# places in results/trials
+CERTAIN = 60.0
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 REESTIMATIONS = 3  # from the inliers among all matches
-RIVAL_SAMPLE = 500  # matches, at most, from which a rival is estimated
 # The lens of the map's photos has probably taken a photo if the confidence with it is at least this
 # multiple of that with estimated intrinsics, and its focal length is within this many standard
 # deviations of the estimated one or within this share of it, or the inliers fit better.
@@ -69,7 +70,7 @@ def estimate(
     with ThreadPoolExecutor(workers) as pool:
         poses = [_estimate(matches, _likeliest(images, number))]
         is_certain = poses[0].confidence >= CERTAIN
-        if number > LIKELIEST and not is_certain:
+        if number > SAMPLE and not is_certain:
             poses.insert(0, _estimate(matches, np.arange(number)))
         if thorough and not is_certain and poses[0].num_inliers < CLEAR * number:
             tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
@@ -90,7 +91,7 @@ def estimate(
 
 
 def _likeliest(images: list[np.ndarray], number: int) -> np.ndarray:
-    """Return the indices of those `LIKELIEST` of a number of matches that are right most often.
+    """Return the indices of those `SAMPLE` of a number of matches that are right most often.
 
     These are matches of several images, and then the most similar ones of each image.
 
@@ -102,7 +103,7 @@ def _likeliest(images: list[np.ndarray], number: int) -> np.ndarray:
     for chosen in images:
         times[chosen] += 1
         rank[chosen] = np.minimum(rank[chosen], np.arange(len(chosen)))
-    return np.sort(np.lexsort((rank, -times))[:LIKELIEST])
+    return np.sort(np.lexsort((rank, -times))[:SAMPLE])
 
 
 def _measures(
@@ -183,7 +184,7 @@ def _of_outliers(matches: Matches, pose: Pose) -> list[Pose]:
         return []
     # half as many inliers as a rival of this confidence is expected to have
     least = ALTERNATIVES["rival"].ratio / 2 * pose.num_inliers / len(others)
-    sample = np.random.default_rng(SEED).permutation(others)[:RIVAL_SAMPLE]
+    sample = np.random.default_rng(SEED).permutation(others)[:SAMPLE]
     return [_estimate(matches, sample, max(LEAST_RATIO, least))]
 
 

@@ -67,7 +67,7 @@ def test_wrong_matches_are_never_trusted(number, config):
 
 
 def test_the_likeliest_matches_are_those_of_several_images_then_the_most_similar(monkeypatch):
-    monkeypatch.setattr(absolute_pose, "LIKELIEST", 4)
+    monkeypatch.setattr(absolute_pose, "SAMPLE", 4)
     images = [np.array([5, 0, 1]), np.array([3, 4, 5, 0]), np.array([2, 6])]
     # 0 and 5 are of two images, and 2 and 3 are the first ones of theirs
     assert absolute_pose._likeliest(images, 8).tolist() == [0, 2, 3, 5]
@@ -401,7 +401,7 @@ def test_a_rival_is_found_in_a_sample_of_many_matches(monkeypatch):
 
     monkeypatch.setattr(absolute_pose, "_estimate", counted)
     found = solve(keypoints, points, [np.arange(800), np.arange(800, 3000)])
-    assert numbers[-1] == absolute_pose.RIVAL_SAMPLE
+    assert numbers[-1] == absolute_pose.SAMPLE
     assert found.refusal is not None
     assert re.fullmatch("ambiguous: another pose has [56].. inliers, this one 8..", found.refusal)
 
