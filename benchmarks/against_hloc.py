@@ -1,10 +1,11 @@
 """Time this project and hloc stage by stage on a data set in Aachen's layout, all images paired.
 
 hloc extracts `sift` and matches with NN-ratio; this project does the same with each --feature and
-its matcher. Each run is a new process that starts with an empty folder and ends with poses. Runs
-take turns, and the fastest of several rounds counts. Needs hloc and a pycolmap that it works with.
-Adds rows to results/runs.csv: seconds and CPU seconds of each stage, file sizes, and queries within
-the finest threshold; and the CPU seconds in one thread without which two stages cannot do.
+its matcher, and SIFT's with each of --keypoints. Each run is a new process that starts with an
+empty folder and ends with poses. Runs take turns, and the fastest of several rounds counts. Needs
+hloc and a pycolmap that it works with. Adds rows to results/runs.csv: seconds and CPU seconds of
+each stage, file sizes, and queries within the finest threshold; and the CPU seconds in one thread
+without which two stages cannot do.
 """
 
 import argparse
@@ -16,12 +17,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import h5py
 
 from benchmarks import rows
+from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import thresholds, true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS
@@ -37,28 +40,54 @@ from hloc_reduce.utils.parsers import parse_pairs, parse_poses, write_pairs
 
 NAME = "runs"
 HLOC = "hloc"
-KEYS = "feature", "storage"
+KEYS = "feature", "storage", "variant"
 
 
-def parted(name: str) -> tuple[str, str]:
-    """Return the feature and the storage of FEATURE or FEATURE:STORAGE."""
-    feature, _, storage = name.partition(":")
-    return feature, storage or STORAGES[0]
+@dataclass(frozen=True)
+class Run:
+    """What runs: hloc, or this project with a feature.
+
+    Args:
+        name: `HLOC`, FEATURE or FEATURE:STORAGE.
+        keypoints: settings of DoG; empty where they change nothing.
+    """
+
+    name: str
+    keypoints: str = ""
+
+    def cells(self) -> dict[str, str]:
+        """Return the cells of its row that name it."""
+        feature, _, storage = self.name.partition(":")
+        variant = f"{self.keypoints} keypoints" if self.keypoints else ""
+        return dict(zip(KEYS, (feature, storage or STORAGES[0], variant), strict=True))
+
+    def conf(self) -> dict:
+        """Return the configuration of the feature."""
+        feature, storage, _ = self.cells().values()
+        keypoints = self.keypoints or KEYPOINT_SETTINGS[0]
+        return features_confs.get(feature, storage=storage, keypoints=keypoints)[1]
 
 
-def stages_of(name: str, keypoints: str, queries: list[str]) -> dict[str, Callable]:
+def runs(names: list[str], settings: list[str]) -> list[Run]:
+    """List the runs of hloc and of features, each at its DoG keypoints with all settings."""
+    listed = [Run(HLOC)]
+    for name in names:
+        at_dog = features_confs.descriptor_of(Run(name).conf()["model"])
+        listed += [Run(name, one) for one in settings] if at_dog else [Run(name)]
+    return listed
+
+
+def stages_of(which: Run, queries: list[str]) -> dict[str, Callable]:
     """Return the stages of hloc or of this project, and the configurations they run with."""
-    if name == HLOC:
+    if which.name == HLOC:
         extractors_package()  # says what to install where hloc is missing or too old
         from hloc import extract_features, localize_sfm, match_features, triangulation
 
         conf, matcher, extract = extract_features.confs["sift"], "NN-ratio", extract_features.main
     else:
         from hloc_reduce import extract_features, localize_sfm, match_features, triangulation
-        from hloc_reduce.confs import features as features_confs
 
-        feature, storage = parted(name)
-        _, conf = features_confs.get(feature, storage=storage, keypoints=keypoints)
+        conf = which.conf()
         matcher = features_confs.matcher_of(conf)
         extract = partial(extract_features.main, queries=queries)
     return {
@@ -107,7 +136,7 @@ def limits(conf: dict, images: Path, features: Path, pair_lists: list[Path]) -> 
     return seconds
 
 
-def run(name: str, dataset: Path, outputs: Path, keypoints: str) -> dict:
+def run(which: Run, dataset: Path, outputs: Path) -> dict:
     """Localize the queries of a data set and time each stage."""
     place = Aachen(dataset)
     database = place.map_names()
@@ -116,7 +145,7 @@ def run(name: str, dataset: Path, outputs: Path, keypoints: str) -> dict:
     sfm_pairs, loc_pairs = outputs / "pairs-sfm.txt", outputs / "pairs-loc.txt"
     write_pairs(list(itertools.combinations(database, 2)), sfm_pairs)
     write_pairs(list(itertools.product(queries, database)), loc_pairs)
-    used = stages_of(name, keypoints, queries)
+    used = stages_of(which, queries)
     seconds: dict[str, float] = {}
     of_cpu: dict[str, float] = {}
     start, cpu_start = time.perf_counter(), cpu_seconds()
@@ -147,6 +176,8 @@ def run(name: str, dataset: Path, outputs: Path, keypoints: str) -> dict:
         estimates = parse_poses(outputs / f"{key}.txt")
         errors = [pose_error(estimates.get(Path(query).name), truth[query]) for query in part]
         within += round(recall(errors, thresholds(key)[:1])[0] * len(part) / 100)
+    pair_lists = [sfm_pairs, loc_pairs]
+    least = {} if which.name == HLOC else limits(conf, place.images, features, pair_lists)
     return {
         "photos": len(database),
         "points": colmap.read_model(sfm).num_points3D(),
@@ -154,7 +185,7 @@ def run(name: str, dataset: Path, outputs: Path, keypoints: str) -> dict:
         **{f"{stage}_cpu_s": value for stage, value in of_cpu.items()},
         "feature_mb": features.stat().st_size / MEGABYTE,
         "match_mb": sum(path.stat().st_size for path in (matches, loc_matches)) / MEGABYTE,
-        **(limits(conf, place.images, features, [sfm_pairs, loc_pairs]) if name != HLOC else {}),
+        **least,
         "queries": len(queries),
         "within_finest": within,
         "seconds": sum(seconds.values()),
@@ -166,36 +197,39 @@ def _main() -> None:
     parser.add_argument("--dataset", type=Path, required=True, help="with true poses of queries")
     parser.add_argument(
         "--feature",
-        nargs="+",
+        nargs="*",
         default=["sift_sv64", "colmap_sift_sv64"],
         help="of this project, with the storage of its map, such as mini32:uint2",
     )
-    parser.add_argument("--keypoints", choices=KEYPOINT_SETTINGS, default=KEYPOINT_SETTINGS[0])
+    parser.add_argument(
+        "--keypoints", nargs="+", choices=KEYPOINT_SETTINGS, default=[KEYPOINT_SETTINGS[0]]
+    )
     parser.add_argument("--rounds", type=int, default=3, help="rounds in which all take turns")
-    parser.add_argument("--once", help=argparse.SUPPRESS)
+    parser.add_argument("--once", action="store_true", help=argparse.SUPPRESS)
     rows.add_again_option(parser)
     args = parser.parse_args()
+    taking_turns = runs(args.feature, args.keypoints)
     if args.once:
         with tempfile.TemporaryDirectory() as temporary:
-            print("\n" + json.dumps(run(args.once, args.dataset, Path(temporary), args.keypoints)))
+            print("\n" + json.dumps(run(taking_turns[-1], args.dataset, Path(temporary))))
         return
     cli.check_positive(args, "rounds")
-    names = [HLOC, *args.feature]
-    place = {"place": args.dataset.name, "variant": f"{args.keypoints} keypoints"}
-    cells = {name: {**place, **dict(zip(KEYS, parted(name), strict=True))} for name in names}
+    place = {"place": args.dataset.name}
     known = rows.read(NAME)
-    if not args.again and all(rows.select(known, **cells[name]) for name in names):
+    if not args.again and all(rows.select(known, **place, **one.cells()) for one in taking_turns):
         return  # a run is only compared with those that it took turns with
-    best: dict[str, dict] = {}
-    for _, name in itertools.product(range(args.rounds), names):
-        command = [sys.executable, "-m", "benchmarks.against_hloc", "--once", name]
-        command += ["--dataset", str(args.dataset), "--keypoints", args.keypoints]
+    best: dict[Run, dict] = {}
+    for _, one in itertools.product(range(args.rounds), taking_turns):
+        command = [sys.executable, "-m", "benchmarks.against_hloc", "--once"]
+        command += ["--dataset", str(args.dataset), "--feature"]
+        command += [] if one.name == HLOC else [one.name]
+        command += ["--keypoints", one.keypoints] if one.keypoints else []
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
         if done.returncode:
-            raise InputError(f"{name} failed.")
+            raise InputError(f"{one.name} failed.")
         result = json.loads(done.stdout.splitlines()[-1])
-        best[name] = min(result, best.get(name, result), key=lambda each: each["seconds"])
-    rows.add(NAME, [cells[name] | rows.how() | best[name] for name in names])
+        best[one] = min(result, best.get(one, result), key=lambda each: each["seconds"])
+    rows.add(NAME, [place | one.cells() | rows.how() | best[one] for one in taking_turns])
 
 
 if __name__ == "__main__":

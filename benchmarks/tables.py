@@ -10,6 +10,7 @@ from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs.features import matcher_of
+from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS
 from hloc_reduce.localization.exif import WELL_KNOWN
 from hloc_reduce.localization.gate import DEFAULT_GATE, FOCAL_LENGTHS, REFINED, RULES
 from hloc_reduce.mapping.adjustment import GAIN_OF_FREE, MAX_ADJUSTED_IMAGES
@@ -289,8 +290,15 @@ def runs_table() -> Table:
         cells += [f"{float(row['seconds']):.1f}"]
         cells += [f"{float(reference['seconds']) / float(row['seconds']):.1f}"]
         cells += [f"{float(row['feature_mb']):.1f}", f"{float(row['match_mb']):.2f}"]
-        table.append([name_of(row), *cells])
+        table.append([run_name(row), *cells])
     return table
+
+
+def run_name(row: Row) -> str:
+    """Name the feature of a run, and its keypoints unless they are found as by default."""
+    keypoints = row["variant"].removesuffix(" keypoints")
+    usual = keypoints in ("", KEYPOINT_SETTINGS[0])
+    return name_of(row) + ("" if usual else f", `{keypoints}` keypoints")
 
 
 def name_of(row: Row) -> str:
@@ -306,7 +314,7 @@ def runs_cpu_table() -> Table:
         cells = [f"{float(row[f'{stage}_cpu_s']):.1f}" for stage in STAGES]
         limits = [row["extraction_limit_s"], row["matching_limit_s"]]
         cells += [f"{cpu_of(row):.1f}", *(f"{float(one):.1f}" if one else "" for one in limits)]
-        table.append([name_of(row), *cells])
+        table.append([run_name(row), *cells])
     return table
 
 

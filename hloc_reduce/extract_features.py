@@ -160,7 +160,7 @@ def _extract(
     model = next(iter(models.values()))
     detect, workers = model.detect, _workers(model, device, len(items))
     with ExitStack() as stack:
-        if detect and workers > 1:
+        if detect and model.detection_blocks and workers > 1:
             submit = stack.enter_context(processes.pool(workers)).submit
             detect = partial(_detect_elsewhere, submit, detect)
         extract = partial(

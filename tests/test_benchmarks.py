@@ -169,7 +169,18 @@ def test_figures_show_what_the_rows_say(name, monkeypatch):
 def test_without_hloc_the_comparison_says_what_to_install(monkeypatch):
     monkeypatch.setattr("hloc_reduce.utils.hloc.is_installed", lambda: False)
     with pytest.raises(InputError, match="hloc is not installed: pip install"):
-        against_hloc.stages_of("hloc", "adaptive", [])
+        against_hloc.stages_of(against_hloc.Run("hloc"), [])
+
+
+def test_features_of_sift_run_with_each_setting_of_the_keypoints():
+    listed = against_hloc.runs(["sift_sv64", "mini32:uint2"], ["hloc", "fast"])
+    assert [list(run.cells().values()) for run in listed] == [
+        ["hloc", "float16", ""],
+        ["sift_sv64", "float16", "hloc keypoints"],
+        ["sift_sv64", "float16", "fast keypoints"],
+        ["mini32", "uint2", ""],
+    ]
+    assert listed[2].conf()["model"]["base"]["keypoints"] == "fast"
 
 
 def test_jobs_without_rows_are_written_as_they_were_read(tmp_path):

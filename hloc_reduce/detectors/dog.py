@@ -15,15 +15,18 @@ import numpy as np
 from ..utils import colmap
 from ..utils.cli import choose
 from ..utils.options import Option
+from . import opencv
 
 HLOC_OPTIONS = {"first_octave": 0, "peak_threshold": 0.01}
 COLMAP_OPTIONS = {"first_octave": -1, "peak_threshold": 0.0067}
-# name -> the settings to try first, and whether to try others if these find too few keypoints
+# name -> the options to try first, and whether to try others if these find too few keypoints
 SETTINGS = {
     "adaptive": (HLOC_OPTIONS, True),
     "colmap": (COLMAP_OPTIONS, True),
     "hloc": (HLOC_OPTIONS, False),
+    "fast": (HLOC_OPTIONS, True),
 }
+FAST = "fast"  # found by OpenCV
 KEYPOINT_SETTINGS = tuple(SETTINGS)
 KeypointSettings = Annotated[
     str,
@@ -31,7 +34,8 @@ KeypointSettings = Annotated[
         "keypoints",
         KEYPOINT_SETTINGS,
         "adaptive finds more keypoints in small, dark and hazy photos; colmap finds several times "
-        "as many in every photo; hloc uses hloc's settings for every photo",
+        "as many in every photo; hloc uses hloc's settings for every photo; fast finds them by "
+        "OpenCV in photos of half the size, in a quarter of the time",
     ),
 ]
 
@@ -70,7 +74,12 @@ def detector(conf: dict) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]
     colmap.check_dog_options(conf["options"])
     own = conf["options"] != HLOC_OPTIONS
     options, adaptive = (conf["options"], False) if own else SETTINGS[name]
-    return partial(detect, options=options, adaptive=adaptive)
+    return partial(detect, options=options, adaptive=adaptive, fast=is_fast(conf))
+
+
+def is_fast(conf: dict) -> bool:
+    """Tell whether OpenCV, not COLMAP, detects keypoints with a conf like `DEFAULT_CONF`."""
+    return conf["keypoints"] == FAST and conf["options"] == HLOC_OPTIONS
 
 
 def is_rotation_invariant(conf: dict) -> bool:
@@ -89,7 +98,7 @@ def strongest(
 
 
 def detect(
-    image: np.ndarray, options: dict, adaptive: bool = False
+    image: np.ndarray, options: dict, adaptive: bool = False, fast: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Detect and describe keypoints.
 
@@ -98,11 +107,13 @@ def detect(
         options: of pycolmap's SiftExtractionOptions.
         adaptive: try other settings if `options` find too few keypoints, unless the image shows
             nothing but noise.
+        fast: detect them by OpenCV.
 
     Returns:
         Keypoints and descriptors, see `colmap.detect_dog`.
     """
-    found = colmap.detect_dog(image, options)
+    search = opencv.detect if fast else colmap.detect_dog
+    found = search(image, options)
     enough = min(ENOUGH_KEYPOINTS, image.size / PIXELS_PER_KEYPOINT)
     if not adaptive or len(found[0]) >= enough or is_noise(image):
         return found
@@ -111,7 +122,7 @@ def detect(
         settings = {"first_octave": first_octave, "peak_threshold": peak_threshold}
         if first_octave > options["first_octave"] or peak_threshold >= options["peak_threshold"]:
             continue
-        more = colmap.detect_dog(image, {**options, **settings})
+        more = search(image, {**options, **settings})
         found = more if len(more[0]) > len(found[0]) else found
         if len(found[0]) >= enough:
             break

@@ -36,6 +36,7 @@ class Extractor(BaseModel):
         detection_noise: standard deviation of the keypoints in pixels.
         detect: detects the keypoints, if that can be done in another process (pickled), separately
             from describing them; `_forward` gets the result as `detected`.
+        detection_blocks: `detect` lets no other thread of its process run meanwhile.
         dim: dimension of the descriptors, as far as it is known.
         rotation_invariant: photos match however they are turned. If that depends on the
             configuration, the subclass writes `is_rotation_invariant`, too.
@@ -47,6 +48,7 @@ class Extractor(BaseModel):
     required_inputs = ("image",)
     detection_noise = 1.0
     detect: Detect | None = None
+    detection_blocks = True
     dim = DIM
     rotation_invariant = False
     gpu_images = 1

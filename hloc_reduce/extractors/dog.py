@@ -79,8 +79,8 @@ class DoG(Extractor):
 
     `keypoints` names the settings of DoG: "adaptive" uses hloc's, and others in photos where these
     find too few (`detectors.dog.detect`); "colmap" uses COLMAP's, which find several times as many,
-    with the same fallback; "hloc" uses hloc's for every photo. `options` that differ from hloc's
-    override `keypoints`.
+    with the same fallback; "hloc" uses hloc's for every photo; "fast" finds them by OpenCV, whose
+    descriptors take the place of COLMAP's. `options` that differ from hloc's override `keypoints`.
     """
 
     default_conf = dog.DEFAULT_CONF
@@ -91,6 +91,7 @@ class DoG(Extractor):
         descriptor = choose("descriptor", conf["descriptor"], BASE_DESCRIPTORS)
         self.describe = None if descriptor == COLMAP_SIFT else Descriptor(descriptor)
         self.detect = dog.detector(conf)
+        self.detection_blocks = not dog.is_fast(conf)
         self.rotation_invariant = self.is_rotation_invariant(conf)
 
     @classmethod

@@ -18,6 +18,7 @@ class Reduced(Extractor):
         self.extractor = load(conf["base"])
         self.detect, self.dim = self.base.detect, self.base.dim
         self.detection_noise = self.base.detection_noise
+        self.detection_blocks = self.base.detection_blocks
         self.gpu_images, self.cpu_images = self.base.gpu_images, self.base.cpu_images
         self.rotation_invariant = self.base.rotation_invariant
         self.project = None

@@ -7,7 +7,7 @@ import torch
 from kornia.feature.laf import extract_patches_from_pyramid, laf_from_center_scale_ori
 from scipy.spatial import cKDTree
 
-from hloc_reduce.detectors import dog
+from hloc_reduce.detectors import dog, opencv
 from hloc_reduce.extractors.dog import DoG, extract_patches
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
@@ -146,6 +146,46 @@ def test_settings_follow_the_photo(textured):
     assert len(dog.detect(small, dog.HLOC_OPTIONS)[0]) == len(few)
 
 
+@pytest.mark.parametrize("octave", [0, -1])
+@pytest.mark.parametrize("size", [(960, 720), (961, 723)])
+def test_keypoints_of_opencv_are_those_of_colmap(textured, octave, size):
+    """Where both find a keypoint, it has the same place, scale, orientation and descriptor."""
+    photo = cv2.resize(textured, size, interpolation=cv2.INTER_CUBIC).astype(np.float32) / 255
+    options = {"first_octave": octave, "peak_threshold": 0.0067}
+    expected, described = colmap.detect_dog(photo, options)
+    keypoints, descriptors = opencv.detect(photo, options)
+    assert keypoints.dtype == descriptors.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=1e-5)
+    similarity = descriptors @ described.T
+    distance = np.linalg.norm(keypoints[:, None, :2] - expected[:, :2], axis=2)
+    near = np.where(distance < 2, similarity, 0)
+    rows = np.flatnonzero(near.max(axis=1) > 0.95)
+    others = expected[near[rows].argmax(axis=1)]
+    assert len(rows) > 0.4 * len(expected)
+    offset = keypoints[rows, :2] - others[:, :2]
+    assert np.abs(np.median(offset, axis=0)).max() < 0.03
+    assert np.median(np.linalg.norm(offset, axis=1)) < 0.2
+    assert np.median(keypoints[rows, 2] / others[:, 2]) == pytest.approx(1, abs=0.02)
+    turn = (keypoints[rows, 3] - others[:, 3] + 180) % 360 - 180
+    assert np.abs(np.median(turn)) < 0.5 and np.median(np.abs(turn)) < 3
+
+
+def test_fast_keypoints_follow_the_photo(textured):
+    """They are sought in a dark photo again, at twice the size in a small one; a blank has none."""
+    photo = np.tile(textured, (3, 4)).astype(np.float32) / 255
+    dark = np.round(photo * 0.06 * 255) / 255
+    once = opencv.detect(dark, dog.SETTINGS["fast"][0])[0]
+    fast = DoG({"keypoints": "fast", "descriptor": "colmap_sift"})
+    assert len(fast.detect(dark)[0]) > 2 * len(once)
+    small = np.round(textured * 0.15).astype(np.float32) / 255
+    few = opencv.detect(small, dog.SETTINGS["fast"][0])[0]
+    assert len(few) < small.size / dog.PIXELS_PER_KEYPOINT
+    assert len(fast.detect(small)[0]) > 2 * len(few)
+    for size in ((1, 1), (1, 9), (40, 30)):
+        keypoints, descriptors = fast.detect(np.full(size, 0.5, np.float32))
+        assert keypoints.shape == (0, 4) and descriptors.shape == (0, 128)
+
+
 @pytest.mark.parametrize("noise", [0, 0.003, 0.02, 0.1])
 @pytest.mark.parametrize("size", [(480, 640), (1024, 1536)])
 def test_noise_does_not_become_keypoints(noise, size):
@@ -179,6 +219,6 @@ def test_options_of_ones_own_are_used_as_they_are(textured):
         colmaps, colmap.detect_dog(image[0, 0].numpy(), dog.COLMAP_OPTIONS)[0][:, :2]
     )
     with pytest.raises(
-        InputError, match="Unknown keypoints 'many'. There are: colmap, adaptive, hloc"
+        InputError, match="Unknown keypoints 'many'. There are: colmap, fast, adaptive, hloc"
     ):
         DoG({"keypoints": "many"})

@@ -13,7 +13,7 @@ from hloc_reduce import extract_features, extractors
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.descriptors.model import Descriptor
 from hloc_reduce.extractors.dog import DoG
-from hloc_reduce.runtime import parallel
+from hloc_reduce.runtime import parallel, processes
 from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
@@ -66,6 +66,22 @@ def test_images_at_once(feature, device, number, monkeypatch):
     model.detect = None
     model.gpu_images = model.cpu_images = extractors.Extractor.gpu_images
     assert extract_features._workers(model, device, 99) == 1  # another's may not be thread-safe
+
+
+def test_fast_keypoints_need_no_processes(tmp_path, textured, monkeypatch):
+    """OpenCV lets other threads run, so that photos are detected in threads."""
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.roll(textured, 17 * i, axis=1))
+    _, conf = features_confs.get("colmap_sift_sv32", keypoints="fast")
+    monkeypatch.setattr(parallel, "cores", lambda: 1)
+    one = extract_features.main(conf, tmp_path, tmp_path / "one")
+    monkeypatch.setattr(parallel, "cores", lambda: 2)
+    monkeypatch.setattr(processes, "pool", None)
+    two = extract_features.main(conf, tmp_path, tmp_path / "two")
+    with h5py.File(one) as first, h5py.File(two) as second:
+        for name in first:
+            for key, dataset in first[name].items():
+                np.testing.assert_array_equal(dataset[()], second[name][key][()])
 
 
 def test_several_features_at_once_are_those_of_each(tmp_path, textured, monkeypatch):
