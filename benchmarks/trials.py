@@ -6,10 +6,10 @@ without, its own also with a wrong focal length. Its own are also tried cropped,
 enlarged, squeezed, and warped as a photo of a print is, without intrinsics. In a COLMAP model,
 every third photo is held out. Keypoints and maps are the same for all features of one base. Another
 --seed holds out other photos, builds other maps, and draws other photos of other places. Each trial
-is a row of results/trials/FEATURE-SEED.csv, or with a --matcher FEATURE+MATCHER-SEED.csv, with its
-outcome (true, near, wrong, none) and all `Measures`, whatever the gate says; `benchmarks.fit_gate`
-and the tables of the documentation read these files. An interrupted run resumes with the next
-place.
+is a row of results/trials/FEATURE-SEED.csv, with a --matcher or --keypoints named after FEATURE,
+with its outcome (true, near, wrong, none) and all `Measures`, whatever the gate says;
+`benchmarks.fit_gate` and the tables of the documentation read these files. An interrupted run
+resumes with the next place.
 """
 
 import argparse
@@ -37,6 +37,7 @@ from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.datasets import scans, true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.inloc import InLoc
+from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import intrinsics, mirrored, query
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
@@ -86,7 +87,7 @@ class Place:
         names: the images of the map.
         features: base descriptors of the images of the map and of the queries.
         metric: whether units are metres.
-        base: the name of the base feature.
+        base: the base feature, see `base_of`.
         extent: norm of the standard deviations of the positions of the images.
         cameras: what the images of the map tell about guessed intrinsics.
     """
@@ -141,7 +142,9 @@ def _of_model(
     metric: bool,
     base: str,
 ) -> Place:
-    built = maps.main(output / "map", images, model, MAP_FEATURES.get(base, base))
+    name, keypoints = parted(base)
+    feature = MAP_FEATURES.get(name, name)
+    built = maps.main(output / "map", images, model, feature, keypoints=keypoints)
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)
     features = _extract(images, output, [*names, *(query for query, _, _ in queries)], base)
@@ -167,7 +170,7 @@ def _of_scans(place: InLoc, output: Path, base: str) -> Place:
 
 
 def _extract(images: Path, output: Path, names: list[str], base: str) -> Path:
-    conf = features_confs.confs[base]
+    conf = base_conf(base)
     return extract_features.main(conf, images, output, image_list=sorted(set(names)))
 
 
@@ -234,7 +237,7 @@ def alter(
             known = warped_pose(camera, truth) if kind == "warped" else known
             written.append((named, None if kind in RESHAPED else camera, known))
     names = [name for name, _, _ in written]
-    conf, features = features_confs.confs[place.base], output / "altered.h5"
+    conf, features = base_conf(place.base), output / "altered.h5"
     extract_features.main(conf, output / "altered", image_list=names, feature_path=features)
     return written
 
@@ -263,10 +266,28 @@ class Described:
         )
 
 
-def base_name(feature: str) -> str:
-    """Return the name of the feature whose descriptors a feature projects, or its own."""
+def base_of(feature: str, keypoints: str) -> str:
+    """Return the feature whose descriptors a feature projects, or its own: NAME or NAME+KEYPOINTS.
+
+    Args:
+        feature: its name.
+        keypoints: settings of DoG; the default ones are not named.
+    """
     model = features_confs.base_of(features_confs.get(feature)[1]["model"])
-    return next(name for name, conf in features_confs.confs.items() if conf["model"] == model)
+    name = next(name for name, conf in features_confs.confs.items() if conf["model"] == model)
+    return name if keypoints == KEYPOINT_SETTINGS[0] else f"{name}+{keypoints}"
+
+
+def parted(base: str) -> tuple[str, str]:
+    """Return the name and the settings of DoG of a base feature."""
+    name, _, keypoints = base.partition("+")
+    return name, keypoints or KEYPOINT_SETTINGS[0]
+
+
+def base_conf(base: str) -> dict:
+    """Return the configuration of a base feature."""
+    name, keypoints = parted(base)
+    return features_confs.get(name, keypoints=keypoints)[1]
 
 
 def trials(
@@ -351,7 +372,7 @@ def run(
 
 def mirror(images: Path, output: Path, name: str, base: str) -> tuple[Path, str]:
     """Extract the features of the mirror image of a photo; return their file and its name."""
-    conf = copy.deepcopy(features_confs.confs[base])
+    conf = copy.deepcopy(base_conf(base))
     conf["preprocessing"]["mirrored"] = True
     path = output / f"mirrored-{images.parent.name}-{images.name}.h5"
     return extract_features.main(conf, images, image_list=[name], feature_path=path), name
@@ -451,6 +472,7 @@ def _main() -> None:
         help="folder of photos of other places, which are tried as wrong ones",
     )
     parser.add_argument("--feature", default="colmap_sift_sv64", help="NAME or NAME:STORAGE")
+    parser.add_argument("--keypoints", choices=KEYPOINT_SETTINGS, default=KEYPOINT_SETTINGS[0])
     parser.add_argument(
         "--matcher",
         help=f"one of {', '.join(matchers_confs.confs)} (default: the feature's)",
@@ -463,8 +485,10 @@ def _main() -> None:
     add_again_option(parser)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    matcher = f"+{args.matcher}" if args.matcher else ""
-    file = TRIALS / f"{args.feature.replace(':', '-')}{matcher}-{args.seed}.csv"
+    others = [args.matcher] if args.matcher else []
+    others += [args.keypoints] if args.keypoints != KEYPOINT_SETTINGS[0] else []
+    name = "+".join([args.feature.replace(":", "-"), *others])
+    file = TRIALS / f"{name}-{args.seed}.csv"
     tried = {root.name for root in args.dataset} | set(parse_maps(args.map))
     if file.exists() and not args.again and tried <= {row["map"] for row in _read(file)}:
         print(f"All maps have rows in {file}.")
@@ -477,8 +501,8 @@ def _main() -> None:
 
 def _trials_of_all(args: argparse.Namespace) -> list[dict]:
     """Try all maps, and return the rows."""
-    base, output = base_name(args.feature.partition(":")[0]), args.output / f"seed{args.seed}"
-    conf = features_confs.get(args.feature.partition(":")[0])[1]
+    name, output = args.feature.partition(":")[0], args.output / f"seed{args.seed}"
+    base, conf = base_of(name, args.keypoints), features_confs.get(name)[1]
     matcher = args.matcher or features_confs.matcher_of(conf)
     sources = [(root.name, of_dataset, (root,)) for root in args.dataset]
     sources += [(name, split, (name, *both)) for name, both in parse_maps(args.map).items()]
