@@ -78,6 +78,9 @@ tried "$small" --dataset $data/herz-jesus --feature colmap_sift_sv64 --seed 1 "$
 tried "bronze-statue cyprus entry-P10 fountain-P11 kitchen" --dataset $data/herz-jesus --feature colmap_sift_sv16 "$@"
 # one core takes a quarter of an hour for each place, and hours for those with more images
 tried "fountain-P11 sceaux entry-P10 bronze-statue cyprus" --feature mini32:uint2 --matcher lightglue --trials 30 "$@"
+for feature in mini64:uint2 xfeat_sv32:uint2; do
+    tried "fountain-P11 sceaux" --feature $feature --matcher lightglue --trials 20 "$@"
+done
 
 # how fast?
 run extraction --dataset $data/herz-jesus "$@" \

@@ -16,14 +16,18 @@ from .pose import Matches, Pose, quality
 from .projection import ALL, FOCAL, POSE, reprojection_errors
 
 SEED = 0
-SAMPLE = 500  # matches, at most, from which a pose is tried before all, or a rival is estimated
+SAMPLE = 500  # matches that are enough for a pose; of more inliers, wrong ones do not bend it
 # confidence of a pose at which no other matches are tried, twice the highest of photos of other
 # places in results/trials
 CERTAIN = 60.0
+STRICT = 1 / 2  # of the inlier threshold, which a wrong match passes less often
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 REESTIMATIONS = 3  # from the inliers among all matches
+# a rival is looked for that has at least this share of the inliers of one that would count, as its
+# confidence may be higher than inliers alone tell
+RIVAL_SHARE = 0.75
 # The lens of the map's photos has probably taken a photo if the confidence with it is at least this
 # multiple of that with estimated intrinsics, and its focal length is within this many standard
 # deviations of the estimated one or within this share of it, or the inliers fit better.
@@ -45,8 +49,9 @@ def estimate(
     First from the likeliest matches, of which more are right, so that RANSAC needs fewer trials; if
     the pose is not certain, also from all. If few of these agree with a pose, RANSAC may have
     missed the right one. So the most similar matches of each image are tried by themselves, too:
-    those of an image that shows the same place agree much more often. The pose with the highest
-    confidence among all matches wins.
+    those of an image that shows the same place agree much more often. Among few inliers, a wrong
+    one bends the pose until it agrees, too: so it is also estimated with a stricter threshold. The
+    pose with the highest confidence among all matches wins.
     If it is trusted although its intrinsics were guessed, and the lens of the map's photos fits as
     well, it is estimated with that. If its photo seems to be cropped or stretched, and that lens
     fits about as well with another pose, it is not trusted. All poses are estimated and compared
@@ -76,6 +81,8 @@ def estimate(
             tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
             poses += pool.map(lambda chosen: _estimate(matches, chosen[:MOST_SIMILAR]), tried)
         first = max(poses, key=quality)
+        if first.num_inliers <= SAMPLE:
+            first = max(first, _estimate_strictly(matches, first), key=quality)
         outliers = pool.submit(_of_outliers, matches, first) if workers > 1 else None
         best, others = with_other_intrinsics(matches, first)
         poses += outliers.result() if outliers and best is first else _of_outliers(matches, best)
@@ -178,23 +185,26 @@ def _with_typical_lens(matches: Matches, pose: Pose) -> Pose:
 
 
 def _of_outliers(matches: Matches, pose: Pose) -> list[Pose]:
-    """Return the pose that the outliers of a pose give, none if they are few."""
+    """Return the pose that the outliers of a pose give, none if they are few or few agree."""
     others = np.flatnonzero(~pose.inliers)
-    if not len(others) >= ALTERNATIVES["rival"].ratio * pose.num_inliers > 0:
+    least = ALTERNATIVES["rival"].ratio * pose.num_inliers
+    if not len(others) >= least > 0:
         return []
-    # half as many inliers as a rival of this confidence is expected to have
-    least = ALTERNATIVES["rival"].ratio / 2 * pose.num_inliers / len(others)
     sample = np.random.default_rng(SEED).permutation(others)[:SAMPLE]
-    return [_estimate(matches, sample, max(LEAST_RATIO, least))]
+    least_ratio = max(LEAST_RATIO, RIVAL_SHARE * least / len(others))
+    return [_estimate(matches, sample, least_ratio, RIVAL_SHARE * least)]
 
 
-def _estimate(matches: Matches, chosen: np.ndarray, least_ratio: float = LEAST_RATIO) -> Pose:
+def _estimate(
+    matches: Matches, chosen: np.ndarray, least_ratio: float = LEAST_RATIO, least: float = 0
+) -> Pose:
     """Estimate a pose from chosen matches, then from all matches that agree with it.
 
     Args:
         matches: of the query.
         chosen: (N,) indices of some of them.
         least_ratio: share of inliers below which RANSAC need not find a pose among these.
+        least: number of inliers below which a pose counts as none.
     """
     points2D, points3D, number = matches.points2D, matches.points3D, len(matches)
     ransac = {"min_inlier_ratio": least_ratio}
@@ -214,9 +224,27 @@ def _estimate(matches: Matches, chosen: np.ndarray, least_ratio: float = LEAST_R
         if inliers.sum() <= pose.num_inliers:
             break
         pose, chosen = Pose(cam_from_world, camera, inliers), np.flatnonzero(inliers)
+    if pose.num_inliers < least:
+        pose = Pose(None, matches.camera, np.zeros(number, bool))
+    return _judged(matches, pose)
+
+
+def _judged(matches: Matches, pose: Pose) -> Pose:
+    """Return an estimated pose with its confidence."""
     if pose.cam_from_world is None:
         return pose
     freedom = FOCAL if matches.is_focal_length_free else POSE
     view = pose.cam_from_world, pose.camera
-    value = confidence(points2D, points3D, *view, matches.max_error, freedom)
+    value = confidence(matches.points2D, matches.points3D, *view, matches.max_error, freedom)
     return replace(pose, confidence=value, degrees_of_freedom=freedom)
+
+
+def _estimate_strictly(matches: Matches, pose: Pose) -> Pose:
+    """Estimate a pose anew from those of its inliers that agree more closely with another one."""
+    strict = matches.with_max_error(STRICT * matches.max_error)
+    found = _estimate(strict, np.flatnonzero(pose.inliers))
+    if found.cam_from_world is None:
+        return found
+    view = found.cam_from_world, found.camera
+    errors, _ = reprojection_errors(matches.points2D, matches.points3D, *view)
+    return _judged(matches, replace(found, inliers=errors <= matches.max_error))

@@ -150,7 +150,7 @@ MATCH_KINDS = {
     "ratio": MatchKind(Evidence(4.13, 17.45), -17.21, 0.8, 0.4),
     "few": MatchKind(Evidence(2.72, 14.71), -8.2, 0.8, 0.4),
     "mutual": MatchKind(Evidence(4.01, 11.42), -8.89, 0.3, 0.8),
-    "lightglue": MatchKind(Evidence(5.37, 29.72), -28.58, 0.5, 0.8),
+    "lightglue": MatchKind(Evidence(4.4, 27.51), -26.96, 0.5, 0.8),
 }
 NEAREST_NEIGHBOR = "nearest_neighbor"  # whose kind its ratio test tells
 KINDS_OF_MATCHERS = {"adalam": "mutual", "lightglue": "lightglue", "superglue": "lightglue"}

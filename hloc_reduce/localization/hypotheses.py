@@ -99,8 +99,10 @@ def _contradicting(matches: Matches, pose: Pose, image: np.ndarray, start: View)
     """
     assert pose.cam_from_world is not None
     others: Alternatives = {}
-    centred = resection.centred(pose.cam_from_world, pose.camera)
-    for points2D, begin in ((image, start), (matches.points2D, centred)):
+    starts = [(image, start)]
+    if not resection.is_centred(pose.camera):
+        starts += [(matches.points2D, resection.centred(pose.cam_from_world, pose.camera))]
+    for points2D, begin in starts:
         other = _resect(matches, points2D, begin, FOCAL)
         if other is None or other.confidence <= pose.confidence:
             continue

@@ -69,6 +69,12 @@ class Matches:
         """The inlier threshold in pixels."""
         return self.config.get("estimation", {}).get("ransac", {}).get("max_error", MAX_ERROR)
 
+    def with_max_error(self, max_error: float) -> "Matches":
+        """Return the same matches with another inlier threshold in pixels."""
+        estimation = self.config.get("estimation", {})
+        ransac = {**estimation.get("ransac", {}), "max_error": max_error}
+        return replace(self, config={**self.config, "estimation": {**estimation, "ransac": ransac}})
+
     def may_be_cropped(self, pose: Pose) -> bool:
         """Return whether the photo may be cropped.
 

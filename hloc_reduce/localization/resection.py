@@ -261,6 +261,13 @@ def _decomposed(
     return pose, _camera(camera, "PINHOLE", fx, fy, cx, cy)
 
 
+def is_centred(camera: pycolmap.Camera) -> bool:
+    """Return whether `centred` and `undistort` change nothing of intrinsics."""
+    (fx, _, cx), (_, fy, cy), _ = camera.calibration_matrix()
+    middle = camera.width / 2, camera.height / 2
+    return fx == fy and (cx, cy) == middle and not is_distorted(camera)
+
+
 def centred(
     cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera
 ) -> tuple[pycolmap.Rigid3d, pycolmap.Camera]:

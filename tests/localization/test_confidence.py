@@ -378,6 +378,27 @@ def test_clusters_of_matches_of_few_points_are_refused(number, repeated):
         assert solve(keypoints, world, [np.arange(len(world))]).refusal is not None
 
 
+@pytest.mark.parametrize("number", [12, 40, 120])
+def test_wrong_matches_do_not_bend_a_pose(number):
+    """Points of a wall fit another pose, too, up to some pixels; wrong matches that fit it exactly
+    give it more inliers, but it is less likely than the pose that the right ones fit closely.
+    """
+    generator = np.random.default_rng(number)
+    points = generator.uniform([-1.9, -1.9, -0.02], [1.9, 1.9, 0.02], (number + 2, 3))
+    bent = pose_of(15, (0, 0, 8))
+    points[number:] = [[3, 1, -2], [-2, 2, 3]]
+    projected = [
+        reprojection_errors(np.zeros((len(points), 2)), points, pose, CAMERA)[1]
+        for pose in (pose_of(10, (0, 0, 8)), bent)
+    ]
+    assert np.linalg.norm(projected[0] - projected[1], axis=1)[:number].max() < 12
+    keypoints = np.concatenate([projected[0][:number], projected[1][number:]])
+    keypoints += 0.5 * generator.standard_normal(keypoints.shape)
+    found = solve(keypoints, points, [np.arange(number + 2)])
+    turned = (found.cam_from_world * pose_of(10, (0, 0, 8)).inverse()).rotation.angle()
+    assert np.degrees(turned) < 1 and found.inliers[:number].all()
+
+
 @pytest.mark.parametrize("number", [51, 62])
 def test_a_rival_is_looked_for_where_many_matches_disagree(number):
     """Of two places that look the same, one with fewer photos, the matches are divided."""
