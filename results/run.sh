@@ -40,6 +40,12 @@ for place in herz-jesus dark-fountain-P11 dark-sceaux sparse-herz-jesus sparse-f
     run lightglue --dataset $data/$place --keypoints 1024 "$@" \
         --feature xfeat:float16 xfeat_sv32:uint4 xfeat_sv32:uint2 mini64:uint2
 done
+for place in herz-jesus dark-fountain-P11 dark-sceaux; do
+    run lightglue --dataset $data/$place --feature xfeat_sv32:uint1 --keypoints 1024 "$@" \
+        --map_matcher lightglue --matcher lightglue
+done
+run lightglue --dataset $data/herz-jesus --feature mini32:uint2 --keypoints 512 1024 2048 --num_loc 3 5 20 "$@" \
+    --map_matcher lightglue --matcher lightglue
 # LightGlue for ALIKED takes a quarter of an hour a place and feature, and the town an hour
 for place in herz-jesus sparse-herz-jesus; do
     run lightglue --dataset $data/$place --keypoints 1024 --map_matcher lightglue --matcher lightglue "$@" \
