@@ -10,7 +10,7 @@ from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs.features import matcher_of
-from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS
+from hloc_reduce.detectors.dog import FAST, KEYPOINT_SETTINGS
 from hloc_reduce.localization.exif import WELL_KNOWN
 from hloc_reduce.localization.gate import DEFAULT_GATE, FOCAL_LENGTHS, REFINED, RULES
 from hloc_reduce.mapping.adjustment import GAIN_OF_FREE, MAX_ADJUSTED_IMAGES
@@ -186,6 +186,26 @@ def readme_table() -> Table:
                 *(inliers(rows, "herz-jesus", part) for part in ("day", "night")),
             ]
         )
+    return table
+
+
+def keypoints_table() -> Table:
+    """Compare settings of DoG keypoints on all places."""
+    feature = features_confs.RECOMMENDED
+    rows = select(read("accuracy"), feature=feature, storage=FLOATS[0], matcher="NN-ratio")
+    table = [["`--keypoints`", "localized", "within 1 cm", "within 5 cm", "inliers, day", "night"]]
+    table[0] += ["town at night"]
+    for name in (KEYPOINT_SETTINGS[0], FAST):
+        variant = "" if name == KEYPOINT_SETTINGS[0] else f"keypoints{name}"
+        of_name = select(rows, variant=variant)
+        counts = (
+            f"{total(of_name, measure):.0f} of {total(of_name, 'queries'):.0f}"
+            for measure in ("localized", "within_1cm", "within_5cm")
+        )
+        town = select(of_name, place="demo_town", list="night")[0]
+        day_and_night = (inliers(of_name, "herz-jesus", part) for part in ("day", "night"))
+        localized = f"{town['localized']} of {town['queries']}"
+        table.append([f"`{name}`", *counts, *day_and_night, localized])
     return table
 
 
@@ -449,6 +469,7 @@ def map_limits_table() -> Table:
 TABLES: dict[str, Callable[[], Table]] = {
     "features": features_table,
     "readme": readme_table,
+    "keypoints": keypoints_table,
     "bytes": bytes_table,
     "schemes": schemes_table,
     "maps": maps_table,

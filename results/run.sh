@@ -80,6 +80,7 @@ tried() { # maps of PLACES, features and other options
 }
 tried "$small fox south-building" --dataset $data/herz-jesus --feature colmap_sift_sv64 "$@"
 tried "$small" --dataset $data/herz-jesus --feature xfeat_sv32 "$@"
+tried "fountain-P11 sceaux" --feature colmap_sift_sv64 --keypoints fast --trials 40 "$@"
 tried "$small" --dataset $data/herz-jesus --feature colmap_sift_sv64 --seed 1 "$@"
 tried "bronze-statue cyprus entry-P10 fountain-P11 kitchen" --dataset $data/herz-jesus --feature colmap_sift_sv16 "$@"
 # one core takes a quarter of an hour for each place, and hours for those with more images
