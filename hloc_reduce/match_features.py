@@ -4,7 +4,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -198,6 +198,10 @@ def _match(
     pairs: Iterable[tuple[str, str]],
 ) -> Results[tuple[None, Group]]:
     """Yield the groups of pairs: this thread reads and yields while others match."""
+    pairs = iter(pairs)
+    first = next(pairs, None)
+    if first is None:
+        return  # without loading torch
     import torch
 
     from . import matchers
@@ -213,7 +217,7 @@ def _match(
         for file in (file0, file1):
             _check_keys(file, conf)
         cache = FeatureCache(CACHE_BYTES, matcher.feature_keys())
-        read = map(partial(_read, cache, file0, file1), pairs)
+        read = map(partial(_read, cache, file0, file1), chain([first], pairs))
         batches = iter(lambda: list(islice(read, size)), [])
         with closing(parallel.ordered("match", match, batches, workers)) as matched:
             for groups in matched:

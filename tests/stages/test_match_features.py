@@ -35,6 +35,15 @@ def test_a_pair_that_is_listed_again_and_reversed_is_matched_once(built, tmp_pat
     assert len(list_h5_names(matches)) == 2
 
 
+def test_finished_matches_need_no_matcher(built, tmp_path, monkeypatch):
+    """Which would take seconds to import torch."""
+    pairs, conf = tmp_path / "pairs.txt", match_features.confs["NN-ratio"]
+    pairs.write_text("db/0.jpg db/1.jpg\n")
+    matches = match_features.main(conf, pairs, built.features, matches=tmp_path / "m.h5")
+    monkeypatch.setattr("hloc_reduce.matchers.load", None)
+    assert match_features.main(conf, pairs, built.features, matches=matches) == matches
+
+
 @pytest.mark.parametrize(
     "pairs",
     [
