@@ -111,6 +111,7 @@ LIGHTGLUE_PLACES = (
     *(f"sparse-{place}" for place in ("herz-jesus", "fountain-P11", "sceaux")),
 )
 ONE_CORE = "1 core"
+RUN_PLACES = "herz-jesus", "day-fountain-P11"
 STAGES = ("extraction", "matching", "triangulation", "localization")
 PAPER = ("sift", "mkd", "tfeat")
 PAPER_DIMS = (64, 32, 24, 16)
@@ -302,13 +303,16 @@ def accuracy(rows: list[Row]) -> str:
 
 def runs_table() -> Table:
     """Compare whole runs with hloc's, stage by stage."""
-    table = [["seconds", *STAGES, "all", "hloc / this", "features [MB]", "matches [MB]"]]
-    runs = select(read("runs"), place="herz-jesus")
-    [reference] = select(runs, feature="hloc")
+    table = [["seconds", *STAGES, "all", "hloc / this", "fountain-P11", "features [MB]"]]
+    table[0] += ["matches [MB]"]
+    runs, others = (select(read("runs"), place=place) for place in RUN_PLACES)
     for row in sorted(runs, key=lambda row: -float(row["seconds"])):
+        [other] = select(others, **{key: row[key] for key in ("feature", "storage", "variant")})
         cells = [f"{float(row[f'{stage}_s']):.1f}" for stage in STAGES]
         cells += [f"{float(row['seconds']):.1f}"]
-        cells += [f"{float(reference['seconds']) / float(row['seconds']):.1f}"]
+        for of_place, one in ((runs, row), (others, other)):
+            [reference] = select(of_place, feature="hloc")
+            cells += [f"{float(reference['seconds']) / float(one['seconds']):.1f}"]
         cells += [f"{float(row['feature_mb']):.1f}", f"{float(row['match_mb']):.2f}"]
         table.append([run_name(row), *cells])
     return table
@@ -330,7 +334,7 @@ def name_of(row: Row) -> str:
 def runs_cpu_table() -> Table:
     """Show the CPU seconds of whole runs, and those that no run of the same photos is without."""
     table = [["CPU seconds", *STAGES, "all", "of one pass of the detector", "of the products"]]
-    for row in sorted(select(read("runs"), place="herz-jesus"), key=lambda row: -cpu_of(row)):
+    for row in sorted(select(read("runs"), place=RUN_PLACES[0]), key=lambda row: -cpu_of(row)):
         cells = [f"{float(row[f'{stage}_cpu_s']):.1f}" for stage in STAGES]
         limits = [row["extraction_limit_s"], row["matching_limit_s"]]
         cells += [f"{cpu_of(row):.1f}", *(f"{float(one):.1f}" if one else "" for one in limits)]

@@ -26,6 +26,7 @@ for place in fountain-P11 sceaux; do
     split dusk $place "$(scene $place)" --gain 0.3 0.5
     split sparse $place "$(scene $place)" --map_every 4
 done
+split day fountain-P11 "$(scene fountain-P11)"
 herz_jesus=$data/herz-jesus/images_upright:$data/herz-jesus/3D-models/aachen_v_1_1
 split sparse herz-jesus $herz_jesus --map_every 4
 
@@ -97,8 +98,10 @@ run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 64 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 32 --storage uint4 "$@"
 run compact_scale --data $data/aachen_v1.1 --share 0.1 1 "$@"
 if "$python" -c "import hloc" 2> /dev/null; then
-    run against_hloc --dataset $data/herz-jesus "$@" \
-        --feature sift_sv64 colmap_sift_sv64 colmap_sift_sv16 xfeat_sv32:uint2 mini32:uint2
+    for place in herz-jesus day-fountain-P11; do
+        run against_hloc --dataset $data/$place --keypoints adaptive hloc fast "$@" \
+            --feature sift_sv64 colmap_sift_sv64 colmap_sift_sv16 xfeat_sv32:uint2 mini32:uint2
+    done
 fi
 
 run render
