@@ -24,7 +24,8 @@ STRICT = 1 / 2  # of the inlier threshold, which a wrong match passes less often
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
-REESTIMATIONS = 3  # from the inliers among all matches
+REESTIMATIONS = 3  # from the matches near the pose
+WIDER = 5  # inlier thresholds, within which matches are near a pose
 # a rival is looked for that has at least this share of the inliers of one that would count, as its
 # confidence may be higher than inliers alone tell
 RIVAL_SHARE = 0.75
@@ -198,7 +199,7 @@ def _of_outliers(matches: Matches, pose: Pose) -> list[Pose]:
 def _estimate(
     matches: Matches, chosen: np.ndarray, least_ratio: float = LEAST_RATIO, least: float = 0
 ) -> Pose:
-    """Estimate a pose from chosen matches, then from all matches that agree with it.
+    """Estimate a pose from chosen matches, then from all matches that are near it.
 
     Args:
         matches: of the query.
@@ -216,14 +217,14 @@ def _estimate(
         if not found:
             break
         cam_from_world = found["cam_from_world"]
+        errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
+        inliers = errors <= matches.max_error
         if len(chosen) == number:
             inliers = np.asarray(found["inlier_mask"], bool)
-        else:
-            errors, _ = reprojection_errors(points2D, points3D, cam_from_world, camera)
-            inliers = errors <= matches.max_error
         if inliers.sum() <= pose.num_inliers:
             break
-        pose, chosen = Pose(cam_from_world, camera, inliers), np.flatnonzero(inliers)
+        pose = Pose(cam_from_world, camera, inliers)
+        chosen = np.flatnonzero(errors <= WIDER * matches.max_error)
     if pose.num_inliers < least:
         pose = Pose(None, matches.camera, np.zeros(number, bool))
     return _judged(matches, pose)

@@ -378,6 +378,25 @@ def test_clusters_of_matches_of_few_points_are_refused(number, repeated):
         assert solve(keypoints, world, [np.arange(len(world))]).refusal is not None
 
 
+def test_the_likeliest_matches_are_only_a_start(monkeypatch):
+    """All that are near the first pose are tried then, not only those that agree with it."""
+    first = matches(500, 0, pose=pose_of(11.5, (0.3, 0.1, 8)))  # of a part that is turned
+    others = matches(1500, 500, seed=1, noise=5.0)
+    keypoints, points = (np.concatenate(part) for part in zip(first, others, strict=True))
+    estimate_pose, tried, poses = colmap.estimate_pose, [], []
+
+    def recorded(points2D, *options):
+        tried.append(len(points2D))
+        poses.append(estimate_pose(points2D, *options))
+        return poses[-1]
+
+    monkeypatch.setattr(colmap, "estimate_pose", recorded)
+    found = solve(keypoints, points, [np.arange(500), np.arange(500), np.arange(500, 2500)])
+    assert tried[0] == absolute_pose.SAMPLE and poses[0]["num_inliers"] > 490
+    assert tried[1] > 1990
+    assert found.num_inliers > 1700
+
+
 @pytest.mark.parametrize("number", [12, 40, 120])
 def test_wrong_matches_do_not_bend_a_pose(number):
     """Points of a wall fit another pose, too, up to some pixels; wrong matches that fit it exactly
