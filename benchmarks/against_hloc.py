@@ -85,7 +85,14 @@ def stages_of(which: Run, queries: list[str]) -> dict[str, Callable]:
 
         conf, matcher, extract = extract_features.confs["sift"], "NN-ratio", extract_features.main
     else:
-        from hloc_reduce import extract_features, localize_sfm, match_features, triangulation
+        from hloc_reduce import (  # noqa: F401  imports of torch are not timed
+            extract_features,
+            extractors,
+            localize_sfm,
+            match_features,
+            matchers,
+            triangulation,
+        )
 
         conf = which.conf()
         matcher = features_confs.matcher_of(conf)
@@ -226,7 +233,7 @@ def _main() -> None:
         command += ["--keypoints", one.keypoints] if one.keypoints else []
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
         if done.returncode:
-            raise InputError(f"{one.name} failed.")
+            raise InputError(f"{one.name} failed ({one.keypoints or 'no'} keypoints).")
         result = json.loads(done.stdout.splitlines()[-1])
         best[one] = min(result, best.get(one, result), key=lambda each: each["seconds"])
     rows.add(NAME, [place | one.cells() | rows.how() | best[one] for one in taking_turns])

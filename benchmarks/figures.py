@@ -13,11 +13,12 @@ from benchmarks.tables import (
     KINDS_OF_TRIALS,
     MAPS,
     ONE_CORE,
+    RUN_PLACES,
     SIZES,
     STAGES,
     chosen,
-    name_of,
     percent,
+    run_name,
     total,
 )
 from benchmarks.trial_rows import OUTCOMES, TRIALS, label
@@ -108,13 +109,14 @@ def draw_maps() -> list[Callable]:
 
 def draw_runs() -> list[Callable]:
     """Draw the seconds of whole runs, stage by stage."""
-    runs = sorted(read("runs"), key=lambda row: float(row["seconds"]))
+    runs = select(read("runs"), place=RUN_PLACES[0])
+    runs.sort(key=lambda row: float(row["seconds"]))
 
     def panel(axis) -> None:
         left = [0.0] * len(runs)
         for colour, stage in zip(plots.COLOURS, STAGES, strict=False):
             seconds = [float(row[f"{stage}_s"]) for row in runs]
-            names = [name_of(row).replace("`", "") for row in runs]
+            names = [run_name(row).replace("`", "") for row in runs]
             axis.barh(names, seconds, left=left, color=colour, label=stage)
             left = [sum(pair) for pair in zip(left, seconds, strict=True)]
         axis.set(xlabel="seconds, 33 photos on two cores")

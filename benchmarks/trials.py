@@ -142,8 +142,8 @@ def _of_model(
     metric: bool,
     base: str,
 ) -> Place:
-    name, keypoints = parted(base)
-    feature = MAP_FEATURES.get(name, name)
+    base_name, keypoints = parted(base)
+    feature = MAP_FEATURES.get(base_name, base_name)
     built = maps.main(output / "map", images, model, feature, keypoints=keypoints)
     reference = SfmMap(colmap.read_model(built.sfm))
     names = sorted(reference.images)

@@ -142,9 +142,9 @@ def _extract(
 ) -> Results[tuple[Path, Group]]:
     """Yield the groups of images for those feature files that lack them.
 
-    COLMAP's detector blocks the other threads of its process, so several images are detected in
-    processes and described in threads. Beside a GPU, reading an image takes longer than a network
-    does, so several are read, and have their noise estimated, at once.
+    COLMAP's detector, unlike OpenCV's, blocks the other threads of its process, so several images
+    are detected in processes and described in threads. Beside a GPU, reading an image takes longer
+    than a network does, so several are read, and have their noise estimated, at once.
     """
     import torch
 

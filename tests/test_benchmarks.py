@@ -24,6 +24,7 @@ from benchmarks import (
     trial_rows,
 )
 from benchmarks import trials as benchmark_trials
+from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import pose_error
@@ -225,6 +226,12 @@ def test_no_pose_of_another_place_is_certain_and_most_right_ones_are(trials):
     own = [row for row in poses if row["kind"] in tables.OWN and row["outcome"] == "true"]
     certain = [row["measures"].confidence >= absolute_pose.CERTAIN for row in own]
     assert np.mean(certain) > 0.95
+
+
+def test_trials_name_the_places_of_their_maps(trials):
+    """With keypoints of other settings, they were once called by their base feature."""
+    bases = {*features_confs.BASES}
+    assert not bases & {row[key] for row in trials for key in ("map", "place")}
 
 
 def test_labels_of_trials():

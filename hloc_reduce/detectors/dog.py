@@ -19,14 +19,14 @@ from . import opencv
 
 HLOC_OPTIONS = {"first_octave": 0, "peak_threshold": 0.01}
 COLMAP_OPTIONS = {"first_octave": -1, "peak_threshold": 0.0067}
+FAST = "fast"  # found by OpenCV
 # name -> the options to try first, and whether to try others if these find too few keypoints
 SETTINGS = {
     "adaptive": (HLOC_OPTIONS, True),
     "colmap": (COLMAP_OPTIONS, True),
     "hloc": (HLOC_OPTIONS, False),
-    "fast": (HLOC_OPTIONS, True),
+    FAST: (HLOC_OPTIONS, True),
 }
-FAST = "fast"  # found by OpenCV
 KEYPOINT_SETTINGS = tuple(SETTINGS)
 KeypointSettings = Annotated[
     str,
@@ -35,7 +35,7 @@ KeypointSettings = Annotated[
         KEYPOINT_SETTINGS,
         "adaptive finds more keypoints in small, dark and hazy photos; colmap finds several times "
         "as many in every photo; hloc uses hloc's settings for every photo; fast finds them by "
-        "OpenCV in photos of half the size, in a quarter of the time",
+        "OpenCV in photos of half the size, in a fraction of the time",
     ),
 ]
 
@@ -104,7 +104,7 @@ def detect(
 
     Args:
         image: (H, W) float32 in [0, 1].
-        options: of pycolmap's SiftExtractionOptions.
+        options: of pycolmap's SiftExtractionOptions; if `fast`, see `opencv.detect`.
         adaptive: try other settings if `options` find too few keypoints, unless the image shows
             nothing but noise.
         fast: detect them by OpenCV.

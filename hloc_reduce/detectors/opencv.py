@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 CONTRAST_PER_PEAK = 3  # OpenCV divides its contrastThreshold by the number of layers of an octave
-MAX_KEYPOINTS = 8192  # COLMAP's default
+MAX_KEYPOINTS = 8192  # COLMAP's default; of more, those of the strongest contrast are kept
 
 
 def detect(image: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray]:
@@ -22,11 +22,11 @@ def detect(image: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray]:
         COLMAP's by rounding and sampling: OpenCV has the same layout, and L1_ROOT is taken here.
     """
     factor = 2 if options["first_octave"] == 0 else 1
-    pixels: np.ndarray = np.round(image * 255).astype(np.uint8)
-    height, width = pixels.shape
+    height, width = image.shape
     if factor > 1:
         size = max(width // factor, 1), max(height // factor, 1)
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    pixels: np.ndarray = np.round(image * 255).astype(np.uint8)
     sift = cv2.SIFT.create(
         nfeatures=MAX_KEYPOINTS,
         contrastThreshold=CONTRAST_PER_PEAK * options["peak_threshold"],

@@ -1,4 +1,4 @@
-"""DoG keypoints of COLMAP's SIFT, with a base descriptor of the patches around them."""
+"""DoG keypoints of COLMAP or OpenCV, with their SIFT or a base descriptor of patches."""
 
 import cv2
 import numpy as np
@@ -71,7 +71,7 @@ def pyramid(image: np.ndarray) -> list[np.ndarray]:
 
 
 class DoG(Extractor):
-    """hloc's `dog`: DoG keypoints of COLMAP and descriptors of 32x32 patches.
+    """hloc's `dog`: DoG keypoints of COLMAP, or of OpenCV, and descriptors of 32x32 patches.
 
     The descriptor `colmap_sift` is COLMAP's SIFT, which needs no patches. Unlike hloc's `dog` this
     one stores keypoints with pixel centres at integers for every version of pycolmap, scores each

@@ -16,11 +16,13 @@ from .pose import Matches, Pose, quality
 from .projection import ALL, FOCAL, POSE, reprojection_errors
 
 SEED = 0
-SAMPLE = 500  # matches that are enough for a pose; of more inliers, wrong ones do not bend it
+SAMPLE = 500  # matches, at most, from which a pose is tried before all, or a rival is estimated
 # confidence of a pose at which no other matches are tried, twice the highest of photos of other
 # places in results/trials
 CERTAIN = 60.0
-STRICT = 1 / 2  # of the inlier threshold, which a wrong match passes less often
+# with at most so many inliers, wrong ones may bend a pose; share of the inlier threshold that fewer
+# of them pass
+FEW_INLIERS, STRICT = 500, 1 / 2
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
@@ -82,7 +84,7 @@ def estimate(
             tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
             poses += pool.map(lambda chosen: _estimate(matches, chosen[:MOST_SIMILAR]), tried)
         first = max(poses, key=quality)
-        if first.num_inliers <= SAMPLE:
+        if first.num_inliers <= FEW_INLIERS:
             first = max(first, _estimate_strictly(matches, first), key=quality)
         outliers = pool.submit(_of_outliers, matches, first) if workers > 1 else None
         best, others = with_other_intrinsics(matches, first)
@@ -241,7 +243,7 @@ def _judged(matches: Matches, pose: Pose) -> Pose:
 
 
 def _estimate_strictly(matches: Matches, pose: Pose) -> Pose:
-    """Estimate a pose anew from those of its inliers that agree more closely with another one."""
+    """Estimate a pose anew from its inliers, with a stricter threshold for them."""
     strict = matches.with_max_error(STRICT * matches.max_error)
     found = _estimate(strict, np.flatnonzero(pose.inliers))
     if found.cam_from_world is None:

@@ -100,7 +100,7 @@ def _contradicting(matches: Matches, pose: Pose, image: np.ndarray, start: View)
     assert pose.cam_from_world is not None
     others: Alternatives = {}
     starts = [(image, start)]
-    if not resection.is_centred(pose.camera):
+    if not resection.is_plain(pose.camera):
         starts += [(matches.points2D, resection.centred(pose.cam_from_world, pose.camera))]
     for points2D, begin in starts:
         other = _resect(matches, points2D, begin, FOCAL)

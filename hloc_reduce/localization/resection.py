@@ -23,6 +23,7 @@ DAMPING = 1e-3  # of the first step
 TINY = 1e-9  # least diagonal of the damping
 CONVERGED = 1e-6  # relative gain of the last step
 FAR_PIXELS = 1e6  # pixels
+PINHOLES = "SIMPLE_PINHOLE", "PINHOLE"  # models without distortion
 BEHIND = 1e6  # the square of a point behind the camera, in units of the noise
 # The search for all parameters: in a sample of SAMPLE matches with errors up to NEAR thresholds, it
 # starts with principal points in the middle and CORNER of width and height away from it.
@@ -261,11 +262,14 @@ def _decomposed(
     return pose, _camera(camera, "PINHOLE", fx, fy, cx, cy)
 
 
-def is_centred(camera: pycolmap.Camera) -> bool:
-    """Return whether `centred` and `undistort` change nothing of intrinsics."""
+def is_plain(camera: pycolmap.Camera) -> bool:
+    """Return whether intrinsics are of a pinhole with square pixels, centred, as `centred` makes.
+
+    Lenses of other models may have no coefficients and bend rays all the same.
+    """
     (fx, _, cx), (_, fy, cy), _ = camera.calibration_matrix()
     middle = camera.width / 2, camera.height / 2
-    return fx == fy and (cx, cy) == middle and not is_distorted(camera)
+    return camera.model.name in PINHOLES and fx == fy and (cx, cy) == middle
 
 
 def centred(

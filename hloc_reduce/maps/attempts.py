@@ -23,7 +23,6 @@ from .. import (
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
-from ..detectors.dog import FAST, KEYPOINT_SETTINGS
 from ..extract_features import keep_readable
 from ..mapping import findings, mapper, plausibility, registration
 from ..mapping.checks import Inputs, another_size, intrinsics, mirrored
@@ -155,7 +154,7 @@ def of_photos_alone(photos: Photos, conf: dict) -> tuple[Attempt, list[Finding]]
 
 def _most_registered(photos: Photos, conf: dict) -> Attempt:
     """Return the model with the most photos: also with more keypoints, if some are missing."""
-    adaptive = features_confs.keypoints_of(conf["model"]) in (KEYPOINT_SETTINGS[0], FAST)
+    adaptive = features_confs.keypoints_of(conf["model"]) == "adaptive"
     several = adaptive and len(photos.names) <= mapper.VERY_FEW
     tried: list[Attempt] = []
     errors: list[registration.NoModelError] = []

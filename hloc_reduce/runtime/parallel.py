@@ -30,6 +30,7 @@ _of_thread = _OfThread()
 _running = 0  # blocks of `one_thread` in all threads
 _threads: int | None = None  # torch's threads before the first of these
 _blas: Any  # ends the limit on BLAS that the first of these has set
+_opencv = 0  # OpenCV's threads before the first of these
 _libraries: tuple[int, ThreadpoolController] | None = None  # and the number of modules before
 
 
@@ -53,15 +54,18 @@ def _controller() -> ThreadpoolController:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let NumPy and torch compute in the calling thread only; such blocks may overlap.
+    """Let NumPy, OpenCV and torch compute in the calling thread only; such blocks may overlap.
 
     With several threads, BLAS waits much longer than it computes if matrices are small, if other
     programs use the cores, or if several threads of Python call it.
     """
-    global _running, _threads, _blas
+    global _running, _threads, _blas, _opencv
     with _lock:
         if not _running:
             _blas = _controller().limit(limits=1, user_api="blas")
+            if cv2 := sys.modules.get("cv2"):
+                _opencv = cv2.getNumThreads()
+                cv2.setNumThreads(1)
         _running += 1
         _of_thread.blocks += 1
         torch = sys.modules.get("torch")
@@ -82,6 +86,9 @@ def one_thread() -> Iterator[None]:
             if not _running:
                 _blas.restore_original_limits()
                 _threads = None
+                if _opencv:
+                    sys.modules["cv2"].setNumThreads(_opencv)
+                    _opencv = 0
 
 
 def ordered(

@@ -213,6 +213,27 @@ def test_a_listed_focal_length_that_moves_the_camera_is_refused():
     assert solve(*given, WHOLE, "list").refusal is None
 
 
+@pytest.mark.parametrize(
+    ("model", "params", "expected"),
+    [
+        ("SIMPLE_PINHOLE", [900, 800, 600], True),
+        ("PINHOLE", [900, 900, 800, 600], True),
+        ("PINHOLE", [900, 910, 800, 600], False),
+        ("PINHOLE", [900, 900, 810, 600], False),
+        ("OPENCV", [900, 900, 800, 600, 0.1, 0, 0, 0], False),
+        ("OPENCV_FISHEYE", [900, 900, 800, 600, 0, 0, 0, 0], False),
+    ],
+)
+def test_which_intrinsics_centring_leaves_as_they_are(model, params, expected):
+    camera = pycolmap.Camera(model=model, width=1600, height=1200, params=params)
+    assert resection.is_plain(camera) == expected
+    points = np.random.default_rng(0).uniform(0, 1000, (9, 2))
+    moved = np.abs(resection.undistort(points, camera)[0] - points).max() > 1e-6
+    _, pinhole = resection.centred(pycolmap.Rigid3d(), camera)
+    changed = moved or not np.array_equal(pinhole.calibration_matrix(), camera.calibration_matrix())
+    assert changed != expected
+
+
 def test_a_centred_principal_point_of_a_cropped_photo_is_refused():
     """Half of such lists were accepted, and the camera turned by 4 to 8 degrees."""
     right = camera_of(1600, 1000, [1400, 1400, 800, 400], "PINHOLE")  # the upper sixth is cut off

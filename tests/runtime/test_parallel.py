@@ -7,6 +7,7 @@ import threading
 import time
 from concurrent.futures import BrokenExecutor
 
+import cv2
 import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -39,6 +40,16 @@ def test_one_thread_of_torch_in_each_worker():
     before = torch.get_num_threads()
     threads = list(parallel.ordered("test", lambda _: torch.get_num_threads(), range(4), 2))
     assert threads == [1] * 4 and torch.get_num_threads() == before
+
+
+def test_one_thread_of_opencv_in_each_worker():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        found = parallel.ordered("count", lambda _: cv2.getNumThreads(), range(4), workers=2)
+        assert list(found) == [1] * 4 and cv2.getNumThreads() == 3
+    finally:
+        cv2.setNumThreads(before)
 
 
 def test_threads_are_as_before_whoever_ends_first():
