@@ -52,9 +52,9 @@ def estimate(
     First from the likeliest matches, of which more are right, so that RANSAC needs fewer trials; if
     the pose is not certain, also from all. If few of these agree with a pose, RANSAC may have
     missed the right one. So the most similar matches of each image are tried by themselves, too:
-    those of an image that shows the same place agree much more often. Among few inliers, a wrong
-    one bends the pose until it agrees, too: so it is also estimated with a stricter threshold. The
-    pose with the highest confidence among all matches wins.
+    those of an image that shows the same place agree much more often. A pose of few inliers is
+    also estimated with a stricter threshold. The pose with the highest confidence among all matches
+    wins.
     If it is trusted although its intrinsics were guessed, and the lens of the map's photos fits as
     well, it is estimated with that. If its photo seems to be cropped or stretched, and that lens
     fits about as well with another pose, it is not trusted. All poses are estimated and compared
@@ -83,9 +83,7 @@ def estimate(
         if thorough and not is_certain and poses[0].num_inliers < CLEAR * number:
             tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
             poses += pool.map(lambda chosen: _estimate(matches, chosen[:MOST_SIMILAR]), tried)
-        first = max(poses, key=quality)
-        if first.num_inliers <= FEW_INLIERS:
-            first = max(first, _estimate_strictly(matches, first), key=quality)
+        first = _unbent(matches, max(poses, key=quality))
         outliers = pool.submit(_of_outliers, matches, first) if workers > 1 else None
         best, others = with_other_intrinsics(matches, first)
         poses += outliers.result() if outliers and best is first else _of_outliers(matches, best)
@@ -164,7 +162,7 @@ def _with_typical_lens(matches: Matches, pose: Pose) -> Pose:
     known = matches.with_typical_lens()
     if known is None or pose.cam_from_world is None or pose.measures.may_be_cropped:
         return pose
-    typical = _estimate(known, np.flatnonzero(pose.inliers))
+    typical = _unbent(known, _estimate(known, np.flatnonzero(pose.inliers)))
     if typical.cam_from_world is None:
         return pose
     if pose.degrees_of_freedom == ALL:
@@ -242,12 +240,18 @@ def _judged(matches: Matches, pose: Pose) -> Pose:
     return replace(pose, confidence=value, degrees_of_freedom=freedom)
 
 
-def _estimate_strictly(matches: Matches, pose: Pose) -> Pose:
-    """Estimate a pose anew from its inliers, with a stricter threshold for them."""
+def _unbent(matches: Matches, pose: Pose) -> Pose:
+    """Estimate a pose of few inliers with a stricter threshold, too; return the likelier one.
+
+    Among few, a wrong one may have bent it until it agrees.
+    """
+    if pose.num_inliers > FEW_INLIERS:
+        return pose
     strict = matches.with_max_error(STRICT * matches.max_error)
     found = _estimate(strict, np.flatnonzero(pose.inliers))
     if found.cam_from_world is None:
-        return found
+        return pose
     view = found.cam_from_world, found.camera
     errors, _ = reprojection_errors(matches.points2D, matches.points3D, *view)
-    return _judged(matches, replace(found, inliers=errors <= matches.max_error))
+    found = _judged(matches, replace(found, inliers=errors <= matches.max_error))
+    return max(pose, found, key=quality)
