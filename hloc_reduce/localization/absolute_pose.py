@@ -20,9 +20,8 @@ SAMPLE = 500  # matches, at most, from which a pose is tried before all, or a ri
 # confidence of a pose at which no other matches are tried, twice the highest of photos of other
 # places in results/trials
 CERTAIN = 60.0
-# with at most so many inliers, wrong ones may bend a pose; share of the inlier threshold that fewer
-# of them pass
-FEW_INLIERS, STRICT = 500, 1 / 2
+FEW_INLIERS = 500  # at most, of a pose that wrong ones may bend
+STRICT = 1 / 2  # of the inlier threshold, for estimating such a pose again
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves

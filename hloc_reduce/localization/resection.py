@@ -265,7 +265,7 @@ def _decomposed(
 def is_plain(camera: pycolmap.Camera) -> bool:
     """Return whether intrinsics are of a pinhole with square pixels, centred, as `centred` makes.
 
-    Lenses of other models may have no coefficients and bend rays all the same.
+    A fisheye lens is none, even if all its coefficients are 0.
     """
     (fx, _, cx), (_, fy, cy), _ = camera.calibration_matrix()
     middle = camera.width / 2, camera.height / 2
