@@ -84,7 +84,7 @@ def test_a_network(name, onnx, run, base_weights, tmp_path):
     }
     assert loaded.get_modelmeta().producer_name == "hloc-reduce"
     assert str(Path(export.__file__).parent).encode() not in path.read_bytes()
-    # what docs/export.md says of TensorRT
+    # sizes but for one NonZero at the end are constants, see docs/export.md on TensorRT
     graph = onnx.load(path).graph
     constants = {value.name for value in graph.initializer}
     (top,) = (node for node in graph.node if node.op_type == "TopK")

@@ -1,0 +1,106 @@
+"""Localize the queries of several places with other limits of the estimation of poses.
+
+Runs the jobs of a file of `pipelines.batch` once, and then localizes their queries again with each
+value of one limit of `localization.absolute_pose`, all others as they are. Features, maps and
+matches are kept in the outputs folder, and an interrupted benchmark resumes. Adds a row for each
+query list of each job to results/pose_limits.csv, and prints the sums. Seconds are those of the
+localization. A pose is wrong if its position is off by more than 25 cm.
+"""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from benchmarks import rows
+from benchmarks.accuracy import measured, what
+from hloc_reduce.localization import absolute_pose
+from hloc_reduce.localization.records import log_file
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.tables import aligned
+from pipelines import batch
+from pipelines.batch import jobs
+
+NAME = "pose_limits"
+AS_IS = "as is"
+LIMITS = {
+    "FEW_INLIERS": (0, 100, 1_000_000),
+    "STRICT": (1 / 4, 1 / 3, 2 / 3),
+    "WIDER": (1, 2, 3, 10),
+    "RIVAL_SHARE": (1 / 2, 1),
+    "SAMPLE": (250, 1000, 1_000_000),
+}
+
+
+def variants() -> dict[str, dict[str, float]]:
+    """Return the limits that each variant changes."""
+    found: dict[str, dict[str, float]] = {AS_IS: {}}
+    for name, values in LIMITS.items():
+        found |= {f"{name} {_text(value)}": {name: value} for value in values}
+    return found
+
+
+@contextmanager
+def changed(limits: dict[str, float]) -> Iterator[None]:
+    """Change limits for a while."""
+    before = {name: getattr(absolute_pose, name) for name in limits}
+    vars(absolute_pose).update(limits)
+    try:
+        yield
+    finally:
+        vars(absolute_pose).update(before)
+
+
+def sums(found: list[rows.Row]) -> list[str]:
+    """Return the sums of the rows of a variant: queries by accuracy, wrong ones and seconds."""
+    names = "localized", *(f"within_{limit}cm" for limit in rows.CENTIMETRES)
+    numbers = [sum(int(row[name]) for row in found) for name in names]
+    seconds = sum(float(row["seconds"]) for row in found)
+    return [*map(str, numbers), str(numbers[0] - numbers[-1]), f"{seconds:.0f}"]
+
+
+def _main() -> None:
+    parser = cli.Parser(__doc__, "results/pose_limits.yaml")
+    parser.add_argument("job_file", type=Path, help="YAML file of jobs, see docs/operations.md")
+    parser.add_argument("--outputs", type=Path, default=Path("outputs/pose_limits"))
+    rows.add_again_option(parser)
+    args = parser.parse_args()
+    wanted = jobs.read(args.job_file)[1]
+    known = [] if args.again else rows.read(NAME)
+    for variant, limits in variants().items():
+        todo = [job for job in wanted if not rows.select(known, **_what(job, variant))]
+        if not todo:
+            continue
+        folders = {job: args.outputs / job.dataset.name / job.name for job in todo}
+        for folder in folders.values():
+            for log in folder.glob(log_file(Path("*")).name):
+                log.unlink()
+        before = {job: _seconds(folder) for job, folder in folders.items()}
+        with changed(limits):
+            batch.main(args.job_file, args.outputs)
+        for job, folder in folders.items():
+            found = [cells | _what(job, variant) for cells in measured(folder)]
+            seconds = (_seconds(folder) - before[job]) / len(found)
+            rows.add(NAME, [cells | {"seconds": seconds} for cells in found])
+    header = ["limit", "localized", *(f"{limit} cm" for limit in rows.CENTIMETRES), "wrong", "s"]
+    all_rows = rows.read(NAME)
+    table = [[name, *sums(rows.select(all_rows, variant=name))] for name in variants()]
+    print(aligned([header, *table]))
+
+
+def _text(value: float) -> str:
+    return f"{value:,}" if value == int(value) else f"{value:.2f}"
+
+
+def _seconds(folder: Path) -> float:
+    """Return the seconds of localization in all runs in a folder so far."""
+    path = folder / "summary.json"
+    return json.loads(path.read_text())["seconds"]["localization"] if path.exists() else 0.0
+
+
+def _what(job: jobs.Job, variant: str) -> dict[str, str]:
+    return what(job) | {"variant": variant}
+
+
+if __name__ == "__main__":
+    cli.run(_main)
