@@ -67,6 +67,37 @@ def stock(images: Path, folder: Path) -> pycolmap.Reconstruction:
     return max(models.values(), key=lambda model: model.num_reg_images())
 
 
+Similarity = tuple[float, np.ndarray, np.ndarray]  # scale, rotation (3, 3) and shift (3,)
+
+
+def align(model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction) -> Similarity:
+    """Align a model with another that has its images: positions map by s R x + t.
+
+    One of least absolute errors: a wrong pose does not spoil the others.
+    """
+    true = {image.name: image.projection_center() for image in reference.images.values()}
+    known = [image for image in model.images.values() if image.name in true]
+    source = np.array([image.projection_center() for image in known])
+    target = np.array([true[image.name] for image in known])
+    weights = np.ones(len(source))
+    for _ in range(REWEIGHTINGS):
+        scale, rotation, shift = fit_similarity(source, target, weights)
+        errors = np.linalg.norm(scale * source @ rotation.T + shift - target, axis=1)
+        weights = 1 / np.maximum(errors, max(np.median(errors), 1e-9) / 10)
+    return scale, rotation, shift
+
+
+def difference(
+    pose: pycolmap.Rigid3d, true: pycolmap.Rigid3d, similarity: Similarity
+) -> tuple[float, float]:
+    """Return how far a pose is from the true one after a similarity: in its units, and degrees."""
+    scale, rotation, shift = similarity
+    position = scale * rotation @ pose.inverse().translation + shift
+    turn = true.rotation.matrix().T @ pose.rotation.matrix() @ rotation.T
+    angle = np.rad2deg(Rotation.from_matrix(turn).magnitude())
+    return float(np.linalg.norm(position - true.inverse().translation)), float(angle)
+
+
 def pose_errors(
     model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -80,24 +111,15 @@ def pose_errors(
         Position errors (N,), in percent of the extent of the reference, and rotation errors (N,),
         in degrees.
     """
+    similarity = align(model, reference)
     true = {image.name: image.cam_from_world() for image in reference.images.values()}
-    known = {image.name: image.cam_from_world() for image in model.images.values()}
-    names = sorted(known)
-    source = np.array([known[name].inverse().translation for name in names])
-    target = np.array([true[name].inverse().translation for name in names])
-    # least absolute errors: one wrong pose does not spoil the others
-    weights = np.ones(len(names))
-    for _ in range(REWEIGHTINGS):
-        scale, rotation, shift = fit_similarity(source, target, weights)
-        errors = np.linalg.norm(scale * source @ rotation.T + shift - target, axis=1)
-        weights = 1 / np.maximum(errors, max(np.median(errors), 1e-9) / 10)
-    angles = [
-        Rotation.from_matrix(
-            true[name].rotation.matrix().T @ known[name].rotation.matrix() @ rotation.T
-        ).magnitude()
-        for name in names
+    extent = pdist([pose.inverse().translation for pose in true.values()]).max()
+    found = [
+        difference(image.cam_from_world(), true[image.name], similarity)
+        for image in sorted(model.images.values(), key=lambda image: image.name)
     ]
-    return 100 * errors / pdist(target).max(), np.rad2deg(angles)
+    distances, angles = np.array(found).T
+    return 100 * distances / extent, angles
 
 
 def fit_similarity(
