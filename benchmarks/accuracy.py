@@ -37,6 +37,8 @@ def what(job: Job) -> dict[str, str]:
     }
     # the name of a job tells further options that are not the default
     parts = job.name.replace(f"+{job.matcher}", "").split("+")[1:]
+    named = {f"keypoints{job.keypoints}": rows.with_keypoints(job.keypoints)}
+    parts = [named.get(part, part) for part in parts]
     return given | {"variant": " ".join(part for part in parts if part not in given.values())}
 
 

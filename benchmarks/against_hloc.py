@@ -58,7 +58,7 @@ class Run:
     def cells(self) -> dict[str, str]:
         """Return the cells of its row that name it."""
         feature, _, storage = self.name.partition(":")
-        variant = f"{self.keypoints} keypoints" if self.keypoints else ""
+        variant = rows.with_keypoints(self.keypoints) if self.keypoints else ""
         return dict(zip(KEYS, (feature, storage or STORAGES[0], variant), strict=True))
 
     def conf(self) -> dict:
@@ -85,14 +85,9 @@ def stages_of(which: Run, queries: list[str]) -> dict[str, Callable]:
 
         conf, matcher, extract = extract_features.confs["sift"], "NN-ratio", extract_features.main
     else:
-        from hloc_reduce import (  # noqa: F401  imports of torch are not timed
-            extract_features,
-            extractors,
-            localize_sfm,
-            match_features,
-            matchers,
-            triangulation,
-        )
+        import torch  # noqa: F401  not timed, as hloc's stages have imported it, too
+
+        from hloc_reduce import extract_features, localize_sfm, match_features, triangulation
 
         conf = which.conf()
         matcher = features_confs.matcher_of(conf)

@@ -100,6 +100,11 @@ def localization(
     }
 
 
+def with_keypoints(settings: str) -> str:
+    """Return what rows call settings of DoG keypoints, as a variant."""
+    return f"{settings} keypoints"
+
+
 def add_again_option(parser: argparse.ArgumentParser) -> None:
     """Add --again to a command line."""
     parser.add_argument("--again", action="store_true", help="also measure rows that exist")

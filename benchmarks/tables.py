@@ -5,7 +5,7 @@ from collections.abc import Callable
 from operator import mul
 from pathlib import Path
 
-from benchmarks.rows import Row, read, select
+from benchmarks.rows import Row, read, select, with_keypoints
 from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
 from hloc_reduce.confs import features as features_confs
@@ -197,7 +197,7 @@ def keypoints_table() -> Table:
     table = [["`--keypoints`", "localized", "within 1 cm", "within 5 cm", "inliers, day", "night"]]
     table[0] += ["town at night"]
     for name in (KEYPOINT_SETTINGS[0], FAST):
-        variant = "" if name == KEYPOINT_SETTINGS[0] else f"keypoints{name}"
+        variant = "" if name == KEYPOINT_SETTINGS[0] else with_keypoints(name)
         of_name = select(rows, variant=variant)
         counts = (
             f"{total(of_name, measure):.0f} of {total(of_name, 'queries'):.0f}"

@@ -198,7 +198,7 @@ def _of_outliers(matches: Matches, pose: Pose) -> list[Pose]:
 def _estimate(
     matches: Matches, chosen: np.ndarray, least_ratio: float = LEAST_RATIO, least: float = 0
 ) -> Pose:
-    """Estimate a pose from chosen matches, then from all matches that are near it.
+    """Estimate a pose from chosen matches, then from all matches that are near it, and judge it.
 
     Args:
         matches: of the query.
@@ -206,9 +206,14 @@ def _estimate(
         least_ratio: share of inliers below which RANSAC need not find a pose among these.
         least: number of inliers below which a pose counts as none.
     """
+    return _judged(matches, _found(matches, chosen, least_ratio, least))
+
+
+def _found(matches: Matches, chosen: np.ndarray, least_ratio: float, least: float) -> Pose:
+    """Return the pose of `_estimate` without its confidence."""
     points2D, points3D, number = matches.points2D, matches.points3D, len(matches)
     ransac = {"min_inlier_ratio": least_ratio}
-    pose = Pose(None, matches.camera, np.zeros(number, bool))
+    pose = none = Pose(None, matches.camera, np.zeros(number, bool))
     for _ in range(1 if len(chosen) == number else REESTIMATIONS):
         camera = copy.deepcopy(pose.camera)
         chosen_points = points2D[chosen], points3D[chosen]
@@ -224,9 +229,7 @@ def _estimate(
             break
         pose = Pose(cam_from_world, camera, inliers)
         chosen = np.flatnonzero(errors <= WIDER * matches.max_error)
-    if pose.num_inliers < least:
-        pose = Pose(None, matches.camera, np.zeros(number, bool))
-    return _judged(matches, pose)
+    return pose if pose.num_inliers >= least else none
 
 
 def _judged(matches: Matches, pose: Pose) -> Pose:
@@ -247,7 +250,7 @@ def _unbent(matches: Matches, pose: Pose) -> Pose:
     if pose.num_inliers > FEW_INLIERS:
         return pose
     strict = matches.with_max_error(STRICT * matches.max_error)
-    found = _estimate(strict, np.flatnonzero(pose.inliers))
+    found = _found(strict, np.flatnonzero(pose.inliers), LEAST_RATIO, 0)
     if found.cam_from_world is None:
         return pose
     view = found.cam_from_world, found.camera
