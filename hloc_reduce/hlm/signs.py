@@ -3,7 +3,7 @@
 import numpy as np
 
 SIGNS = 1024  # bits of a descriptor, at most
-DESCRIPTORS_PER_BLOCK = 1024  # that are unpacked at once
+BYTES = np.arange(256, dtype=np.uint8)[:, None]
 
 
 def hadamard(rows: np.ndarray, number: int) -> np.ndarray:
@@ -40,7 +40,7 @@ def pack(descriptors: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 class Signs:
-    """Packed signs of global descriptors, unpacked when they are needed.
+    """Packed signs of global descriptors.
 
     Args:
         packed: (I, B) uint8 from `pack`.
@@ -48,27 +48,34 @@ class Signs:
     """
 
     def __init__(self, packed: np.ndarray, number: int):
-        self._packed, self._number, self._count = packed, number, count(number)
+        self._columns = np.ascontiguousarray(packed.T)  # (B, I): `similarity` reads byte by byte
+        self._number, self._count = number, count(number)
 
     def descriptors(self) -> np.ndarray:
         """Return the descriptors (I, G) float32 of unit norm that the signs tell."""
-        found = hadamard(self._unpacked(slice(None)), self._number)
+        found = hadamard(_signs(self._columns.T, self._count), self._number)
         return found[:, : self._number] * self._scale(found.shape[1])
 
     def similarity(self, descriptor: np.ndarray) -> np.ndarray:
-        """Return the products (I,) of a descriptor (G,) with `descriptors`, without these."""
+        """Return the products (I,) of a descriptor (G,) with `descriptors`, without these.
+
+        A table has the sums of the eight products that a byte may stand for.
+        """
         transformed = hadamard(descriptor[None], self._number)[0]
-        parts = [
-            self._unpacked(slice(start, start + DESCRIPTORS_PER_BLOCK)) @ transformed[: self._count]
-            for start in range(0, len(self._packed), DESCRIPTORS_PER_BLOCK)
-        ]
-        return np.concatenate(parts) * self._scale(len(transformed))
+        parts = np.zeros(8 * len(self._columns), np.float32)
+        parts[: self._count] = transformed[: self._count]
+        tables = parts.reshape(-1, 8) @ _signs(BYTES, 8).T
+        found = np.zeros(self._columns.shape[1], np.float32)
+        for table, column in zip(tables, self._columns, strict=True):
+            found += table.take(column)
+        return found * self._scale(len(transformed))
 
     def _scale(self, size: int) -> np.float32:
         """Return what undoes the change of norms by a transform of a size: by its square root."""
         return np.float32(1 / np.sqrt(self._count * size))
 
-    def _unpacked(self, rows: slice) -> np.ndarray:
-        """Return some signs (N, S) float32, -1 and 1."""
-        bits = np.unpackbits(self._packed[rows], axis=1, count=self._count, bitorder="little")
-        return 2 * bits.astype(np.float32) - 1
+
+def _signs(packed: np.ndarray, number: int) -> np.ndarray:
+    """Return packed signs (N, S) float32, -1 and 1."""
+    bits = np.unpackbits(packed, axis=1, count=number, bitorder="little")
+    return 2 * bits.astype(np.float32) - 1

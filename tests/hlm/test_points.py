@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 from row_of_photos import row
 from small_map import build
 
-from hloc_reduce.hlm import points, signs, writer
+from hloc_reduce.hlm import points, writer
 from hloc_reduce.hlm.reader import rotation_of
 from hloc_reduce.hlm.signs import Signs, hadamard, pack
 
@@ -100,16 +100,25 @@ def test_hadamard_is_its_own_inverse():
     np.testing.assert_allclose(hadamard(there, 12)[:, :12] / 16, rows, atol=1e-5)
 
 
-@pytest.mark.parametrize("number", [12, 1024, 3000])
-def test_signs_retrieve_as_the_descriptors_that_they_tell(number, monkeypatch):
-    monkeypatch.setattr(signs, "DESCRIPTORS_PER_BLOCK", 3)
+def signed(number):
+    """Return ten descriptors of a number of dimensions, and their signs."""
     descriptors = np.random.default_rng(0).standard_normal((10, number)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    found = Signs(pack(descriptors)[0], number)
+    return descriptors, Signs(pack(descriptors)[0], number)
+
+
+@pytest.mark.parametrize("number", [3, 12, 1024, 3000])
+def test_signs_retrieve_as_the_descriptors_that_they_tell(number):
+    descriptors, found = signed(number)
     products = descriptors @ found.descriptors().T
     for query, expected in zip(descriptors, products, strict=True):
         np.testing.assert_allclose(found.similarity(query), expected, atol=1e-5)
-    assert (products.argmax(axis=1) == np.arange(10)).all()
+
+
+@pytest.mark.parametrize("number", [12, 1024, 3000])
+def test_a_descriptor_finds_its_signs(number):
+    descriptors, found = signed(number)
+    assert [found.similarity(query).argmax() for query in descriptors] == list(range(10))
 
 
 def test_selected_points_are_spread():

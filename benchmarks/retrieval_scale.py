@@ -1,0 +1,136 @@
+"""Search the signs of global descriptors in up to a million images, by this project and by faiss.
+
+A compact map keeps 1,024 signs of an image's global descriptor, 128 bytes. The descriptors are
+those of a map's images, drawn again and again with noise. Queries are noisy, too. Adds rows to
+results/retrieval.csv: milliseconds of a query on one core, seconds to build an index, and the share
+of the 10 most similar images by all numbers that are among the first 10, or among the first 50.
+Needs faiss (pip install faiss-cpu).
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import rows
+from hloc_reduce.hlm.signs import Signs, pack
+from hloc_reduce.retrieval.ranking import read_global
+from hloc_reduce.utils import cli
+from hloc_reduce.utils.h5 import list_h5_names
+from hloc_reduce.utils.progress import progress
+
+NAME = "retrieval"
+QUERIES, WANTED, FOUND = 50, 10, 50
+NOISE = 1.0  # norm of that of an image, and of a query, relative to the descriptor
+BLOCK = 5000  # descriptors in memory at once
+LINKS, EFFORT = 16, 256  # of HNSW, and of a search in it
+CELLS_OF_ROOT, VISITED = 4, 0.05  # cells of IVF by the root of the images; share that is searched
+
+Search = Callable[[np.ndarray], np.ndarray]  # the rows (FOUND,) of a query (G,), best first
+
+
+def noisy(descriptors: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Add noise to descriptors (N, G) of unit norm."""
+    number = descriptors.shape[1]
+    noise = generator.standard_normal(descriptors.shape, np.float32) * (NOISE / number**0.5)
+    found = descriptors + noise
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def synthesize(real: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray, list[set[int]]]:
+    """Return the packed signs of a number of images, queries (Q, G), and the best of each."""
+    generator = np.random.default_rng(0)
+    queries = noisy(real[generator.choice(len(real), QUERIES)], generator)
+    packed, best = [], np.empty((QUERIES, 0), np.int64)
+    values = np.empty((QUERIES, 0), np.float32)
+    for start in progress(range(0, number, BLOCK), "Images", "block"):
+        drawn = generator.choice(len(real), min(BLOCK, number - start))
+        images = noisy(real[drawn], generator)
+        packed.append(pack(images)[0])
+        values = np.hstack([values, queries @ images.T])
+        best = np.hstack([best, np.tile(np.arange(start, start + len(images)), (QUERIES, 1))])
+        kept = np.argsort(-values, axis=1)[:, :WANTED]
+        best, values = (np.take_along_axis(array, kept, 1) for array in (best, values))
+    return np.concatenate(packed), queries, [set(row) for row in best.tolist()]
+
+
+def first(similarity: np.ndarray) -> np.ndarray:
+    """Return the rows of the FOUND most similar images, best first."""
+    rows_of_best = np.argpartition(-similarity, FOUND)[:FOUND]
+    return rows_of_best[np.argsort(-similarity[rows_of_best])]
+
+
+def recall(best: list[set[int]], found: list[np.ndarray], most: int) -> float:
+    """Return the share of the best rows that are among the first ones found."""
+    shares = [
+        len(wanted & set(one[:most].tolist())) / WANTED
+        for wanted, one in zip(best, found, strict=True)
+    ]
+    return float(np.mean(shares))
+
+
+def searches(packed: np.ndarray, number: int) -> Iterator[tuple[str, Callable[[], Search]]]:
+    """Yield the name of each way of searching, and what builds it."""
+    import faiss
+
+    bits = 8 * packed.shape[1]
+
+    def by_signs() -> Search:
+        found = Signs(packed, number)
+        return lambda query: first(found.similarity(query))
+
+    def by_faiss(index: "faiss.IndexBinary") -> Search:
+        if not index.is_trained:
+            index.train(packed[:: max(1, len(packed) // 50_000)])
+        index.add(packed)
+        return lambda query: index.search(pack(query[None])[0], FOUND)[1][0]
+
+    def hnsw() -> Search:
+        index = faiss.IndexBinaryHNSW(bits, LINKS)
+        index.hnsw.efSearch = EFFORT
+        return by_faiss(index)
+
+    def ivf() -> Search:
+        cells = int(CELLS_OF_ROOT * len(packed) ** 0.5)
+        quantizer = faiss.IndexBinaryFlat(bits)
+        index = faiss.IndexBinaryIVF(quantizer, bits, cells)
+        index.nprobe = max(1, int(VISITED * cells))
+        return by_faiss(index)
+
+    yield "products with signs, all images", by_signs
+    yield "faiss, Hamming, all images", lambda: by_faiss(faiss.IndexBinaryFlat(bits))
+    yield "faiss, Hamming, HNSW", hnsw
+    yield "faiss, Hamming, IVF", ivf
+
+
+def _main() -> None:
+    parser = cli.Parser(__doc__, "--globals outputs/town/global-feats.h5 --images 10000 100000")
+    add = parser.add_argument
+    add("--globals", type=Path, required=True, help="file of global descriptors of a map")
+    add("--images", nargs="+", type=int, default=[10_000, 100_000, 1_000_000], help="numbers")
+    rows.add_again_option(parser)
+    args = parser.parse_args()
+    import faiss
+
+    faiss.omp_set_num_threads(1)
+    real = read_global(args.globals, list_h5_names(args.globals))
+    for number in args.images:
+        cells = {"place": f"{number} images"}
+        if not args.again and rows.select(rows.read(NAME), **cells):
+            continue
+        packed, queries, best = synthesize(real, number)
+        for name, build in searches(packed, real.shape[1]):
+            start = time.perf_counter()
+            search = build()
+            built = time.perf_counter()
+            found = [search(query) for query in queries]
+            seconds = (time.perf_counter() - built) / len(queries)
+            shares = {f"recall_{most}": recall(best, found, most) for most in (WANTED, FOUND)}
+            measures = {"variant": name, "bytes": packed.shape[1], "photos": number}
+            measures |= {"ms": 1000 * seconds, "build_s": built - start, **shares}
+            rows.add(NAME, [cells | measures | rows.how(cores=1)])
+
+
+if __name__ == "__main__":
+    cli.run(_main)
