@@ -292,6 +292,44 @@ def lightglue_table() -> Table:
     return table
 
 
+def lightglue_bytes_table() -> Table:
+    """Compare raw descriptors with their codes, matched by LightGlue in maps and queries."""
+    lists = [("herz-jesus", "day"), *((place, "night") for place in LIGHTGLUE_PLACES[:3])]
+    lists += [("sparse-herz-jesus", "day")]
+    heads = [f"{place.removesuffix('-P11')}, {part}" for place, part in lists]
+    table = [["feature", "bytes", *heads]]
+    for base in ("aliked", "xfeat"):
+        codes = ((f"{base}_sv32", storage) for storage in ("uint4", "uint2", "uint1"))
+        for feature, storage in [(base, FLOATS[0]), *codes]:
+            variant = f"map by lightglue, 1024 keypoints, {RETRIEVED} images"
+            given = {"feature": feature, "storage": storage, "variant": variant}
+            rows = select(read("lightglue"), matcher="lightglue", **given)
+            cells = []
+            for place, part in lists:
+                found = select(rows, place=place, list=part)
+                cells += [inliers_and_median(row) for row in found] or [""]
+            table.append([f"`{feature}`, `{storage}`", rows[0]["bytes"], *cells])
+    return table
+
+
+def inliers_and_median(row: Row) -> str:
+    """Format the mean inliers of a query list and its median error in cm."""
+    return f"{float(row['inliers']):,.0f}; {float(row['median_cm']):.2f}"
+
+
+def lightglue_seconds_table() -> Table:
+    """Show the milliseconds of a pair with LightGlue, by keypoints and threads."""
+    rows = read("lightglue_seconds")
+    variants = list(dict.fromkeys(row["variant"] for row in rows))
+    table = [["feature", "keypoints", *variants]]
+    for row in rows:
+        if row["variant"] == variants[0]:
+            same = {key: row[key] for key in ("place", "list", "feature")}
+            cells = [f"{float(one['ms']):,.0f}" for one in select(rows, **same)]
+            table.append([f"`{row['feature']}`", row["list"].split()[0], *cells])
+    return table[:1] + sorted(table[1:], key=lambda cells: (cells[0], int(cells[1])))
+
+
 def accuracy(rows: list[Row]) -> str:
     """Format the queries within 1 and 5 cm, and the mean inliers, of query lists."""
     near = (f"{total(rows, f'within_{limit}cm'):.0f}" for limit in (1, 5))
@@ -481,6 +519,8 @@ TABLES: dict[str, Callable[[], Table]] = {
     "limits": limits_table,
     "map_limits": map_limits_table,
     "lightglue": lightglue_table,
+    "lightglue_bytes": lightglue_bytes_table,
+    "lightglue_seconds": lightglue_seconds_table,
     "runs": runs_table,
     "runs_cpu": runs_cpu_table,
     "extraction": extraction_table,
