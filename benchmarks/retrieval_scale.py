@@ -14,10 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import rows
+from hloc_reduce import aggregate_features, extract_features
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.confs import retrieval as retrieval_confs
+from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.hlm.signs import Signs, pack
 from hloc_reduce.retrieval.ranking import read_global
 from hloc_reduce.utils import cli
-from hloc_reduce.utils.h5 import list_h5_names
 from hloc_reduce.utils.progress import progress
 
 NAME = "retrieval"
@@ -28,6 +31,14 @@ LINKS, EFFORT = 16, 256  # of HNSW, and of a search in it
 CELLS_OF_ROOT, VISITED = 4, 0.05  # cells of IVF by the root of the images; share that is searched
 
 Search = Callable[[np.ndarray], np.ndarray]  # the rows (FOUND,) of a query (G,), best first
+
+
+def descriptors(place: Aachen, outputs: Path) -> np.ndarray:
+    """Return the global descriptors (N, G) of the map images of a place."""
+    conf, names = features_confs.get(features_confs.RECOMMENDED)[1], place.map_names()
+    features = extract_features.main(conf, place.images, outputs, image_list=names)
+    path = aggregate_features.main(retrieval_confs.get(retrieval_confs.VLAD), features, names)
+    return read_global(path, names)
 
 
 def noisy(descriptors: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -105,18 +116,19 @@ def searches(packed: np.ndarray, number: int) -> Iterator[tuple[str, Callable[[]
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--globals outputs/town/global-feats.h5 --images 10000 100000")
+    parser = cli.Parser(__doc__, "--dataset datasets/demo_town-400 --images 10000 100000")
     add = parser.add_argument
-    add("--globals", type=Path, required=True, help="file of global descriptors of a map")
+    add("--dataset", type=Path, required=True, help="a place in Aachen's layout")
     add("--images", nargs="+", type=int, default=[10_000, 100_000, 1_000_000], help="numbers")
+    add("--outputs", type=Path, default=Path("outputs/retrieval"))
     rows.add_again_option(parser)
     args = parser.parse_args()
     import faiss
 
     faiss.omp_set_num_threads(1)
-    real = read_global(args.globals, list_h5_names(args.globals))
+    real = descriptors(Aachen(args.dataset), args.outputs / args.dataset.name)
     for number in args.images:
-        cells = {"place": f"{number} images"}
+        cells = {"place": args.dataset.name, "list": f"{number} images"}
         if not args.again and rows.select(rows.read(NAME), **cells):
             continue
         packed, queries, best = synthesize(real, number)
