@@ -20,6 +20,7 @@ PAGES = (
     "docs/localize.md",
     "docs/maps.md",
     "docs/performance.md",
+    "docs/lab.md",
 )
 LONGEST_NUMBER = 30  # characters of a cell, with units
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from operator import mul
 from pathlib import Path
 
-from benchmarks.rows import Row, read, select, with_keypoints
+from benchmarks import pose_limits
+from benchmarks.rows import CENTIMETRES, Row, read, select, with_keypoints
 from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
 from hloc_reduce.confs import features as features_confs
@@ -110,6 +111,8 @@ LIGHTGLUE_PLACES = (
     *("herz-jesus", "dark-fountain-P11", "dark-sceaux"),
     *(f"sparse-{place}" for place in ("herz-jesus", "fountain-P11", "sceaux")),
 )
+# folders of photos from the web, see `benchmarks.strangers`
+WEB_PHOTOS = {"cvg+Hierarchical-Localization": "facade", "naver+mast3r": "tower"}
 ONE_CORE = "1 core"
 RUN_PLACES = "herz-jesus", "day-fountain-P11"
 STAGES = ("extraction", "matching", "triangulation", "localization")
@@ -318,16 +321,58 @@ def inliers_and_median(row: Row) -> str:
 
 
 def lightglue_seconds_table() -> Table:
-    """Show the milliseconds of a pair with LightGlue, by keypoints and threads."""
-    rows = read("lightglue_seconds")
-    variants = list(dict.fromkeys(row["variant"] for row in rows))
-    table = [["feature", "keypoints", *variants]]
-    for row in rows:
-        if row["variant"] == variants[0]:
-            same = {key: row[key] for key in ("place", "list", "feature")}
-            cells = [f"{float(one['ms']):,.0f}" for one in select(rows, **same)]
-            table.append([f"`{row['feature']}`", row["list"].split()[0], *cells])
-    return table[:1] + sorted(table[1:], key=lambda cells: (cells[0], int(cells[1])))
+    """Show the milliseconds of a pair with LightGlue, by keypoints, layers and pairs at a time."""
+    rows = [row for row in read("lightglue_seconds") if not row["variant"].endswith("2 threads")]
+    table = [["feature", "keypoints", *dict.fromkeys(row["variant"] for row in rows)]]
+    for feature in dict.fromkeys(row["feature"] for row in rows):
+        of_feature = select(rows, feature=feature)
+        by_number = {int(row["list"].split()[0]): row["list"] for row in of_feature}
+        for number, name in sorted(by_number.items()):
+            cells = [f"{float(row['ms']):,.0f}" for row in select(of_feature, list=name)]
+            table.append([f"`{feature}`", f"{number:,}", *cells])
+    return table
+
+
+def web_photos_table() -> Table:
+    """Show maps of photos from the web, and what is localized in them."""
+    table = [["feature", "matcher"]]
+    for called in WEB_PHOTOS.values():
+        table[0] += [f"{called}: in the maps", "localized", "median error [%]"]
+    of_places = [select(read("web_photos"), place=place) for place in WEB_PHOTOS]
+    for rows in zip(*of_places, strict=True):
+        cells = [name_of(rows[0]), f"`{rows[0]['matcher']}`"]
+        for row in rows:
+            cells += [f"{row['registered']} of {row['photos']}"]
+            cells += [f"{row['localized']} of {row['queries']}"]
+            cells += [f"{float(row['median_percent']):.1f}" if row["median_percent"] else ""]
+        table.append(cells)
+    return table
+
+
+def pose_limits_table() -> Table:
+    """Show what other limits of the estimation of poses would localize."""
+    heads = "localized", *(f"within {limit} cm" for limit in CENTIMETRES)
+    table = [["limit", *heads, "localization [s]"]]
+    for name in pose_limits.variants():
+        rows = select(read("pose_limits"), variant=name)
+        measures = "localized", *(f"within_{limit}cm" for limit in CENTIMETRES)
+        counts = (f"{total(rows, measure):.0f}" for measure in measures)
+        shown = name if name == pose_limits.AS_IS else f"`{name.replace(' ', '` ', 1)}"
+        table.append([shown, *counts, f"{total(rows, 'seconds'):.0f}"])
+    return table
+
+
+def retrieval_table() -> Table:
+    """Show how long the search for similar images takes, by their number."""
+    table = [["images", "search", "a query [ms]", "index [s]", "right of the first 50"]]
+    for row in sorted(read("retrieval"), key=lambda row: int(row["photos"])):
+        measures = (
+            f"{float(row['ms']):.3g}",
+            f"{float(row['build_s']):.1f}",
+            f"{float(row['right']):.0f}",
+        )
+        table.append([thousands(row["photos"]), row["variant"], *measures])
+    return table
 
 
 def accuracy(rows: list[Row]) -> str:
@@ -521,6 +566,9 @@ TABLES: dict[str, Callable[[], Table]] = {
     "lightglue": lightglue_table,
     "lightglue_bytes": lightglue_bytes_table,
     "lightglue_seconds": lightglue_seconds_table,
+    "pose_limits": pose_limits_table,
+    "retrieval": retrieval_table,
+    "web_photos": web_photos_table,
     "runs": runs_table,
     "runs_cpu": runs_cpu_table,
     "extraction": extraction_table,
