@@ -24,9 +24,8 @@ from pipelines.batch import jobs
 NAME = "pose_limits"
 AS_IS = "as is"
 LIMITS = {
-    "FEW_INLIERS": (0, 100, 1_000_000),
-    "STRICT": (1 / 4, 1 / 3, 2 / 3),
-    "WIDER": (1, 2, 3, 10),
+    "WIDER": (5, 20, 2, 1),
+    "STRICT": (1, 1 / 3, 2 / 3),
     "RIVAL_SHARE": (1 / 2, 1),
 }
 

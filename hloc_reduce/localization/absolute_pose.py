@@ -20,13 +20,12 @@ SAMPLE = 500  # matches, at most, from which a pose is tried before all, or a ri
 # confidence of a pose at which no other matches are tried, twice the highest of photos of other
 # places in results/trials
 CERTAIN = 60.0
-FEW_INLIERS = 500  # at most, of a pose that wrong ones may bend
-STRICT = 1 / 2  # of the inlier threshold, for estimating such a pose again
+STRICT = 1 / 2  # of the inlier threshold, for estimating a pose again
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 REESTIMATIONS = 3  # from the matches near the pose
-WIDER = 5  # inlier thresholds, within which matches are near a pose
+WIDER = 10  # inlier thresholds, within which matches are near a pose
 # a rival is looked for that has at least this share of the inliers of one that would count, as its
 # confidence may be higher than inliers alone tell
 RIVAL_SHARE = 0.75
@@ -51,9 +50,8 @@ def estimate(
     First from the likeliest matches, of which more are right, so that RANSAC needs fewer trials; if
     the pose is not certain, also from all. If few of these agree with a pose, RANSAC may have
     missed the right one. So the most similar matches of each image are tried by themselves, too:
-    those of an image that shows the same place agree much more often. A pose of few inliers is
-    also estimated with a stricter threshold. The pose with the highest confidence among all matches
-    wins.
+    those of an image that shows the same place agree much more often. The pose with the highest
+    confidence among all matches wins, and is estimated with a stricter threshold, too.
     If it is trusted although its intrinsics were guessed, and the lens of the map's photos fits as
     well, it is estimated with that. If its photo seems to be cropped or stretched, and that lens
     fits about as well with another pose, it is not trusted. All poses are estimated and compared
@@ -243,12 +241,10 @@ def _judged(matches: Matches, pose: Pose) -> Pose:
 
 
 def _unbent(matches: Matches, pose: Pose) -> Pose:
-    """Estimate a pose of few inliers with a stricter threshold, too; return the likelier one.
+    """Estimate a pose with a stricter threshold, too; return the likelier one.
 
-    Among few, a wrong one may have bent it until it agrees.
+    Wrong matches may have bent it until they agree, above all one of few.
     """
-    if pose.num_inliers > FEW_INLIERS:
-        return pose
     strict = matches.with_max_error(STRICT * matches.max_error)
     found = _found(strict, np.flatnonzero(pose.inliers), LEAST_RATIO, 0)
     if found.cam_from_world is None:
