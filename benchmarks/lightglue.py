@@ -39,7 +39,8 @@ def _main() -> None:
     parser = cli.Parser(__doc__, "--dataset datasets/dark-fountain-P11 --feature mini32:uint2")
     add = parser.add_argument
     add("--dataset", nargs="+", type=Path, required=True, help="places in Aachen's layout")
-    add("--feature", nargs="+", default=["mini32:uint2"], help="features, with the map's storage")
+    help_ = "features or YAML files, with the map's storage"
+    add("--feature", nargs="+", default=["mini32:uint2"], help=help_)
     add("--map_matcher", nargs="+", default=[FAST, "lightglue"], help=f"{FAST}, lightglue")
     add(
         "--matcher",
@@ -59,7 +60,7 @@ def _main() -> None:
     for root, given, number in product(args.dataset, args.feature, args.keypoints):
         feature, _, storage = given.partition(":")
         storage = storage or "float16"
-        place, conf = Aachen(root), features_confs.get(feature)[1]
+        place, (feature, conf) = Aachen(root), features_confs.get(feature)
         names = {FAST: features_confs.matcher_of(conf)}
         folder = args.outputs / place.root.name / str(number)
         folder.mkdir(parents=True, exist_ok=True)
