@@ -74,9 +74,14 @@ def align(model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction) ->
     """Align a model with another that has its images: positions map by s R x + t.
 
     One of least absolute errors: a wrong pose does not spoil the others.
+
+    Raises:
+        InputError: if they share fewer than three images.
     """
     true = {image.name: image.projection_center() for image in reference.images.values()}
-    known = [image for image in model.images.values() if image.name in true]
+    known = [image for image in model.images.values() if image.has_pose and image.name in true]
+    if len(known) < 3:
+        raise InputError(f"Models that share {len(known)} images cannot be aligned.")
     source = np.array([image.projection_center() for image in known])
     target = np.array([true[image.name] for image in known])
     weights = np.ones(len(source))

@@ -3,8 +3,8 @@
 Runs the jobs of a file of `pipelines.batch` once, and then localizes their queries again with each
 value of one limit of `localization.absolute_pose`, all others as they are. Features, maps and
 matches are kept in the outputs folder, and an interrupted benchmark resumes. Adds a row for each
-query list of each job to results/pose_limits.csv, and prints the sums. Seconds are those of the
-localization. A pose is wrong if its position is off by more than 25 cm.
+query list of each job to results/pose_limits.csv, whose sums are in docs/lab.md. Seconds are those
+of the localization.
 """
 
 import json
@@ -17,7 +17,6 @@ from benchmarks.accuracy import measured, what
 from hloc_reduce.localization import absolute_pose
 from hloc_reduce.localization.records import log_file
 from hloc_reduce.utils import cli
-from hloc_reduce.utils.tables import aligned
 from pipelines import batch
 from pipelines.batch import jobs
 
@@ -49,14 +48,6 @@ def changed(limits: dict[str, float]) -> Iterator[None]:
         vars(absolute_pose).update(before)
 
 
-def sums(found: list[rows.Row]) -> list[str]:
-    """Return the sums of the rows of a variant: queries by accuracy, wrong ones and seconds."""
-    names = "localized", *(f"within_{limit}cm" for limit in rows.CENTIMETRES)
-    numbers = [sum(int(row[name]) for row in found) for name in names]
-    seconds = sum(float(row["seconds"]) for row in found)
-    return [*map(str, numbers), str(numbers[0] - numbers[-1]), f"{seconds:.0f}"]
-
-
 def _main() -> None:
     parser = cli.Parser(__doc__, "results/pose_limits.yaml")
     parser.add_argument("job_file", type=Path, help="YAML file of jobs, see docs/operations.md")
@@ -80,10 +71,6 @@ def _main() -> None:
             found = [cells | _what(job, variant) for cells in measured(folder)]
             seconds = (_seconds(folder) - before[job]) / len(found)
             rows.add(NAME, [cells | {"seconds": seconds} for cells in found])
-    header = ["limit", "localized", *(f"{limit} cm" for limit in rows.CENTIMETRES), "wrong", "s"]
-    all_rows = rows.read(NAME)
-    table = [[name, *sums(rows.select(all_rows, variant=name))] for name in variants()]
-    print(aligned([header, *table]))
 
 
 def _text(value: float) -> str:

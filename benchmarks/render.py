@@ -11,6 +11,7 @@ from benchmarks.figures import FIGURES
 from benchmarks.tables import TABLES, Table
 from hloc_reduce.evaluation import plots
 from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.files import replacing
 
 PAGES = (
@@ -28,6 +29,8 @@ MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 def markdown(table: Table) -> str:
     """Format a table; columns of numbers are aligned to the right."""
+    if len(table) == 1:
+        raise InputError(f"There are no rows for the table of {', '.join(table[0])}.")
     columns = list(zip(*table[1:], strict=True))
     numeric = [
         any(cell[:1].isdigit() for cell in column) and max(map(len, column)) < LONGEST_NUMBER

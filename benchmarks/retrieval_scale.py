@@ -3,7 +3,7 @@
 A compact map keeps 1,024 signs of an image's global descriptor, 128 bytes. The descriptors are
 those of a map's images, drawn again and again with noise. Queries are noisy, too. Adds rows to
 results/retrieval.csv: milliseconds of a query on one core, seconds to build an index, and how many
-of the first 50 images are of the image that a query is of. Needs faiss (pip install faiss-cpu).
+of the first 20 images are of the image that a query is of. Needs faiss (pip install faiss-cpu).
 """
 
 import time
@@ -18,12 +18,12 @@ from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.hlm.signs import Signs, pack
-from hloc_reduce.retrieval.ranking import read_global
+from hloc_reduce.retrieval.ranking import rank, read_global
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.progress import progress
 
 NAME = "retrieval"
-QUERIES, FOUND = 50, 50
+QUERIES, FOUND = 50, 20
 NOISE = 1.0  # norm of that of an image, and of a query, relative to the descriptor
 BLOCK = 5000  # descriptors in memory at once
 LINKS, EFFORT = 16, 256  # of HNSW, and of a search in it
@@ -68,12 +68,6 @@ def synthesize(
     return np.concatenate(packed), of_image, queries, of_query
 
 
-def first(similarity: np.ndarray) -> np.ndarray:
-    """Return the rows of the FOUND most similar images, best first."""
-    rows_of_best = np.argpartition(-similarity, FOUND)[:FOUND]
-    return rows_of_best[np.argsort(-similarity[rows_of_best])]
-
-
 def searches(packed: np.ndarray, number: int) -> Iterator[tuple[str, Callable[[], Search]]]:
     """Yield the name of each way of searching, and what builds it."""
     import faiss
@@ -82,7 +76,7 @@ def searches(packed: np.ndarray, number: int) -> Iterator[tuple[str, Callable[[]
 
     def by_signs() -> Search:
         found = Signs(packed, number)
-        return lambda query: first(found.similarity(query))
+        return lambda query: rank(found.similarity(query)[None], FOUND)[0]
 
     def by_faiss(index: "faiss.IndexBinary") -> Search:
         if not index.is_trained:
@@ -125,6 +119,7 @@ def _main() -> None:
         if not args.again and rows.select(rows.read(NAME), **cells):
             continue
         packed, of_image, queries, of_query = synthesize(real, number)
+        found_rows = []
         for name, build in searches(packed, real.shape[1]):
             start = time.perf_counter()
             search = build()
@@ -134,7 +129,8 @@ def _main() -> None:
             right = float((of_image[found] == of_query[:, None]).sum(axis=1).mean())
             measures = {"variant": name, "bytes": packed.shape[1], "photos": number}
             measures |= {"ms": 1000 * seconds, "build_s": built - start, "right": right}
-            rows.add(NAME, [cells | measures | rows.how(cores=1)])
+            found_rows.append(cells | measures | rows.how(cores=1))
+        rows.add(NAME, found_rows)
 
 
 if __name__ == "__main__":

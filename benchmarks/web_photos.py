@@ -58,14 +58,18 @@ def localized(
             continue
         model = colmap.read_model(built.sfm)
         registered, points = registered + model.num_reg_images(), points + model.num_points3D()
-        similarity = align(model, reference)
+        try:
+            similarity, compared = align(model, reference), set(true)
+        except InputError as error:
+            logger.error("%s", error)
+            compared = set()
         localizer = Localizer(built.folder)
         for name in progress(left_out, "Localizing", "photo"):
             pose, info = localizer.localize(photos / name)
             if pose is None:
                 continue
             inliers.append(info["num_inliers"])
-            if name in true:
+            if name in compared:
                 distance, degrees = difference(pose, true[name], similarity)
                 errors.append((100 * distance / extent, degrees))
         shutil.rmtree(fold / "photos")

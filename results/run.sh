@@ -81,8 +81,10 @@ small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.25 0.5 1 "$@"
 # how often wrong?
 [ -e $data/strangers ] || run strangers --output $data/strangers || true # from GitHub
 web="$data/strangers/naver+mast3r $data/strangers/cvg+Hierarchical-Localization"
-run web_photos --photos $web --feature colmap_sift_sv64 --matcher NN "$@"
-run web_photos --photos $web --feature xfeat:float16 xfeat_sv32:uint2 mini32:uint2 "$@"
+if [ -e $data/strangers ]; then
+    run web_photos --photos $web --feature colmap_sift_sv64 --matcher NN "$@"
+    run web_photos --photos $web --feature xfeat:float16 xfeat_sv32:uint2 mini32:uint2 "$@"
+fi
 run pose_limits results/pose_limits.yaml "$@"
 # fox and south-building, whose images are all matched with each photo, only with the default feature
 small="bronze-statue cyprus entry-P10 fountain-P11 kitchen liberty-statue monstree sceaux"
@@ -97,8 +99,6 @@ tried "$small" --dataset $data/herz-jesus --feature xfeat_sv32 "$@"
 tried "fountain-P11 sceaux" --feature colmap_sift_sv64 --keypoints fast --trials 40 "$@"
 tried "$small" --dataset $data/herz-jesus --feature colmap_sift_sv64 --seed 1 "$@"
 tried "bronze-statue cyprus entry-P10 fountain-P11 kitchen" --dataset $data/herz-jesus --feature colmap_sift_sv16 "$@"
-sparse="--dataset $data/sparse-sceaux --dataset $data/sparse-fountain-P11 --dataset $data/sparse-herz-jesus"
-run trials $sparse --same sparse-fountain-P11 sparse-herz-jesus --feature xfeat_sv32 --seed 2 --trials 20 "$@"
 # one core takes a quarter of an hour for each place, and hours for those with more images
 tried "fountain-P11 sceaux entry-P10 bronze-statue cyprus" --feature mini32:uint2 --matcher lightglue --trials 30 "$@"
 for feature in mini64:uint2 xfeat_sv32:uint2; do
@@ -109,7 +109,7 @@ done
 run extraction --dataset $data/herz-jesus "$@" \
     --feature colmap_sift colmap_sift_sv64 sift_sv64 mini32 mini64 edgepoint2_m32 edgepoint2_m64 xfeat aliked
 run matching "$@"
-run lightglue_seconds --dataset $data/herz-jesus --feature mini32 --pairs 3 --rounds 2 "$@"
+run lightglue_seconds --dataset $data/herz-jesus --feature mini32 --rounds 2 "$@"
 run lightglue_seconds --dataset $data/herz-jesus --feature aliked --keypoints 512 1024 2048 --pairs 2 --rounds 1 "$@"
 run retrieval_scale --dataset $data/demo_town-400 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 64 "$@"

@@ -17,6 +17,7 @@ from benchmarks import (
     accuracy,
     against_hloc,
     fit_gate,
+    photos_alone,
     render,
     rows,
     split_place,
@@ -58,6 +59,41 @@ def test_a_row_replaces_one_of_the_same(results):
     assert rows.select(found, feature="sift", storage="uint8") == found[2:]
     assert found[0]["recall"] == ""
     assert not rows.read("maps")
+
+
+def moved(model, similarity):
+    """Return a copy of a model that is moved by a similarity."""
+    copied = pycolmap.Reconstruction(model)
+    copied.transform(similarity)
+    return copied
+
+
+def test_models_are_aligned_in_spite_of_a_wrong_pose():
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 12
+    options.num_points3D = 20
+    reference = pycolmap.synthesize_dataset(options)
+    turn = pycolmap.Rotation3d(np.array([0.1, 0.2, 0.3]))
+    similarity = pycolmap.Sim3d(0.5, turn, np.array([1.0, 2, 3]))
+    model = moved(reference, similarity)
+    wrong = min(model.images.values(), key=lambda image: image.name)
+    wrong.frame.set_cam_from_world(wrong.camera_id, pycolmap.Rigid3d())
+    scale, rotation, shift = photos_alone.align(model, reference)
+    back = similarity.inverse()
+    assert scale == pytest.approx(back.scale, rel=1e-2)
+    np.testing.assert_allclose(rotation, back.rotation.matrix(), atol=1e-2)
+    distances, angles = photos_alone.pose_errors(model, reference)
+    assert (distances[1:] < 1).all() and (angles[1:] < 1).all() and angles[0] > 1
+    few = pycolmap.Reconstruction(reference)
+    for image in sorted(few.images.values(), key=lambda image: image.name)[2:]:
+        few.deregister_frame(image.frame_id)
+    with pytest.raises(InputError, match="share 2 images"):
+        photos_alone.align(few, reference)
+
+
+def test_a_table_without_rows_is_an_error():
+    with pytest.raises(InputError, match="no rows for the table of images, search"):
+        render.markdown([["images", "search"]])
 
 
 def test_a_row_says_who_measured_it():

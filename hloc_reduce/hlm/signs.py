@@ -76,6 +76,6 @@ class Signs:
 
 
 def _signs(packed: np.ndarray, number: int) -> np.ndarray:
-    """Return packed signs (N, S) float32, -1 and 1."""
+    """Unpack signs (N, B): (N, S) float32, -1 and 1."""
     bits = np.unpackbits(packed, axis=1, count=number, bitorder="little")
     return 2 * bits.astype(np.float32) - 1

@@ -1,5 +1,6 @@
 """LightGlue: a network that matches by descriptors and positions, by kornia, as in hloc."""
 
+import re
 from typing import Any
 
 import torch
@@ -13,8 +14,9 @@ from ..utils.cli import InputError
 from .base import Matcher
 
 CONSTANT = "confidence_thresholds"  # a buffer that published weights lack
-# the names of XFeat's weights begin with the first; those of its extractor, with the second
-PREFIX, OTHERS = "matcher.", "extractor."
+PREFIX = "matcher."  # of the names of XFeat's weights
+# tensors of published weights that matching does not use: XFeat's extractor, scalars of DISK's
+UNUSED = re.compile(r"extractor\..*|log_assignment\.\d+\.r")
 OPTIONS = ("depth_confidence", "width_confidence", "filter_threshold")  # of kornia
 
 
@@ -139,7 +141,7 @@ def published(network: str) -> dict[str, torch.Tensor]:
     """
     what = weights_of.what(network)
     weights = read_weights(download(LIGHTGLUE[network], what), what)
-    return {_renamed(key): value for key, value in weights.items() if not key.startswith(OTHERS)}
+    return {_renamed(key): value for key, value in weights.items() if not UNUSED.fullmatch(key)}
 
 
 def _renamed(name: str) -> str:

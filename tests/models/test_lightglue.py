@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +19,7 @@ from torch.nn.functional import normalize
 from hloc_reduce import Localizer, compact, extract_features, extractors, matchers, projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs import matchers as matchers_confs
-from hloc_reduce.matchers.lightglue import LightGlue
+from hloc_reduce.matchers.lightglue import CONSTANT, LightGlue
 from hloc_reduce.networks import lightglue
 from hloc_reduce.networks.lightglue import LIGHTGLUE
 from hloc_reduce.training import adapters
@@ -229,6 +231,24 @@ def test_weights_that_are_missing_or_broken(tmp_path, monkeypatch):
     file.write_bytes(b"PK")
     with pytest.raises(InputError, match="their sha256 is not"):
         LightGlue({"features": "xfeat"})
+
+
+def test_weights_with_tensors_that_matching_does_not_use(tmp_path, monkeypatch):
+    """Those of DISK have some, and were once refused as another network's."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    disk = replace(LIGHTGLUE["disk"], sha256=None)
+    monkeypatch.setitem(LIGHTGLUE, "disk", disk)
+    no_features: Any = None
+    net = KorniaLightGlue(no_features, **KorniaLightGlue.features["disk"] | {"weights": None})
+    weights = {key: value for key, value in net.state_dict().items() if key != CONSTANT}
+    file = downloads.cache() / disk.file
+    file.parent.mkdir(parents=True)
+    torch.save(weights | {"log_assignment.0.r": torch.ones(())}, file)
+    loaded = LightGlue({"features": "disk"}).net.state_dict()
+    assert all(torch.equal(loaded[key], value) for key, value in weights.items())
+    torch.save(weights | {"log_assignment.0.other": torch.ones(())}, file)
+    with pytest.raises(InputError, match="those of another network"):
+        LightGlue({"features": "disk"})
 
 
 def test_photos_are_localized_by_it(
