@@ -350,15 +350,14 @@ def web_photos_table() -> Table:
 
 
 def pose_limits_table() -> Table:
-    """Show what other limits of the estimation of poses would localize."""
+    """Show what is localized with today's limits of the estimation of poses, then with others."""
     heads = "localized", *(f"within {limit} cm" for limit in CENTIMETRES)
-    table = [["limit", *heads]]
-    for name in pose_limits.variants():
-        rows = select(read("pose_limits"), variant=name)
-        measures = "localized", *(f"within_{limit}cm" for limit in CENTIMETRES)
-        counts = (f"{total(rows, measure):.0f}" for measure in measures)
-        shown = name if name == pose_limits.AS_IS else f"`{name.replace(' ', '` ', 1)}"
-        table.append([shown, *counts])
+    table = [[*pose_limits.LIMITS, *heads]]
+    measures = "localized", *(f"within_{limit}cm" for limit in CENTIMETRES)
+    for name, limits in pose_limits.variants().items():
+        if rows := select(read("pose_limits"), variant=name):
+            counts = (f"{total(rows, measure):.0f}" for measure in measures)
+            table.append([*(f"{value:.3g}" for value in limits.values()), *counts])
     return table
 
 

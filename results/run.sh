@@ -120,6 +120,15 @@ if "$python" -c "import hloc" 2> /dev/null; then
         run against_hloc --dataset $data/$place --keypoints adaptive hloc fast "$@" \
             --feature sift_sv64 colmap_sift_sv64 colmap_sift_sv16 xfeat_sv32:uint2 mini32:uint2
     done
+    mkdir -p outputs
+    { # photos of 1,600 pixels take half a minute
+        echo "model: {name: disk, max_keypoints: 4096}"
+        echo "preprocessing: {grayscale: false, resize_max: 1024}"
+    } > outputs/disk.yaml
+    for matcher in NN-mutual lightglue; do
+        run lightglue --dataset $data/dark-fountain-P11 --feature outputs/disk.yaml:float16 --keypoints 1024 "$@" \
+            --map_matcher $matcher --matcher $matcher
+    done
 fi
 
 run render

@@ -25,7 +25,7 @@ LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
 REESTIMATIONS = 3  # from the matches near the pose
-WIDER = 10  # inlier thresholds, within which matches are near a pose
+WIDER = 5  # inlier thresholds, within which matches are near a pose
 # a rival is looked for that has at least this share of the inliers of one that would count, as its
 # confidence may be higher than inliers alone tell
 RIVAL_SHARE = 0.75
