@@ -5,7 +5,7 @@ from collections.abc import Callable
 from operator import mul
 from pathlib import Path
 
-from benchmarks import pose_limits
+from benchmarks import lightglue_seconds, pose_limits
 from benchmarks.rows import CENTIMETRES, Row, read, select, with_keypoints
 from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
@@ -100,7 +100,6 @@ MAP_SIZES = (0.06, 0.03)
 # of LightGlue: features, and the numbers of keypoints that are matched
 LIGHTGLUE: list[tuple[str, str, int]] = [
     ("xfeat", "float16", 1024),
-    ("xfeat_sv32", "uint4", 1024),
     ("xfeat_sv32", "uint2", 1024),
     ("mini64", "uint2", 1024),
     ("mini32", "uint2", 1024),
@@ -112,7 +111,12 @@ LIGHTGLUE_PLACES = (
     *(f"sparse-{place}" for place in ("herz-jesus", "fountain-P11", "sceaux")),
 )
 # folders of photos from the web, see `benchmarks.strangers`
-WEB_PHOTOS = {"cvg+Hierarchical-Localization": "facade", "naver+mast3r": "tower"}
+WEB_PHOTOS = "cvg+Hierarchical-Localization", "naver+mast3r"  # a facade, a tower
+SECONDS_OF_PAIRS = {
+    "all layers, 1 thread": "all layers, one core",
+    "early exit, 1 thread": "early exit",
+    "early exit, 2 pairs at a time": "a pair on each of two cores",
+}
 ONE_CORE = "1 core"
 RUN_PLACES = "herz-jesus", "day-fountain-P11"
 STAGES = ("extraction", "matching", "triangulation", "localization")
@@ -321,31 +325,31 @@ def inliers_and_median(row: Row) -> str:
 
 
 def lightglue_seconds_table() -> Table:
-    """Show the milliseconds of a pair with LightGlue, by keypoints, layers and pairs at a time."""
-    rows = [row for row in read("lightglue_seconds") if not row["variant"].endswith(" threads")]
-    table = [["feature", "keypoints", *dict.fromkeys(row["variant"] for row in rows)]]
+    """Show the time and the matches of a pair with LightGlue, by keypoints."""
+    table = [["feature", "keypoints", *(f"{head} [ms]" for head in SECONDS_OF_PAIRS.values())]]
+    table[0] += [f"matches, {layers}" for layers in lightglue_seconds.LAYERS]
+    rows = read("lightglue_seconds")
     for feature in dict.fromkeys(row["feature"] for row in rows):
         of_feature = select(rows, feature=feature)
         by_number = {int(row["list"].split()[0]): row["list"] for row in of_feature}
         for number, name in sorted(by_number.items()):
-            cells = [f"{float(row['ms']):,.0f}" for row in select(of_feature, list=name)]
+            found = {row["variant"]: row for row in select(of_feature, list=name)}
+            cells = [f"{float(found[variant]['ms']):,.0f}" for variant in SECONDS_OF_PAIRS]
+            one_core = (found[f"{layers}, 1 thread"] for layers in lightglue_seconds.LAYERS)
+            cells += [thousands(row["matches"]) for row in one_core]
             table.append([f"`{feature}`", f"{number:,}", *cells])
     return table
 
 
 def web_photos_table() -> Table:
     """Show maps of photos from the web, and what is localized in them."""
-    table = [["feature", "matcher"]]
-    for called in WEB_PHOTOS.values():
-        table[0] += [f"{called}: in the maps", "localized", "off by 10 % or 10°"]
-    of_places = [select(read("web_photos"), place=place) for place in WEB_PHOTOS]
-    for rows in zip(*of_places, strict=True):
-        cells = [name_of(rows[0]), f"`{rows[0]['matcher']}`"]
-        for row in rows:
-            cells += [f"{row['registered']} of {row['photos']}"]
-            cells += [f"{row['localized']} of {row['queries']}"]
-            cells += [row["far"]]
-        table.append(cells)
+    facade, tower = (select(read("web_photos"), place=place) for place in WEB_PHOTOS)
+    table = [["feature", "matcher", "facade: in the maps", "localized", "off by 10 % or 10°"]]
+    table[0] += ["tower: in the maps"]
+    for row, other in zip(facade, tower, strict=True):
+        cells = [f"{one['registered']} of {one['photos']}" for one in (row, other)]
+        cells[1:1] = [f"{row['localized']} of {row['queries']}", row["far"]]
+        table.append([name_of(row), f"`{row['matcher']}`", *cells])
     return table
 
 
