@@ -23,6 +23,7 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.matchers.base import Features, Matcher
 from hloc_reduce.runtime import parallel
 from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.feature_files import get_features
 from hloc_reduce.utils.h5 import open_h5
 
@@ -98,6 +99,8 @@ def _main() -> None:
     rows.add_again_option(parser)
     args = parser.parse_args()
     cli.check_positive(args, "pairs", "rounds")
+    if min(args.keypoints) < 1:
+        raise InputError("--keypoints: at least 1.")
     place, cores = Aachen(args.dataset), parallel.cores()
     threads = sorted({1, cores})
     known = [] if args.again else rows.read(NAME)

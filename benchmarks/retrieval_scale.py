@@ -20,6 +20,7 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.hlm.signs import Signs, pack
 from hloc_reduce.retrieval.ranking import rank, read_global
 from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.progress import progress
 
 NAME = "retrieval"
@@ -110,6 +111,8 @@ def _main() -> None:
     add("--outputs", type=Path, default=Path("outputs/retrieval"))
     rows.add_again_option(parser)
     args = parser.parse_args()
+    if min(args.images) < FOUND:
+        raise InputError(f"--images: at least {FOUND}.")
     import faiss
 
     faiss.omp_set_num_threads(1)

@@ -85,6 +85,7 @@ def _main() -> None:
         "--matcher",
         nargs="+",
         default=["NN", "lightglue"],
+        choices=("NN", "lightglue"),
         help="of maps and queries: NN, the feature's own; lightglue",
     )
     add("--outputs", type=Path, default=Path("outputs/web_photos"))
