@@ -1,7 +1,7 @@
 """Localize the queries of InLoc: 2D-3D matches through the scans of cutouts, PnP + RANSAC."""
 
 import hashlib
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -46,7 +46,7 @@ def main(
     executor: Executor = SERIAL,
     points: Annotated[Path, HIDDEN] | None = None,
     gate: Gate = DEFAULT_GATE,
-    again: stage.Try | None = None,
+    again: Sequence[stage.Try] = (),
 ) -> dict[str, dict]:
     """Localize queries in a data set of InLoc's layout.
 
@@ -70,7 +70,8 @@ def main(
         points: file of the points that keypoints of cutouts show, for later runs and for other
             features with the same keypoints; default: `points_file(features)`.
         gate: what a pose must have for the query to be called localized.
-        again: how queries that are not localized are matched once more.
+        again: how queries that are not localized are matched once more, see
+            `localization.stage.main`.
 
     Returns:
         A record for each query, as `localization.stage.main` returns it. A query that is not

@@ -41,7 +41,7 @@ def main(
     executor: Executor = SERIAL,
     gate: Gate = DEFAULT_GATE,
     mirror_images: MirrorImages | None = None,
-    again: stage.Try | None = None,
+    again: Sequence[stage.Try] = (),
 ) -> dict[str, dict]:
     """Localize queries in a COLMAP model.
 
@@ -67,7 +67,8 @@ def main(
         executor: runs the localization; with a reconstruction in memory, this process does.
         gate: what a pose must have for the query to be called localized.
         mirror_images: extracts and matches mirror images of queries, see `localization.stage.main`.
-        again: how queries that are not localized are matched once more.
+        again: how queries that are not localized are matched once more, see
+            `localization.stage.main`.
 
     Returns:
         A record for each query, as `localization.stage.main` returns it and keeps it in

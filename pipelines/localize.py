@@ -31,7 +31,7 @@ from hloc_reduce.utils.codes import STORAGES, Storage
 from hloc_reduce.utils.options import Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
-from .common import changes, command
+from .common import changes, command, turned
 from .common.options import Matcher, Positive, Retrieval
 from .common.queries import LISTED, Photos, Queries, identity, results_folder
 from .common.retrieval import check_retrieval, retrieval_name, retrieve, retrieve_in_map
@@ -214,7 +214,7 @@ def main(
         wanted.log()
         with run.stage("extract_features"):
             features = extract_features.main(
-                built.conf,
+                built.query_conf,
                 query_images,
                 outputs,
                 image_list=names,
@@ -231,7 +231,20 @@ def main(
         matches = run.match("match_queries", loc_pairs, features, built.features)
         poses = outputs / f"poses_hloc_{built.feature}+{matcher}_{retrieved}.txt"
         mirror_images = run.mirror_images(
-            built.conf, query_images, loc_pairs, features, built.features
+            built.query_conf, query_images, loc_pairs, features, built.features
+        )
+        further = (
+            []
+            if built.is_rotation_invariant
+            else turned.tries(
+                run,
+                built,
+                query_images,
+                names,
+                features,
+                loc_pairs,
+                num_loc if retrieval == built.retrieval else None,
+            )
         )
         with run.stage("localization"):
             records = localize_sfm.main(
@@ -245,7 +258,7 @@ def main(
                 full_names=True,
                 gate=gate,
                 mirror_images=mirror_images(steps[0]),
-                again=run.again(loc_pairs, features, built.features, mirror_images),
+                again=run.again(loc_pairs, features, built.features, mirror_images, further),
             )
         limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
         summary = {

@@ -49,6 +49,7 @@ def _query_row(
         "list": list_name,
         "status": status(pose, record["localized"]),
         "again": record["again"],
+        "turned": record["turned"],
         "num_matches": record["num_matches"],
         "num_without_point": record["num_without_point"],
         "num_correspondences": correspondences,

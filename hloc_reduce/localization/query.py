@@ -34,7 +34,7 @@ def localize(
         matches: from map images, best first, to (M, 2) indices of the keypoints of the query and
             of the image, the most similar first.
         config: hloc's dict of options of pycolmap, under "estimation" and "refinement"; under
-            "photo", what `absolute_pose.estimate` reads, and how it is "turned", see `turned`.
+            "photo", what `absolute_pose.estimate` reads.
         gate: what a pose must have to be trusted.
         thorough: where few matches agree with a pose, try those of single images, too.
         workers: threads that estimate poses.
@@ -76,8 +76,6 @@ def localize(
         if rivals := [one for one in rivals if gates.differ(one, gates.RIVALS)]:
             others = {**best.measures.alternatives, "other_images": max(rivals)}
             info |= gates.verdict(replace(best.measures, alternatives=others), gate)
-    if info["reason"] and len(keypoints) and (turned := config.get("photo", {}).get("turned")):
-        info["reason"] += f"; {turned}"
     info["confidence"] = round(max(0.0, info["measures"].confidence), 2)
     info["agreement"] = round(info["measures"].agreement, 3)
     return best.cam_from_world, info

@@ -5,6 +5,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import h5py
@@ -21,7 +22,7 @@ from ..utils.cli import InputError
 from ..utils.feature_files import dimension, get_colmap_keypoints, get_image_size
 from ..utils.h5 import open_h5
 from ..utils.match_files import find_pair, get_matcher, get_matches, most_similar_first
-from ..utils.parsers import parse_query_lists, write_poses
+from ..utils.parsers import parse_query_lists, parse_retrieval, write_poses
 from ..utils.progress import progress
 from .gate import DEFAULT_GATE, MATCH_KINDS, Gate, may_be_mirrored
 from .mirrored import MirrorImages, mirror, mirror_options
@@ -44,21 +45,38 @@ SHOWN = 3  # queries whose reasons a message gives
 Task = tuple[str, pycolmap.Camera | None, list[str]]  # a query, and the images retrieved for it
 
 
+class Matched(NamedTuple):
+    """Files of queries: their features and matches, and the pairs if these are others than before.
+
+    Pairs are of queries and map images, best first.
+    """
+
+    features: Path
+    matches: Path
+    pairs: Path | None = None
+
+
 class Try(NamedTuple):
-    """How queries are matched.
+    """A further way to match queries that are not localized.
 
     Args:
-        match: matches queries, given their names, with the map images retrieved for them, and
-            returns the match file.
+        match: matches queries, given their names.
+        made_from: what determines the matches beside the features of the first try.
         mirror_images: extracts and matches mirror images of queries whose intrinsics are not
             given: if the poses of these are nearly as likely, their own are refused; None: no query
             is tested.
-        made_from: what determines the matches beside the features.
+        names: the queries that may be tried; None: all.
+        told: what the record of a query says of the try, as `main` returns it.
     """
 
-    match: Callable[[list[str]], Path]
+    match: Callable[[list[str]], Matched]
+    made_from: dict
     mirror_images: MirrorImages | None = None
-    made_from: dict | None = None
+    names: frozenset[str] | None = None
+    told: Mapping[str, object] = MappingProxyType({"again": True})
+
+
+FIRST = {"again": False, "turned": 0}  # what the records of the first try say of it
 
 
 def main(
@@ -76,7 +94,7 @@ def main(
     executor: Executor = SERIAL,
     gate: Gate = DEFAULT_GATE,
     mirror_images: MirrorImages | None = None,
-    again: Try | None = None,
+    again: Sequence[Try] = (),
 ) -> dict[str, dict]:
     """Localize queries by the files of their features and matches.
 
@@ -100,34 +118,36 @@ def main(
         gate: what a pose must have for the query to be called localized; what is not given is that
             for the matcher and the dimension in the files.
         mirror_images: see `Try`.
-        again: how queries that are not localized are matched once more; default: they are not.
+        again: how queries that are not localized are matched once more, one after the other.
 
     Returns:
-        A record for each query: `localized`; `reason`, why it is not localized, None if it is;
-        `again`, whether it is of the second try; `confidence` and `agreement`; the written pose as
-        `qvec` (w, x, y, z) and `tvec`, the fallback if the query is not localized, None if there is
-        none; `camera`, the model, width, height and parameters in a list, None if not known;
-        `max_error`, RANSAC's inlier threshold in pixels, None for pycolmap's default; `measures`,
-        see `Measures`; and the numbers and `db` of `localize`.
+        A record for each query, of the try that localized it or else came nearest: `localized`;
+        `reason`, why it is not localized, None if it is; `try`, the index of the try in `again`
+        plus 1, or 0; `tried`, that of the last one that was made; `again`, whether a second matcher
+        matched it, and `turned`, by how many degrees, counterclockwise, it was shown turned to the
+        feature; `confidence` and `agreement`; the written pose as `qvec` (w, x, y, z) and `tvec`,
+        the fallback if the query is not localized, None if there is none; `camera`, the model,
+        width, height and parameters in a list, None if not known; `max_error`, RANSAC's inlier
+        threshold in pixels, None for pycolmap's default; `measures`, see `Measures`; and the
+        numbers and `db` of `localize`.
     """
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
     header |= {"mirror_images": True} if mirror_images else {}
-    header |= {"again": again.made_from} if again else {}
+    header |= {"again": [one.made_from for one in again]} if again else {}
     with Log(log_file(results), header, overwrite) as log:
         all_tasks = [(name, camera, retrieved.get(name, [])) for name, camera in queries]
         reasons = _reasons(features, queries)
         refuse = [task for task in all_tasks if task[0] in reasons.keys() - log.records.keys()]
         for name, record in _refuse(load_reference, refuse, reasons):
-            log.add(name, {**record, "again": False})
+            log.add(name, {**record, **FIRST, "try": 0, "tried": len(again)})
         tasks = [task for task in all_tasks if task[0] not in reasons]
         if any(name not in log.records for name, _, _ in tasks):
             _check_some_matched(matches, [name for name, _ in queries], retrieved)
-        localizing = _Localizing(
-            log, load_reference, features, config, skip_matches, gate, executor
-        )
-        localizing.run(Try(lambda _: matches, mirror_images), tasks, False)
-        if again:
-            localizing.run(again, tasks, True)
+        localizing = _Localizing(log, load_reference, config, skip_matches, gate, executor)
+        matched = Matched(features, matches)
+        first = Try(lambda _: matched, {}, mirror_images, told=FIRST)
+        for number, one in enumerate([first, *again]):
+            localizing.run(number, one, tasks)
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose_of(record) for name, record in records.items()}
     submitted = {name: known for name, known in poses.items() if known is not None}
@@ -144,35 +164,51 @@ class _Localizing:
 
     log: Log
     load_reference: Callable[[], Reference]
-    features: Path
     config: Callable[[str, pycolmap.Camera], dict]
     skip_matches: int
     gate: Gate
     executor: Executor
 
-    def run(self, given: Try, tasks: list[Task], is_again: bool) -> None:
-        """Localize queries that have no record or, if `is_again`, those that are not localized.
+    def run(self, number: int, given: Try, tasks: list[Task]) -> None:
+        """Localize queries by the first try, number 0, or those not localized by a further one.
 
         Queries that an interrupted run has localized in the same try are only tested for being
         mirrored.
         """
         records = self.log.records
-        if is_again:  # the others have nothing to be matched with
-            tasks = [task for task in tasks if task[2]]
-        before = {name: records[name] for name, _, _ in tasks if name in records}
-        done = {name for name, record in before.items() if record["again"] == is_again}
-        wanted = [name for name, _, _ in tasks if name not in before]
-        if is_again:
-            wanted = [name for name, record in before.items() if not record["localized"]]
-        of_try = [task for task in tasks if task[0] in done.union(wanted)]
-        if not of_try:
+        todo, localized = [], []
+        for task in tasks:
+            name, record = task[0], records.get(task[0])
+            if record is None:
+                todo.append(name)
+            elif record["tried"] < number:
+                # without an image that was retrieved there is nothing to be matched with
+                is_left = not record["localized"] and task[2]
+                if is_left and (given.names is None or name in given.names):
+                    todo.append(name)
+            elif record["localized"] and record["try"] == number:
+                localized.append(name)
+        if not todo + localized:
             return
-        todo = [task for task in of_try if task[0] not in done]
-        files = self.features, given.match([name for name, _, _ in of_try])
-        for name, record in self._solve(self.config, files, todo, True, "Localizing"):
-            self.log.add(name, {**record, "again": is_again})
+        matched = given.match(todo + localized)
+        cameras = {name: camera for name, camera, _ in tasks}
+        retrieved = {name: retrieved for name, _, retrieved in tasks}
+        if matched.pairs:
+            retrieved = parse_retrieval(matched.pairs)
+
+        def of_try(names: list[str]) -> list[Task]:
+            return [(name, cameras[name], retrieved.get(name, [])) for name in names]
+
+        files = matched.features, matched.matches
+        for name, record in self._solve(self.config, files, of_try(todo), True, "Localizing"):
+            before = records.get(name)
+            record |= {**FIRST, **given.told, "try": number, "tried": number}
+            if before and not record["localized"]:
+                best = max(before, record, key=lambda one: (one["confidence"], one["num_inliers"]))
+                record = {**best, "tried": number}
+            self.log.add(name, record)
         if given.mirror_images:
-            self._try_mirror_images(given.mirror_images, files, of_try)
+            self._try_mirror_images(given.mirror_images, files, of_try(todo + localized))
 
     def _try_mirror_images(
         self, mirror_images: MirrorImages, files: tuple[Path, Path], tasks: list[Task]

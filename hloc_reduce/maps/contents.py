@@ -72,7 +72,7 @@ class Contents:
         reference: its points.
         names: its images.
         describe: returns the global descriptor (G,) float32 of a photo, rounded as in files, given
-            its features and its file or pixels.
+            its features, its file or pixels, and by how many quarter turns it is shown.
         similarity: returns the similarity (I,) of a global descriptor (G,) to those of its images.
     """
 
@@ -85,7 +85,7 @@ class Contents:
     doubts: list[str]
     reference: Reference
     names: list[str]
-    describe: Callable[[dict, Path | np.ndarray], np.ndarray]
+    describe: Callable[[dict, Path | np.ndarray, int], np.ndarray]
     similarity: Callable[[np.ndarray], np.ndarray]
 
 
@@ -295,14 +295,15 @@ def _torch_engine(compact: CompactMap) -> Engine:
 
 def _describe(
     retrieval: str, vocabulary: np.ndarray | None
-) -> Callable[[dict, Path | np.ndarray], np.ndarray]:
+) -> Callable[[dict, Path | np.ndarray, int], np.ndarray]:
     """Return `Contents.describe` of a key of `confs.retrieval` and its vocabulary, if any."""
     conf = retrieval_confs.get(retrieval)
     model, preprocessing = load_retrieval(conf["model"]), conf.get("preprocessing", {})
     if vocabulary is not None:
         model.vocabulary = vocabulary
 
-    def describe(features: dict, image: Path | np.ndarray) -> np.ndarray:
-        return model.describe_photo(features, image, preprocessing).astype(np.float32)
+    def describe(features: dict, image: Path | np.ndarray, turns: int) -> np.ndarray:
+        shown = {**preprocessing, "turns": turns}
+        return model.describe_photo(features, image, shown).astype(np.float32)
 
     return describe

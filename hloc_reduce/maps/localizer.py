@@ -1,6 +1,7 @@
 """Localize one photo at a time in a map that is held in memory."""
 
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from ..localization import gate as gates
-from ..localization import intrinsics, mirrored, query, stage, turned
+from ..localization import intrinsics, mirrored, query, stage, views
 from ..localization.gate import DEFAULT_GATE, Gate
 from ..localization.query import merged, ransac_options
 from ..localize_sfm import RANSAC_THRESH
@@ -66,7 +67,9 @@ class Localizer:
         contents = read(Path(map_dir), feature_file, matcher, matcher_file)
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.workers = parallel.cores()
-        self.preprocessing, self.cameras = contents.preprocessing, contents.cameras
+        self.cameras, self.preprocessing = contents.cameras, contents.preprocessing
+        if not contents.engine.rotation_invariant:
+            self.preprocessing = views.at_map_size(self.preprocessing, self.cameras)
         self.doubts = contents.doubts
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
@@ -84,7 +87,9 @@ class Localizer:
         """Localize a photo.
 
         Args:
-            image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
+            image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8. If the feature needs
+                upright photos, pixels are taken to be upright, and a file whose EXIF data do not
+                tell which side is up is tried all four ways.
             camera: its intrinsics; default: those of the map's camera if it took the photo, by its
                 EXIF data; else from EXIF data or guessed, and estimated with the pose, or those of
                 the map's photos if these fit a guess.
@@ -93,7 +98,8 @@ class Localizer:
             The pose, camera from world, in the units of the map, or None if the photo cannot be
             localized, for the `reason` in info; and info as from `localization.query.localize`,
             with `points2D` (M, 2) in COLMAP's pixels, `again`, whether its matches are those of a
-            second matcher, `retrieved`, names of map images, best first,
+            second matcher, `turned`, by how many degrees, counterclockwise, the photo had to be
+            turned to look like the map's, `retrieved`, names of map images, best first,
             `intrinsics`, "given" or their source (`intrinsics.infer`), `map_doubts`, why the map,
             and the pose with it, may be wrong, in a few words each, and `seconds` by stage.
 
@@ -102,58 +108,87 @@ class Localizer:
             InputError: if the camera has another size.
         """
         image = image if isinstance(image, np.ndarray) else Path(image)
+        source, refinement = "given", {}
+        if camera is None:
+            camera, source = intrinsics.infer(image, self.cameras)
+            refinement = intrinsics.refinement(camera, source, self.cameras)
         seconds: dict[str, float] = {}
-        start = time.perf_counter()
+        best: tuple[pycolmap.Rigid3d | None, dict] | None = None
+        for found in self._tries(image, camera, refinement, seconds):
+            if best is None or _quality(found[1]) > _quality(best[1]):
+                best = found
+            if best[1]["reason"] is None or source == "none":  # no other try helps
+                break
+        assert best is not None
+        cam_from_world, info = best
+        info |= {"intrinsics": source, "map_doubts": self.doubts, "seconds": seconds}
+        return cam_from_world if info["reason"] is None else None, info
+
+    def _tries(
+        self,
+        image: Path | np.ndarray,
+        camera: pycolmap.Camera,
+        refinement: dict,
+        seconds: dict[str, float],
+    ) -> Iterator[tuple[pycolmap.Rigid3d | None, dict]]:
+        """Localize a photo by each matcher, and as it looks turned, and yield each pose and info.
+
+        Args:
+            image: its file or pixels.
+            camera: its intrinsics.
+            refinement: options of `localization.query.localize`.
+            seconds: those of each stage, which are added to.
+        """
+        start = time.perf_counter() - sum(seconds.values())
 
         def lap(stage: str) -> None:
             now = time.perf_counter() - start - sum(seconds.values())
             seconds[stage] = seconds.get(stage, 0.0) + now
 
-        source, refinement = "given", {}
-        if camera is None:
-            camera, source = intrinsics.infer(image, self.cameras)
-            refinement = intrinsics.refinement(camera, source, self.cameras)
-        if not self.engine.rotation_invariant:
-            refinement = merged(refinement, turned.options(image, self.cameras, self.preprocessing))
-        features = self._extract(image)
-        width, height = map(int, features["image_size"])
-        if (camera.width, camera.height) != (width, height):
-            raise InputError(
-                f"The camera has {camera.width}x{camera.height} pixels, the photo has "
-                f"{width}x{height}."
-            )
-        lap("extraction")
-        retrieved = self._retrieve(features, image)
-        lap("retrieval")
-        for i, (match, gate) in enumerate(self.steps):
-            matches = match(features, retrieved)
-            lap("matching")
-            cam_from_world, info = self._estimate(features, matches, camera, refinement, gate)
-            lap("pose")
-            if info["reason"] is None and gates.may_be_mirrored(info["measures"], gate):
-                flipped = self._extract(image, flip=True)
-                given = mirrored.mirror(camera), mirrored.mirror_options(refinement), gate
-                matches = match(flipped, retrieved)
-                _, other = self._estimate(flipped, matches, *given, thorough=False)
-                measures = replace(info["measures"], mirror_image=other["confidence"])
-                info |= gates.verdict(measures, gate)
-                lap("mirror_image")
-            info["again"] = i > 0
-            if info["reason"] is None:
-                break
-        info |= {
-            "points2D": to_colmap(features["keypoints"][info["keypoints"]]),
-            "retrieved": retrieved,
-            "intrinsics": source,
-            "map_doubts": self.doubts,
-            "seconds": seconds,
-        }
-        return cam_from_world if info["reason"] is None else None, info
+        for turns in (0, *self._other_turns(image)):
+            features = self._extract(image, turns)
+            width, height = map(int, features["image_size"])
+            if (camera.width, camera.height) != (width, height):
+                raise InputError(
+                    f"The camera has {camera.width}x{camera.height} pixels, the photo has "
+                    f"{width}x{height}."
+                )
+            lap("extraction")
+            retrieved = self._retrieve(features, image, turns)
+            lap("retrieval")
+            for i, (match, gate) in enumerate(self.steps):
+                matches = match(features, retrieved)
+                lap("matching")
+                cam_from_world, info = self._estimate(features, matches, camera, refinement, gate)
+                lap("pose")
+                if info["reason"] is None and gates.may_be_mirrored(info["measures"], gate):
+                    flipped = self._extract(image, turns, flip=True)
+                    given = mirrored.mirror(camera), mirrored.mirror_options(refinement), gate
+                    matches = match(flipped, retrieved)
+                    _, other = self._estimate(flipped, matches, *given, thorough=False)
+                    measures = replace(info["measures"], mirror_image=other["confidence"])
+                    info |= gates.verdict(measures, gate)
+                    lap("mirror_image")
+                info |= {
+                    "points2D": to_colmap(features["keypoints"][info["keypoints"]]),
+                    "retrieved": retrieved,
+                    "again": i > 0,
+                    "turned": 90 * turns,
+                }
+                yield cam_from_world, info
+            if not len(features["keypoints"]):
+                return
 
-    def _extract(self, image: Path | np.ndarray, flip: bool = False) -> dict:
+    def _other_turns(self, image: Path | np.ndarray) -> tuple[int, ...]:
+        """Return the other ways to show a photo to the feature, see `views.other_turns`."""
+        if isinstance(image, np.ndarray) or self.engine.rotation_invariant:
+            return ()
+        return views.other_turns(image, self.cameras, self.preprocessing)
+
+    def _extract(self, image: Path | np.ndarray, turns: int = 0, flip: bool = False) -> dict:
         """Extract features, float32 and rounded as in a feature file, see `matchers.Matcher`."""
-        preprocessing = {**self.preprocessing, "mirrored": flip}
-        features = self.engine.extract(image, preprocessing)
+        shown = {**self.preprocessing, "turns": turns, "mirrored": flip}
+        features = self.engine.extract(image, shown)
         stored, _ = store({key: np.asarray(part) for key, part in features.items()}, self.dtype)
         rounded = {key: part.astype(np.float32) for key, part in stored.items()}
         return {**rounded, "descriptors": restore(stored, {}).T}
@@ -181,7 +216,11 @@ class Localizer:
         )
 
     @parallel.one_thread()
-    def _retrieve(self, features: dict, image: Path | np.ndarray) -> list[str]:
+    def _retrieve(self, features: dict, image: Path | np.ndarray, turns: int) -> list[str]:
         """Return the names of the map images that are most similar to a photo, best first."""
-        query = self._describe(features, image)
+        query = self._describe(features, image, turns)
         return [self.names[j] for j in rank(self._similarity(query)[None], self.num_loc)[0]]
+
+
+def _quality(info: dict) -> tuple[bool, float]:
+    return info["reason"] is None, info["confidence"]

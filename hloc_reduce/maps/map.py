@@ -4,6 +4,7 @@ import json
 import shutil
 import uuid
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..detectors.dog import KEYPOINT_SETTINGS
-from ..localization import intrinsics
+from ..localization import intrinsics, views
 from ..mapping.findings import Finding, warn
 from ..runtime import provenance
 from ..runtime.outputs import CONF
@@ -200,12 +201,28 @@ class Map:
                 "Leave it out to localize in this map."
             )
 
+    @cached_property
+    def is_rotation_invariant(self) -> bool:
+        """Whether photos match however they are turned, and of whatever size."""
+        from .. import extractors
+
+        return extractors.is_rotation_invariant(self.conf["model"])
+
+    @property
+    def query_conf(self) -> dict:
+        """The configuration of the features of queries."""
+        if self.is_rotation_invariant:
+            return self.conf
+        shown = views.at_map_size(self.conf["preprocessing"], self.cameras)
+        return {**self.conf, "preprocessing": shown}
+
     def aggregate(
         self,
         features: Path,
         names: list[str],
         image_dir: Path | None,
         export_dir: Path | None = None,
+        turns: int = 0,
     ) -> Path:
         """Compute global descriptors of other photos that compare with the map's.
 
@@ -214,12 +231,14 @@ class Map:
             names: the photos.
             image_dir: their folder, which only some retrievals need.
             export_dir: folder of the h5 file of global descriptors; default: that of `features`.
+            turns: quarter turns, counterclockwise, by which the photos are shown.
 
         Returns:
             The h5 file.
         """
+        conf = retrieval_confs.confs[self.retrieval]
         return aggregate_features.main(
-            retrieval_confs.confs[self.retrieval],
+            views.shown(conf, turns=turns) if turns else conf,
             features,
             export_dir=export_dir,
             vocabulary=self.vocabulary,

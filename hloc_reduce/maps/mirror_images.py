@@ -5,6 +5,7 @@ from pathlib import Path
 
 from .. import extract_features
 from ..localization.mirrored import MirrorImages
+from ..localization.views import shown
 from ..runtime.executors import SERIAL, Executor
 from ..utils.parsers import write_pairs_of
 
@@ -65,4 +66,4 @@ def extract(
 
 def of_mirror_images(conf: dict) -> dict:
     """Return the configuration of features, or of global descriptors, of mirror images."""
-    return {**conf, "preprocessing": {**conf.get("preprocessing", {}), "mirrored": True}}
+    return shown(conf, mirrored=True)

@@ -37,13 +37,13 @@ def matched(run: Run, query: str) -> dict | None:
         return None
     names = [record["db"]]
     if record["localized"]:
-        present = [name for name in run.retrieved.get(query, ()) if name in run.reference]
+        present = [name for name in run.retrieved_for(query) if name in run.reference]
         clusters = run.reference.clusters(present)
         names = next((part for part in clusters if record["db"] in part), names)
-    with open_h5(run.files["features"]) as file:
+    with open_h5(run.file_of(query, "features")) as file:
         keypoints, _ = get_keypoints(file, query)
     found = []
-    with open_h5(run.files["matches_again" if record["again"] else "matches"]) as file:
+    with open_h5(run.file_of(query, "matches")) as file:
         for name in names:
             sizes = len(keypoints), run.reference.num_keypoints(name)
             matches, _ = get_matches(file, query, name, sizes)

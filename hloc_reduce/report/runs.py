@@ -38,6 +38,7 @@ class Run:
     Attributes:
         summary: summary.json.
         files: the files of the run by their keys in the summary, None if the run has none.
+        tries: by their number, the files of further tries, see `localization.stage.Matched`.
         rows: queries.csv by query, counts as int, errors as float or None if unknown.
         records: the record of each query, as from `localization.main`.
         feature: name of the feature.
@@ -61,6 +62,10 @@ class Run:
             self.summary = dict(json.loads((folder / "summary.json").read_text()))
             files = self.summary["files"].items()
             self.files = {key: value and folder / value for key, value in files}
+            self.tries = {
+                int(number): {key: value and folder / value for key, value in found.items()}
+                for number, found in self.summary["tries"].items()
+            }
             self.rows = _read_rows(folder / "queries.csv")
             self.feature = self.label = str(self.summary["feature"])
             self.family = self.label.rstrip("0123456789")
@@ -136,6 +141,15 @@ class Run:
     def retrieved(self) -> dict[str, list[str]]:
         """The map images that were retrieved for each query, best first."""
         return parse_retrieval(self.files["pairs"])
+
+    def retrieved_for(self, query: str) -> list[str]:
+        """Return the map images that were retrieved in the try that a record is of, best first."""
+        pairs = self.tries.get(self.records[query]["try"], {}).get("pairs")
+        return (parse_retrieval(pairs) if pairs else self.retrieved).get(query, [])
+
+    def file_of(self, query: str, key: str) -> Path:
+        """Return the `features` or `matches` of the try that a record is of."""
+        return self.tries.get(self.records[query]["try"], self.files)[key]
 
     @cached_property
     def truth(self) -> dict[str, pycolmap.Rigid3d]:

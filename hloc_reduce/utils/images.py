@@ -161,12 +161,13 @@ def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
 def resized(image: Path | np.ndarray, preprocessing: Mapping) -> tuple[np.ndarray, Frame]:
     """Read an image and resize its longer side to at most `resize_max` pixels.
 
-    With `resize_force` smaller images are enlarged to `resize_max` pixels.
+    Smaller images are enlarged to `resize_min` or, with `resize_force`, to `resize_max` pixels.
 
     Args:
         image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
         preprocessing: `grayscale`, `resize_max`, `resize_force` and `upright`, whether EXIF data
-            turn it, of a feature's configuration; and `mirrored`, whether to swap left and right.
+            turn it, of a feature's configuration; and `resize_min`; `turns`, further quarter turns,
+            counterclockwise; and `mirrored`, whether to swap left and right.
 
     Returns:
         The image, (H, W) if `grayscale`, else (H, W, 3) RGB, float32 in [0, 1], and how it is
@@ -179,17 +180,21 @@ def resized(image: Path | np.ndarray, preprocessing: Mapping) -> tuple[np.ndarra
     pixels = (
         convert(image, grayscale) if isinstance(image, np.ndarray) else read_image(image, grayscale)
     )
-    turns = 0
+    turns = preprocessing.get("turns", 0)
     if preprocessing.get("upright") and isinstance(image, Path):
-        turns = TURNS.get(orientation(image) or 0, 0)
+        turns += TURNS.get(orientation(image) or 0, 0)
     if preprocessing.get("mirrored"):
-        pixels, turns = pixels[:, ::-1], -turns % 4
-    frame = Frame(np.array(pixels.shape[1::-1]), turns)
-    pixels, size = np.rot90(pixels, turns).astype(np.float32, order="C"), frame.shown
-    resize_max = preprocessing.get("resize_max")
-    if resize_max and (size.max() > resize_max or preprocessing.get("resize_force")):
+        pixels, turns = pixels[:, ::-1], -turns
+    frame = Frame(np.array(pixels.shape[1::-1]), turns % 4)
+    pixels, size = np.rot90(pixels, frame.turns).astype(np.float32, order="C"), frame.shown
+    resize_max = preprocessing.get("resize_max") or size.max()
+    resize_min = preprocessing.get("resize_min", 0)
+    if preprocessing.get("resize_force"):
+        resize_min = resize_max
+    longer = min(max(size.max(), resize_min), resize_max)
+    if longer != size.max():
         # at least one pixel: a panorama may be a thousand times wider than high
-        new_size = np.maximum(1, np.round(size * (resize_max / size.max())).astype(int))
+        new_size = np.maximum(1, np.round(size * (longer / size.max())).astype(int))
         smaller = (new_size <= size).all()
         interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR  # as hloc
         pixels = cv2.resize(pixels, new_size.tolist(), interpolation=interpolation)

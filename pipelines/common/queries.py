@@ -10,8 +10,7 @@ from typing import Self
 import pycolmap
 
 from hloc_reduce import logger
-from hloc_reduce.localization import intrinsics, turned
-from hloc_reduce.localization.query import merged
+from hloc_reduce.localization import intrinsics
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF
@@ -68,15 +67,13 @@ class Queries:
             lists = {stem: [name for name, _ in part] for stem, part in given.items()}
             names = [name for part in lists.values() for name in part]
             check_queries(query_images, names, strict)
-            return cls(lists, refinements=_turned(query_images, names, built))
+            return cls(lists)
         names = list_images(query_images)
         check_distinct(names)
         inferred = intrinsics.infer_all(query_images, names, built.cameras, strict)
         refinements = {
             name: intrinsics.refinement(*found, built.cameras) for name, found in inferred.items()
         }
-        for name, hint in _turned(query_images, inferred, built).items():
-            refinements[name] = merged(refinements[name], hint)
         return cls({query_images.resolve().name: names}, inferred, refinements)
 
     @property
@@ -103,17 +100,6 @@ class Queries:
         for source, said in SOURCES.items():
             if some := [name for name in sources if sources[name] == source]:
                 logger.info("Intrinsics of %d queries are %s: %s", len(some), said, cli.some(some))
-
-
-def _turned(query_images: Path, names: Iterable[str], built: Map) -> dict[str, dict]:
-    """Return the options of queries that are stored turned, if that matters for the feature."""
-    from hloc_reduce import extractors
-
-    if extractors.is_rotation_invariant(built.conf["model"]):
-        return {}
-    given = built.cameras, built.conf["preprocessing"]
-    found = {name: turned.options(query_images / name, *given) for name in names}
-    return {name: options for name, options in found.items() if options}
 
 
 class Photos:

@@ -93,6 +93,7 @@ def retrieve_in_map(
     query_names: list[str],
     map_names: list[str],
     image_dir: Path | None = None,
+    turns: int = 0,
 ) -> None:
     """Write pairs of queries and the images of a map, by the map's retrieval.
 
@@ -106,11 +107,12 @@ def retrieve_in_map(
         query_names: the queries.
         map_names: the map images.
         image_dir: folder of the queries, which only some retrievals need.
+        turns: quarter turns, counterclockwise, by which the queries are shown.
     """
     if not query_names:
         write_pairs([], output)
         return
-    descriptors = built.aggregate(features, query_names, image_dir, output.parent)
+    descriptors = built.aggregate(features, query_names, image_dir, output.parent, turns)
     pairs_from_retrieval.main(
         descriptors,
         output,

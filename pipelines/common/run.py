@@ -17,7 +17,7 @@ from hloc_reduce.evaluation.summaries import (
     write_summary,
 )
 from hloc_reduce.localization.mirrored import MirrorImages
-from hloc_reduce.localization.stage import Try
+from hloc_reduce.localization.stage import Matched, Try
 from hloc_reduce.maps.mirror_images import mirror_images
 from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.runtime.group_writer import failures
@@ -56,7 +56,7 @@ class Run:
     ):
         self.folder, self.feature, self.matcher, self.steps = folder, feature, matcher, steps
         self.executor = executor
-        self._matches_again: Path | None = None
+        self._further: dict[int, Matched] = {}
         self._folders = [folder] if earlier is None else [earlier, folder]
 
     def __enter__(self) -> Self:
@@ -82,9 +82,12 @@ class Run:
             features_ref: feature file of the second images; default: `features`.
         """
         with self.stage(stage):
-            return self._match(self.steps[0], pairs, features, features_ref)
+            return self.match_pairs(self.steps[0], pairs, features, features_ref)
 
-    def _match(self, matcher: str, pairs: Path, features: Path, features_ref: Path | None) -> Path:
+    def match_pairs(
+        self, matcher: str, pairs: Path, features: Path, features_ref: Path | None
+    ) -> Path:
+        """Match pairs, see `match`."""
         conf = matchers_confs.confs[matcher]
         matches = self.folder.path / f"{features.stem}_{conf['output']}_{pairs.stem}.h5"
         if next(parse_pairs(pairs), None) is not None:  # else no query could be read
@@ -104,28 +107,48 @@ class Run:
         features: Path,
         features_ref: Path | None = None,
         mirror_images: Callable[[str], MirrorImages] | None = None,
-    ) -> Try | None:
-        """Return how queries that are not localized are matched by a second matcher, if any.
+        turned: Iterable[Try] = (),
+    ) -> list[Try]:
+        """Return how queries that are not localized are matched once more; the summary names files.
 
         Args:
             pairs: pairs of all queries and map images; those of the queries go beside it.
             features: feature file.
             features_ref: feature file of the map images; default: `features`.
             mirror_images: returns the `mirror_images` of a matcher.
+            turned: tries after that by a second matcher, if there is one.
         """
-        if len(self.steps) == 1:
-            return None
-        matcher = self.steps[1]
+        given = pairs, features, features_ref, mirror_images
+        tries = [*(self._second(matcher, *given) for matcher in self.steps[1:]), *turned]
+        return [self._noted(number, one) for number, one in enumerate(tries, 1)]
 
-        def match(names: list[str]) -> Path:
+    def _noted(self, number: int, one: Try) -> Try:
+        """Return a further try, whose files are noted once it has them."""
+
+        def match(names: list[str]) -> Matched:
+            self._further[number] = one.match(names)
+            return self._further[number]
+
+        return one._replace(match=match)
+
+    def _second(
+        self,
+        matcher: str,
+        pairs: Path,
+        features: Path,
+        features_ref: Path | None,
+        mirror_images: Callable[[str], MirrorImages] | None,
+    ) -> Try:
+        """Return how a second matcher matches queries, see `again`."""
+
+        def match(names: list[str]) -> Matched:
             listed = write_pairs_of(names, pairs, "again")
-            self._matches_again = self._match(matcher, listed, features, features_ref)
-            return self._matches_again
+            return Matched(features, self.match_pairs(matcher, listed, features, features_ref))
 
         model = matchers_confs.confs[matcher]["model"]
         with open_h5(features) as file:
             made_from = {"model": model, **matchers_confs.provenance(model, get_conf(file))}
-        return Try(match, mirror_images(matcher) if mirror_images else None, made_from)
+        return Try(match, made_from, mirror_images(matcher) if mirror_images else None)
 
     def mirror_images(
         self, conf: dict, image_dir: Path, pairs: Path, features: Path, map_features: Path
@@ -143,7 +166,7 @@ class Run:
 
         def of_matcher(matcher: str) -> MirrorImages:
             def match(listed: Path, mirrored: Path) -> Path:
-                return self._match(matcher, listed, mirrored, map_features)
+                return self.match_pairs(matcher, listed, mirrored, map_features)
 
             return mirror_images(conf, image_dir, pairs, mirrored, match, self.executor)
 
@@ -196,6 +219,9 @@ class Run:
             "queries": len(rows),
             "queries_localized": sum(row["status"] == "localized" for row in rows),
             "queries_matched_again": sum(row["again"] for row in rows),
+            "queries_turned": sum(
+                row["turned"] > 0 for row in rows if row["status"] == "localized"
+            ),
             "queries_unreadable": len(failed),
             "lists": {
                 name: summarize_list([row for row in rows if row["list"] == name], thresholds[name])
@@ -208,11 +234,14 @@ class Run:
             "poses": poses.name,
             "files": {
                 key: None if path is None else relative(path, outputs)
-                for key, path in {
-                    "features": features,
-                    "matches_again": self._matches_again,
-                    **files,
-                }.items()
+                for key, path in {"features": features, **files}.items()
+            },
+            "tries": {
+                str(number): {
+                    key: None if path is None else relative(path, outputs)
+                    for key, path in matched._asdict().items()
+                }
+                for number, matched in sorted(self._further.items())
             },
         }
         write_summary(summary, outputs / "summary.json")

@@ -289,14 +289,16 @@ def test_queries_that_are_not_localized_are_matched_once_more(built):
         asked.append(names)
         pairs = small_map.all_pairs(built.root / "pairs-again.txt", names)
         matches = built.root / "matches-again.h5"
-        return match_features.main(MATCHER, pairs, built.features, matches=matches)
+        match_features.main(MATCHER, pairs, built.features, matches=matches)
+        return stage.Matched(built.features, matches)
 
-    again = stage.Try(match)
+    again = [stage.Try(match, {})]
     alone = built.localize()
     assert not alone["query/6.jpg"]["localized"]
     records = built.localize(again=again)
     assert asked == [["query/6.jpg"]]
-    assert records["query/6.jpg"] == {**expected["query/6.jpg"], "again": True}
+    told = {"again": True, "try": 1, "tried": 1}
+    assert records["query/6.jpg"] == expected["query/6.jpg"] | told
     assert records["query/7.jpg"] == expected["query/7.jpg"]
     assert records["query/8.jpg"]["reason"] == "cannot be read"
     assert records["query/9.jpg"]["reason"] == "no map image was retrieved"
@@ -312,5 +314,37 @@ def test_queries_that_are_not_localized_are_matched_once_more(built):
         assert built.localize(again=again) == records
         assert {*log.read_text().splitlines()} == {*before.splitlines()}
     # another second matcher
-    other = stage.Try(lambda names: built.loc_matches, None, {"model": "other"})
+    first = stage.Matched(built.features, built.loc_matches)
+    other = [stage.Try(lambda names: first, {"model": "other"})]
     assert not built.localize(again=other)["query/6.jpg"]["localized"]
+
+
+def test_each_further_try_has_the_queries_that_are_left(built):
+    """Of two that are lost, one may not be tried by the second try, the other is by the third."""
+    expected, asked = built.localize(), []
+    with h5py.File(built.loc_matches, "a") as file:
+        for name in ("query-6.jpg", "query-7.jpg"):
+            for i in range(6):
+                file[f"{name}/db-{i}.jpg/matches0"][:] = -1
+
+    def matching(number, pairs_of):
+        def match(names):
+            asked.append((number, names))
+            pairs = small_map.all_pairs(built.root / f"pairs-{number}.txt", pairs_of)
+            matches = built.root / f"matches-{number}.h5"
+            match_features.main(MATCHER, pairs, built.features, matches=matches)
+            return stage.Matched(built.features, matches, pairs)
+
+        return match
+
+    names = ["query/6.jpg", "query/7.jpg"]
+    again = [
+        stage.Try(matching(1, names), {}, names=frozenset(["query/7.jpg"]), told={"turned": 90}),
+        stage.Try(matching(2, names), {}, told={"turned": 180}),
+    ]
+    records = built.localize(again=again)
+    assert asked == [(1, ["query/7.jpg"]), (2, ["query/6.jpg"])]
+    for name, turned in (("query/7.jpg", 90), ("query/6.jpg", 180)):
+        assert records[name]["localized"] and records[name]["turned"] == turned
+        assert records[name]["tvec"] == expected[name]["tvec"]
+    assert built.localize(again=again) == records

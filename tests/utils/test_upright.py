@@ -91,3 +91,33 @@ def test_turns_of_keypoints():
     for turns in TURNS.values():
         there = turned(corners, size, turns)
         assert turned(there, Frame(size, turns).shown, -turns).tolist() == corners.tolist()
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_further_turns_add_to_those_of_exif_data(mirrored, pixels, tmp_path):
+    path = save(tmp_path / "a.png", pixels, 6)
+    preprocessing = {**UPRIGHT, "mirrored": mirrored}
+    shown, frame = resized(path, preprocessing)
+    for turns in (1, 2, 3):
+        other, its_frame = resized(path, {**preprocessing, "turns": turns})
+        number = -turns if mirrored else turns
+        np.testing.assert_allclose(other, np.rot90(shown, number))
+        assert its_frame.turns == (frame.turns + number) % 4
+
+
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        ({}, 40),
+        ({"resize_min": 30}, 40),
+        ({"resize_min": 80}, 80),
+        ({"resize_min": 80, "resize_max": 60}, 60),
+        ({"resize_max": 20}, 20),
+        ({"resize_max": None}, 40),
+        ({"resize_max": 60, "resize_force": True}, 60),
+    ],
+)
+def test_the_longer_side_of_a_photo(limits, expected, pixels):
+    shown, frame = resized(pixels, {**UPRIGHT, **limits})
+    assert shown.shape == (0.75 * expected, expected)
+    assert frame.size.tolist() == [40, 30]

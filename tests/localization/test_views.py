@@ -1,0 +1,252 @@
+"""Queries that are stored turned, or of another size than the photos of a map."""
+
+import cv2
+import h5py
+import numpy as np
+import pycolmap
+import pytest
+from command import outcome, write
+from PIL import Image
+
+from hloc_reduce import Localizer, compact, extract_features, extractors
+from hloc_reduce.confs import features
+from hloc_reduce.confs import matchers as matchers_confs
+from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.localization import views
+from hloc_reduce.localization.intrinsics import MapCameras, merged, of_map
+from hloc_reduce.localization.records import log_file, pose_of, read_records
+from hloc_reduce.report import pictures
+from hloc_reduce.report.runs import Run
+from hloc_reduce.utils import colmap
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.feature_files import get_features, get_turns
+from hloc_reduce.utils.images import ORIENTATION
+from hloc_reduce.utils.parsers import parse_query_list, to_line
+from pipelines import localize
+
+PIPELINE = localize
+
+
+def save(path, pixels, orientation=None):
+    """Write a photo as it is, with an EXIF orientation."""
+    exif = Image.Exif()
+    if orientation is not None:
+        exif[ORIENTATION] = orientation
+    Image.fromarray(pixels).save(path, exif=exif)
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize(
+    ("orientation", "orientations", "upright", "others"),
+    [
+        (1, {1}, True, ()),
+        (6, {1, 8}, True, ()),  # both are shown upright
+        (6, {1}, False, views.TURNS),  # a map whose photos are shown as they are stored
+        (None, {1}, True, views.TURNS),
+        (99, {1}, True, views.TURNS),
+        (1, set(), True, views.TURNS),
+    ],
+)
+def test_photos_are_turned_unless_exif_data_tell(
+    orientation, orientations, upright, others, tmp_path
+):
+    save(tmp_path / "a.jpg", np.zeros((30, 40), np.uint8), orientation)
+    of_map, preprocessing = MapCameras({}, {}, orientations=orientations), {"upright": upright}
+    assert views.other_turns(tmp_path / "a.jpg", of_map, preprocessing) == others
+    found = views.of_folder(tmp_path, ["a.jpg", "absent.jpg"], of_map, preprocessing)
+    assert found == {n: ["a.jpg", "absent.jpg"] if others else ["absent.jpg"] for n in views.TURNS}
+
+
+@pytest.mark.parametrize(
+    ("sizes", "preprocessing", "expected"),
+    [
+        ({(1600, 1200)}, {"resize_max": 1600}, (1600, 1600)),
+        ({(640, 480), (300, 900)}, {"resize_max": 1600}, (640, 900)),
+        ({(4000, 3000), (3000, 4000)}, {"resize_max": 1600}, (1600, 1600)),
+        ({(4000, 3000), (640, 480)}, {"resize_max": 1024}, (640, 1024)),
+        ({(4000, 3000)}, {"resize_max": None}, (4000, 4000)),
+        (set(), {"resize_max": 1600}, (None, 1600)),
+        ({(640, 480)}, {"resize_max": 1024, "resize_force": True}, (None, 1024)),
+    ],
+)
+def test_queries_are_shown_at_the_size_of_map_photos(sizes, preprocessing, expected):
+    found = views.at_map_size(preprocessing, MapCameras({}, sizes))
+    assert (found.get("resize_min"), found["resize_max"]) == expected
+    lenses = dict.fromkeys(sizes, ())
+    assert views.at_map_size(preprocessing, MapCameras({}, set(), lenses=lenses)) == found
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize(
+    ("found", "known"),
+    [([1, 1], {1}), ([1, 6], {1, 6}), ([1, None], set()), ([None, None], set()), ([6, 99], set())],
+)
+def test_orientations_of_a_map_are_known_if_all_photos_have_them(found, known, tmp_path):
+    model, pixels = pycolmap.Reconstruction(), np.zeros((30, 40), np.uint8)
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=40, height=30, params=[50, 20, 15], camera_id=1
+    )
+    for number, orientation in enumerate(found, start=1):
+        save(tmp_path / f"{number}.jpg", pixels, orientation)
+        image = pycolmap.Image(name=f"{number}.jpg", camera_id=1, image_id=number)
+        colmap.add_image(model, camera, image, pycolmap.Rigid3d())
+    assert of_map(model, tmp_path).orientations == known
+    parts = [of_map(model, tmp_path, [f"{number}.jpg"]) for number in (1, 2)]
+    assert merged(*parts).orientations == known  # a map to which a photo was added
+    assert merged(parts[0], of_map(model, tmp_path, [])).orientations == parts[0].orientations
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize(
+    ("model", "invariant"),
+    [
+        (features.confs["colmap_sift_sv64"]["model"], True),
+        (features.confs["hardnet"]["model"], True),
+        ({"name": "dog", "options": {"upright": True}, "descriptor": "colmap_sift"}, False),
+        (features.confs["mini32"]["model"], False),
+    ],
+)
+def test_features_are_invariant_if_their_keypoints_have_orientations(model, invariant, monkeypatch):
+    monkeypatch.setattr("hloc_reduce.extractors.dog.Descriptor", lambda name: None)
+    assert extractors.load(model).rotation_invariant == invariant
+    assert extractors.is_rotation_invariant(model) == invariant
+
+
+@pytest.mark.fault(11)
+@pytest.mark.parametrize("known", [lambda conf: conf, lambda conf: {"name": "hloc", "conf": conf}])
+@pytest.mark.parametrize(("name", "invariant"), [("dog", True), ("disk", False)])
+def test_a_feature_of_hloc_is_known_where_hloc_is_not_installed(
+    known, name, invariant, monkeypatch
+):
+    """Queries that were localized need not be described again."""
+    monkeypatch.setattr("hloc_reduce.utils.hloc.find_spec", lambda name: None)
+    model = {"name": "reduced", "base": known({"name": f"hloc.{name}"})}
+    with pytest.raises(InputError, match="hloc is not installed"):
+        extractors.load(model)
+    assert extractors.is_rotation_invariant(model) == invariant
+
+
+def on_its_side(camera):
+    """Return the intrinsics of a photo that is turned by 90 degrees."""
+    params = [camera.focal_length, camera.height / 2, camera.width / 2]
+    size = {"width": camera.height, "height": camera.width}
+    return pycolmap.Camera(model="SIMPLE_PINHOLE", **size, params=params)
+
+
+@pytest.mark.parametrize("matcher", ["NN-mutual", "lightglue"])
+def test_a_network_sees_photos_upright(matcher, place, aachen_layout, tmp_path, run, monkeypatch):
+    """A query that is stored turned has the pose of the upright one, turned about its axis."""
+    model = {"name": "lightglue", "max_keypoints": 512}
+    monkeypatch.setitem(matchers_confs.confs["lightglue"], "model", model)
+    build, images, outputs = place
+    for photo in sorted(images.glob("db/*.png")):
+        save(photo, np.array(Image.open(photo)), 1)
+    run(*build, "--feature", "mini32", "--storage", "uint2", "--matcher", matcher)
+    compact.main(tmp_path / "map.hlm", outputs / "map")
+    listed = aachen_layout / "queries/day_time_queries_with_intrinsics.txt"
+    name, camera = parse_query_list(listed)[0]
+    pixels = np.array(Image.open(images / name))
+    other = on_its_side(camera)
+    turns = {"upright": (0, 1), "left": (1, 6), "down": (2, 3), "right": (3, 8), "untold": (1, 99)}
+    for one, (number, orientation) in turns.items():
+        save(tmp_path / f"{one}.png", np.rot90(pixels, number), orientation)
+    for path in (outputs / "map", tmp_path / "map.hlm"):
+        localizer = Localizer(path)
+        found = {
+            one: localizer.localize(tmp_path / f"{one}.png", other if number % 2 else camera)
+            for one, (number, _) in turns.items()
+        }
+        expected, told = found["upright"]
+        for one in ("left", "down", "right", "untold"):
+            pose, info = found[one]
+            assert info["num_matches"] == told["num_matches"]
+            assert info["turned"] == (270 if one == "untold" else 0)
+            number = turns[one][0]
+            about_axis = pycolmap.Rotation3d(np.array([0, 0, -number * np.pi / 2]))
+            back = pycolmap.Rigid3d(about_axis, np.zeros(3)) * expected
+            distance, degrees = pose_error(pose, back)
+            assert distance < 1e-3 and degrees < 0.05
+        with_pixels = np.array(Image.open(tmp_path / "untold.png"))
+        assert localizer.localize(with_pixels, other)[0] is None  # are taken to be upright
+    extract_features.main(
+        features.confs["mini32"], tmp_path, feature_path=tmp_path / "f.h5", image_list=["left.png"]
+    )
+    with h5py.File(tmp_path / "f.h5") as file:
+        assert get_turns(file, "left.png") == 3
+        found = get_features(file, "left.png", ["keypoints", "image_size"])
+        assert found["image_size"].tolist() == [camera.width, camera.height]
+        assert found["keypoints"][:, 0].max() > camera.height  # of the upright photo
+        assert file["left.png/keypoints"][:, 0].max() < camera.height
+
+
+@pytest.mark.fault(11)
+def test_a_folder_of_turned_queries(place, aachen_layout, tmp_path, run):
+    """EXIF data tell nothing; the pipeline and the Localizer find the same, and the report."""
+    build, images, outputs = place
+    name = "query/day/a.png"
+    queries = tmp_path / "turned"
+    queries.mkdir()
+    pixels = np.array(Image.open(images / name))
+    noise = np.random.default_rng(0).integers(0, 255, pixels.shape, np.uint8)
+    listed = aachen_layout / "queries/day_time_queries_with_intrinsics.txt"
+    cameras = dict(parse_query_list(listed))
+    camera, lines = cameras[name], []
+    for number in range(4):
+        save(queries / f"{90 * number}.png", np.rot90(pixels, -number))
+    for other, content in (("noise", noise), ("grey", np.full_like(pixels, 128))):
+        save(queries / f"{other}.png", content)
+    taken = {}
+    for photo in sorted(queries.iterdir()):
+        taken[photo.name] = (
+            camera if photo.stem in ("0", "180", "noise", "grey") else on_its_side(camera)
+        )
+        one = taken[photo.name]
+        lines.append(to_line(photo.name, one.model.name, one.width, one.height, *one.params))
+    write(tmp_path / "turned.txt", "".join(lines))
+    given = "--query_images", queries, "--queries", tmp_path / "turned.txt"
+    run(*build, "--feature", "mini32", *given)
+    folder = outputs / "queries-turned"
+    summary, rows = outcome(folder)
+    localizer = Localizer(outputs / "map")
+    for number in range(4):
+        row = rows[f"{90 * number}.png"]
+        assert row["status"] == "localized" and int(row["turned"]) == 90 * number
+        pose, info = localizer.localize(queries / f"{90 * number}.png", taken[f"{90 * number}.png"])
+        assert info["turned"] == 90 * number
+        record = read_records(log_file(folder / summary["poses"]))[f"{90 * number}.png"]
+        assert pose_error(pose, pose_of(record))[0] < 1e-6
+    assert summary["queries_turned"] == 3
+    for other in ("noise.png", "grey.png"):
+        assert (
+            rows[other]["status"] == "fallback"
+            and localizer.localize(queries / other, camera)[0] is None
+        )
+    assert rows["grey.png"]["reason"] == "no keypoints"
+    found = Run(folder)
+    assert all(pictures.matched(found, f"{n}.png")["inliers"].sum() > 50 for n in (0, 90, 180, 270))
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
+    run("--map", outputs / "map", "--outputs", outputs, *given)
+    assert outcome(folder)[1] == rows
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*.h5")} == before
+
+
+def test_queries_of_another_size(place, aachen_layout, tmp_path, run):
+    """A network finds a photo of a third of the size, and as many matches as in the whole one."""
+    build, images, outputs = place
+    listed = aachen_layout / "queries/day_time_queries_with_intrinsics.txt"
+    name, camera = parse_query_list(listed)[0]
+    run(*build, "--feature", "mini32")
+    localizer = Localizer(outputs / "map")
+    _, whole = localizer.localize(images / name, camera)
+    pixels = np.array(Image.open(images / name))
+    camera.rescale(1 / 3)
+    (tmp_path / "small").mkdir()
+    small = cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    save(tmp_path / "small/a.png", small)
+    _, info = localizer.localize(tmp_path / "small/a.png", camera)
+    assert info["num_inliers"] > 0.7 * whole["num_inliers"]
+    line = to_line("a.png", camera.model.name, camera.width, camera.height, *camera.params)
+    given = "--query_images", tmp_path / "small", "--queries", write(tmp_path / "small.txt", line)
+    run("--map", outputs / "map", "--outputs", outputs, *given)
+    _, rows = outcome(outputs / "queries-small")
+    assert int(rows["a.png"]["num_inliers"]) == info["num_inliers"]
