@@ -60,15 +60,14 @@ def build(place: Aachen, folder: Path, size: float, feature: str, storage: str) 
 
 
 def on_its_side(camera: pycolmap.Camera, turns: int) -> pycolmap.Camera:
-    """Return the intrinsics of a photo after quarter turns, counterclockwise."""
+    """Return the intrinsics of a photo without distortion after quarter turns, counterclockwise."""
+    if camera.extra_params_idxs():
+        raise InputError("Cameras with a distortion are not turned.")
+    calibration, width, height = camera.calibration_matrix(), camera.width, camera.height
+    (fx, _, x), (_, fy, y), _ = calibration.tolist()
     for _ in range(turns):
-        if len({camera.params[i] for i in camera.focal_length_idxs()}) > 1:
-            raise InputError("Cameras need one focal length to be turned.")
-        x, y = camera.principal_point()
-        camera = copy.deepcopy(camera)
-        camera.width, camera.height = camera.height, camera.width
-        camera.principal_point_x, camera.principal_point_y = y, camera.height - x
-    return camera
+        fx, fy, x, y, width, height = fy, fx, y, width - x, height, width
+    return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, x, y])
 
 
 def about_axis(pose: pycolmap.Rigid3d, turns: int) -> pycolmap.Rigid3d:

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from itertools import product
 from operator import mul
 from pathlib import Path
 
@@ -110,8 +111,18 @@ LIGHTGLUE_PLACES = (
     *("herz-jesus", "dark-fountain-P11", "dark-sceaux"),
     *(f"sparse-{place}" for place in ("herz-jesus", "fountain-P11", "sceaux")),
 )
-# folders of photos from the web, see `benchmarks.strangers`
-WEB_PHOTOS = "cvg+Hierarchical-Localization", "naver+mast3r"  # a facade, a tower
+# from what `benchmarks.changed_photos` changes to what tables say
+CHANGED_PHOTOS = {
+    "map 1, queries 1, turned 0": "unchanged",
+    "map 1, queries 0.5, turned 0": "of half the size",
+    "map 1, queries 0.35, turned 0": "of 35 %",
+    "map 1, queries 0.25, turned 0": "of a quarter",
+    "map 0.5, queries 1, turned 0": "map of half the size",
+    "map 0.35, queries 1, turned 0": "map of 35 %",
+    "map 1, queries 1, turned 90": "turned by 90°",
+    "map 1, queries 1, turned 180": "by 180°",
+}
+AS = "as stored", "as shown"
 SECONDS_OF_PAIRS = {
     "all layers, 1 thread": "all layers, one core",
     "early exit, 1 thread": "early exit",
@@ -341,15 +352,20 @@ def lightglue_seconds_table() -> Table:
     return table
 
 
-def web_photos_table() -> Table:
-    """Show maps of photos from the web, and what is localized in them."""
-    facade, tower = (select(read("web_photos"), place=place) for place in WEB_PHOTOS)
-    table = [["feature", "matcher", "facade: in the maps", "localized", "off by 10 % or 10°"]]
-    table[0] += ["tower: in the maps"]
-    for row, other in zip(facade, tower, strict=True):
-        cells = [f"{one['registered']} of {one['photos']}" for one in (row, other)]
-        cells[1:1] = [f"{row['localized']} of {row['queries']}", row["far"]]
-        table.append([name_of(row), f"`{row['matcher']}`", *cells])
+def changed_photos_table() -> Table:
+    """Show what is localized of changed queries, and in a map of small photos."""
+    rows = read("changed_photos")
+    names = dict.fromkeys(map(name_of, rows))
+    table = [["photos", *(f"{name}: {how}" for name in names for how in AS)]]
+    for change, said in CHANGED_PHOTOS.items():
+        cells = []
+        for name, how in product(names, AS):
+            [row] = [
+                one for one in select(rows, variant=f"{change}, {how}") if name_of(one) == name
+            ]
+            median = f"{float(row['median_cm']):.2f}" if row["median_cm"] else ""
+            cells.append(f"{row['localized']}; {thousands(row['inliers'])}; {median}".strip("; "))
+        table.append([said, *cells])
     return table
 
 
@@ -571,7 +587,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "lightglue_seconds": lightglue_seconds_table,
     "pose_limits": pose_limits_table,
     "retrieval": retrieval_table,
-    "web_photos": web_photos_table,
+    "changed_photos": changed_photos_table,
     "runs": runs_table,
     "runs_cpu": runs_cpu_table,
     "extraction": extraction_table,

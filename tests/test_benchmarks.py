@@ -16,6 +16,7 @@ import yaml
 from benchmarks import (
     accuracy,
     against_hloc,
+    changed_photos,
     fit_gate,
     photos_alone,
     render,
@@ -30,6 +31,7 @@ from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import absolute_pose, gate
+from hloc_reduce.utils import images
 from hloc_reduce.utils.cli import InputError
 from pipelines.batch import jobs
 from pipelines.batch.jobs import Job
@@ -311,3 +313,15 @@ def test_a_warped_photo_is_taken_by_a_turned_camera():
 
 def project(cam_from_world, points):
     return points @ cam_from_world.rotation.matrix().T + cam_from_world.translation
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_points_of_a_turned_photo_are_where_its_pixels_are(turns):
+    camera = pycolmap.Camera(model="PINHOLE", width=40, height=30, params=[31, 32, 19, 16])
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.3])), np.array([0, 0.2, 5]))
+    points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
+    expected = images.turned(camera.img_from_cam(pose * points) - 0.5, np.array([40, 30]), turns)
+    turned = changed_photos.on_its_side(camera, turns)
+    found = turned.img_from_cam(changed_photos.about_axis(pose, turns) * points)
+    np.testing.assert_allclose(found - 0.5, expected, atol=1e-9)
+    assert (turned.width, turned.height) == ((30, 40) if turns % 2 else (40, 30))

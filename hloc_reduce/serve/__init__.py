@@ -182,6 +182,7 @@ def answer(
         "probability": info["probability"],
         "num_inliers": info["num_inliers"],
         "again": info["again"],
+        "turned": info["turned"],
         "camera": to_list(info["camera"]),
         "intrinsics": info["intrinsics"],
         "map_doubts": info["map_doubts"],
