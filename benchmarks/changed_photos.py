@@ -1,9 +1,9 @@
 """Localize queries that were resized or turned, or in a map of resized photos.
 
 The place is in the layout of Aachen. Photos are written without EXIF data; intrinsics are given.
-Each change is tried as it is, as a feature that knows nothing of the map would see the photo, and
-as `localization.views` shows it. Adds rows to results/changed_photos.csv, leaving out what has rows
-unless --again is given.
+Each change is tried as photos are stored, and as `localization.views` shows them to the feature.
+With --mixed, every second photo of the map is resized. Adds rows to results/changed_photos.csv,
+leaving out what has rows unless --again is given.
 """
 
 import copy
@@ -15,9 +15,11 @@ import cv2
 import numpy as np
 import pycolmap
 import torch
+import yaml
 
 from benchmarks import rows
 from hloc_reduce import Localizer, maps
+from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import FAILED, pose_error
@@ -28,6 +30,7 @@ from hloc_reduce.utils.images import read_image
 
 NAME = "changed_photos"
 NUM_LOC = 10
+SHOWN = "as stored", "as shown"
 
 
 def resized(photo: np.ndarray, size: float) -> np.ndarray:
@@ -43,17 +46,37 @@ def write(photo: np.ndarray, path: Path) -> None:
         cv2.imwrite(str(path), photo[..., ::-1])
 
 
-def build(place: Aachen, folder: Path, size: float, feature: str, storage: str) -> Map:
-    """Build the map of photos of another size."""
-    options = {"feature": feature, "storage": storage}
-    built = folder / f"{feature}-{storage}"
+def build(
+    place: Aachen,
+    folder: Path,
+    size: float,
+    mixed: bool,
+    feature: str,
+    storage: str,
+    as_stored: bool,
+) -> Map:
+    """Build the map of photos of another size, all or every second one."""
+    options, built = {"storage": storage, "feature": feature}, folder / f"{feature}-{storage}"
+    if as_stored:
+        _, conf = features_confs.get(feature)
+        conf = {**conf, "preprocessing": {**conf["preprocessing"], "resize_min": 0}}
+        built = folder / f"{feature}-{storage}-as-stored"
+        file = folder / f"{feature}.yaml"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(yaml.safe_dump({key: conf[key] for key in ("model", "preprocessing")}))
+        options |= {"feature": str(file), "matcher": features_confs.matcher_of(conf)}
     if size == 1:
         return maps.main(built, place.images, place.reference_model, **options)
-    model = colmap.read_model(place.reference_model)
-    for image in model.images.values():
-        write(resized(read_image(place.images / image.name), size), folder / "images" / image.name)
-    for camera in model.cameras.values():
-        camera.rescale(*(max(1, round(side * size)) for side in (camera.width, camera.height)))
+    model, resized_cameras = colmap.read_model(place.reference_model), set()
+    for i, image in enumerate(sorted(model.images.values(), key=lambda image: image.name)):
+        its_size = size if i % 2 or not mixed else 1
+        photo = resized(read_image(place.images / image.name), its_size)
+        write(photo, folder / "images" / image.name)
+        if image.camera_id not in resized_cameras:
+            model.cameras[image.camera_id].rescale(photo.shape[1], photo.shape[0])
+        resized_cameras.add(image.camera_id)
+    if mixed and len(model.cameras) < len(model.images):
+        raise InputError("--mixed needs a camera for each photo of the map.")
     (folder / "sparse").mkdir(exist_ok=True)
     model.write_binary(folder / "sparse")
     return maps.main(built, folder / "images", folder / "sparse", **options)
@@ -131,30 +154,38 @@ def _main() -> None:
         help="of queries, by 90 degrees",
     )
     add("--outputs", type=Path, default=Path("outputs/changed_photos"))
+    add("--mixed", action="store_true", help="resize every second map photo only")
     rows.add_again_option(parser)
     args = parser.parse_args()
     if not 0 < min(args.map_size + args.size) <= max(args.map_size + args.size) <= 4:
         raise InputError("--map_size and --size: above 0, at most 4.")
     torch.set_num_threads(1)
     known = [] if args.again else rows.read(NAME)
-    for root, given, map_size in product(args.dataset, args.feature, args.map_size):
-        place, (feature, _, storage) = Aachen(root), given.partition(":")
+    for root, name, map_size in product(args.dataset, args.feature, args.map_size):
+        place, (feature, _, storage) = Aachen(root), name.partition(":")
         storage = storage or "float16"
         folder = args.outputs / place.root.name
-        built = None
-        for size, turns, as_stored in product(args.size, args.turns, (True, False)):
-            change = f"map {map_size:g}, queries {size:g}, turned {90 * turns}"
-            variant = f"{change}, {'as stored' if as_stored else 'as shown'}"
-            cells = {"place": place.root.name, "feature": feature, "storage": storage}
-            cells |= {"variant": variant}
-            if rows.select(known, **cells):
-                continue
-            built = built or build(place, folder / f"map-{map_size:g}", map_size, feature, storage)
-            localizer = Localizer(built.folder, num_loc=NUM_LOC)
-            if as_stored:
-                localizer.preprocessing = built.conf["preprocessing"]
-            cells["matcher"] = built.matcher
-            rows.add(NAME, [cells | measured(localizer, place, folder, size, turns, as_stored)])
+        mixed = args.mixed and map_size != 1
+        of_map = f"map {map_size:g}{' and 1' if mixed else ''}"
+        part = folder / of_map.replace(" ", "-")
+        for as_stored in (True, False):
+            built = None
+            for size, turns in product(args.size, args.turns):
+                change = f"{of_map}, queries {size:g}, turned {90 * turns}"
+                cells = {
+                    "place": place.root.name,
+                    "feature": feature,
+                    "storage": storage,
+                    "variant": f"{change}, {SHOWN[not as_stored]}",
+                }
+                if rows.select(known, **cells):
+                    continue
+                given = part, map_size, mixed, feature, storage, as_stored
+                built = built or build(place, *given)
+                localizer = Localizer(built.folder, num_loc=NUM_LOC)
+                cells["matcher"] = built.matcher
+                changed = folder, size, turns, as_stored
+                rows.add(NAME, [cells | measured(localizer, place, *changed)])
 
 
 if __name__ == "__main__":

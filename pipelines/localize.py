@@ -214,7 +214,7 @@ def main(
         wanted.log()
         with run.stage("extract_features"):
             features = extract_features.main(
-                built.query_conf,
+                built.conf,
                 query_images,
                 outputs,
                 image_list=names,
@@ -231,7 +231,7 @@ def main(
         matches = run.match("match_queries", loc_pairs, features, built.features)
         poses = outputs / f"poses_hloc_{built.feature}+{matcher}_{retrieved}.txt"
         mirror_images = run.mirror_images(
-            built.query_conf, query_images, loc_pairs, features, built.features
+            built.conf, query_images, loc_pairs, features, built.features
         )
         further = (
             []

@@ -85,6 +85,13 @@ if [ -e $data/strangers ]; then
     run web_photos --photos $web --feature colmap_sift_sv64 --matcher NN "$@"
     run web_photos --photos $web --feature xfeat:float16 xfeat_sv32:uint2 mini32:uint2 "$@"
 fi
+for feature in mini32:uint2 xfeat_sv32:uint2 colmap_sift_sv64; do
+    changed() { run changed_photos --dataset $data/herz-jesus --feature $feature "$@"; }
+    changed --size 1 0.5 0.35 0.25 "$@"
+    changed --size 1 --map_size 0.5 0.35 "$@"
+    changed --size 1 --map_size 0.35 --mixed "$@"
+    changed --size 1 --turns 1 2 "$@"
+done
 run pose_limits results/pose_limits.yaml "$@"
 # fox and south-building, whose images are all matched with each photo, only with the default feature
 small="bronze-statue cyprus entry-P10 fountain-P11 kitchen liberty-statue monstree sceaux"
@@ -129,6 +136,21 @@ if "$python" -c "import hloc" 2> /dev/null; then
         run lightglue --dataset $data/dark-fountain-P11 --feature outputs/disk.yaml:float16 --keypoints 1024 "$@" \
             --map_matcher $matcher --matcher $matcher
     done
+    projected=outputs/disk_sv32.safetensors
+    if [ ! -e $projected ]; then # half an hour
+        maps= images=
+        for place in bronze-statue cyprus entry-P10 liberty-statue monstree; do
+            maps="$maps --map $(scene "$place")" images="$images $data/scenes/$place/images"
+        done
+        { # as disk.yaml, projected
+            echo "model: {name: reduced, base: {name: disk, max_keypoints: 4096}, projection: $projected}"
+            echo "preprocessing: {grayscale: false, resize_max: 1024}"
+        } > outputs/disk_sv32.yaml
+        "$python" -m hloc_reduce.training --base outputs/disk.yaml --scheme sv --dim 32 $maps --output outputs
+        "$python" -m hloc_reduce.training.adapters --feature outputs/disk_sv32.yaml --photos 40 --images $images
+    fi
+    run lightglue --dataset $data/dark-fountain-P11 --feature outputs/disk_sv32.yaml:uint4 \
+        outputs/disk_sv32.yaml:uint2 --keypoints 1024 --map_matcher lightglue --matcher lightglue "$@"
 fi
 
 run render

@@ -272,11 +272,14 @@ def check(content: object, path: Path) -> dict:
         raise InputError(f"{path}: preprocessing cannot be {given!r}.")
     # hloc's confs also have an `output`, which is ignored
     unknown = content.keys() - {"model", "preprocessing", "output"}
-    unknown |= given.keys() - {*IN_COLOUR, "resize_force"}
+    unknown |= given.keys() - {*IN_COLOUR, "resize_force", "resize_min"}
     if unknown:
         raise InputError(f"{path}: unknown keys {', '.join(map(str, sorted(unknown, key=str)))}.")
     preprocessing = {**(IN_COLOUR if network_of(model) else PREPROCESSING), **given}
     resize_max = preprocessing["resize_max"]
     if resize_max is not None and not (isinstance(resize_max, int) and resize_max > 0):
         raise InputError(f"{path}: resize_max is a number of pixels or null, not {resize_max!r}.")
+    resize_min = preprocessing.get("resize_min", 0)
+    if not (isinstance(resize_min, int) and 0 <= resize_min <= (resize_max or 0)):
+        raise InputError(f"{path}: resize_min is a number of pixels up to resize_max.")
     return {"model": model, "preprocessing": preprocessing}

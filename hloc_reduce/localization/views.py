@@ -1,35 +1,38 @@
-"""How queries are shown to a feature that knows objects of one size, the right way up.
+"""How photos are shown to a feature that knows objects of one size, the right way up.
 
-Networks find hardly a right match if objects are 2.5 times as large as in the photos of the map, or
-turned by 90 degrees. So queries are shown at the size of the map's photos, as EXIF data turn them
-upright or, where these do not tell, in each of the four ways until one is localized.
+Networks find hardly a right match if objects are 2.5 times as large in one photo as in the other,
+or turned by 90 degrees. So all photos of a place are shown at about one size, as EXIF data turn
+them upright; where these do not tell, queries are tried in each of the four ways.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from ..utils.images import orientation
 from .intrinsics import MapCameras
 
+MOST_APART = 1.6  # ratio of sizes that networks match well
 TURNS = (1, 3, 2)  # quarter turns, counterclockwise, that are tried: the likely ones first
 
 
-def at_map_size(preprocessing: dict, of_map: MapCameras) -> dict:
-    """Return the preprocessing of queries, which shows them at the size of a map's photos.
+def at_one_size(preprocessing: dict, sizes: Collection[tuple[int, int]]) -> dict:
+    """Return the preprocessing of the photos of a map, and of all that are matched with these.
 
-    Queries that are smaller than all of these are enlarged to the smallest one, and queries that
-    are larger are reduced to the largest.
+    Smaller photos are enlarged to the smallest of the map, and larger ones reduced to the largest.
+    If sizes of the map's photos differ too much, all are shown at the size of their median.
 
     Args:
         preprocessing: of the feature's configuration.
-        of_map: what the map tells about its photos.
+        sizes: (width, height) of each photo of the map.
     """
-    longer = [max(size) for size in (*of_map.sizes, *of_map.lenses)]
-    if not longer or preprocessing.get("resize_force"):
+    most = preprocessing.get("resize_max")
+    is_given = "resize_min" in preprocessing or preprocessing.get("resize_force")
+    if most is None or is_given or not sizes:
         return preprocessing
-    most = preprocessing.get("resize_max") or max(longer)
-    limits = {"resize_min": min(*longer, most), "resize_max": min(max(longer), most)}
-    return {**preprocessing, **limits}
+    seen = sorted(min(max(size), most) for size in sizes)
+    if seen[-1] > MOST_APART * seen[0]:
+        seen = [seen[len(seen) // 2]]
+    return {**preprocessing, "resize_min": seen[0], "resize_max": seen[-1]}
 
 
 def shown(conf: dict, **how: object) -> dict:

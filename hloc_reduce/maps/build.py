@@ -13,7 +13,7 @@ from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..detectors.dog import KEYPOINT_SETTINGS
 from ..extract_features import keep_present, without
-from ..localization import intrinsics
+from ..localization import intrinsics, views
 from ..mapping import registration
 from ..mapping.checks import Inputs, judging, run, sizes
 from ..mapping.findings import Finding, check_accepted, names_in, staying
@@ -130,7 +130,7 @@ def main(
                 camera_mode=camera_mode,
                 retrieval=retrieval,
             )
-            conf = keep_projection(conf, map_dir)
+            conf = keep_projection(_at_one_size(conf, image_dir, usable), map_dir)
             if model is not None and reference is not None:
                 attempt = of_model(photos, conf, model, reference)
                 return _finish(attempt, [], True, feature, keypoints, model=str(model.resolve()))
@@ -146,6 +146,22 @@ def main(
         drop_others(folder, built)  # a killed run may have left some
         built.warn()
         return built
+
+
+def _at_one_size(conf: dict, image_dir: Path, names: list[str]) -> dict:
+    """Return the configuration of a feature that shows photos at about one size, if it needs that.
+
+    Args:
+        conf: its configuration.
+        image_dir: the folder of the photos.
+        names: the photos of the map.
+    """
+    from .. import extractors
+
+    if extractors.is_rotation_invariant(conf["model"]):
+        return conf
+    sizes = [size for name in names if (size := stored_size(image_dir / name))]
+    return {**conf, "preprocessing": views.at_one_size(conf["preprocessing"], sizes)}
 
 
 def _finish(

@@ -67,9 +67,7 @@ class Localizer:
         contents = read(Path(map_dir), feature_file, matcher, matcher_file)
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.workers = parallel.cores()
-        self.cameras, self.preprocessing = contents.cameras, contents.preprocessing
-        if not contents.engine.rotation_invariant:
-            self.preprocessing = views.at_map_size(self.preprocessing, self.cameras)
+        self.preprocessing, self.cameras = contents.preprocessing, contents.cameras
         self.doubts = contents.doubts
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]

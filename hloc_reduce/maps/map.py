@@ -208,14 +208,6 @@ class Map:
 
         return extractors.is_rotation_invariant(self.conf["model"])
 
-    @property
-    def query_conf(self) -> dict:
-        """The configuration of the features of queries."""
-        if self.is_rotation_invariant:
-            return self.conf
-        shown = views.at_map_size(self.conf["preprocessing"], self.cameras)
-        return {**self.conf, "preprocessing": shown}
-
     def aggregate(
         self,
         features: Path,

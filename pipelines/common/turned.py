@@ -34,7 +34,7 @@ def tries(
         num_loc: map images that the map's retrieval finds for a turned query; None: those of
             `pairs`.
     """
-    conf, map_names = built.query_conf, built.names()
+    conf, map_names = built.conf, built.names()
 
     def of_turns(turns: int, of_turn: list[str], matcher: str) -> Try:
         shown = views.shown(conf, turns=turns)

@@ -60,20 +60,21 @@ def test_photos_are_turned_unless_exif_data_tell(
 @pytest.mark.parametrize(
     ("sizes", "preprocessing", "expected"),
     [
-        ({(1600, 1200)}, {"resize_max": 1600}, (1600, 1600)),
-        ({(640, 480), (300, 900)}, {"resize_max": 1600}, (640, 900)),
-        ({(4000, 3000), (3000, 4000)}, {"resize_max": 1600}, (1600, 1600)),
-        ({(4000, 3000), (640, 480)}, {"resize_max": 1024}, (640, 1024)),
-        ({(4000, 3000)}, {"resize_max": None}, (4000, 4000)),
-        (set(), {"resize_max": 1600}, (None, 1600)),
-        ({(640, 480)}, {"resize_max": 1024, "resize_force": True}, (None, 1024)),
+        ([(1600, 1200)], {"resize_max": 1600}, (1600, 1600)),
+        ([(640, 480), (300, 900)], {"resize_max": 1600}, (640, 900)),
+        ([(4000, 3000), (3000, 4000)], {"resize_max": 1600}, (1600, 1600)),
+        ([(4000, 3000), (640, 480)], {"resize_max": 1024}, (640, 1024)),
+        ([(4000, 3000), (640, 480)], {"resize_max": 1600}, (1600, 1600)),  # too far apart
+        ([(4000, 3000), (640, 480), (700, 100)], {"resize_max": 1600}, (700, 700)),
+        ([(4000, 3000)], {"resize_max": None}, (None, None)),
+        ([], {"resize_max": 1600}, (None, 1600)),
+        ([(640, 480)], {"resize_max": 1024, "resize_force": True}, (None, 1024)),
+        ([(640, 480)], {"resize_max": 1024, "resize_min": 800}, (800, 1024)),
     ],
 )
-def test_queries_are_shown_at_the_size_of_map_photos(sizes, preprocessing, expected):
-    found = views.at_map_size(preprocessing, MapCameras({}, sizes))
+def test_photos_are_shown_at_the_size_of_those_of_the_map(sizes, preprocessing, expected):
+    found = views.at_one_size(preprocessing, sizes)
     assert (found.get("resize_min"), found["resize_max"]) == expected
-    lenses = dict.fromkeys(sizes, ())
-    assert views.at_map_size(preprocessing, MapCameras({}, set(), lenses=lenses)) == found
 
 
 @pytest.mark.fault(11)
@@ -230,23 +231,42 @@ def test_a_folder_of_turned_queries(place, aachen_layout, tmp_path, run):
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*.h5")} == before
 
 
-def test_queries_of_another_size(place, aachen_layout, tmp_path, run):
-    """A network finds a photo of a third of the size, and as many matches as in the whole one."""
+@pytest.mark.parametrize("small", ["query", "map"])
+def test_photos_of_another_size(small, place, aachen_layout, tmp_path, run):
+    """A network finds photos of a third of the size, or in a map of half the size."""
     build, images, outputs = place
     listed = aachen_layout / "queries/day_time_queries_with_intrinsics.txt"
     name, camera = parse_query_list(listed)[0]
+
+    def reduced(photo, size):
+        (tmp_path / "small" / photo).parent.mkdir(parents=True, exist_ok=True)
+        pixels = cv2.resize(np.array(Image.open(images / photo)), size, None, 0, 0, cv2.INTER_AREA)
+        save(tmp_path / "small" / photo, pixels)
+
     run(*build, "--feature", "mini32")
+    queries = images
+    if small == "query":
+        camera.rescale(1 / 3)
+        reduced(name, (camera.width, camera.height))
+        queries = tmp_path / "small"
+    else:
+        model = colmap.read_model(build[1])
+        for one in model.cameras.values():
+            one.rescale(1 / 2)
+        for image in model.images.values():
+            reduced(image.name, (image.camera.width, image.camera.height))
+        (tmp_path / "sparse").mkdir()
+        model.write(tmp_path / "sparse")
+        outputs = tmp_path / "of small photos"
+        given = "--map", tmp_path / "sparse", "--map_images", tmp_path / "small"
+        run(*given, "--outputs", outputs, "--feature", "mini32")
     localizer = Localizer(outputs / "map")
-    _, whole = localizer.localize(images / name, camera)
-    pixels = np.array(Image.open(images / name))
-    camera.rescale(1 / 3)
-    (tmp_path / "small").mkdir()
-    small = cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    save(tmp_path / "small/a.png", small)
-    _, info = localizer.localize(tmp_path / "small/a.png", camera)
-    assert info["num_inliers"] > 0.7 * whole["num_inliers"]
-    line = to_line("a.png", camera.model.name, camera.width, camera.height, *camera.params)
-    given = "--query_images", tmp_path / "small", "--queries", write(tmp_path / "small.txt", line)
+    _, info = localizer.localize(queries / name, camera)
+    localizer.preprocessing = features.confs["mini32"]["preprocessing"]
+    _, as_stored = localizer.localize(queries / name, camera)
+    assert info["num_inliers"] > 1.5 * as_stored["num_inliers"]
+    line = to_line(name, camera.model.name, camera.width, camera.height, *camera.params)
+    given = "--query_images", queries, "--queries", write(tmp_path / "one.txt", line)
     run("--map", outputs / "map", "--outputs", outputs, *given)
-    _, rows = outcome(outputs / "queries-small")
-    assert int(rows["a.png"]["num_inliers"]) == info["num_inliers"]
+    _, rows = outcome(outputs / "queries-one")
+    assert int(rows[name]["num_inliers"]) == info["num_inliers"]

@@ -149,7 +149,7 @@ def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
     np.testing.assert_array_equal(*rounded)
     query = rounded[0].astype(np.float32)
     both = light, heavy
-    described = light.describe({"descriptors": query.T}, photo)
+    described = light.describe({"descriptors": query.T}, photo, 0)
     np.testing.assert_array_equal(*(one.similarity(described) for one in both))
     matched = [one.steps[0].match({"descriptors": query.T}, one.names) for one in both]
     for name in light.names:
