@@ -316,12 +316,14 @@ def lightglue_bytes_table() -> Table:
     lists += [("sparse-herz-jesus", "day")]
     heads = [f"{place.removesuffix('-P11')}, {part}" for place, part in lists]
     table = [["feature", "bytes", *heads]]
-    for base in ("aliked", "xfeat"):
+    for base in ("aliked", "xfeat", "disk"):
         codes = ((f"{base}_sv32", storage) for storage in ("uint4", "uint2", "uint1"))
         for feature, storage in [(base, FLOATS[0]), *codes]:
             variant = f"map by lightglue, 1024 keypoints, {RETRIEVED} images"
             given = {"feature": feature, "storage": storage, "variant": variant}
             rows = select(read("lightglue"), matcher="lightglue", **given)
+            if not rows:
+                continue
             cells = []
             for place, part in lists:
                 found = select(rows, place=place, list=part)
