@@ -1,4 +1,4 @@
-"""Localize queries that were resized or turned, or in a map of resized photos.
+"""Localize queries that were resized, cropped or turned, or in a map of resized photos.
 
 The place is in the layout of Aachen. Photos are written without EXIF data; intrinsics are given.
 Each change is tried as photos are stored, and as `localization.views` shows them to the feature.
@@ -10,6 +10,7 @@ import copy
 import os
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ from hloc_reduce.evaluation.poses import FAILED, pose_error
 from hloc_reduce.maps.map import Map
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.files import replacing
 from hloc_reduce.utils.images import read_image
 
 NAME = "changed_photos"
@@ -43,7 +45,8 @@ def write(photo: np.ndarray, path: Path) -> None:
     """Write a photo (H, W, 3) RGB, unless it is there."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), photo[..., ::-1])
+        with replacing(path) as temporary:
+            temporary.write_bytes(cv2.imencode(path.suffix, photo[..., ::-1])[1].tobytes())
 
 
 def build(
@@ -82,8 +85,24 @@ def build(
     return maps.main(built, folder / "images", folder / "sparse", **options)
 
 
+def middle(
+    photo: np.ndarray, camera: pycolmap.Camera, part: float
+) -> tuple[np.ndarray, pycolmap.Camera]:
+    """Return the middle part of a photo (H, W, 3), a share of each side, and its intrinsics."""
+    height, width = photo.shape[:2]
+    h, w = (max(1, round(side * part)) for side in (height, width))
+    x, y = (width - w) // 2, (height - h) // 2
+    camera = copy.deepcopy(camera)
+    camera.width, camera.height = w, h
+    camera.principal_point_x -= x
+    camera.principal_point_y -= y
+    return photo[y : y + h, x : x + w], camera
+
+
 def on_its_side(camera: pycolmap.Camera, turns: int) -> pycolmap.Camera:
     """Return the intrinsics of a photo without distortion after quarter turns, counterclockwise."""
+    if not turns:
+        return camera
     if camera.extra_params_idxs():
         raise InputError("Cameras with a distortion are not turned.")
     calibration, width, height = camera.calibration_matrix(), camera.width, camera.height
@@ -99,8 +118,20 @@ def about_axis(pose: pycolmap.Rigid3d, turns: int) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(turn, np.zeros(3)) * pose
 
 
+class Change(NamedTuple):
+    """How queries are changed: resized, then cropped, then turned."""
+
+    size: float  # relative to their own
+    part: float  # that is left of each side, in the middle
+    turns: int  # quarter turns, counterclockwise
+
+    def __str__(self) -> str:
+        part = "" if self.part == 1 else f", middle {self.part:g}"
+        return f"queries {self.size:g}{part}, turned {90 * self.turns}"
+
+
 def measured(
-    localizer: Localizer, place: Aachen, folder: Path, size: float, turns: int, as_stored: bool
+    localizer: Localizer, place: Aachen, folder: Path, change: Change, as_stored: bool
 ) -> dict[str, object]:
     """Return the cells of all queries after a change.
 
@@ -108,26 +139,25 @@ def measured(
         localizer: of the map.
         place: the place.
         folder: for the changed photos.
-        size: of the queries, relative to their own.
-        turns: quarter turns, counterclockwise.
+        change: of the queries.
         as_stored: give pixels, which are not turned.
     """
     queries = [query for part in place.query_lists().values() for query in part]
     truth = true_poses([name for name, _ in queries], place.ground_truth, True)
     errors, inliers, seconds = [], [], []
     for name, camera in queries:
-        photo = np.rot90(resized(read_image(place.images / name), size), turns)
-        path = folder / f"{size:g}-{turns}" / Path(name).with_suffix(".png")
+        photo = resized(read_image(place.images / name), change.size)
+        camera = copy.deepcopy(camera)
+        camera.rescale(*photo.shape[1::-1])
+        photo, camera = middle(photo, camera, change.part)
+        photo = np.ascontiguousarray(np.rot90(photo, change.turns))
+        path = folder / str(change).replace(" ", "-") / Path(name).with_suffix(".png")
         write(photo, path)
-        its_camera = copy.deepcopy(camera)
-        its_camera.rescale(*photo.shape[:2][:: 1 if turns % 2 else -1])
-        its_camera = on_its_side(its_camera, turns)
-        pose, info = localizer.localize(
-            np.ascontiguousarray(photo) if as_stored else path, its_camera
-        )
+        given = photo if as_stored else path
+        pose, info = localizer.localize(given, on_its_side(camera, change.turns))
         inliers.append(info["num_inliers"])
         seconds.append(sum(info["seconds"].values()))
-        true = about_axis(truth[name], turns)
+        true = about_axis(truth[name], change.turns)
         errors.append(FAILED if pose is None else pose_error(pose, true))
     localized = sum(error != FAILED for error in errors)
     return {
@@ -145,6 +175,7 @@ def _main() -> None:
     add("--feature", nargs="+", default=["mini32:uint2"], help="features, with the map's storage")
     add("--map_size", nargs="+", type=float, default=[1], help="of map photos, of their own")
     add("--size", nargs="+", type=float, default=[1, 0.5, 0.35, 0.25], help="of queries")
+    add("--part", nargs="+", type=float, default=[1], help="of each side of the queries")
     add(
         "--turns",
         nargs="+",
@@ -159,6 +190,8 @@ def _main() -> None:
     args = parser.parse_args()
     if not 0 < min(args.map_size + args.size) <= max(args.map_size + args.size) <= 4:
         raise InputError("--map_size and --size: above 0, at most 4.")
+    if not 0 < min(args.part) <= max(args.part) <= 1:
+        raise InputError("--part: above 0, at most 1.")
     torch.set_num_threads(1)
     known = [] if args.again else rows.read(NAME)
     for root, name, map_size in product(args.dataset, args.feature, args.map_size):
@@ -169,23 +202,22 @@ def _main() -> None:
         of_map = f"map {map_size:g}{' and 1' if mixed else ''}"
         part = folder / of_map.replace(" ", "-")
         for as_stored in (True, False):
-            built = None
-            for size, turns in product(args.size, args.turns):
-                change = f"{of_map}, queries {size:g}, turned {90 * turns}"
+            localizer = None
+            for change in map(Change._make, product(args.size, args.part, args.turns)):
                 cells = {
                     "place": place.root.name,
                     "feature": feature,
                     "storage": storage,
-                    "variant": f"{change}, {SHOWN[not as_stored]}",
+                    "variant": f"{of_map}, {change}, {SHOWN[not as_stored]}",
                 }
                 if rows.select(known, **cells):
                     continue
-                given = part, map_size, mixed, feature, storage, as_stored
-                built = built or build(place, *given)
-                localizer = Localizer(built.folder, num_loc=NUM_LOC)
+                if localizer is None:
+                    given = part, map_size, mixed, feature, storage, as_stored
+                    built = build(place, *given)
+                    localizer = Localizer(built.folder, num_loc=NUM_LOC)
                 cells["matcher"] = built.matcher
-                changed = folder, size, turns, as_stored
-                rows.add(NAME, [cells | measured(localizer, place, *changed)])
+                rows.add(NAME, [cells | measured(localizer, place, folder, change, as_stored)])
 
 
 if __name__ == "__main__":

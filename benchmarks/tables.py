@@ -334,7 +334,8 @@ def lightglue_bytes_table() -> Table:
 
 def inliers_and_median(row: Row) -> str:
     """Format the mean inliers of a query list and its median error in cm."""
-    return f"{float(row['inliers']):,.0f}; {float(row['median_cm']):.2f}"
+    median = f"; {float(row['median_cm']):.2f}" if row["median_cm"] else ""
+    return f"{float(row['inliers']):,.0f}{median}"
 
 
 def lightglue_seconds_table() -> Table:
@@ -362,11 +363,11 @@ def changed_photos_table() -> Table:
     for change, said in CHANGED_PHOTOS.items():
         cells = []
         for name, how in product(names, changed_photos.SHOWN):
-            [row] = [
-                one for one in select(rows, variant=f"{change}, {how}") if name_of(one) == name
-            ]
-            median = f"{float(row['median_cm']):.2f}" if row["median_cm"] else ""
-            cells.append(f"{row['localized']}; {thousands(row['inliers'])}; {median}".strip("; "))
+            found = select(rows, variant=f"{change}, {how}")
+            of_name = [one for one in found if name_of(one) == name]
+            cells.append(
+                "".join(f"{row['localized']}; {inliers_and_median(row)}" for row in of_name)
+            )
         table.append([said, *cells])
     return table
 

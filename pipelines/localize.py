@@ -31,7 +31,7 @@ from hloc_reduce.utils.codes import STORAGES, Storage
 from hloc_reduce.utils.options import Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
-from .common import changes, command, turned
+from .common import changes, command, other_views
 from .common.options import Matcher, Positive, Retrieval
 from .common.queries import LISTED, Photos, Queries, identity, results_folder
 from .common.retrieval import check_retrieval, retrieval_name, retrieve, retrieve_in_map
@@ -233,18 +233,14 @@ def main(
         mirror_images = run.mirror_images(
             built.conf, query_images, loc_pairs, features, built.features
         )
-        further = (
-            []
-            if built.is_rotation_invariant
-            else turned.tries(
-                run,
-                built,
-                query_images,
-                names,
-                features,
-                loc_pairs,
-                num_loc if retrieval == built.retrieval else None,
-            )
+        others = other_views.tries(
+            run,
+            built,
+            query_images,
+            [name for name in names if wanted.sources.get(name) != "none"],
+            features,
+            loc_pairs,
+            num_loc if retrieval == built.retrieval else None,
         )
         with run.stage("localization"):
             records = localize_sfm.main(
@@ -258,7 +254,7 @@ def main(
                 full_names=True,
                 gate=gate,
                 mirror_images=mirror_images(steps[0]),
-                again=run.again(loc_pairs, features, built.features, mirror_images, further),
+                again=run.again(loc_pairs, features, built.features, mirror_images, others),
             )
         limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
         summary = {

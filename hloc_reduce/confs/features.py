@@ -280,6 +280,7 @@ def check(content: object, path: Path) -> dict:
     if resize_max is not None and not (isinstance(resize_max, int) and resize_max > 0):
         raise InputError(f"{path}: resize_max is a number of pixels or null, not {resize_max!r}.")
     resize_min = preprocessing.get("resize_min", 0)
-    if not (isinstance(resize_min, int) and 0 <= resize_min <= (resize_max or 0)):
-        raise InputError(f"{path}: resize_min is a number of pixels up to resize_max.")
+    if type(resize_min) is not int or not 0 <= resize_min <= (resize_max or 0):
+        said = f"a number of pixels, at most resize_max ({resize_max}), not {resize_min!r}"
+        raise InputError(f"{path}: resize_min is {said}.")
     return {"model": model, "preprocessing": preprocessing}

@@ -201,7 +201,7 @@ def extract(
     Args:
         model: an extractor.
         image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-        preprocessing: of the feature's configuration, and `mirrored`, to swap left and right.
+        preprocessing: see `utils.images.resized`.
         device: of the model.
 
     Returns:
@@ -227,7 +227,7 @@ def extract_several(
     Args:
         models: extractors with equal `detection`.
         image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-        preprocessing: of the feature's configuration, and `mirrored`, to swap left and right.
+        preprocessing: see `utils.images.resized`.
         device: of the models.
         detect: replaces `detect` of the models, for example by a call in another process.
 

@@ -1,6 +1,7 @@
 """The record of each query: its pose, or why it has none, and how well it fits."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,11 @@ from .references import Reference
 
 RECORDS = 27  # the version of the content of records, and of the gate
 NUMBERS = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
+
+
+def nearness(found: Mapping) -> tuple[bool, float, int]:
+    """Return how near a try came to localizing a query, given its record or info, to compare it."""
+    return found["reason"] is None, found["confidence"], found["num_inliers"]
 
 
 def pose_of(record: dict) -> pycolmap.Rigid3d | None:

@@ -32,6 +32,7 @@ from .records import (
     Log,
     log_file,
     measures_of,
+    nearness,
     pose_of,
     refused,
     to_record,
@@ -124,12 +125,12 @@ def main(
         A record for each query, of the try that localized it or else came nearest: `localized`;
         `reason`, why it is not localized, None if it is; `try`, the index of the try in `again`
         plus 1, or 0; `tried`, that of the last one that was made; `again`, whether a second matcher
-        matched it, and `turned`, by how many degrees, counterclockwise, it was shown turned to the
-        feature; `confidence` and `agreement`; the written pose as `qvec` (w, x, y, z) and `tvec`,
-        the fallback if the query is not localized, None if there is none; `camera`, the model,
-        width, height and parameters in a list, None if not known; `max_error`, RANSAC's inlier
-        threshold in pixels, None for pycolmap's default; `measures`, see `Measures`; and the
-        numbers and `db` of `localize`.
+        matched it in that try, and `turned`, by how many degrees, counterclockwise, it was turned
+        there, beyond what EXIF data say; `confidence` and `agreement`; the written pose as `qvec`
+        (w, x, y, z) and `tvec`, the fallback if the query is not localized, None if there is none;
+        `camera`, the model, width, height and parameters in a list, None if not known;
+        `max_error`, RANSAC's inlier threshold in pixels, None for pycolmap's default; `measures`,
+        see `Measures`; and the numbers and `db` of `localize`.
     """
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
     header |= {"mirror_images": True} if mirror_images else {}
@@ -139,7 +140,7 @@ def main(
         reasons = _reasons(features, queries)
         refuse = [task for task in all_tasks if task[0] in reasons.keys() - log.records.keys()]
         for name, record in _refuse(load_reference, refuse, reasons):
-            log.add(name, {**record, **FIRST, "try": 0, "tried": len(again)})
+            log.add(name, {**record, **FIRST, "try": 0, "tried": 0})
         tasks = [task for task in all_tasks if task[0] not in reasons]
         if any(name not in log.records for name, _, _ in tasks):
             _check_some_matched(matches, [name for name, _ in queries], retrieved)
@@ -172,11 +173,11 @@ class _Localizing:
     def run(self, number: int, given: Try, tasks: list[Task]) -> None:
         """Localize queries by the first try, number 0, or those not localized by a further one.
 
-        Queries that an interrupted run has localized in the same try are only tested for being
+        Queries whose records are of the same try, of an interrupted run, are only tested for being
         mirrored.
         """
         records = self.log.records
-        todo, localized = [], []
+        todo, done = [], []
         for task in tasks:
             name, record = task[0], records.get(task[0])
             if record is None:
@@ -186,11 +187,11 @@ class _Localizing:
                 is_left = not record["localized"] and task[2]
                 if is_left and (given.names is None or name in given.names):
                     todo.append(name)
-            elif record["localized"] and record["try"] == number:
-                localized.append(name)
-        if not todo + localized:
+            elif record["try"] == number:
+                done.append(name)
+        if not todo + done:
             return
-        matched = given.match(todo + localized)
+        matched = given.match(todo + done)
         cameras = {name: camera for name, camera, _ in tasks}
         retrieved = {name: retrieved for name, _, retrieved in tasks}
         if matched.pairs:
@@ -204,11 +205,11 @@ class _Localizing:
             before = records.get(name)
             record |= {**FIRST, **given.told, "try": number, "tried": number}
             if before and not record["localized"]:
-                best = max(before, record, key=lambda one: (one["confidence"], one["num_inliers"]))
+                best = max(before, record, key=nearness)
                 record = {**best, "tried": number}
             self.log.add(name, record)
         if given.mirror_images:
-            self._try_mirror_images(given.mirror_images, files, of_try(todo + localized))
+            self._try_mirror_images(given.mirror_images, files, of_try(todo + done))
 
     def _try_mirror_images(
         self, mirror_images: MirrorImages, files: tuple[Path, Path], tasks: list[Task]

@@ -12,7 +12,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..hlm.reader import CompactMap, check_feature_keys, is_compact
-from ..localization import intrinsics
+from ..localization import intrinsics, views
 from ..localization.references import Reference, SfmMap
 from ..retrieval import load as load_retrieval
 from ..retrieval.ranking import read_global, similarity
@@ -159,7 +159,7 @@ def _of_folder(path: Path, matcher: str | None) -> Contents:
         doubts=built.doubts,
         reference=reference,
         names=names,
-        describe=_describe(built.retrieval, vocabulary),
+        describe=_describe(built.retrieval, vocabulary, built.conf["preprocessing"]),
         similarity=lambda descriptor: similarity(descriptor[None], global_descriptors)[0],
     )
 
@@ -221,7 +221,7 @@ def _of_file(
         doubts=compact.doubts,
         reference=compact,
         names=compact.names,
-        describe=_describe(compact.retrieval, compact.vocabulary),
+        describe=_describe(compact.retrieval, compact.vocabulary, compact.conf["preprocessing"]),
         similarity=compact.similarity,
     )
 
@@ -294,16 +294,22 @@ def _torch_engine(compact: CompactMap) -> Engine:
 
 
 def _describe(
-    retrieval: str, vocabulary: np.ndarray | None
+    retrieval: str, vocabulary: np.ndarray | None, of_feature: dict
 ) -> Callable[[dict, Path | np.ndarray, int], np.ndarray]:
-    """Return `Contents.describe` of a key of `confs.retrieval` and its vocabulary, if any."""
+    """Return `Contents.describe`.
+
+    Args:
+        retrieval: a key of `confs.retrieval`.
+        vocabulary: its vocabulary, if any.
+        of_feature: preprocessing of the local feature.
+    """
     conf = retrieval_confs.get(retrieval)
-    model, preprocessing = load_retrieval(conf["model"]), conf.get("preprocessing", {})
+    model = load_retrieval(conf["model"])
     if vocabulary is not None:
         model.vocabulary = vocabulary
 
     def describe(features: dict, image: Path | np.ndarray, turns: int) -> np.ndarray:
-        shown = {**preprocessing, "turns": turns}
+        shown = views.for_retrieval(conf, turns, of_feature).get("preprocessing", {})
         return model.describe_photo(features, image, shown).astype(np.float32)
 
     return describe

@@ -12,6 +12,8 @@ from ..localization import gate as gates
 from ..localization import intrinsics, mirrored, query, stage, views
 from ..localization.gate import DEFAULT_GATE, Gate
 from ..localization.query import merged, ransac_options
+from ..localization.records import nearness
+from ..localization.views import View
 from ..localize_sfm import RANSAC_THRESH
 from ..retrieval.ranking import rank
 from ..runtime import parallel
@@ -19,6 +21,24 @@ from ..utils.cli import InputError
 from ..utils.codes import FLOATS, restore, store
 from ..utils.feature_files import to_colmap
 from .contents import read
+
+
+class Laps:
+    """Times the stages of a query.
+
+    Attributes:
+        seconds: by stage.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._begin = time.perf_counter()
+
+    def end(self, stage: str) -> None:
+        """Add the time since the last stage ended to that of a stage."""
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._begin
+        self._begin = now
 
 
 class Localizer:
@@ -96,96 +116,86 @@ class Localizer:
             The pose, camera from world, in the units of the map, or None if the photo cannot be
             localized, for the `reason` in info; and info as from `localization.query.localize`,
             with `points2D` (M, 2) in COLMAP's pixels, `again`, whether its matches are those of a
-            second matcher, `turned`, by how many degrees, counterclockwise, the photo had to be
-            turned to look like the map's, `retrieved`, names of map images, best first,
-            `intrinsics`, "given" or their source (`intrinsics.infer`), `map_doubts`, why the map,
-            and the pose with it, may be wrong, in a few words each, and `seconds` by stage.
+            second matcher, `turned`, by how many degrees, counterclockwise, beyond what its EXIF
+            data say, the photo had to be turned to look like the map's, `retrieved`, names of map
+            images, best first, `intrinsics`, "given" or their source (`intrinsics.infer`),
+            `map_doubts`, why the map, and the pose with it, may be wrong, in a few words each, and
+            `seconds` by stage.
 
         Raises:
             UnreadableImage: if the image cannot be read.
             InputError: if the camera has another size.
         """
         image = image if isinstance(image, np.ndarray) else Path(image)
-        source, refinement = "given", {}
+        laps, source, refinement = Laps(), "given", {}
         if camera is None:
             camera, source = intrinsics.infer(image, self.cameras)
             refinement = intrinsics.refinement(camera, source, self.cameras)
-        seconds: dict[str, float] = {}
         best: tuple[pycolmap.Rigid3d | None, dict] | None = None
-        for found in self._tries(image, camera, refinement, seconds):
-            if best is None or _quality(found[1]) > _quality(best[1]):
+        for found in self._tries(image, camera, refinement, laps):
+            if best is None or nearness(found[1]) > nearness(best[1]):
                 best = found
             if best[1]["reason"] is None or source == "none":  # no other try helps
                 break
         assert best is not None
         cam_from_world, info = best
-        info |= {"intrinsics": source, "map_doubts": self.doubts, "seconds": seconds}
+        info |= {"intrinsics": source, "map_doubts": self.doubts, "seconds": laps.seconds}
         return cam_from_world if info["reason"] is None else None, info
 
     def _tries(
-        self,
-        image: Path | np.ndarray,
-        camera: pycolmap.Camera,
-        refinement: dict,
-        seconds: dict[str, float],
+        self, image: Path | np.ndarray, camera: pycolmap.Camera, refinement: dict, laps: "Laps"
     ) -> Iterator[tuple[pycolmap.Rigid3d | None, dict]]:
-        """Localize a photo by each matcher, and as it looks turned, and yield each pose and info.
+        """Yield the pose and the info by each matcher, in each way that the photo may be shown.
 
         Args:
             image: its file or pixels.
             camera: its intrinsics.
             refinement: options of `localization.query.localize`.
-            seconds: those of each stage, which are added to.
+            laps: times the stages.
         """
-        start = time.perf_counter() - sum(seconds.values())
-
-        def lap(stage: str) -> None:
-            now = time.perf_counter() - start - sum(seconds.values())
-            seconds[stage] = seconds.get(stage, 0.0) + now
-
-        for turns in (0, *self._other_turns(image)):
-            features = self._extract(image, turns)
+        for view in (views.USUAL, *self._other_views(image)):
+            features = self._extract(image, view)
             width, height = map(int, features["image_size"])
             if (camera.width, camera.height) != (width, height):
                 raise InputError(
                     f"The camera has {camera.width}x{camera.height} pixels, the photo has "
                     f"{width}x{height}."
                 )
-            lap("extraction")
-            retrieved = self._retrieve(features, image, turns)
-            lap("retrieval")
+            laps.end("extraction")
+            retrieved = self._retrieve(features, image, view)
+            laps.end("retrieval")
             for i, (match, gate) in enumerate(self.steps):
                 matches = match(features, retrieved)
-                lap("matching")
+                laps.end("matching")
                 cam_from_world, info = self._estimate(features, matches, camera, refinement, gate)
-                lap("pose")
+                laps.end("pose")
                 if info["reason"] is None and gates.may_be_mirrored(info["measures"], gate):
-                    flipped = self._extract(image, turns, flip=True)
+                    flipped = self._extract(image, view, flip=True)
                     given = mirrored.mirror(camera), mirrored.mirror_options(refinement), gate
                     matches = match(flipped, retrieved)
                     _, other = self._estimate(flipped, matches, *given, thorough=False)
                     measures = replace(info["measures"], mirror_image=other["confidence"])
                     info |= gates.verdict(measures, gate)
-                    lap("mirror_image")
+                    laps.end("mirror_image")
                 info |= {
                     "points2D": to_colmap(features["keypoints"][info["keypoints"]]),
                     "retrieved": retrieved,
                     "again": i > 0,
-                    "turned": 90 * turns,
+                    "turned": 90 * view.turns,
                 }
                 yield cam_from_world, info
             if not len(features["keypoints"]):
                 return
 
-    def _other_turns(self, image: Path | np.ndarray) -> tuple[int, ...]:
-        """Return the other ways to show a photo to the feature, see `views.other_turns`."""
-        if isinstance(image, np.ndarray) or self.engine.rotation_invariant:
-            return ()
-        return views.other_turns(image, self.cameras, self.preprocessing)
+    def _other_views(self, image: Path | np.ndarray) -> list[View]:
+        """Return the other ways to show a photo to the feature, if it needs them."""
+        if self.engine.rotation_invariant:
+            return []
+        return views.others(image, self.cameras, self.preprocessing)
 
-    def _extract(self, image: Path | np.ndarray, turns: int = 0, flip: bool = False) -> dict:
+    def _extract(self, image: Path | np.ndarray, view: View, flip: bool = False) -> dict:
         """Extract features, float32 and rounded as in a feature file, see `matchers.Matcher`."""
-        shown = {**self.preprocessing, "turns": turns, "mirrored": flip}
+        shown = {**self.preprocessing, **view.how, "mirrored": flip}
         features = self.engine.extract(image, shown)
         stored, _ = store({key: np.asarray(part) for key, part in features.items()}, self.dtype)
         rounded = {key: part.astype(np.float32) for key, part in stored.items()}
@@ -214,11 +224,7 @@ class Localizer:
         )
 
     @parallel.one_thread()
-    def _retrieve(self, features: dict, image: Path | np.ndarray, turns: int) -> list[str]:
+    def _retrieve(self, features: dict, image: Path | np.ndarray, view: View) -> list[str]:
         """Return the names of the map images that are most similar to a photo, best first."""
-        query = self._describe(features, image, turns)
+        query = self._describe(features, image, view.turns)
         return [self.names[j] for j in rank(self._similarity(query)[None], self.num_loc)[0]]
-
-
-def _quality(info: dict) -> tuple[bool, float]:
-    return info["reason"] is None, info["confidence"]

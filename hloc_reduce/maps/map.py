@@ -203,7 +203,7 @@ class Map:
 
     @cached_property
     def is_rotation_invariant(self) -> bool:
-        """Whether photos match however they are turned, and of whatever size."""
+        """Whether photos match however they are turned: by such features, also of any size."""
         from .. import extractors
 
         return extractors.is_rotation_invariant(self.conf["model"])
@@ -223,14 +223,14 @@ class Map:
             names: the photos.
             image_dir: their folder, which only some retrievals need.
             export_dir: folder of the h5 file of global descriptors; default: that of `features`.
-            turns: quarter turns, counterclockwise, by which the photos are shown.
+            turns: of the photos, see `localization.views.View`.
 
         Returns:
             The h5 file.
         """
         conf = retrieval_confs.confs[self.retrieval]
         return aggregate_features.main(
-            views.shown(conf, turns=turns) if turns else conf,
+            views.for_retrieval(conf, turns, self.conf["preprocessing"]),
             features,
             export_dir=export_dir,
             vocabulary=self.vocabulary,

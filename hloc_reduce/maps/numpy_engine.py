@@ -40,7 +40,7 @@ class NumpyEngine:
 
         Args:
             image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
-            preprocessing: of the feature's configuration, and `mirrored`, to swap left and right.
+            preprocessing: see `utils.images.resized`.
         """
         pixels, frame = resized(image, preprocessing)
         return in_original(

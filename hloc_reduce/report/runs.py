@@ -4,7 +4,8 @@ import csv
 import json
 import re
 from collections import Counter
-from functools import cached_property
+from collections.abc import Callable
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -137,19 +138,23 @@ class Run:
         poses = {name: scans.read_pose(self.files["map_images"], name) for name in names}
         return ScanMap(of_points, of_features, poses)
 
-    @cached_property
+    @property
     def retrieved(self) -> dict[str, list[str]]:
-        """The map images that were retrieved for each query, best first."""
-        return parse_retrieval(self.files["pairs"])
+        """The map images that were retrieved for each query in the first try, best first."""
+        return self._retrieved(self.files["pairs"])
+
+    @cached_property
+    def _retrieved(self) -> Callable[[Path], dict[str, list[str]]]:
+        return cache(parse_retrieval)
 
     def retrieved_for(self, query: str) -> list[str]:
         """Return the map images that were retrieved in the try that a record is of, best first."""
-        pairs = self.tries.get(self.records[query]["try"], {}).get("pairs")
-        return (parse_retrieval(pairs) if pairs else self.retrieved).get(query, [])
+        return self._retrieved(self.file_of(query, "pairs")).get(query, [])
 
     def file_of(self, query: str, key: str) -> Path:
-        """Return the `features` or `matches` of the try that a record is of."""
-        return self.tries.get(self.records[query]["try"], self.files)[key]
+        """Return the `features`, `matches` or `pairs` of the try that a record is of."""
+        number = self.records[query]["try"]
+        return (self.tries[number][key] if number else None) or self.files[key]
 
     @cached_property
     def truth(self) -> dict[str, pycolmap.Rigid3d]:

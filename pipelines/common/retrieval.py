@@ -107,7 +107,7 @@ def retrieve_in_map(
         query_names: the queries.
         map_names: the map images.
         image_dir: folder of the queries, which only some retrievals need.
-        turns: quarter turns, counterclockwise, by which the queries are shown.
+        turns: of the queries, see `localization.views.View`.
     """
     if not query_names:
         write_pairs([], output)

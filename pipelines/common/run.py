@@ -56,7 +56,7 @@ class Run:
     ):
         self.folder, self.feature, self.matcher, self.steps = folder, feature, matcher, steps
         self.executor = executor
-        self._further: dict[int, Matched] = {}
+        self._files_of_tries: dict[int, Matched] = {}
         self._folders = [folder] if earlier is None else [earlier, folder]
 
     def __enter__(self) -> Self:
@@ -107,27 +107,27 @@ class Run:
         features: Path,
         features_ref: Path | None = None,
         mirror_images: Callable[[str], MirrorImages] | None = None,
-        turned: Iterable[Try] = (),
+        others: Iterable[Try] = (),
     ) -> list[Try]:
-        """Return how queries that are not localized are matched once more; the summary names files.
+        """Return how queries that are not localized are matched once more.
 
         Args:
             pairs: pairs of all queries and map images; those of the queries go beside it.
             features: feature file.
             features_ref: feature file of the map images; default: `features`.
             mirror_images: returns the `mirror_images` of a matcher.
-            turned: tries after that by a second matcher, if there is one.
+            others: tries after that by a second matcher, if there is one.
         """
         given = pairs, features, features_ref, mirror_images
-        tries = [*(self._second(matcher, *given) for matcher in self.steps[1:]), *turned]
-        return [self._noted(number, one) for number, one in enumerate(tries, 1)]
+        tries = [*(self._second(matcher, *given) for matcher in self.steps[1:]), *others]
+        return [self._recorded(number, one) for number, one in enumerate(tries, 1)]
 
-    def _noted(self, number: int, one: Try) -> Try:
-        """Return a further try, whose files are noted once it has them."""
+    def _recorded(self, number: int, one: Try) -> Try:
+        """Return a try whose files go to the summary."""
 
         def match(names: list[str]) -> Matched:
-            self._further[number] = one.match(names)
-            return self._further[number]
+            self._files_of_tries[number] = one.match(names)
+            return self._files_of_tries[number]
 
         return one._replace(match=match)
 
@@ -202,6 +202,7 @@ class Run:
         """
         outputs = self.folder.path
         rows = query_table(lists, records, truth)
+        localized = [row for row in rows if row["status"] == "localized"]
         failed = {name: reason for name, reason in failures(features).items() if name in records}
         if failed:
             logger.warning(
@@ -217,11 +218,9 @@ class Run:
             "matcher": self.matcher,
             **summary,
             "queries": len(rows),
-            "queries_localized": sum(row["status"] == "localized" for row in rows),
-            "queries_matched_again": sum(row["again"] for row in rows),
-            "queries_turned": sum(
-                row["turned"] > 0 for row in rows if row["status"] == "localized"
-            ),
+            "queries_localized": len(localized),
+            "queries_matched_again": sum(row["again"] for row in localized),
+            "queries_turned": sum(row["turned"] > 0 for row in localized),
             "queries_unreadable": len(failed),
             "lists": {
                 name: summarize_list([row for row in rows if row["list"] == name], thresholds[name])
@@ -241,7 +240,7 @@ class Run:
                     key: None if path is None else relative(path, outputs)
                     for key, path in matched._asdict().items()
                 }
-                for number, matched in sorted(self._further.items())
+                for number, matched in sorted(self._files_of_tries.items())
             },
         }
         write_summary(summary, outputs / "summary.json")

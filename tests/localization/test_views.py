@@ -37,24 +37,37 @@ def save(path, pixels, orientation=None):
 
 @pytest.mark.fault(11)
 @pytest.mark.parametrize(
-    ("orientation", "orientations", "upright", "others"),
+    ("orientation", "orientations", "upright", "expected"),
     [
         (1, {1}, True, ()),
         (6, {1, 8}, True, ()),  # both are shown upright
-        (6, {1}, False, views.TURNS),  # a map whose photos are shown as they are stored
-        (None, {1}, True, views.TURNS),
-        (99, {1}, True, views.TURNS),
-        (1, set(), True, views.TURNS),
+        (6, {1}, False, views.TURNED),  # a map whose photos are shown as they are stored
+        (None, {1}, True, views.TURNED),
+        (99, {1}, True, views.TURNED),
+        (1, set(), True, views.TURNED),
     ],
 )
 def test_photos_are_turned_unless_exif_data_tell(
-    orientation, orientations, upright, others, tmp_path
+    orientation, orientations, upright, expected, tmp_path
 ):
     save(tmp_path / "a.jpg", np.zeros((30, 40), np.uint8), orientation)
     of_map, preprocessing = MapCameras({}, {}, orientations=orientations), {"upright": upright}
-    assert views.other_turns(tmp_path / "a.jpg", of_map, preprocessing) == others
-    found = views.of_folder(tmp_path, ["a.jpg", "absent.jpg"], of_map, preprocessing)
-    assert found == {n: ["a.jpg", "absent.jpg"] if others else ["absent.jpg"] for n in views.TURNS}
+    given = of_map, preprocessing
+    assert views.others(tmp_path / "a.jpg", *given) == [*expected]
+    assert views.others(np.zeros((30, 40), np.uint8), *given) == []  # taken to be upright
+    found = views.of_folder(tmp_path, ["a.jpg", "absent.jpg"], *given)
+    names = ["a.jpg", "absent.jpg"] if expected else ["absent.jpg"]
+    assert found == dict.fromkeys(views.TURNED, names)
+
+
+@pytest.mark.parametrize(("size", "others"), [(39, [views.OWN_SIZE]), (40, []), (41, [])])
+def test_enlarged_photos_are_shown_as_they_are_too(size, others, tmp_path):
+    """A small photo may be a part of a larger one."""
+    pixels, preprocessing = np.zeros((30, size), np.uint8), {"resize_min": 40, "upright": True}
+    of_map = MapCameras({}, {}, orientations={1})
+    save(tmp_path / "a.png", pixels, 1)
+    for image in (tmp_path / "a.png", pixels):
+        assert views.others(image, of_map, preprocessing) == others
 
 
 @pytest.mark.parametrize(
@@ -218,16 +231,19 @@ def test_a_folder_of_turned_queries(place, aachen_layout, tmp_path, run):
         assert pose_error(pose, pose_of(record))[0] < 1e-6
     assert summary["queries_turned"] == 3
     for other in ("noise.png", "grey.png"):
-        assert (
-            rows[other]["status"] == "fallback"
-            and localizer.localize(queries / other, camera)[0] is None
-        )
+        pose, info = localizer.localize(queries / other, camera)
+        assert pose is None and rows[other]["status"] == "fallback"
+        told = {key: str(info[key]) for key in ("reason", "turned", "num_inliers")}
+        assert told == {key: rows[other][key] for key in told}
     assert rows["grey.png"]["reason"] == "no keypoints"
     found = Run(folder)
     assert all(pictures.matched(found, f"{n}.png")["inliers"].sum() > 50 for n in (0, 90, 180, 270))
+    assert pictures.matched(found, "noise.png") is not None
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
     run("--map", outputs / "map", "--outputs", outputs, *given)
-    assert outcome(folder)[1] == rows
+    again, same = outcome(folder)
+    assert same == rows and again["tries"] == summary["tries"]
+    assert pictures.matched(Run(folder), "noise.png") is not None
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*.h5")} == before
 
 
@@ -270,3 +286,46 @@ def test_photos_of_another_size(small, place, aachen_layout, tmp_path, run):
     run("--map", outputs / "map", "--outputs", outputs, *given)
     _, rows = outcome(outputs / "queries-one")
     assert int(rows[name]["num_inliers"]) == info["num_inliers"]
+
+
+@pytest.mark.parametrize("given", ["a part", "pairs"])
+def test_other_views_in_a_pipeline(given, place, aachen_layout, tmp_path, run, monkeypatch):
+    """A part of a photo is found as it is; with given pairs, a turned photo, by LightGlue, too."""
+    model = {"name": "lightglue", "max_keypoints": 512}
+    monkeypatch.setitem(matchers_confs.confs["lightglue"], "model", model)
+    build, images, outputs = place
+    listed = aachen_layout / "queries/day_time_queries_with_intrinsics.txt"
+    name, camera = parse_query_list(listed)[0]
+    pixels = np.array(Image.open(images / name))
+    (tmp_path / "new").mkdir()
+    run(*build, "--feature", "mini32")
+    options: tuple = ()
+    if given == "a part":
+        width, height = camera.width // 2, camera.height // 2
+        x, y = (camera.width - width) // 2, (camera.height - height) // 2
+        pixels = pixels[y : y + height, x : x + width]
+        params = [camera.focal_length, camera.principal_point_x - x, camera.principal_point_y - y]
+    else:
+        pixels = np.rot90(pixels, 3)
+        width, height = camera.height, camera.width
+        params = on_its_side(camera).params
+        pairs = [f"a.png {path.relative_to(images)}\n" for path in sorted(images.glob("db/*"))]
+        write(tmp_path / "pairs.txt", "".join(pairs))
+        options = "--retrieval", tmp_path / "pairs.txt", "--matcher", "NN+lightglue"
+    save(tmp_path / "new/a.png", pixels)
+    write(tmp_path / "one.txt", to_line("a.png", "SIMPLE_PINHOLE", width, height, *params))
+    query = "--query_images", tmp_path / "new", "--queries", tmp_path / "one.txt"
+    run("--map", outputs / "map", "--outputs", outputs, *query, *options)
+    folder = outputs / "queries-one"
+    summary, rows = outcome(folder)
+    assert rows["a.png"]["status"] == "localized"
+    found = Run(folder)
+    record = found.records["a.png"]
+    assert record["turned"] == (0 if given == "a part" else 90) and not record["again"]
+    assert found.file_of("a.png", "features").name.endswith(
+        "-own-size.h5" if given == "a part" else "-turned90.h5"
+    )
+    assert pictures.matched(found, "a.png")["inliers"].sum() > 10
+    if given == "pairs":
+        assert [*folder.glob("*_matches-lightglue_*-again.h5")]
+        assert summary["queries_turned"] == 1

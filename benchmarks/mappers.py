@@ -1,0 +1,84 @@
+"""Compare COLMAP's incremental mapper with its global one on the same verified matches.
+
+Builds a map of the photos of each place without their poses, whose database both mappers then read,
+in one thread and with default options. A similarity aligns the positions of the largest model with
+the given ones. Adds rows to results/mappers.csv, leaving out what has rows unless --again is given;
+position errors are in percent of the largest distance between two given positions, and `seconds`
+those of the mapper.
+"""
+
+import os
+import shutil
+import time
+from pathlib import Path
+
+import pycolmap
+
+from benchmarks import rows
+from benchmarks.photos_alone import link, measured
+from hloc_reduce import maps
+from hloc_reduce.confs import features as features_confs
+from hloc_reduce.reconstruction import MAPPER_OPTIONS
+from hloc_reduce.training.tracks import parse_maps
+from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils.cli import InputError
+
+NAME = "mappers"
+
+
+def incremental(database: Path, photos: Path, output: Path) -> dict[int, pycolmap.Reconstruction]:
+    """Reconstruct photos as maps of photos alone are, in one attempt."""
+    options = colmap.mapper_options(MAPPER_OPTIONS)
+    return pycolmap.incremental_mapping(database, photos, output, options=options)
+
+
+def global_(database: Path, photos: Path, output: Path) -> dict[int, pycolmap.Reconstruction]:
+    """Reconstruct photos by GLOMAP, as COLMAP has it since version 4."""
+    options = pycolmap.GlobalPipelineOptions()
+    for part in (options, options.mapper):
+        part.num_threads, part.random_seed = 1, 0
+    return pycolmap.global_mapping(database, photos, output, options)
+
+
+MAPPERS = {"incremental": incremental, "global": global_}
+
+
+def _main() -> None:
+    parser = cli.Parser(__doc__, "--map scenes/fox/images:scenes/fox/sparse")
+    add = parser.add_argument
+    add("--map", action="append", required=True, metavar="IMAGES:MODEL", help="may be repeated")
+    add("--feature", default=features_confs.RECOMMENDED, help="name or YAML file")
+    add("--outputs", type=Path, default=Path("outputs/mappers"))
+    rows.add_again_option(parser)
+    args = parser.parse_args()
+    if not hasattr(pycolmap, "global_mapping"):
+        raise InputError("pycolmap has no global mapper: install version 4.2 or later.")
+    known = [] if args.again else rows.read(NAME)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+    for place, (images, model) in parse_maps(args.map).items():
+        cells = {"place": place, "feature": args.feature}
+        todo = [one for one in MAPPERS if not rows.select(known, **cells, variant=one)]
+        if not todo:
+            continue
+        reference = colmap.read_model(model)
+        names = sorted(image.name for image in reference.images.values())
+        folder = args.outputs / f"{place}-{Path(args.feature).stem}"
+        photos = link(images, names, folder / "photos")
+        built = maps.main(folder / "map", photos, feature=args.feature, accept_partial=True)
+        for mapper in todo:
+            output = folder / mapper
+            shutil.rmtree(output, ignore_errors=True)
+            output.mkdir()
+            database = Path(shutil.copy(built.sfm / "database.db", folder / f"{mapper}.db"))
+            start = time.perf_counter()
+            models = MAPPERS[mapper](database, photos, output)
+            seconds = time.perf_counter() - start
+            found = max(models.values(), key=lambda one: one.num_reg_images(), default=None)
+            measures = {"registered": 0} if found is None else measured(found, reference)
+            how = {"photos": len(names)} | rows.how(seconds, cores=1)
+            rows.add(NAME, [cells | {"variant": mapper} | measures | how])
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    cli.run(_main)
