@@ -13,7 +13,13 @@ from hloc_reduce.localization.measures import Alternative, Measures, Uncertainty
 TRIALS = RESULTS / "trials"
 # kinds of altered photos whose intrinsics are not those of the place
 RESHAPED = ("cropped", "squeezed", "zoomed", "warped")
-STRANGERS = "other", "mirrored", "black", "noise"  # kinds of photos whose poses are all wrong
+STRANGERS = (
+    "other",
+    "turned",
+    "mirrored",
+    "black",
+    "noise",
+)  # kinds of photos whose poses are all wrong
 OUTCOMES = "true", "near", "wrong"  # of poses
 LABELS = (
     *("feature", "matcher", "dim", "blur", "map", "place", "photo", "kind", "intrinsics", "commit"),

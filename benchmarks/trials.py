@@ -3,8 +3,8 @@
 Each map is tried with held-out photos of its place, with photos of all other places, and with
 darkened, blurred, mirrored, black and noisy versions of its own; all with their intrinsics and
 without, its own also with a wrong focal length. Its own are also tried cropped, cropped and
-enlarged, squeezed, and warped as a photo of a print is, without intrinsics. In a COLMAP model,
-every third photo is held out. Keypoints and maps are the same for all features of one base. Another
+enlarged, squeezed, and warped as a photo of a print is, without intrinsics; those of other places,
+with --turned, as networks see them turned. In a COLMAP model, every third photo is held out. Keypoints and maps are the same for all features of one base. Another
 --seed holds out other photos, builds other maps, and draws other photos of other places. Each trial
 is a row of results/trials/FEATURE-SEED.csv, with a --matcher or --keypoints named after FEATURE,
 with its outcome (true, near, wrong, none) and all `Measures`, whatever the gate says;
@@ -39,7 +39,7 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.localization import intrinsics, mirrored, query
+from hloc_reduce.localization import intrinsics, mirrored, query, views
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.localization.query import merged
 from hloc_reduce.localization.references import Reference, ScanMap, SfmMap
@@ -291,7 +291,7 @@ def base_conf(base: str) -> dict:
 
 
 def trials(
-    place: Place, others: list[Place], output: Path, number: int, seed: int
+    place: Place, others: list[Place], output: Path, number: int, turned: bool, seed: int
 ) -> Iterator[tuple]:
     """Yield the photos to try a map with: place, name, camera, true pose, features and kind."""
     for name, camera, truth in place.queries:
@@ -302,6 +302,11 @@ def trials(
     chosen = np.random.default_rng(seed).choice(len(pool), min(number, len(pool)), replace=False)
     for other, name, camera in (pool[i] for i in sorted(chosen)):
         yield other, name, camera, None, other.features, "other"
+        for view in views.TURNED if turned else ():
+            conf = views.shown(base_conf(place.base), **view.how)
+            path = output / f"{view.name}-{other.images.parent.name}-{other.images.name}.h5"
+            seen = extract_features.main(conf, other.images, image_list=[name], feature_path=path)
+            yield other, name, camera, None, seen, "turned"
 
 
 def run(
@@ -310,6 +315,7 @@ def run(
     output: Path,
     feature: str,
     number: int,
+    turned: bool,
     matcher: str,
     seed: int,
 ) -> list[dict]:
@@ -318,7 +324,7 @@ def run(
     made_from = extract_features.provenance(features_confs.get(feature.partition(":")[0])[1])
     matching = matchers.load(matchers_confs.for_features(model, made_from))
     other_keys = [key for key in matching.feature_keys() if key != "descriptors"]
-    tried = list(trials(place, others, output, number, seed))
+    tried = list(trials(place, others, output, number, turned, seed))
     describe = Described(feature)
     shown, rows = {}, []
 
@@ -349,7 +355,7 @@ def run(
         return keypoints, matches, blur
 
     for source, name, camera, truth, path, kind in progress(tried, place.name, "photo"):
-        images = source.images if path == source.features else output / "altered"
+        images = output / "altered" if path == output / "altered.h5" else source.images
         with open_h5(path) as file:
             size = get_image_size(file, name)
         (*matched, blur), flipped = match(path, name), None
@@ -479,6 +485,9 @@ def _main() -> None:
     )
     parser.add_argument("--trials", type=int, default=40, help="photos of other places, per map")
     parser.add_argument(
+        "--turned", action="store_true", help="also show photos of other places turned, three ways"
+    )
+    parser.add_argument(
         "--seed", type=int, default=0, help="seed of the maps and of the drawn photos"
     )
     parser.add_argument("--output", type=Path, default=Path("outputs/trials"))
@@ -517,7 +526,7 @@ def _trials_of_all(args: argparse.Namespace) -> list[dict]:
         folder = output / base / name
         file = folder / f"trials_{args.feature.replace(':', '-')}_{matcher}.csv"
         if not file.exists():
-            options = args.feature, args.trials, matcher, args.seed
+            options = args.feature, args.trials, args.turned, matcher, args.seed
             write_csv(run(place, others, folder, *options), file, COLUMNS)
         rows += _read(file)
         print(f"{name}: {len(rows):,} trials", flush=True)

@@ -103,6 +103,9 @@ tried() { # maps of PLACES, features and other options
 }
 tried "$small fox south-building" --dataset $data/herz-jesus --feature colmap_sift_sv64 "$@"
 tried "$small" --dataset $data/herz-jesus --feature xfeat_sv32 "$@"
+for feature in mini32:uint2 xfeat_sv32:uint2; do # photos without EXIF data are tried four ways
+    tried "fountain-P11 sceaux" --feature $feature --turned --seed 3 --trials 20 "$@"
+done
 tried "fountain-P11 sceaux" --feature colmap_sift_sv64 --keypoints fast --trials 40 "$@"
 tried "$small" --dataset $data/herz-jesus --feature colmap_sift_sv64 --seed 1 "$@"
 tried "bronze-statue cyprus entry-P10 fountain-P11 kitchen" --dataset $data/herz-jesus --feature colmap_sift_sv16 "$@"
