@@ -4,12 +4,13 @@ Each map is tried with held-out photos of its place, with photos of all other pl
 darkened, blurred, mirrored, black and noisy versions of its own; all with their intrinsics and
 without, its own also with a wrong focal length. Its own are also tried cropped, cropped and
 enlarged, squeezed, and warped as a photo of a print is, without intrinsics; those of other places,
-with --turned, as networks see them turned. In a COLMAP model, every third photo is held out. Keypoints and maps are the same for all features of one base. Another
---seed holds out other photos, builds other maps, and draws other photos of other places. Each trial
-is a row of results/trials/FEATURE-SEED.csv, with a --matcher or --keypoints named after FEATURE,
-with its outcome (true, near, wrong, none) and all `Measures`, whatever the gate says;
-`benchmarks.fit_gate` and the tables of the documentation read these files. An interrupted run
-resumes with the next place.
+with --turned, as networks see them turned. In a COLMAP model, every third photo is held out.
+Keypoints and maps are the same for all features of one base. Another --seed holds out other photos,
+builds other maps, and draws other photos of other places. Each trial is a row of
+results/trials/FEATURE-SEED.csv, with a --matcher or --keypoints named after FEATURE, with its
+outcome (true, near, wrong, none) and all `Measures`, whatever the gate says; `benchmarks.fit_gate`
+and the tables of the documentation read these files. An interrupted run resumes with the next
+place.
 """
 
 import argparse
