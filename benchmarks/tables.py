@@ -120,6 +120,7 @@ CHANGED_PHOTOS = {
     "map 0.5, queries 1, turned 0": "map of half the size",
     "map 0.35, queries 1, turned 0": "map of 35 %",
     "map 0.35 and 1, queries 1, turned 0": "half of the map of 35 %",
+    "map 1, queries 1, middle 0.5, turned 0": "their middle, half of each side",
     "map 1, queries 1, turned 90": "turned by 90°",
     "map 1, queries 1, turned 180": "by 180°",
 }

@@ -78,6 +78,10 @@ for feature in mini32 xfeat_sv32; do # LightGlue finds fewer points than nearest
 done
 small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.25 0.5 1 "$@"
 
+mappers= # of photos alone
+for place in fountain-P11 monstree kitchen fox south-building; do mappers="$mappers --map $(scene "$place")"; done
+run mappers $mappers --map $data/demo_town-400/images_upright:$data/demo_town-400/3D-models/aachen_v_1_1 "$@"
+
 # how often wrong?
 [ -e $data/strangers ] || run strangers --output $data/strangers || true # from GitHub
 web="$data/strangers/naver+mast3r $data/strangers/cvg+Hierarchical-Localization"
@@ -90,6 +94,7 @@ for feature in mini32:uint2 xfeat_sv32:uint2 colmap_sift_sv64; do
     changed --size 1 0.5 0.35 0.25 "$@"
     changed --size 1 --map_size 0.5 0.35 "$@"
     changed --size 1 --map_size 0.35 --mixed "$@"
+    changed --size 1 --part 0.5 "$@"
     changed --size 1 --turns 1 2 "$@"
 done
 run pose_limits results/pose_limits.yaml "$@"

@@ -261,11 +261,12 @@ def test_how_often_the_gate_errs_in_the_trials(trials):
 
 def test_no_pose_of_another_place_is_certain_and_most_right_ones_are(trials):
     poses = [row for row in trials if "measures" in row]
-    elsewhere = [row["measures"].confidence for row in poses if row["kind"] == "other"]
+    kinds = "other", "turned"
+    elsewhere = [row["measures"].confidence for row in poses if row["kind"] in kinds]
     assert len(elsewhere) > 1500 and 1.5 * max(elsewhere) < absolute_pose.CERTAIN
     own = [row for row in poses if row["kind"] in tables.OWN and row["outcome"] == "true"]
     certain = [row["measures"].confidence >= absolute_pose.CERTAIN for row in own]
-    assert np.mean(certain) > 0.95
+    assert np.mean(certain) > 0.94  # with dark and blurred ones
 
 
 def test_trials_name_the_places_of_their_maps(trials):

@@ -149,7 +149,7 @@ FEW = 32  # dimensions of descriptors: with fewer, fewer matches are right
 MATCH_KINDS = {
     "ratio": MatchKind(Evidence(4.03, 18.08), -17.74, 0.8, 0.4),
     "few": MatchKind(Evidence(2.72, 14.71), -8.2, 0.8, 0.4),
-    "mutual": MatchKind(Evidence(4.01, 11.42), -8.89, 0.3, 0.8),
+    "mutual": MatchKind(Evidence(3.81, 11.87), -8.71, 0.3, 0.8),
     "lightglue": MatchKind(Evidence(4.4, 27.51), -26.96, 0.5, 0.8),
 }
 NEAREST_NEIGHBOR = "nearest_neighbor"  # whose kind its ratio test tells
