@@ -17,8 +17,8 @@ from .projection import ALL, FOCAL, POSE, reprojection_errors
 
 SEED = 0
 SAMPLE = 500  # matches, at most, from which a pose is tried before all, or a rival is estimated
-# confidence of a pose at which no other matches are tried, one and a half times the highest of photos
-# of other places in results/trials
+# confidence of a pose at which no other matches are tried, one and a half times the highest of
+# photos of other places in results/trials
 CERTAIN = 85.0
 STRICT = 1 / 2  # of the inlier threshold, for estimating a pose again
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
