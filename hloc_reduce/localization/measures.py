@@ -1,6 +1,6 @@
 """What a pose of a query measures: numbers without limits, by which `gate` decides."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from math import comb, log10
 from typing import Any, NamedTuple
@@ -22,6 +22,16 @@ INDEPENDENT = 100  # inliers with independent errors: neighbors err alike
 # the same where other intrinsics may make up for errors of the map, which are alike in a bent one
 INDEPENDENT_IF_BENT = 30
 MIN_MATCHES = 6  # of an image whose matches may tell whether a pose is right
+
+
+class Seen(NamedTuple):
+    """The matches of a photo, and what they are judged by, see `confidence`."""
+
+    points2D: np.ndarray
+    points3D: np.ndarray
+    cam_from_world: pycolmap.Rigid3d
+    camera: pycolmap.Camera
+    max_error: float
 
 
 def confidence(
@@ -57,30 +67,62 @@ def confidence(
         Minus the decimal logarithm of the number of false alarms. Above 0 the pose is not expected
         by chance; at 8 one is expected in a hundred million queries of a wrong place.
     """
+    seen = Seen(points2D, points3D, cam_from_world, camera, max_error)
+    return joint_confidence([seen], degrees_of_freedom)
+
+
+def joint_confidence(photos: Sequence[Seen], degrees_of_freedom: int = POSE) -> float:
+    """Return the `confidence` of one pose that places several photos, as those of a rig.
+
+    Args:
+        photos: their matches; those of all count together.
+        degrees_of_freedom: the number of estimated parameters, see `projection`.
+    """
+    sample = -(-degrees_of_freedom // 2)  # matches that determine a pose
+    counts = [_counting(seen) for seen in photos]
+    thresholds = [
+        np.geomspace(
+            min(FINEST * photo_scale(seen.camera), seen.max_error), seen.max_error, THRESHOLDS
+        )
+        for seen in photos
+    ]
+
+    def log10_false_alarms(limits: tuple[float, ...]) -> float:
+        found = [count(limit) for count, limit in zip(counts, limits, strict=True)]
+        number, inliers, expected, matches = map(sum, zip(*found, strict=True))
+        if number <= sample:
+            return np.inf
+        tail = _log10_tail(inliers - sample, number - sample, expected / number)
+        poses = log10(comb(number, sample)) + sample * np.log10(matches / number)
+        return poses + np.log10(SOLUTIONS * THRESHOLDS) + tail
+
+    return float(-min(map(log10_false_alarms, zip(*thresholds, strict=True))))
+
+
+def _counting(seen: Seen) -> Callable[[float], tuple[int, int, float, int]]:
+    """Return what counts the matches of a photo for `confidence`, given an inlier threshold.
+
+    It returns the number of cells with a keypoint, of these the inliers, how many are expected by
+    chance, and the number of matches.
+    """
+    points2D, points3D, cam_from_world, camera, _ = seen
     errors, projected = reprojection_errors(points2D, points3D, cam_from_world, camera)
     density = _density(points2D, projected, camera)
     # one number tells points apart: hardly any two points have equal ones
     point = np.unique(points3D @ [1, np.sqrt(2), np.sqrt(3)], return_inverse=True)[1]
     scale = photo_scale(camera)
-    sample = -(-degrees_of_freedom // 2)  # matches that determine a pose
 
-    def log10_false_alarms(threshold: float) -> float:
+    def count(threshold: float) -> tuple[int, int, float, int]:
         side = max(SAME_PLACE * scale, threshold)
         column, row = np.floor(points2D / side).astype(np.int64).T
         _, first, place = np.unique((column << 32) + row, return_index=True, return_inverse=True)
-        number = len(first)
-        if number <= sample:
-            return np.inf
         agree = errors <= threshold
         inliers = min(_num_distinct(place[agree]), _num_distinct(point[agree]))
-        chances = np.bincount(place)
-        by_chance = np.minimum(1, chances * np.pi * threshold**2 * density[first]).mean()
-        tail = _log10_tail(inliers - sample, number - sample, by_chance)
-        poses = log10(comb(number, sample)) + sample * np.log10(chances.mean())
-        return poses + np.log10(SOLUTIONS * THRESHOLDS) + tail
+        chances = np.bincount(place, minlength=len(first))
+        expected = np.minimum(1, chances * np.pi * threshold**2 * density[first]).sum()
+        return len(first), inliers, float(expected), len(points2D)
 
-    thresholds = np.geomspace(min(FINEST * scale, max_error), max_error, THRESHOLDS)
-    return float(-min(map(log10_false_alarms, thresholds)))
+    return count
 
 
 def _num_distinct(numbers: np.ndarray) -> int:
@@ -179,6 +221,50 @@ def covariance(
     unit = np.ones(degrees_of_freedom)
     unit[3:POSE] = depth
     return found * np.outer(unit, unit)
+
+
+def rig_covariance(
+    photos: Sequence[Seen], cams_from_rig: Sequence[pycolmap.Rigid3d]
+) -> np.ndarray | None:
+    """Return the `covariance` of the pose of a rig, of a small motion of it in its own frame.
+
+    Args:
+        photos: the inliers of each camera.
+        cams_from_rig: the pose of each camera in the rig.
+
+    Returns:
+        (6, 6) float64; None if the inliers do not determine the pose.
+    """
+    information, squares, equations = np.zeros((POSE, POSE)), 0.0, 0
+    least, depths = 0.0, []
+    for seen, cam_from_rig in zip(photos, cams_from_rig, strict=True):
+        if not len(seen.points2D):
+            continue
+        pose = seen.cam_from_world
+        local = seen.points3D @ pose.rotation.matrix().T + pose.translation
+        _, derivatives = project(local)
+        jacobian = seen.camera.mean_focal_length() * np.concatenate(derivatives, axis=1)[:POSE].T
+        x, y, z = cam_from_rig.translation
+        cross, rotation = (
+            np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]),
+            cam_from_rig.rotation.matrix(),
+        )
+        moved = np.block([[rotation, np.zeros((3, 3))], [cross @ rotation, rotation]])
+        information += (jacobian @ moved).T @ (jacobian @ moved)
+        errors, _ = reprojection_errors(*seen[:4])
+        squares, equations = squares + (errors**2).sum(), equations + 2 * len(errors)
+        least = max(least, (LEAST_NOISE * photo_scale(seen.camera)) ** 2)
+        depths.append(local[:, 2])
+    if equations <= POSE:
+        return None
+    unit = np.ones(POSE)
+    unit[3:] = np.median(np.concatenate(depths))
+    noise = max(least, squares / (equations - POSE))
+    try:
+        found = noise * np.linalg.inv(information * np.outer(unit, unit))
+    except np.linalg.LinAlgError:
+        return None
+    return found * np.outer(unit, unit) if (np.diag(found) > 0).all() else None
 
 
 def uncertainty(

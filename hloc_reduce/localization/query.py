@@ -52,7 +52,7 @@ def localize(
     """
     solved = []
     for names in reference.clusters(list(matches)) if matches else [[]]:
-        info, images = _correspondences(reference, names, matches)
+        info, images = correspondences(reference, names, matches)
         points = keypoints[info["keypoints"]], info["points3D"]
         found = lens_choice.estimate(*points, images, camera, config, gate, thorough, workers)
         info |= {
@@ -103,10 +103,15 @@ def _reason(num_keypoints: int, names: list[str], info: dict) -> str | None:
     return None if info["num_matches"] else "no match with a 3D point"
 
 
-def _correspondences(
+def correspondences(
     reference: Reference, names: list[str], matches: Mapping[str, np.ndarray]
 ) -> tuple[dict, list[np.ndarray]]:
     """Collect the different 2D-3D matches through some images, sorted.
+
+    Args:
+        reference: the map.
+        names: the images.
+        matches: see `localize`.
 
     Returns:
         The first part of the info of `localize`, and of each image the indices of its matches, in

@@ -1,7 +1,7 @@
 """Localize one photo at a time in a map that is held in memory."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from ..localization import gate as gates
-from ..localization import intrinsics, mirrored, query, stage, views
+from ..localization import intrinsics, mirrored, query, rig_pose, stage, views
 from ..localization.gate import DEFAULT_GATE, Gate
 from ..localization.query import merged, ransac_options
 from ..localization.records import nearness
@@ -154,16 +154,7 @@ class Localizer:
             laps: times the stages.
         """
         for view in (views.USUAL, *self._other_views(image)):
-            features = self._extract(image, view)
-            width, height = map(int, features["image_size"])
-            if (camera.width, camera.height) != (width, height):
-                raise InputError(
-                    f"The camera has {camera.width}x{camera.height} pixels, the photo has "
-                    f"{width}x{height}."
-                )
-            laps.end("extraction")
-            retrieved = self._retrieve(features, image, view)
-            laps.end("retrieval")
+            features, retrieved = self._described(image, view, camera, laps)
             for i, (match, gate) in enumerate(self.steps):
                 matches = match(features, retrieved)
                 laps.end("matching")
@@ -186,6 +177,122 @@ class Localizer:
                 yield cam_from_world, info
             if not len(features["keypoints"]):
                 return
+
+    def _described(
+        self, image: Path | np.ndarray, view: View, camera: pycolmap.Camera, laps: "Laps"
+    ) -> tuple[dict, list[str]]:
+        """Return the features of a photo, and the map images that are most similar to it."""
+        features = self._extract(image, view)
+        width, height = map(int, features["image_size"])
+        if (camera.width, camera.height) != (width, height):
+            raise InputError(
+                f"The camera has {camera.width}x{camera.height} pixels, the photo has "
+                f"{width}x{height}."
+            )
+        laps.end("extraction")
+        retrieved = self._retrieve(features, image, view)
+        laps.end("retrieval")
+        return features, retrieved
+
+    def localize_rig(
+        self,
+        images: Sequence[Path | str | np.ndarray],
+        cameras: Sequence[pycolmap.Camera],
+        cams_from_rig: Sequence[pycolmap.Rigid3d],
+        names: Sequence[str] = (),
+    ) -> tuple[pycolmap.Rigid3d | None, dict]:
+        """Localize photos that cameras which are fixed to each other took at one moment.
+
+        Each photo is matched by itself; one pose comes from all matches.
+
+        Args:
+            images: of each camera the file, or the pixels (H, W) or (H, W, 3) RGB, uint8; upright.
+            cameras: their intrinsics.
+            cams_from_rig: their poses in the rig, camera from rig, in the units of the map.
+            names: of the cameras, for messages; default: camera 0, camera 1, and so on.
+
+        Returns:
+            The pose, rig from world, in the units of the map, or None if the rig cannot be
+            localized, for the `reason` in info; and info: `probability`, `confidence`, `agreement`,
+            `num_inliers`, `num_correspondences`, `measures` and `again` of all cameras together, as
+            from `localize`; the `covariance` (6, 6) of the pose, see `measures.rig_covariance`,
+            None if it is not determined; `cameras`, a dict for each with its `num_matches`,
+            `num_correspondences` and `num_inliers`, `points2D` (M, 2), `points3D` (M, 3) and
+            `inliers` (M,) bool, and `retrieved`; `map_doubts`, and `seconds` by stage.
+
+        Raises:
+            UnreadableImage: if an image cannot be read.
+            InputError: if there is no camera, there are not as many images, cameras and poses, or a
+                camera has another size than its photo.
+        """
+        number = len(images)
+        if not number or not number == len(cameras) == len(cams_from_rig) == len(names or images):
+            raise InputError("A rig has an image, a camera, a pose and a name for each camera.")
+        laps, photos = Laps(), []
+        for image, camera in zip(images, cameras, strict=True):
+            image = image if isinstance(image, np.ndarray) else Path(image)
+            photos.append(self._described(image, views.USUAL, camera, laps))
+        named = names or [f"camera {i}" for i in range(number)]
+        rig = [*zip(named, cameras, cams_from_rig, strict=True)]
+        for again in range(len(self.steps)):
+            pose, of_cameras = self._try_rig(photos, rig, self.steps[again], laps)
+            if pose.refusal is None:
+                break
+        info = {
+            **gates.verdict(pose.measures, self.steps[again][1]),
+            "reason": pose.refusal,
+            "confidence": round(max(0.0, pose.measures.confidence), 2),
+            "agreement": round(pose.measures.agreement, 3),
+            "num_inliers": pose.measures.num_inliers,
+            "num_correspondences": pose.measures.num_matches,
+            "again": again > 0,
+            "covariance": pose.covariance,
+            "cameras": of_cameras,
+            "map_doubts": self.doubts,
+            "seconds": laps.seconds,
+        }
+        return pose.rig_from_world if pose.refusal is None else None, info
+
+    def _try_rig(
+        self, photos: list[tuple[dict, list[str]]], rig: list[tuple], step: tuple, laps: "Laps"
+    ) -> tuple[rig_pose.RigPose, list[dict]]:
+        """Localize a rig by one matcher, and return the pose and the info of each camera.
+
+        Args:
+            photos: of each camera the features, and the map images that are most similar.
+            rig: of each camera its name, intrinsics and pose in the rig.
+            step: what matches, and what a pose must have to be trusted.
+            laps: times the stages.
+        """
+        match, gate = step
+        sights, infos = [], []
+        for (features, retrieved), one in zip(photos, rig, strict=True):
+            sight, info = self._sight(features, match(features, retrieved), gate, *one)
+            sights.append(sight)
+            infos.append(info | {"retrieved": retrieved})
+        laps.end("matching")
+        pose = rig_pose.estimate(sights, gate)
+        laps.end("pose")
+        for info, inliers in zip(infos, pose.inliers, strict=True):
+            info |= {"inliers": inliers, "num_inliers": int(inliers.sum())}
+        return pose, infos
+
+    def _sight(
+        self,
+        features: dict,
+        matches: dict[str, np.ndarray],
+        gate: Gate,
+        name: str,
+        camera: pycolmap.Camera,
+        cam_from_rig: pycolmap.Rigid3d,
+    ) -> tuple[rig_pose.Sight, dict]:
+        """Return what a camera of a rig sees, and the first part of its info."""
+        info, chosen = query.correspondences(self.reference, list(matches), matches)
+        points2D = to_colmap(features["keypoints"])[info.pop("keypoints")]
+        points3D = info["points3D"]
+        config = ransac_options(self.ransac_thresh, camera)
+        given = points2D, points3D, chosen, camera, cam_from_rig, config, gate
+        return rig_pose.Sight(name, *given), info | {"points2D": points2D}
 
     def _other_views(self, image: Path | np.ndarray) -> list[View]:
         """Return the other ways to show a photo to the feature, if it needs them."""

@@ -15,12 +15,15 @@ from .databases import (
     write_reference,
 )
 from .estimators import (
+    MIN_OF_RIG,
     bundle_adjuster,
     covariance,
     estimate_pose,
+    estimate_rig_pose,
     exact,
     incremental_mapping,
     mapper_options,
+    refine_rig_pose,
     triangulate_points,
     verify_matches,
 )

@@ -1,6 +1,6 @@
 """COLMAP's estimators: two-view geometries, points, models and the pose of a query."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
@@ -19,6 +19,7 @@ REPROJECTION_LIMITS = (  # options that are the largest reprojection errors of p
     ("triangulation", "complete_max_reproj_error"),
     ("triangulation", "merge_max_reproj_error"),
 )
+MIN_OF_RIG = 4  # matches from which the pose of a rig is estimated
 _lock = Lock()
 _levels: list[int] = []  # those of COLMAP's log before each running block of `_log`
 
@@ -198,3 +199,45 @@ def estimate_pose(
         return None
     estimate: Callable[..., dict | None] = pycolmap.estimate_and_refine_absolute_pose
     return estimate(points2D, points3D, camera, estimation, config.get("refinement", {}))
+
+
+def estimate_rig_pose(
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    camera_of: np.ndarray,
+    cams_from_rig: Sequence[pycolmap.Rigid3d],
+    cameras: Sequence[pycolmap.Camera],
+    max_error: float,
+) -> pycolmap.Rigid3d | None:
+    """Estimate the pose of a rig, rig from world, by GP3P + LO-RANSAC, deterministically.
+
+    Args:
+        points2D: (M, 2) image points in COLMAP's pixels.
+        points3D: (M, 3) world points.
+        camera_of: (M,) index of the camera of each.
+        cams_from_rig: the pose of each camera in the rig.
+        cameras: their intrinsics.
+        max_error: RANSAC's inlier threshold in pixels.
+    """
+    if len(points2D) < MIN_OF_RIG:
+        return None
+    ransac = {"max_error": max_error, "random_seed": 0}
+    estimate: Callable[..., dict | None] = pycolmap.estimate_generalized_absolute_pose
+    found = estimate(points2D, points3D, camera_of, cams_from_rig, cameras, ransac)
+    return None if found is None else found["rig_from_world"]
+
+
+def refine_rig_pose(
+    rig_from_world: pycolmap.Rigid3d,
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    inliers: np.ndarray,
+    camera_of: np.ndarray,
+    cams_from_rig: Sequence[pycolmap.Rigid3d],
+    cameras: Sequence[pycolmap.Camera],
+) -> pycolmap.Rigid3d | None:
+    """Refine the pose of a rig by its inliers (M,) bool, see `estimate_rig_pose`."""
+    refine: Callable[..., dict | None] = pycolmap.refine_generalized_absolute_pose
+    given = points2D, points3D, inliers, camera_of, cams_from_rig, cameras
+    found = refine(rig_from_world, *given)
+    return None if found is None else found["rig_from_world"]

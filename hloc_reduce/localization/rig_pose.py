@@ -1,0 +1,328 @@
+"""The pose of a rig of cameras that are fixed to each other, from the 2D-3D matches of all."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+
+from ..utils import colmap
+from . import absolute_pose
+from . import gate as gates
+from .gate import Gate
+from .measures import (
+    INDEPENDENT,
+    MIN_MATCHES,
+    UNDETERMINED,
+    Alternative,
+    Measures,
+    Seen,
+    Uncertainty,
+    agreement,
+    joint_confidence,
+    rig_covariance,
+)
+from .pose import Pose
+from .projection import reprojection_errors
+
+REFINEMENTS = 3  # of a pose by the matches that agree with it
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a camera of a rig sees.
+
+    Args:
+        name: of the camera, for messages.
+        points2D: (M, 2) image points of all matches, COLMAP's pixels.
+        points3D: (M, 3) their world points.
+        images: of each map image the indices of its matches, the most similar first.
+        camera: intrinsics, which are exact.
+        cam_from_rig: its pose in the rig, in the units of the map.
+        config: as in `absolute_pose.estimate`, with RANSAC's inlier threshold.
+        gate: what a pose by this camera alone must have to be trusted.
+    """
+
+    name: str
+    points2D: np.ndarray
+    points3D: np.ndarray
+    images: list[np.ndarray]
+    camera: pycolmap.Camera
+    cam_from_rig: pycolmap.Rigid3d
+    config: dict
+    gate: Gate
+
+    @property
+    def max_error(self) -> float:
+        """The inlier threshold in pixels."""
+        return self.config["estimation"]["ransac"]["max_error"]
+
+    def seen(self, rig_from_world: pycolmap.Rigid3d) -> Seen:
+        """Return the matches with the pose of the camera that a pose of the rig gives it."""
+        pose = self.cam_from_rig * rig_from_world
+        return Seen(self.points2D, self.points3D, pose, self.camera, self.max_error)
+
+
+@dataclass(frozen=True)
+class RigPose:
+    """The pose of a rig, and how the matches of its cameras agree with it.
+
+    Args:
+        rig_from_world: the pose, None if there is none.
+        inliers: of each camera (M,) bool.
+        measures: those of all cameras together.
+        refusal: why it is not trusted, None if it is.
+        covariance: (6, 6) of a small motion of the rig in its own frame, see
+            `measures.rig_covariance`; None if the inliers do not determine it.
+    """
+
+    rig_from_world: pycolmap.Rigid3d | None
+    inliers: list[np.ndarray]
+    measures: Measures = Measures()
+    refusal: str | None = None
+    covariance: np.ndarray | None = None
+
+
+def estimate(sights: Sequence[Sight], gate: Gate) -> RigPose:
+    """Estimate the pose of a rig and judge it by the measures of a single photo, over all cameras.
+
+    It is the likeliest of the poses that each camera has by itself, and of those that minimal
+    samples of all cameras give (GP3P), refined by all matches that agree with it. A camera whose
+    own pose would be trusted, but is another one, contradicts the rest: its matches, its
+    intrinsics or its place in the rig are wrong, and the pose is not trusted.
+
+    Args:
+        sights: what each camera sees.
+        gate: what a pose must have to be trusted.
+    """
+    near_from_world = colmap.near_from_world(np.concatenate([one.points3D for one in sights]))
+    near = [_moved(one, near_from_world) for one in sights]
+    own = [_by_itself(one) for one in near]
+    starts = [
+        one.cam_from_rig.inverse() * pose.cam_from_world
+        for one, pose in zip(near, own, strict=True)
+        if pose.cam_from_world is not None
+    ]
+    everything = [np.ones(len(one.points2D), bool) for one in near]
+    starts += _sampled(near, everything)
+    found = [_judged(near, _refined(near, start)) for start in starts]
+    if not found:
+        return RigPose(None, [~chosen for chosen in everything], refusal=_none(near, gate))
+    best = max(found, key=_quality)
+    outliers = [~chosen for chosen in best.inliers]
+    found += [_judged(near, _refined(near, start)) for start in _sampled(near, outliers)]
+    best = _measured(near, best, found)
+    refusal = _contradiction(near, own, best) or gates.refusal(best.measures, gate)
+    world_from_near = near_from_world.inverse()
+    assert best.rig_from_world is not None
+    covariance = None
+    if best.covariance is not None:  # translations are in the units of the map again
+        unit = np.repeat([1.0, 1 / near_from_world.scale], 3)
+        covariance = best.covariance * np.outer(unit, unit)
+    return replace(
+        best,
+        rig_from_world=world_from_near.transform_camera_world(best.rig_from_world),
+        refusal=refusal,
+        covariance=covariance,
+    )
+
+
+def _moved(one: Sight, near_from_world: pycolmap.Sim3d) -> Sight:
+    """Return what a camera sees in a frame near the points, which has another unit."""
+    pose = pycolmap.Rigid3d(
+        one.cam_from_rig.rotation, near_from_world.scale * one.cam_from_rig.translation
+    )
+    points3D = colmap.transformed(near_from_world, one.points3D)
+    return replace(one, points3D=points3D, cam_from_rig=pose)
+
+
+def _by_itself(one: Sight) -> Pose:
+    """Estimate the pose of a camera by its own matches, and judge it."""
+    if len(one.points2D) < MIN_MATCHES:
+        return Pose(None, one.camera, np.zeros(len(one.points2D), bool))
+    given = one.points2D, one.points3D, one.images, one.camera, one.config, one.gate
+    return absolute_pose.estimate(*given)
+
+
+class _Cameras(NamedTuple):
+    """Which camera each match is of, and the cameras, as pycolmap takes them."""
+
+    camera_of: np.ndarray
+    cams_from_rig: list[pycolmap.Rigid3d]
+    cameras: list[pycolmap.Camera]
+
+
+def _together(
+    sights: Sequence[Sight], chosen: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, _Cameras]:
+    """Return chosen matches of all cameras: image points (N, 2), world points (N, 3), cameras."""
+    points2D = np.concatenate([s.points2D[c] for s, c in zip(sights, chosen, strict=True)])
+    points3D = np.concatenate([s.points3D[c] for s, c in zip(sights, chosen, strict=True)])
+    camera_of = np.repeat(np.arange(len(sights)), [int(c.sum()) for c in chosen])
+    poses, cameras = [s.cam_from_rig for s in sights], [s.camera for s in sights]
+    return points2D, points3D, _Cameras(camera_of, poses, cameras)
+
+
+def _sampled(sights: Sequence[Sight], chosen: Sequence[np.ndarray]) -> list[pycolmap.Rigid3d]:
+    """Return the pose that minimal samples of chosen matches of all cameras give, if any."""
+    points2D, points3D, cameras = _together(sights, chosen)
+    least = min(one.max_error for one in sights)
+    found = colmap.estimate_rig_pose(points2D, points3D, *cameras, max_error=least)
+    return [] if found is None else [found]
+
+
+def _inliers(sights: Sequence[Sight], rig_from_world: pycolmap.Rigid3d) -> list[np.ndarray]:
+    found = []
+    for one in sights:
+        errors, _ = reprojection_errors(*one.seen(rig_from_world)[:4])
+        found.append(errors <= one.max_error)
+    return found
+
+
+def _refined(sights: Sequence[Sight], start: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
+    """Refine a pose by the matches of all cameras that agree with it, as long as more do."""
+    pose, inliers = start, _inliers(sights, start)
+    everything = [np.ones(len(one.points2D), bool) for one in sights]
+    points2D, points3D, cameras = _together(sights, everything)
+    for _ in range(REFINEMENTS):
+        mask = np.concatenate(inliers)
+        if mask.sum() < colmap.MIN_OF_RIG:
+            break
+        refined = colmap.refine_rig_pose(pose, points2D, points3D, mask, *cameras)
+        if refined is None:
+            break
+        agreeing = _inliers(sights, refined)
+        more = sum(map(np.sum, agreeing)) - mask.sum()
+        if more < 0:
+            break
+        pose, inliers = refined, agreeing
+        if more == 0:
+            break
+    return pose
+
+
+def _judged(sights: Sequence[Sight], pose: pycolmap.Rigid3d) -> RigPose:
+    """Return a pose with its inliers and confidence."""
+    inliers = _inliers(sights, pose)
+    value = joint_confidence([one.seen(pose) for one in sights])
+    number = int(sum(map(np.sum, inliers)))
+    return RigPose(pose, inliers, Measures(num_inliers=number, confidence=value))
+
+
+def _quality(found: RigPose) -> tuple[float, int]:
+    return found.measures.confidence, found.measures.num_inliers
+
+
+def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> RigPose:
+    """Return the best pose with all that is measured of it.
+
+    Args:
+        sights: what each camera sees.
+        best: the pose.
+        found: all poses, that one included.
+    """
+    assert best.rig_from_world is not None
+    photos = [one.seen(best.rig_from_world) for one in sights]
+    agreeing = [
+        seen._replace(points2D=seen.points2D[chosen], points3D=seen.points3D[chosen])
+        for seen, chosen in zip(photos, best.inliers, strict=True)
+    ]
+    covariance = rig_covariance(agreeing, [one.cam_from_rig for one in sights])
+    depth = _median_depth(agreeing)
+    start, images = 0, []
+    for one in sights:
+        images += [start + chosen for chosen in one.images]
+        start += len(one.points2D)
+    others = [one for one in found if one is not best and _shares_few(best, one)]
+    rivals = [rival for one in others if (rival := _rival(best, one, depth))]
+    measures = replace(
+        best.measures,
+        num_matches=start,
+        agreement=agreement(np.concatenate(best.inliers), images),
+        uncertainty=_uncertainty(covariance, depth, best.measures.num_inliers),
+        is_camera_given=True,
+        focal_range=(0.0, np.inf),
+        alternatives={"rival": max(rivals)} if rivals else {},
+        **_intrinsics(sights),
+    )
+    return replace(best, measures=measures, covariance=covariance)
+
+
+def _intrinsics(sights: Sequence[Sight]) -> dict:
+    """Return what the gate needs of the intrinsics: those whose focal length is least plausible."""
+
+    def oddness(camera: pycolmap.Camera) -> float:
+        return abs(np.log(max(1e-9, camera.mean_focal_length()) / max(camera.width, camera.height)))
+
+    camera = max((one.camera for one in sights), key=oddness)
+    length = camera.mean_focal_length()
+    side = max(camera.width, camera.height)
+    return {"longer_side": side, "focal_length": length, "given_focal_length": length}
+
+
+def _median_depth(photos: Sequence[Seen]) -> float:
+    depths = [
+        seen.points3D @ seen.cam_from_world.rotation.matrix()[2]
+        + seen.cam_from_world.translation[2]
+        for seen in photos
+    ]
+    together = np.concatenate(depths)
+    return float(np.median(together)) if len(together) else 1.0
+
+
+def _uncertainty(covariance: np.ndarray | None, depth: float, number: int) -> Uncertainty:
+    """Return standard deviations, see `measures.uncertainty`."""
+    if covariance is None:
+        return UNDETERMINED
+    variance = np.diag(covariance) * max(1, number / INDEPENDENT)
+    rotation, position = variance[:3].sum(), variance[3:].sum()
+    return Uncertainty(float(np.sqrt(position) / depth), float(np.degrees(np.sqrt(rotation))), 0.0)
+
+
+def _rival(best: RigPose, other: RigPose, depth: float) -> Alternative | None:
+    """Compare another pose with the best one; None if both are about the same."""
+    assert best.rig_from_world is not None and other.rig_from_world is not None
+    position, rotation = _apart(best.rig_from_world, other.rig_from_world)
+    ratio = other.measures.confidence / max(1.0, best.measures.confidence)
+    found = Alternative(ratio, position / depth, rotation, other.measures.num_inliers)
+    return found if gates.differ(found, gates.RIVALS) else None
+
+
+def _apart(pose: pycolmap.Rigid3d, other: pycolmap.Rigid3d) -> tuple[float, float]:
+    """Return the distance of two poses, and the angle between them in degrees."""
+    relative = pose * other.inverse()
+    return float(np.linalg.norm(relative.translation)), float(np.degrees(relative.rotation.angle()))
+
+
+def _shares_few(best: RigPose, other: RigPose) -> bool:
+    """Tell whether less than half of the inliers of another pose are those of the best one."""
+    shared = sum((a & b).sum() for a, b in zip(best.inliers, other.inliers, strict=True))
+    return 2 * shared < other.measures.num_inliers
+
+
+def _contradiction(sights: Sequence[Sight], own: Sequence[Pose], best: RigPose) -> str | None:
+    """Name the cameras with trusted poses of their own that hardly any match has in the rig."""
+    assert best.rig_from_world is not None
+    names = []
+    for one, pose, inliers in zip(sights, own, best.inliers, strict=True):
+        if pose.cam_from_world is None or pose.refusal or 2 * inliers.sum() >= pose.num_inliers:
+            continue
+        seen = one.seen(best.rig_from_world)._replace(cam_from_world=pose.cam_from_world)
+        depth = _median_depth([seen])
+        position, rotation = _apart(one.cam_from_rig * best.rig_from_world, pose.cam_from_world)
+        if gates.differ(Alternative(1.0, position / abs(depth), rotation), gates.SAME_POSE):
+            names.append(one.name)
+    if not names:
+        return None
+    verb = "contradicts" if len(names) == 1 else "contradict"
+    return (
+        f"{' and '.join(names)} {verb} the rig: by their own matches they are elsewhere; is the "
+        "rig calibrated, and are its photos of one moment?"
+    )
+
+
+def _none(sights: Sequence[Sight], gate: Gate) -> str | None:
+    """Return why there is no pose."""
+    number = sum(len(one.points2D) for one in sights)
+    return gates.refusal(Measures(num_matches=number, given_focal_length=1.0), gate)

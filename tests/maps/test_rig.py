@@ -1,0 +1,76 @@
+"""Rigs of cameras that are localized in memory."""
+
+import copy
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from hloc_reduce import Localizer, compact
+from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.utils.cli import InputError
+
+
+@pytest.fixture
+def rig(build_map, plane, place):
+    """A map; and two cameras: a query, and a photo of the map, which is darker in the rig."""
+    folder, (_, images, _) = build_map(), place
+    model = pycolmap.Reconstruction(plane / "model")
+    by_name = {image.name: image for image in model.images.values()}
+    first, second = by_name["4.png"], by_name["0.png"]
+    true = first.cam_from_world()
+    cams_from_rig = [pycolmap.Rigid3d(), second.cam_from_world() * true.inverse()]
+    photos = [images / "query/day/a.png", cv2.imread(str(images / "db/0.png"))[..., ::-1] // 2]
+    photos[1] = np.ascontiguousarray(photos[1])
+    cameras = [copy.deepcopy(image.camera) for image in (first, second)]  # they outlive the model
+    return folder, photos, cameras, cams_from_rig, true
+
+
+@pytest.mark.parametrize("is_compact", [False, True])
+def test_a_rig_is_localized_by_all_its_cameras(is_compact, rig, tmp_path):
+    path, photos, cameras, cams_from_rig, true = rig
+    if is_compact:
+        compact.main(tmp_path / "map.hlm", path)
+        path = tmp_path / "map.hlm"
+    localizer = Localizer(path)
+    pose, info = localizer.localize_rig(photos, cameras, cams_from_rig)
+    assert info["reason"] is None
+    distance, degrees = pose_error(pose, true)
+    assert distance < 0.02 and degrees < 0.2
+    alone, its = localizer.localize(photos[0], cameras[0])
+    of_cameras = info["cameras"]
+    assert info["num_inliers"] == sum(one["num_inliers"] for one in of_cameras)
+    assert of_cameras[0]["num_correspondences"] == its["num_correspondences"]
+    assert of_cameras[0]["retrieved"] == its["retrieved"]
+    assert abs(of_cameras[0]["num_inliers"] - its["num_inliers"]) < 0.1 * its["num_inliers"]
+    assert np.trace(info["covariance"]) < np.trace(its["covariance"])
+    for one, camera, cam_from_rig in zip(of_cameras, cameras, cams_from_rig, strict=True):
+        assert len(one["points2D"]) == len(one["points3D"]) == one["num_correspondences"]
+        local = one["points3D"] @ (cam_from_rig * pose).rotation.matrix().T
+        projected = camera.img_from_cam(local + (cam_from_rig * pose).translation)
+        errors = np.linalg.norm(projected - one["points2D"], axis=1)
+        assert errors[one["inliers"]].max() <= 12
+
+
+def test_a_camera_that_was_moved_is_named(rig):
+    path, photos, cameras, (first, second), _ = rig
+    moved = pycolmap.Rigid3d(second.rotation, second.translation + [3.0, 0, 0])
+    localizer = Localizer(path)
+    pose, info = localizer.localize_rig(photos, cameras, [first, moved], ["left", "right"])
+    assert pose is None and "contradict" in info["reason"]
+    assert "left" in info["reason"] or "right" in info["reason"]
+
+
+def test_what_is_no_rig(rig):
+    path, photos, cameras, cams_from_rig, _ = rig
+    localizer = Localizer(path)
+    for given in ((photos[:1], cameras, cams_from_rig), ([], [], []), (photos, cameras, [])):
+        with pytest.raises(InputError, match="A rig has an image, a camera"):
+            localizer.localize_rig(*given)
+    with pytest.raises(InputError, match="The camera has"):
+        smaller = pycolmap.Camera(model="SIMPLE_PINHOLE", width=9, height=9, params=[9, 4, 4])
+        localizer.localize_rig(photos, [cameras[0], smaller], cams_from_rig)
+    grey = np.full((*cv2.imread(str(photos[0])).shape[:2], 3), 128, np.uint8)
+    pose, info = localizer.localize_rig([grey, grey], cameras, cams_from_rig)
+    assert pose is None and info["reason"].startswith("too few inliers: 0")
