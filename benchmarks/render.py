@@ -22,6 +22,7 @@ PAGES = (
     "docs/maps.md",
     "docs/performance.md",
     "docs/lab.md",
+    "docs/robot.md",
 )
 LONGEST_NUMBER = 30  # characters of a cell, with units
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)

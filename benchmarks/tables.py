@@ -115,14 +115,11 @@ LIGHTGLUE_PLACES = (
 CHANGED_PHOTOS = {
     "map 1, queries 1, turned 0": "unchanged",
     "map 1, queries 0.5, turned 0": "of half the size",
-    "map 1, queries 0.35, turned 0": "of 35 %",
     "map 1, queries 0.25, turned 0": "of a quarter",
     "map 0.5, queries 1, turned 0": "map of half the size",
-    "map 0.35, queries 1, turned 0": "map of 35 %",
     "map 0.35 and 1, queries 1, turned 0": "half of the map of 35 %",
     "map 1, queries 1, middle 0.5, turned 0": "their middle, half of each side",
     "map 1, queries 1, turned 90": "turned by 90°",
-    "map 1, queries 1, turned 180": "by 180°",
 }
 SECONDS_OF_PAIRS = {
     "all layers, 1 thread": "all layers, one core",
@@ -357,9 +354,10 @@ def lightglue_seconds_table() -> Table:
 
 
 def changed_photos_table() -> Table:
-    """Show what is localized of changed queries, and in a map of small photos."""
+    """Show what networks localize of changed queries, and in a map of small photos."""
     rows = read("changed_photos")
-    names = dict.fromkeys(map(name_of, rows))
+    networks = [row for row in rows if not row["feature"].startswith("colmap_sift")]
+    names = dict.fromkeys(map(name_of, networks))
     table = [["photos", *(f"{name}: {how}" for name in names for how in changed_photos.SHOWN)]]
     for change, said in CHANGED_PHOTOS.items():
         cells = []
@@ -370,6 +368,23 @@ def changed_photos_table() -> Table:
                 "".join(f"{row['localized']}; {inliers_and_median(row)}" for row in of_name)
             )
         table.append([said, *cells])
+    return table
+
+
+def rigs_table() -> Table:
+    """Compare rigs of cameras with the best of their photos alone."""
+    table = [["feature", "cameras", "localized", "within 5 cm", "median [cm]"]]
+    table[0] += ["best alone: localized", "within 5 cm", "median [cm]"]
+    rows = read("rigs")
+    for name in dict.fromkeys(map(name_of, rows)):
+        of_name = {row["variant"]: row for row in rows if name_of(row) == name}
+        for number in (2, 4):
+            cells = []
+            for variant in (f"{number} cameras", f"best of {number}"):
+                row = of_name[variant]
+                localized = f"{row['localized']} of {row['queries']}"
+                cells += [localized, row["within_5cm"], f"{float(row['median_cm']):.2f}"]
+            table.append([name, str(number), *cells])
     return table
 
 
@@ -592,6 +607,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "pose_limits": pose_limits_table,
     "retrieval": retrieval_table,
     "changed_photos": changed_photos_table,
+    "rigs": rigs_table,
     "runs": runs_table,
     "runs_cpu": runs_cpu_table,
     "extraction": extraction_table,
