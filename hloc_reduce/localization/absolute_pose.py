@@ -73,7 +73,7 @@ def estimate(
     matches = Matches(points2D, colmap.transformed(near_from_world, points3D), camera, config)
     number = len(matches)
     with ThreadPoolExecutor(workers) as pool:
-        poses = [_estimate(matches, _likeliest(images, number))]
+        poses = [_estimate(matches, likeliest(images, number))]
         is_certain = poses[0].confidence >= CERTAIN
         if number > SAMPLE and not is_certain:
             poses.insert(0, _estimate(matches, np.arange(number)))
@@ -95,20 +95,21 @@ def estimate(
     return replace(best, cam_from_world=world_from_near.transform_camera_world(best.cam_from_world))
 
 
-def _likeliest(images: list[np.ndarray], number: int) -> np.ndarray:
-    """Return the indices of those `SAMPLE` of a number of matches that are right most often.
+def likeliest(images: list[np.ndarray], number: int, most: int = SAMPLE) -> np.ndarray:
+    """Return the indices, ascending, of those of a number of matches that are right most often.
 
     These are matches of several images, and then the most similar ones of each image.
 
     Args:
         images: of each map image the indices of its matches, the most similar first.
         number: of all matches.
+        most: how many are returned, at most.
     """
     times, rank = np.zeros(number, np.int64), np.full(number, number)
     for chosen in images:
         times[chosen] += 1
         rank[chosen] = np.minimum(rank[chosen], np.arange(len(chosen)))
-    return np.sort(np.lexsort((rank, -times))[:SAMPLE])
+    return np.sort(np.lexsort((rank, -times))[:most])
 
 
 def _measures(

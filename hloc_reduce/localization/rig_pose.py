@@ -165,8 +165,17 @@ def _together(
 
 
 def _sampled(sights: Sequence[Sight], chosen: Sequence[np.ndarray]) -> list[pycolmap.Rigid3d]:
-    """Return the pose that minimal samples of chosen matches of all cameras give, if any."""
-    points2D, points3D, cameras = _together(sights, chosen)
+    """Return the pose that minimal samples of chosen matches of all cameras give, if any.
+
+    Of these, the likeliest ones are sampled, of each camera as many: RANSAC's time grows with them.
+    """
+    most = -(-absolute_pose.SAMPLE // len(sights))
+    few = []
+    for one, of_one in zip(sights, chosen, strict=True):
+        which = [image[of_one[image]] for image in one.images]
+        few.append(np.zeros(len(of_one), bool))
+        few[-1][absolute_pose.likeliest(which, len(of_one), min(most, int(of_one.sum())))] = True
+    points2D, points3D, cameras = _together(sights, few)
     least = min(one.max_error for one in sights)
     found = colmap.estimate_rig_pose(points2D, points3D, *cameras, max_error=least)
     return [] if found is None else [found]
