@@ -66,12 +66,11 @@ def test_wrong_matches_are_never_trusted(number, config):
         assert found.refusal is not None and found.confidence < 3
 
 
-def test_the_likeliest_matches_are_those_of_several_images_then_the_most_similar(monkeypatch):
-    monkeypatch.setattr(absolute_pose, "SAMPLE", 4)
+def test_the_likeliest_matches_are_those_of_several_images_then_the_most_similar():
     images = [np.array([5, 0, 1]), np.array([3, 4, 5, 0]), np.array([2, 6])]
     # 0 and 5 are of two images, and 2 and 3 are the first ones of theirs
-    assert absolute_pose._likeliest(images, 8).tolist() == [0, 2, 3, 5]
-    assert absolute_pose._likeliest([], 3).tolist() == [0, 1, 2]
+    assert absolute_pose.likeliest(images, 8, 4).tolist() == [0, 2, 3, 5]
+    assert absolute_pose.likeliest([], 3).tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("right", "counts"), [(300, [500]), (30, [500, 4000])])
