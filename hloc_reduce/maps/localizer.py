@@ -226,8 +226,7 @@ class Localizer:
                 camera has another size than its photo.
         """
         number = len(images)
-        if not number or not number == len(cameras) == len(cams_from_rig) == len(names or images):
-            raise InputError("A rig has an image, a camera, a pose and a name for each camera.")
+        _check_rig(images, cameras, cams_from_rig, names or [""] * number)
         laps, photos = Laps(), []
         for image, camera in zip(images, cameras, strict=True):
             image = image if isinstance(image, np.ndarray) else Path(image)
@@ -335,3 +334,17 @@ class Localizer:
         """Return the names of the map images that are most similar to a photo, best first."""
         query = self._describe(features, image, view.turns)
         return [self.names[j] for j in rank(self._similarity(query)[None], self.num_loc)[0]]
+
+
+def _check_rig(
+    images: Sequence, cameras: Sequence, cams_from_rig: Sequence, names: Sequence[str]
+) -> None:
+    """Raise an InputError unless there is one of each, of the right type, for every camera."""
+    numbers = [len(images), len(cameras), len(cams_from_rig), len(names)]
+    if not images or len({*numbers}) > 1:
+        said = "{} images, {} cameras, {} poses and {} names".format(*numbers)
+        raise InputError(f"A rig needs one of each for every camera, not {said}.")
+    if not all(isinstance(one, pycolmap.Camera) for one in cameras):
+        raise InputError("The cameras of a rig are pycolmap.Camera: their intrinsics are needed.")
+    if not all(isinstance(one, pycolmap.Rigid3d) for one in cams_from_rig):
+        raise InputError("The poses of the cameras in a rig are pycolmap.Rigid3d, camera from rig.")

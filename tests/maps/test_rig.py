@@ -66,8 +66,12 @@ def test_what_is_no_rig(rig):
     path, photos, cameras, cams_from_rig, _ = rig
     localizer = Localizer(path)
     for given in ((photos[:1], cameras, cams_from_rig), ([], [], []), (photos, cameras, [])):
-        with pytest.raises(InputError, match="A rig has an image, a camera"):
+        with pytest.raises(InputError, match="A rig needs one of each for every camera, not"):
             localizer.localize_rig(*given)
+    with pytest.raises(InputError, match=r"are pycolmap.Camera"):
+        localizer.localize_rig(photos, [None, None], cams_from_rig)
+    with pytest.raises(InputError, match=r"are pycolmap.Rigid3d"):
+        localizer.localize_rig(photos, cameras, [np.eye(4), np.eye(4)])
     with pytest.raises(InputError, match="The camera has"):
         smaller = pycolmap.Camera(model="SIMPLE_PINHOLE", width=9, height=9, params=[9, 4, 4])
         localizer.localize_rig(photos, [cameras[0], smaller], cams_from_rig)
