@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -126,7 +127,7 @@ class Localizer:
             UnreadableImage: if the image cannot be read.
             InputError: if the camera has another size.
         """
-        image = image if isinstance(image, np.ndarray) else Path(image)
+        image = _pixels_or_file(image)
         laps, source, refinement = Laps(), "given", {}
         if camera is None:
             camera, source = intrinsics.infer(image, self.cameras)
@@ -229,8 +230,7 @@ class Localizer:
         _check_rig(images, cameras, cams_from_rig, names or [""] * number)
         laps, photos = Laps(), []
         for image, camera in zip(images, cameras, strict=True):
-            image = image if isinstance(image, np.ndarray) else Path(image)
-            photos.append(self._described(image, views.USUAL, camera, laps))
+            photos.append(self._described(_pixels_or_file(image), views.USUAL, camera, laps))
         named = names or [f"camera {i}" for i in range(number)]
         rig = [*zip(named, cameras, cams_from_rig, strict=True)]
         for again in range(len(self.steps)):
@@ -334,6 +334,16 @@ class Localizer:
         """Return the names of the map images that are most similar to a photo, best first."""
         query = self._describe(features, image, view.turns)
         return [self.names[j] for j in rank(self._similarity(query)[None], self.num_loc)[0]]
+
+
+def _pixels_or_file(image: Path | str | np.ndarray) -> Path | np.ndarray:
+    """Return pixels, or the path of a file; raise an InputError for what is neither."""
+    if isinstance(image, np.ndarray):
+        return image
+    if not isinstance(image, str | PathLike):
+        said = "cv2.imread returns that for a file that it cannot read" if image is None else image
+        raise InputError(f"An image is a file or an array, not {type(image).__name__}: {said}.")
+    return Path(image)
 
 
 def _check_rig(

@@ -75,6 +75,11 @@ def test_what_is_no_rig(rig):
     with pytest.raises(InputError, match="The camera has"):
         smaller = pycolmap.Camera(model="SIMPLE_PINHOLE", width=9, height=9, params=[9, 4, 4])
         localizer.localize_rig(photos, [cameras[0], smaller], cams_from_rig)
+    for given in ([photos[0], None], [photos[0], 7]):
+        with pytest.raises(InputError, match="An image is a file or an array, not"):
+            localizer.localize_rig(given, cameras, cams_from_rig)
+    with pytest.raises(InputError, match=r"NoneType: cv2.imread returns that"):
+        localizer.localize(None)
     grey = np.full((*cv2.imread(str(photos[0])).shape[:2], 3), 128, np.uint8)
     pose, info = localizer.localize_rig([grey, grey], cameras, cams_from_rig)
     assert pose is None and info["reason"].startswith("too few inliers: 0")
