@@ -111,6 +111,7 @@ LIGHTGLUE_PLACES = (
     *("herz-jesus", "dark-fountain-P11", "dark-sceaux"),
     *(f"sparse-{place}" for place in ("herz-jesus", "fountain-P11", "sceaux")),
 )
+MANY_IMAGES = 100_000  # from which the table of retrieval has them
 # from what `benchmarks.changed_photos` changes to what tables say
 CHANGED_PHOTOS = {
     "map 1, queries 1, turned 0": "unchanged",
@@ -403,7 +404,8 @@ def pose_limits_table() -> Table:
 def retrieval_table() -> Table:
     """Show how long the search for similar images takes, by their number."""
     table = [["images", "search", "a query [ms]", "index [s]", "right of the first 20"]]
-    for row in sorted(read("retrieval"), key=lambda row: int(row["photos"])):
+    rows = [row for row in read("retrieval") if int(row["photos"]) >= MANY_IMAGES]
+    for row in sorted(rows, key=lambda row: int(row["photos"])):
         measures = (
             f"{float(row['ms']):.3g}",
             f"{float(row['build_s']):.1f}",
