@@ -78,7 +78,7 @@ def test_more_cameras_are_more_precise():
 
 @pytest.mark.parametrize(
     "moved",
-    [about_y(100, (0.2, 0, 0.1)), about_y(90, (1.5, 0, 0.1)), about_y(93, (0.2, 0, 0.1))],
+    [about_y(100, (0.2, 0, 0.1)), about_y(90, (1.5, 0, 0.1)), about_y(91.5, (0.2, 0, 0.1))],
 )
 def test_a_camera_that_contradicts_the_others_is_named(moved):
     """Even if it is turned by no more than poses that count as one may be."""
