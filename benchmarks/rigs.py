@@ -3,7 +3,7 @@
 A rig stands where a query by night was taken; its cameras look ahead, to the left, back and to the
 right, and are 20 cm apart. Adds rows to results/rigs.csv, leaving out what has rows unless --again
 is given: the first one to four cameras, and the one of these that is localized with the most
-inliers by itself. Errors are those of the rig.
+inliers by itself. Errors are of the rig's pose.
 """
 
 import os

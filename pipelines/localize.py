@@ -241,6 +241,7 @@ def main(
             features,
             loc_pairs,
             num_loc if retrieval == built.retrieval else None,
+            map_names,
         )
         with run.stage("localization"):
             records = localize_sfm.main(

@@ -245,10 +245,8 @@ def rig_covariance(
         _, derivatives = project(local)
         jacobian = seen.camera.mean_focal_length() * np.concatenate(derivatives, axis=1)[:POSE].T
         x, y, z = cam_from_rig.translation
-        cross, rotation = (
-            np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]),
-            cam_from_rig.rotation.matrix(),
-        )
+        rotation = cam_from_rig.rotation.matrix()
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         moved = np.block([[rotation, np.zeros((3, 3))], [cross @ rotation, rotation]])
         information += (jacobian @ moved).T @ (jacobian @ moved)
         errors, _ = reprojection_errors(*seen[:4])

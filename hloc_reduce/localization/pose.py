@@ -149,11 +149,16 @@ def apart(pose: Pose, other: Pose, points3D: np.ndarray) -> tuple[float, float]:
         the angle between their rotations in degrees.
     """
     assert pose.cam_from_world is not None and other.cam_from_world is not None
-    relative = pose.cam_from_world * other.cam_from_world.inverse()
+    moved, degrees = motion(pose.cam_from_world, other.cam_from_world)
     inliers = points3D[pose.inliers]
     depths = inliers @ pose.cam_from_world.rotation.matrix().T + pose.cam_from_world.translation
-    moved = np.linalg.norm(relative.translation) / np.median(depths[:, 2])
-    return float(moved), float(np.degrees(relative.rotation.angle()))
+    return float(moved / np.median(depths[:, 2])), degrees
+
+
+def motion(pose: pycolmap.Rigid3d, other: pycolmap.Rigid3d) -> tuple[float, float]:
+    """Return the distance of the positions of two poses, and the angle between them in degrees."""
+    relative = pose * other.inverse()
+    return float(np.linalg.norm(relative.translation)), float(np.degrees(relative.rotation.angle()))
 
 
 def differ(pose: Pose, other: Pose, points3D: np.ndarray, tolerance: gate.Tolerance) -> bool:

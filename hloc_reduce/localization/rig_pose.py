@@ -23,10 +23,8 @@ from .measures import (
     joint_confidence,
     rig_covariance,
 )
-from .pose import Pose
+from .pose import Pose, motion
 from .projection import reprojection_errors
-
-REFINEMENTS = 3  # of a pose by the matches that agree with it
 
 
 @dataclass(frozen=True)
@@ -87,9 +85,9 @@ class RigPose:
 def estimate(sights: Sequence[Sight], gate: Gate) -> RigPose:
     """Estimate the pose of a rig and judge it by the measures of a single photo, over all cameras.
 
-    It is the likeliest of the poses that each camera has by itself, and of those that minimal
-    samples of all cameras give (GP3P), refined by all matches that agree with it. A camera whose
-    own pose would be trusted, but has few inliers in the rig, contradicts the rest: its
+    Candidates are the pose that each camera has by itself, and one from minimal samples of all
+    cameras (GP3P), each refined by all matches that agree with it; the likeliest is taken. A camera
+    whose own pose would be trusted, but has few inliers in the rig, contradicts the rest: its
     intrinsics or its place in the rig are wrong, and the pose is not trusted.
 
     Args:
@@ -194,7 +192,7 @@ def _refined(sights: Sequence[Sight], start: pycolmap.Rigid3d) -> pycolmap.Rigid
     pose, inliers = start, _inliers(sights, start)
     everything = [np.ones(len(one.points2D), bool) for one in sights]
     points2D, points3D, cameras = _together(sights, everything)
-    for _ in range(REFINEMENTS):
+    for _ in range(absolute_pose.REESTIMATIONS):
         mask = np.concatenate(inliers)
         if mask.sum() < colmap.MIN_OF_RIG:
             break
@@ -292,16 +290,10 @@ def _uncertainty(covariance: np.ndarray | None, depth: float, number: int) -> Un
 def _rival(best: RigPose, other: RigPose, depth: float) -> Alternative | None:
     """Compare another pose with the best one; None if both are about the same."""
     assert best.rig_from_world is not None and other.rig_from_world is not None
-    position, rotation = _apart(best.rig_from_world, other.rig_from_world)
+    position, rotation = motion(best.rig_from_world, other.rig_from_world)
     ratio = other.measures.confidence / max(1.0, best.measures.confidence)
     found = Alternative(ratio, position / depth, rotation, other.measures.num_inliers)
     return found if gates.differ(found, gates.RIVALS) else None
-
-
-def _apart(pose: pycolmap.Rigid3d, other: pycolmap.Rigid3d) -> tuple[float, float]:
-    """Return the distance of two poses, and the angle between them in degrees."""
-    relative = pose * other.inverse()
-    return float(np.linalg.norm(relative.translation)), float(np.degrees(relative.rotation.angle()))
 
 
 def _shares_few(best: RigPose, other: RigPose) -> bool:

@@ -204,7 +204,7 @@ class Localizer:
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Localize photos that cameras which are fixed to each other took at one moment.
 
-        Each photo is matched by itself; one pose comes from all matches.
+        Photos are matched one by one, and the matches of all give one pose.
 
         Args:
             images: of each camera the file, or the pixels (H, W) or (H, W, 3) RGB, uint8; upright.

@@ -22,6 +22,7 @@ def tries(
     features: Path,
     pairs: Path,
     num_loc: int | None,
+    map_names: list[str],
 ) -> list[Try]:
     """Return how queries are tried in other views, if the feature of the map needs that.
 
@@ -34,10 +35,10 @@ def tries(
         pairs: pairs of all queries, as they are, and map images.
         num_loc: map images that the map's retrieval finds for a query in another view; None: those
             of `pairs`.
+        map_names: images of the map.
     """
     if built.is_rotation_invariant:
         return []
-    map_names = built.names()
 
     def of_view(view: View, of_this: list[str], matcher: str) -> Try:
         again = matcher != run.steps[0]

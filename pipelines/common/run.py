@@ -231,15 +231,9 @@ class Run:
             "bytes": {k: v for folder in self._folders for k, v in folder.bytes().items()},
             "versions": versions(),
             "poses": poses.name,
-            "files": {
-                key: None if path is None else relative(path, outputs)
-                for key, path in {"features": features, **files}.items()
-            },
+            "files": _relative({"features": features, **files}, outputs),
             "tries": {
-                str(number): {
-                    key: None if path is None else relative(path, outputs)
-                    for key, path in matched._asdict().items()
-                }
+                str(number): _relative(matched._asdict(), outputs)
                 for number, matched in sorted(self._files_of_tries.items())
             },
         }
@@ -262,6 +256,10 @@ def readable(features: Path, names: list[str]) -> list[str]:
     """Return the images that could be read when their features were extracted."""
     failed = failures(features)
     return [name for name in names if name not in failed]
+
+
+def _relative(files: Mapping[str, Path | None], outputs: Path) -> dict[str, str | None]:
+    return {key: None if path is None else relative(path, outputs) for key, path in files.items()}
 
 
 def relative(path: Path, outputs: Path) -> str:
