@@ -87,8 +87,8 @@ run mappers $mappers --map $data/demo_town-400/images_upright:$data/demo_town-40
 [ -e $data/strangers ] || run strangers --output $data/strangers || true # from GitHub
 web="$data/strangers/naver+mast3r $data/strangers/cvg+Hierarchical-Localization"
 if [ -e $data/strangers ]; then
-    run web_photos --photos $web --feature colmap_sift_sv64 --matcher NN "$@"
-    run web_photos --photos $web --feature xfeat:float16 xfeat_sv32:uint2 mini32:uint2 "$@"
+    run own_maps --photos $web --feature colmap_sift_sv64 --matcher NN "$@"
+    run own_maps --photos $web --feature xfeat:float16 xfeat_sv32:uint2 mini32:uint2 "$@"
 fi
 for feature in mini32:uint2 xfeat_sv32:uint2 colmap_sift_sv64; do
     changed() { run changed_photos --dataset $data/herz-jesus --feature $feature "$@"; }
