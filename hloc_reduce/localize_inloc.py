@@ -5,6 +5,7 @@ from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated
 
 import numpy as np
@@ -17,6 +18,7 @@ from .localization import stage
 from .localization.gate import DEFAULT_GATE, Gate
 from .localization.intrinsics import to_lists
 from .localization.references import ScanMap, point_group
+from .localization.rigs import Frames
 from .runtime import provenance
 from .runtime.executors import SERIAL, Executor
 from .runtime.group_writer import Group, GroupWriter, failures, fill
@@ -47,6 +49,7 @@ def main(
     points: Annotated[Path, HIDDEN] | None = None,
     gate: Gate = DEFAULT_GATE,
     again: Sequence[stage.Try] = (),
+    rigs: Annotated[Frames, HIDDEN] = MappingProxyType({}),
 ) -> dict[str, dict]:
     """Localize queries in a data set of InLoc's layout.
 
@@ -72,6 +75,7 @@ def main(
         gate: what a pose must have for the query to be called localized.
         again: how queries that are not localized are matched once more, see
             `localization.stage.main`.
+        rigs: queries of which one pose is estimated together, see `localization.stage.main`.
 
     Returns:
         A record for each query, as `localization.stage.main` returns it. A query that is not
@@ -114,6 +118,7 @@ def main(
         executor=executor,
         gate=gate,
         again=again,
+        rigs=rigs,
     )
 
 

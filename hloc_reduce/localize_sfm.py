@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated
 
 import pycolmap
@@ -13,6 +14,7 @@ from .localization.intrinsics import to_lists
 from .localization.mirrored import MirrorImages
 from .localization.query import merged, ransac_options
 from .localization.references import SfmMap
+from .localization.rigs import Frames
 from .runtime import provenance
 from .runtime.executors import SERIAL, Executor
 from .utils import cli, colmap, options
@@ -42,6 +44,7 @@ def main(
     gate: Gate = DEFAULT_GATE,
     mirror_images: MirrorImages | None = None,
     again: Sequence[stage.Try] = (),
+    rigs: Annotated[Frames, HIDDEN] = MappingProxyType({}),
 ) -> dict[str, dict]:
     """Localize queries in a COLMAP model.
 
@@ -69,6 +72,7 @@ def main(
         mirror_images: extracts and matches mirror images of queries, see `localization.stage.main`.
         again: how queries that are not localized are matched once more, see
             `localization.stage.main`.
+        rigs: queries of which one pose is estimated together, see `localization.stage.main`.
 
     Returns:
         A record for each query, as `localization.stage.main` returns it and keeps it in
@@ -117,6 +121,7 @@ def main(
             gate=gate,
             mirror_images=mirror_images,
             again=again,
+            rigs=rigs,
         )
     finally:
         _load.cache_clear()  # a map may be large

@@ -90,6 +90,7 @@ def main(
                 executor=given.executor,
                 gate=given.gate,
                 again=run.again(loc_pairs, features),
+                rigs=run.rigs,
             )
         sizes = {"map_points3D": reconstruction.num_points3D(), "map_bytes": run.map_bytes(sfm)}
         return run.finish_dataset(lists, limits, records, poses, loc_matches, sfm, **sizes)

@@ -71,6 +71,7 @@ def main(
                 points=points,
                 gate=given.gate,
                 again=run.again(pairs, features),
+                rigs=run.rigs,
             )
         source = "list" if place.query_list.is_file() else "iphone7"
         limits = dict.fromkeys(lists, INLOC_THRESHOLDS)

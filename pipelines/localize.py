@@ -32,7 +32,7 @@ from hloc_reduce.utils.options import Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
 from .common import changes, command, other_views
-from .common.options import Matcher, Positive, Retrieval
+from .common.options import Matcher, Positive, Retrieval, Rigs
 from .common.queries import LISTED, Photos, Queries, identity, results_folder
 from .common.retrieval import check_retrieval, retrieval_name, retrieve, retrieve_in_map
 from .common.run import Run, readable
@@ -160,6 +160,7 @@ def main(
     gate: Gate = DEFAULT_GATE,
     retrieval: Retrieval | None = None,
     matcher: Matcher | None = None,
+    rigs: Rigs | None = None,
 ) -> dict:
     """Localize queries in a map and return the summary, as in summary.json.
 
@@ -176,11 +177,13 @@ def main(
         gate: what a pose must have for the query to be called localized.
         retrieval: hloc's text file of pairs or h5 file of global descriptors; default: the map's.
         matcher: matcher of queries; default: the map's.
+        rigs: COLMAP's file of cameras that are fixed to each other, in the units of the map: photos
+            with the same name in the folders of their cameras get their poses together.
 
     Raises:
         InputError: when something is missing or wrong.
     """
-    wanted = Queries.find(query_images, queries, built, strict)
+    wanted = Queries.find(query_images, queries, built, strict, rigs)
     names = wanted.names
     map_names = built.names()
     built.check_features(map_names)  # a broken map is found before photos are read
@@ -256,6 +259,7 @@ def main(
                 gate=gate,
                 mirror_images=mirror_images(steps[0]),
                 again=run.again(loc_pairs, features, built.features, mirror_images, others),
+                rigs=wanted.frames,
             )
         limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
         summary = {

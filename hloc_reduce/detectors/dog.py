@@ -41,6 +41,9 @@ KeypointSettings = Annotated[
 
 ENOUGH_KEYPOINTS = 2500  # of a photo
 PIXELS_PER_KEYPOINT = 200  # fewer keypoints are enough in small photos
+# After settings that find a smaller share of enough keypoints, the next ones do not find enough
+# either: `python -m benchmarks.keypoint_steps`
+HOPELESS = 0.01
 SMALL_PHOTO_PIXELS = 1200  # on the longer side: detection is fast even at twice the size
 # (first_octave, peak_threshold), tried in turn until there are enough keypoints. Octave -1 is the
 # photo at twice its size; 0.0067 is COLMAP's threshold.
@@ -113,20 +116,28 @@ def detect(
         Keypoints and descriptors, see `colmap.detect_dog`.
     """
     search = opencv.detect if fast else colmap.detect_dog
-    found = search(image, options)
-    enough = min(ENOUGH_KEYPOINTS, image.size / PIXELS_PER_KEYPOINT)
-    if not adaptive or len(found[0]) >= enough or is_noise(image):
+    found = more = search(image, options)
+    least = enough(image)
+    if not adaptive or len(found[0]) >= least or is_noise(image):
         return found
     ladder = LADDERS["small" if max(image.shape) <= SMALL_PHOTO_PIXELS else "large"]
-    for first_octave, peak_threshold in ladder:
-        settings = {"first_octave": first_octave, "peak_threshold": peak_threshold}
-        if first_octave > options["first_octave"] or peak_threshold >= options["peak_threshold"]:
-            continue
-        more = search(image, {**options, **settings})
+    left = [
+        {"first_octave": first_octave, "peak_threshold": peak_threshold}
+        for first_octave, peak_threshold in ladder
+        if first_octave <= options["first_octave"] and peak_threshold < options["peak_threshold"]
+    ]
+    while left and len(found[0]) < least:
+        if len(more[0]) < HOPELESS * least:
+            left = left[1:] or left
+        more = search(image, {**options, **left[0]})
         found = more if len(more[0]) > len(found[0]) else found
-        if len(found[0]) >= enough:
-            break
+        left = left[1:]
     return found
+
+
+def enough(image: np.ndarray) -> float:
+    """Return how many keypoints of a photo (H, W) are enough."""
+    return min(ENOUGH_KEYPOINTS, image.size / PIXELS_PER_KEYPOINT)
 
 
 def is_noise(image: np.ndarray) -> bool:

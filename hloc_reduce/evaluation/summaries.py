@@ -43,13 +43,14 @@ def _query_row(
     name: str, list_name: str, record: dict, true: pycolmap.Rigid3d | None
 ) -> dict[str, object]:
     correspondences, inliers = record["num_correspondences"], record["num_inliers"]
-    pose = pose_of(record)
+    pose, rig = pose_of(record), record["rig"]
     return {
         "query": name,
         "list": list_name,
         "status": status(pose, record["localized"]),
         "again": record["again"],
         "turned": record["turned"],
+        "frame": rig["frame"] if rig and not rig["reason"] else None,
         "num_matches": record["num_matches"],
         "num_without_point": record["num_without_point"],
         "num_correspondences": correspondences,

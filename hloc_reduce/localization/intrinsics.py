@@ -31,6 +31,7 @@ _GUESSED = {"estimation": {"estimate_focal_length": True}, **_REFINED}
 # source of intrinsics -> options of `localize_sfm.main` that make up for their errors
 REFINEMENTS = {
     "list": {},
+    "rig": {},
     "map": {"photo": {"of_map": True}},
     "lens": {"photo": OF_SIZE},
     "EXIF": _REFINED,
@@ -38,7 +39,7 @@ REFINEMENTS = {
     "unknown": {**_GUESSED, "photo": {"cropped": True}},
     "none": {},
 }
-EXACT = "map", "lens"  # sources of intrinsics that are not estimated with the pose
+EXACT = "rig", "map", "lens"  # sources of intrinsics that are not estimated with the pose
 
 
 class Lens(NamedTuple):

@@ -244,10 +244,7 @@ def rig_covariance(
         local = seen.points3D @ pose.rotation.matrix().T + pose.translation
         _, derivatives = project(local)
         jacobian = seen.camera.mean_focal_length() * np.concatenate(derivatives, axis=1)[:POSE].T
-        x, y, z = cam_from_rig.translation
-        rotation = cam_from_rig.rotation.matrix()
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        moved = np.block([[rotation, np.zeros((3, 3))], [cross @ rotation, rotation]])
+        moved = cam_from_rig.adjoint()
         information += (jacobian @ moved).T @ (jacobian @ moved)
         errors, _ = reprojection_errors(*seen[:4])
         squares, equations = squares + (errors**2).sum(), equations + 2 * len(errors)

@@ -1,6 +1,6 @@
 """The pose of a rig of cameras that are fixed to each other, from the 2D-3D matches of all."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -23,8 +23,10 @@ from .measures import (
     joint_confidence,
     rig_covariance,
 )
-from .pose import Pose, motion
+from .pose import MAX_ERROR, Pose, motion
 from .projection import reprojection_errors
+from .query import correspondences
+from .references import Reference
 
 
 @dataclass(frozen=True)
@@ -54,12 +56,41 @@ class Sight:
     @property
     def max_error(self) -> float:
         """The inlier threshold in pixels."""
-        return self.config["estimation"]["ransac"]["max_error"]
+        return self.config["estimation"]["ransac"].get("max_error", MAX_ERROR)
 
     def seen(self, rig_from_world: pycolmap.Rigid3d) -> Seen:
         """Return the matches with the pose of the camera that a pose of the rig gives it."""
         pose = self.cam_from_rig * rig_from_world
         return Seen(self.points2D, self.points3D, pose, self.camera, self.max_error)
+
+
+def sight(
+    reference: Reference,
+    keypoints: np.ndarray,
+    matches: Mapping[str, np.ndarray],
+    config: dict,
+    gate: Gate,
+    name: str,
+    camera: pycolmap.Camera,
+    cam_from_rig: pycolmap.Rigid3d,
+) -> tuple[Sight, dict]:
+    """Return what a camera of a rig sees, and the first part of the info of `query.localize`.
+
+    Args:
+        reference: the map.
+        keypoints: (N, 2) of the photo, COLMAP's pixels.
+        matches: see `query.localize`.
+        config: see `query.localize`; intrinsics are exact, so that only RANSAC's options count.
+        gate: what a pose by this camera alone must have to be trusted.
+        name: of the camera.
+        camera: intrinsics.
+        cam_from_rig: its pose in the rig.
+    """
+    info, images = correspondences(reference, list(matches), matches)
+    points = keypoints[info["keypoints"]], info["points3D"]
+    ransac = config.get("estimation", {}).get("ransac", {})
+    options = {"estimation": {"ransac": ransac}}
+    return Sight(name, *points, images, camera, cam_from_rig, options, gate), info
 
 
 @dataclass(frozen=True)

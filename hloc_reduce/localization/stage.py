@@ -9,22 +9,21 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import h5py
-import numpy as np
 import pycolmap
 
 from .. import logger
-from ..confs.matchers import OF_HLOC, confs
 from ..runtime import parallel
 from ..runtime.executors import SERIAL, Executor
 from ..runtime.group_writer import failure_of, failures
 from ..utils import cli
 from ..utils.cli import InputError
-from ..utils.feature_files import dimension, get_colmap_keypoints, get_image_size
+from ..utils.feature_files import get_image_size
 from ..utils.h5 import open_h5
-from ..utils.match_files import find_pair, get_matcher, get_matches, most_similar_first
+from ..utils.match_files import find_pair
 from ..utils.parsers import parse_query_lists, parse_retrieval, write_poses
 from ..utils.progress import progress
-from .gate import DEFAULT_GATE, MATCH_KINDS, Gate, may_be_mirrored
+from .gate import DEFAULT_GATE, Gate, may_be_mirrored
+from .inputs import Settings, of_matches, read_matches
 from .mirrored import MirrorImages, mirror, mirror_options
 from .query import localize
 from .records import (
@@ -39,6 +38,8 @@ from .records import (
     with_mirror_image,
 )
 from .references import Reference
+from .rig_stage import localize_frames, open_frames, report_frames
+from .rigs import Frames, written
 
 CHUNK = 8  # queries
 SHOWN = 3  # queries whose reasons a message gives
@@ -77,7 +78,7 @@ class Try(NamedTuple):
     told: Mapping[str, object] = MappingProxyType({"again": True})
 
 
-FIRST = {"again": False, "turned": 0}  # what the records of the first try say of it
+FIRST = {"again": False, "turned": 0, "rig": None}  # what the records of the first try say of it
 
 
 def main(
@@ -96,6 +97,7 @@ def main(
     gate: Gate = DEFAULT_GATE,
     mirror_images: MirrorImages | None = None,
     again: Sequence[Try] = (),
+    rigs: Frames = MappingProxyType({}),
 ) -> dict[str, dict]:
     """Localize queries by the files of their features and matches.
 
@@ -120,6 +122,8 @@ def main(
             for the matcher and the dimension in the files.
         mirror_images: see `Try`.
         again: how queries that are not localized are matched once more, one after the other.
+        rigs: queries of which one pose is estimated together; their intrinsics are exact. If it is
+            trusted, it replaces their own ones.
 
     Returns:
         A record for each query, of the try that localized it or else came nearest: `localized`;
@@ -130,9 +134,12 @@ def main(
         (w, x, y, z) and `tvec`, the fallback if the query is not localized, None if there is none;
         `camera`, the model, width, height and parameters in a list, None if not known;
         `max_error`, RANSAC's inlier threshold in pixels, None for pycolmap's default; `measures`,
-        see `Measures`; and the numbers and `db` of `localize`.
+        see `Measures`; the numbers and `db` of `localize`; and `rig`, None or, of a photo of a rig,
+        its `frame`, the `reason` why the pose of that is not trusted, None if it is, and `tried`,
+        as above. The measures, but not the numbers, of such a pose are those of all photos.
     """
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
+    header |= {"rigs": written(rigs)} if rigs else {}
     header |= {"mirror_images": True} if mirror_images else {}
     header |= {"again": [one.made_from for one in again]} if again else {}
     with Log(log_file(results), header, overwrite) as log:
@@ -144,15 +151,20 @@ def main(
         tasks = [task for task in all_tasks if task[0] not in reasons]
         if any(name not in log.records for name, _, _ in tasks):
             _check_some_matched(matches, [name for name, _ in queries], retrieved)
-        localizing = _Localizing(log, load_reference, config, skip_matches, gate, executor)
+        settings = Settings(load_reference, config, skip_matches, gate, executor)
+        localizing = _Localizing(log, settings)
         matched = Matched(features, matches)
-        first = Try(lambda _: matched, {}, mirror_images, told=FIRST)
-        for number, one in enumerate([first, *again]):
+        tries = [Try(lambda _: matched, {}, mirror_images, told=FIRST), *again]
+        for number, one in enumerate(tries):
             localizing.run(number, one, tasks)
+        for number, one in enumerate(tries):
+            if one.names is None:  # it shows photos as they are
+                localizing.run_rigs(number, one, rigs, tasks)
     records = {name: log.records[name] for name, _ in queries}
     poses = {name: pose_of(record) for name, record in records.items()}
     submitted = {name: known for name, known in poses.items() if known is not None}
     write_poses(submitted, results, name_parts)
+    report_frames(records.values())
     _report(records, failures(features), log.path)
     localized = sum(record["localized"] for record in records.values())
     logger.info("Localized %d of %d queries: %s", localized, len(records), results)
@@ -164,11 +176,7 @@ class _Localizing:
     """Localizes the queries of `main` and logs their records."""
 
     log: Log
-    load_reference: Callable[[], Reference]
-    config: Callable[[str, pycolmap.Camera], dict]
-    skip_matches: int
-    gate: Gate
-    executor: Executor
+    settings: Settings
 
     def run(self, number: int, given: Try, tasks: list[Task]) -> None:
         """Localize queries by the first try, number 0, or those not localized by a further one.
@@ -201,7 +209,8 @@ class _Localizing:
             return [(name, cameras[name], retrieved.get(name, [])) for name in names]
 
         files = matched.features, matched.matches
-        for name, record in self._solve(self.config, files, of_try(todo), True, "Localizing"):
+        solved = localize_all(self.settings, *files, of_try(todo), True, "Localizing")
+        for name, record in solved:
             before = records.get(name)
             record |= {**FIRST, **given.told, "try": number, "tried": number}
             if before and not record["localized"]:
@@ -211,6 +220,21 @@ class _Localizing:
         if given.mirror_images:
             self._try_mirror_images(given.mirror_images, files, of_try(todo + done))
 
+    def run_rigs(self, number: int, given: Try, rigs: Frames, tasks: list[Task]) -> None:
+        """Localize the frames of rigs by a try, unless an earlier one found a trusted pose."""
+        records = self.log.records
+        frames = open_frames(number, rigs, tasks, records)
+        if not frames:
+            return
+        matched = given.match([photo.name for _, photos in frames for photo in photos])
+        found = localize_frames(self.settings, matched.features, matched.matches, frames)
+        for frame, reason, of_photos in found:
+            rig = {"frame": frame, "reason": reason, "tried": number}
+            for name, record in of_photos.items():
+                before = records[name]
+                told = {**FIRST, **given.told, "try": number, "tried": before["tried"]}
+                self.log.add(name, {**(before if reason else record | told), "rig": rig})
+
     def _try_mirror_images(
         self, mirror_images: MirrorImages, files: tuple[Path, Path], tasks: list[Task]
     ) -> None:
@@ -218,7 +242,7 @@ class _Localizing:
         records = self.log.records
         if not any(records[name]["localized"] for name, _, _ in tasks):
             return
-        gate = _of_matches(self.gate, *files)
+        gate = of_matches(self.settings.gate, *files)
         flipped: list[Task] = [
             (name, mirror(camera), names)
             for name, camera, names in tasks
@@ -226,34 +250,15 @@ class _Localizing:
         ]
         if not flipped:
             return
-        reference, config = self.load_reference(), partial(_mirrored, self.config)
+        reference = self.settings.load_reference()
+        settings = self.settings._replace(config=partial(_mirrored, self.settings.config))
         mirrored = mirror_images([name for name, _, _ in flipped])
         retrieved = {name: names for name, _, names in flipped}
-        for name, record in self._solve(config, mirrored, flipped, False, "Trying mirror images"):
+        solved = localize_all(settings, *mirrored, flipped, False, "Trying mirror images")
+        for name, record in solved:
             names = [other for other in retrieved[name] if other in reference]
             before = records[name]
             self.log.add(name, with_mirror_image(before, record, reference, names, gate))
-
-    def _solve(
-        self,
-        config: Callable[[str, pycolmap.Camera], dict],
-        files: tuple[Path, Path],
-        tasks: list[Task],
-        thorough: bool,
-        said: str,
-    ) -> Iterator[tuple[str, dict]]:
-        """Yield the names and the records of queries, see `localize_all`."""
-        return localize_all(
-            self.load_reference,
-            config,
-            self.skip_matches,
-            self.gate,
-            self.executor,
-            *files,
-            tasks,
-            thorough,
-            said,
-        )
 
 
 def _report(records: dict[str, dict], unreadable: Mapping[str, str], log_path: Path) -> None:
@@ -336,11 +341,7 @@ def _mirrored(
 
 
 def localize_all(
-    load_reference: Callable[[], Reference],
-    config: Callable[[str, pycolmap.Camera], dict],
-    skip_matches: int,
-    gate: Gate,
-    executor: Executor,
+    settings: Settings,
     features: Path,
     matches: Path,
     tasks: list[Task],
@@ -350,21 +351,16 @@ def localize_all(
     """Yield the names and the records of queries.
 
     Args:
-        load_reference: returns the map; called in each process that localizes queries.
-        config: returns the options of a query from its name and intrinsics.
-        skip_matches: leave out retrieved images with fewer matches.
-        gate: what a pose must have for the query to be called localized.
-        executor: does the work.
+        settings: how they are localized.
         features: feature file of the queries.
         matches: match file of the pairs.
         tasks: names and intrinsics of the queries, with the images that are retrieved for each.
         thorough: also try matches of single images, as `absolute_pose.estimate` does.
         said: what the progress bar says.
     """
-    files = features, matches
-    gate = _of_matches(gate, features, matches)
-    work = partial(_localize_chunk, load_reference, *files, config, skip_matches, gate, thorough)
-    with closing(executor.map(work, tasks, CHUNK)) as found:
+    settings = settings._replace(gate=of_matches(settings.gate, features, matches))
+    work = partial(_localize_chunk, settings, features, matches, thorough)
+    with closing(settings.executor.map(work, tasks, CHUNK)) as found:
         yield from progress(found, said, "query", len(tasks))
 
 
@@ -374,76 +370,32 @@ def check_threshold(ransac_thresh: float) -> None:
         raise InputError(f"ransac_thresh is {ransac_thresh}: it must be above 0.")
 
 
-def _of_matches(gate: Gate, features: Path, matches: Path) -> Gate:
-    """Return the gate for the matcher of a match file and descriptors like those of a file."""
-    with open_h5(matches) as file:
-        matcher = get_matcher(file) or _by_name(matches)
-    if not matcher and gate.match_kind is None:
-        raise InputError(
-            f"{matches} does not say which matcher made it, nor does its name: give --match_kind, "
-            f"{' or '.join(MATCH_KINDS)}."
-        )
-    return gate.of_matches(matcher, dimension(features))
-
-
-def _by_name(matches: Path) -> dict:
-    """Return the configuration of a matcher from the name that hloc gives its match files."""
-    known = {conf["output"]: conf["model"] for conf in confs.values()} | OF_HLOC
-    return next((model for name, model in known.items() if f"_{name}_" in matches.name), {})
-
-
 def _localize_chunk(
-    load_reference: Callable[[], Reference],
+    settings: Settings,
     features: Path,
     matches: Path,
-    config: Callable[[str, pycolmap.Camera], dict],
-    skip_matches: int,
-    gate: Gate,
     thorough: bool,
     queries: Iterable[Task],
 ) -> Generator[tuple[str, dict], None, None]:
     """Yield the names and the records of queries with their intrinsics and retrieved images."""
-    reference = load_reference()
+    reference, least = settings.load_reference(), settings.skip_matches
 
     def solve(task: tuple) -> tuple[str, dict]:
         name, camera, keypoints, found = task
-        used = {other: pairs for other, pairs in found.items() if len(pairs) >= skip_matches}
-        options = config(name, camera)
-        query = keypoints, camera, used, options, gate
+        used = {other: pairs for other, pairs in found.items() if len(pairs) >= least}
+        options = settings.config(name, camera)
+        query = keypoints, camera, used, options, settings.gate
         cam_from_world, info = localize(reference, *query, thorough)
         info["max_error"] = options.get("estimation", {}).get("ransac", {}).get("max_error")
         return name, to_record(reference, list(found), cam_from_world, info)
 
     with open_h5(features) as feature_file, open_h5(matches) as match_file:
         tasks = (
-            (name, camera, *_read(feature_file, match_file, name, retrieved, reference))
+            (name, camera, *read_matches(feature_file, match_file, name, retrieved, reference))
             for name, camera, retrieved in queries
         )
         with closing(parallel.ordered("localize", solve, tasks)) as solved:
             yield from solved
-
-
-def _read(
-    feature_file: h5py.File,
-    match_file: h5py.File,
-    name: str,
-    names: list[str],
-    reference: Reference,
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Read the keypoints of a query, and its matches, the most similar first."""
-    keypoints, _ = get_colmap_keypoints(feature_file, name)
-    present = [other for other in names if other in reference]
-    if len(present) < len(names):
-        absent = len(names) - len(present)
-        logger.warning("%d images retrieved for %s are not in the map.", absent, name)
-    if present and not any(find_pair(match_file, name, other)[0] for other in present):
-        logger.warning("%s was not matched: %s has none of its pairs.", name, match_file.filename)
-        return keypoints, {other: np.zeros((0, 2), np.int64) for other in present}
-    sizes = {other: (len(keypoints), reference.num_keypoints(other)) for other in present}
-    return keypoints, {
-        other: most_similar_first(*get_matches(match_file, name, other, both))
-        for other, both in sizes.items()
-    }
 
 
 def read_queries(queries: Path) -> list[tuple[str, pycolmap.Camera]]:

@@ -11,6 +11,7 @@ from .. import aggregate_features, match_features, pairs_from_retrieval
 from ..confs.matchers import confs as matchers_confs
 from ..localization import intrinsics, stage
 from ..localization.gate import DEFAULT_GATE
+from ..localization.inputs import Settings
 from ..localization.mirrored import mirror
 from ..localization.query import merged, ransac_options
 from ..localization.references import SfmMap
@@ -95,11 +96,13 @@ class ByOthers:
         ]
         return dict(
             stage.localize_all(
-                load_reference=lambda: reference,
-                config=lambda name, _: options[name],
-                skip_matches=0,
-                gate=DEFAULT_GATE,
-                executor=SERIAL,
+                Settings(
+                    load_reference=lambda: reference,
+                    config=lambda name, _: options[name],
+                    skip_matches=0,
+                    gate=DEFAULT_GATE,
+                    executor=SERIAL,
+                ),
                 features=features,
                 matches=matches,
                 tasks=tasks,

@@ -265,33 +265,20 @@ class Localizer:
         """
         match, gate = step
         sights, infos = [], []
-        for (features, retrieved), one in zip(photos, rig, strict=True):
-            sight, info = self._sight(features, match(features, retrieved), gate, *one)
+        for (features, retrieved), (name, camera, pose) in zip(photos, rig, strict=True):
+            matches, keypoints = match(features, retrieved), to_colmap(features["keypoints"])
+            config = ransac_options(self.ransac_thresh, camera)
+            given = matches, config, gate, name, camera, pose
+            sight, info = rig_pose.sight(self.reference, keypoints, *given)
             sights.append(sight)
-            infos.append(info | {"retrieved": retrieved})
+            del info["keypoints"]
+            infos.append(info | {"points2D": sight.points2D, "retrieved": retrieved})
         laps.end("matching")
         pose = rig_pose.estimate(sights, gate)
         laps.end("pose")
         for info, inliers in zip(infos, pose.inliers, strict=True):
             info |= {"inliers": inliers, "num_inliers": int(inliers.sum())}
         return pose, infos
-
-    def _sight(
-        self,
-        features: dict,
-        matches: dict[str, np.ndarray],
-        gate: Gate,
-        name: str,
-        camera: pycolmap.Camera,
-        cam_from_rig: pycolmap.Rigid3d,
-    ) -> tuple[rig_pose.Sight, dict]:
-        """Return what a camera of a rig sees, and the first part of its info."""
-        info, chosen = query.correspondences(self.reference, list(matches), matches)
-        points2D = to_colmap(features["keypoints"])[info.pop("keypoints")]
-        points3D = info["points3D"]
-        config = ransac_options(self.ransac_thresh, camera)
-        given = points2D, points3D, chosen, camera, cam_from_rig, config, gate
-        return rig_pose.Sight(name, *given), info | {"points2D": points2D}
 
     def _other_views(self, image: Path | np.ndarray) -> list[View]:
         """Return the other ways to show a photo to the feature, if it needs them."""

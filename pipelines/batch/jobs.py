@@ -30,7 +30,7 @@ from ..common.options import Method, Positive
 SHIPPED = Path(__file__).parents[2] / "confs/jobs"
 CALLED: dict[type | None, str] = {int: "an integer", float: "a number"}  # others are names
 # the options that name a job's folder if they are not the default, in this order
-NAMED = ("matcher", "storage", "keypoints", "retrieval")
+NAMED = ("matcher", "storage", "keypoints", "retrieval", "rigs")
 NUMBERS = ("num_covis", "num_loc", "min_confidence", "min_inliers")
 NAME_PARTS = ("descriptor", "scheme", "dim")  # of a feature's name
 

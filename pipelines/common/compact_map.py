@@ -99,6 +99,7 @@ def main(
                 executor=run.executor,
                 gate=run.options.gate,
                 again=part.again(pairs, features, built.features),
+                rigs=run.rigs,
             )
         files = run.files(built.features, built.sfm, pairs, matches)
         summary = run.summary(

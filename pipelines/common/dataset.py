@@ -11,6 +11,7 @@ from hloc_reduce.confs import matchers as matchers_confs
 from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.datasets import Place, true_poses
 from hloc_reduce.evaluation.summaries import map_bytes
+from hloc_reduce.localization import rigs
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, RunFolder
 from hloc_reduce.utils.h5 import get_text, open_h5
@@ -37,6 +38,7 @@ class DatasetRun(Run):
         query_names: the queries.
         map_names: the map images that are needed; after `extract_features` the readable ones.
         features: the feature file, after `extract_features`.
+        rigs: the frames of rigs among the queries.
         label: names files of results, such as `sift_sv64+NN-ratio_vlad50`.
 
     Raises:
@@ -62,6 +64,7 @@ class DatasetRun(Run):
         self.is_partial = len(self.map_names) < len(needed)
         if options.features is None:
             check_queries(place.images, self.query_names, options.strict)
+        self.rigs = rigs.frames(options.rigs, self.query_names) if options.rigs else {}
         self.truth_file = options.ground_truth or place.ground_truth
         self.truth = (
             true_poses(self.query_names, options.ground_truth, True)

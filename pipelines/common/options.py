@@ -15,6 +15,7 @@ from hloc_reduce.utils.options import HIDDEN, POSITIVE, Checked, Option
 
 Positive = Annotated[int, POSITIVE]
 Matcher = Annotated[str, Option("matcher", matchers_confs.names)]
+Rigs = Annotated[Path, Option(metavar="rig_config.json")]
 Retrieval = Annotated[str, Option(metavar="|".join([*retrieval_confs.confs, "FILE"]))]
 
 
@@ -32,6 +33,8 @@ class Method(Checked):
             or h5 file of global descriptors.
         ground_truth: true poses of the queries; default: those of the data set.
         num_loc: retrieved map images per query.
+        rigs: COLMAP's file of cameras that are fixed to each other, in the units of the map:
+            queries with the same name in the folders of their cameras get their poses together.
         gate: what a pose must have for the query to be called localized.
     """
 
@@ -42,6 +45,7 @@ class Method(Checked):
     retrieval: Retrieval = retrieval_confs.VLAD
     ground_truth: Path | None = None
     num_loc: Positive | None = None
+    rigs: Rigs | None = None
     gate: Gate = DEFAULT_GATE
 
 

@@ -11,10 +11,12 @@ import pycolmap
 
 from hloc_reduce import logger
 from hloc_reduce.localization import intrinsics
+from hloc_reduce.localization.rigs import Frames, frames, of_rig
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF
 from hloc_reduce.utils import cli
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.files import is_readable
 from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.match_files import check_distinct
@@ -23,6 +25,7 @@ from hloc_reduce.utils.parsers import parse_query_lists
 from .run import check_queries
 
 SOURCES = {
+    "rig": "those of the cameras of --rigs",
     "map": "those of the map's camera, according to their EXIF data",
     "lens": "those of the map's photos of their size",
     "none": "not known, as photos of the map are by a fisheye or the like: give them by --queries",
@@ -43,14 +46,23 @@ class Queries:
         inferred: intrinsics with their sources, as from `intrinsics.infer`, but none of unreadable
             photos; None if the lists have intrinsics.
         refinements: which of these are refined with the pose, see `intrinsics.refinement`.
+        frames: those of rigs that have several photos.
     """
 
     lists: dict[str, list[str]]
     inferred: dict[str, tuple[pycolmap.Camera, str]] | None = None
     refinements: Mapping[str, dict] = field(default_factory=dict)
+    frames: Frames = field(default_factory=dict)
 
     @classmethod
-    def find(cls, query_images: Path, queries: Path | None, built: Map, strict: bool) -> Self:
+    def find(
+        cls,
+        query_images: Path,
+        queries: Path | None,
+        built: Map,
+        strict: bool,
+        rigs: Path | None = None,
+    ) -> Self:
         """Read the queries of lists, or of a folder, whose intrinsics are inferred.
 
         Args:
@@ -58,23 +70,29 @@ class Queries:
             queries: query list with intrinsics, or a glob of several; None for the whole folder.
             built: the map.
             strict: stop at an unreadable photo.
+            rigs: COLMAP's `rig_config.json`, whose intrinsics count if there is no list.
 
         Raises:
-            InputError: when a list is wrong, a photo is missing, or, if `strict`, unreadable.
+            InputError: when a list is wrong, a photo is missing, or, if `strict`, unreadable; or
+                the rigs are wrong, or intrinsics of their photos are not known exactly.
         """
         if queries:
             given = parse_query_lists(queries)
             lists = {stem: [name for name, _ in part] for stem, part in given.items()}
             names = [name for part in lists.values() for name in part]
             check_queries(query_images, names, strict)
-            return cls(lists)
+            return cls(lists, frames=frames(rigs, names) if rigs else {})
         names = list_images(query_images)
         check_distinct(names)
         inferred = intrinsics.infer_all(query_images, names, built.cameras, strict)
+        of_rigs = frames(rigs, names) if rigs else {}
+        if rigs:
+            inferred |= of_rig(rigs, inferred)
+            _check_exact(rigs, of_rigs, inferred)
         refinements = {
             name: intrinsics.refinement(*found, built.cameras) for name, found in inferred.items()
         }
-        return cls({query_images.resolve().name: names}, inferred, refinements)
+        return cls({query_images.resolve().name: names}, inferred, refinements, of_rigs)
 
     @property
     def names(self) -> list[str]:
@@ -100,6 +118,18 @@ class Queries:
         for source, said in SOURCES.items():
             if some := [name for name in sources if sources[name] == source]:
                 logger.info("Intrinsics of %d queries are %s: %s", len(some), said, cli.some(some))
+
+
+def _check_exact(
+    rigs: Path, of_rigs: Frames, inferred: Mapping[str, tuple[pycolmap.Camera, str]]
+) -> None:
+    """Refuse photos of rigs whose intrinsics are estimated with their poses."""
+    names = [name for photos in of_rigs.values() for name in photos if name in inferred]
+    if unknown := [name for name in names if inferred[name][1] not in ("rig", "map")]:
+        raise InputError(
+            f"The intrinsics of {cli.some(unknown)} are not known: give --queries, a list with "
+            f"intrinsics, or add camera_model_name and camera_params to {rigs}."
+        )
 
 
 class Photos:

@@ -16,6 +16,7 @@ from hloc_reduce.evaluation.summaries import (
     summarize_list,
     write_summary,
 )
+from hloc_reduce.localization import rig_stage
 from hloc_reduce.localization.mirrored import MirrorImages
 from hloc_reduce.localization.stage import Matched, Try
 from hloc_reduce.maps.mirror_images import mirror_images
@@ -213,6 +214,8 @@ class Run:
                 with_reasons(failed),
             )
         write_csv(rows, outputs / "queries.csv")
+        frames = rig_stage.reasons(records.values())
+        of_rigs = {"frames": len(frames), "frames_localized": list(frames.values()).count(None)}
         summary = {
             "feature": self.feature,
             "matcher": self.matcher,
@@ -222,6 +225,7 @@ class Run:
             "queries_matched_again": sum(row["again"] for row in localized),
             "queries_turned": sum(row["turned"] > 0 for row in localized),
             "queries_unreadable": len(failed),
+            **(of_rigs if frames else {}),
             "lists": {
                 name: summarize_list([row for row in rows if row["list"] == name], thresholds[name])
                 for name in lists

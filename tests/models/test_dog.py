@@ -146,6 +146,31 @@ def test_settings_follow_the_photo(textured):
     assert len(dog.detect(small, dog.HLOC_OPTIONS)[0]) == len(few)
 
 
+@pytest.mark.parametrize(
+    ("numbers", "searched"),
+    [
+        ({0.01: 400, 0.005: 3000}, [0.01, 0.005]),
+        ({0.01: 20, 0.005: 900, 0.0025: 3000}, [0.01, 0.0025]),  # 0.005 is hopeless
+        ({0.01: 400, 0.005: 20, 0.0025: 900, 0.001: 3000}, [0.01, 0.005, 0.001]),
+        ({}, [0.01, 0.0025, 0.0033]),  # the last one is always tried
+    ],
+)
+def test_steps_after_a_hopeless_one_are_skipped(monkeypatch, textured, numbers, searched):
+    """Where a search finds less than 1 % of 2,500 keypoints, the next step is not tried."""
+    tried = []
+
+    def search(image, options):
+        tried.append(options["peak_threshold"])
+        number = numbers.get(options["peak_threshold"], 0)
+        return np.zeros((number, 4), np.float32), np.zeros((number, 128), np.float32)
+
+    monkeypatch.setattr(colmap, "detect_dog", search)
+    photo = np.tile(textured, (3, 4)).astype(np.float32) / 255
+    found, _ = dog.detect(photo, dog.HLOC_OPTIONS, adaptive=True)
+    assert tried == searched
+    assert len(found) == max(numbers.get(threshold, 0) for threshold in searched)
+
+
 @pytest.mark.parametrize("octave", [0, -1])
 @pytest.mark.parametrize("size", [(960, 720), (961, 723)])
 def test_keypoints_of_opencv_are_those_of_colmap(textured, octave, size):
