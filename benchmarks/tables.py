@@ -529,7 +529,8 @@ def thousands(number: str) -> str:
 
 def limits_table() -> Table:
     """List what a pose must have to be localized."""
-    return [["a pose must", "limit"], *([rule.text, rule.limit] for rule in RULES)]
+    rows = [pair for rule in RULES for pair in ((rule.text, rule.limit), *rule.parts)]
+    return [["a pose must", "limit"], *map(list, rows)]
 
 
 def map_limits_table() -> Table:

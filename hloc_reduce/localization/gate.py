@@ -53,52 +53,68 @@ class Limit(NamedTuple):
 
     Args:
         ratio: of both confidences, above which it is.
+        found: how the other pose is found, in words.
         reason: the message; {detail:.0f} is that of the `Alternative`, {inliers} of the pose.
         tolerance: beyond it, the poses differ.
     """
 
     ratio: float
+    found: str
     reason: str
     tolerance: Tolerance = SAME_POSE
 
 
 ALTERNATIVES = {
     # with a skew, which no lens has
-    "skew": Limit(LIKELIER, "it may be warped, or a photo of a picture: a skew fits better"),
+    "skew": Limit(
+        LIKELIER,
+        "a skew, which no lens has",
+        "it may be warped, or a photo of a picture: a skew fits better",
+    ),
     # for given intrinsics
     "focal_length": Limit(
         LIKELIER,
+        "another focal length than the given one",
         "its intrinsics contradict the map: other ones, as a focal length of {detail:.0f} pixels, "
         "fit better, and the pose differs",
     ),
     "principal_point": Limit(
         MUCH_LIKELIER,
+        "another principal point and aspect ratio than the given ones",
         "its intrinsics contradict the map: another principal point and aspect ratio fit much "
         "better, and the pose differs",
     ),
     # for those of a lens of the map's photos that may have taken it
     "lens_by_size": Limit(
         AS_LIKELY,
+        "other parameters than those of the map's lens for its size",
         "another lens than that of the map's photos of its size may have taken it: other "
         "parameters fit about as well, and the pose differs; known intrinsics would help",
     ),
     "lens": Limit(
         AS_LIKELY,
+        "another of the map's lenses for its size",
         "another lens of the map's photos of its size fits about as well, and the pose differs; "
         "known intrinsics would help",
     ),
     # for estimated ones: with another principal point and aspect ratio, of a photo that may be
     # cropped and of another one; and with the map's lens
-    "cropped": Limit(AS_LIKELY, STRETCHED),
-    "stretched": Limit(LIKELIER, STRETCHED),
-    "typical_lens": Limit(AS_LIKELY, STRETCHED),
+    "cropped": Limit(
+        AS_LIKELY, "another principal point and aspect ratio, if it may be cropped", STRETCHED
+    ),
+    "stretched": Limit(LIKELIER, "the same, if it is not cropped", STRETCHED),
+    "typical_lens": Limit(AS_LIKELY, "the map's typical lens", STRETCHED),
     # by other matches; right poses of a statue on a symmetric pedestal have rivals of up to 0.46
     "rival": Limit(
-        0.5, "ambiguous: another pose has {detail:.0f} inliers, this one {inliers}", RIVALS
+        0.5,
+        "other matches (a rival)",
+        "ambiguous: another pose has {detail:.0f} inliers, this one {inliers}",
+        RIVALS,
     ),
     # by other images that do not see those of the pose, as on another floor; of their inliers
     "other_images": Limit(
         AS_LIKELY,
+        "other images, as of another floor",
         "ambiguous: a pose by other images has {detail:.0f} inliers, this one {inliers}",
         RIVALS,
     ),
@@ -365,11 +381,13 @@ class Rule(NamedTuple):
         refusal: returns why a pose does not have it, None if it does.
         text: completes "a pose must".
         limit: in words.
+        parts: further lines of the table: what is meant, and its limit.
     """
 
     refusal: Callable[[Measures, Gate], str | None]
     text: str
     limit: str
+    parts: tuple[tuple[str, str], ...] = ()
 
 
 def _words(most: Tolerance) -> str:
@@ -385,8 +403,8 @@ RULES = (
     Rule(_few_inliers, "have inliers", f"{DEFAULT_GATE.min_inliers} (`--min_inliers`)"),
     Rule(
         _chance,
-        "be unlikely by chance: `confidence`, -log10 of the number of equally good poses expected "
-        "if all matches are wrong",
+        "be unlikely by chance: `confidence`, -log10 of how many poses as good are expected if all "
+        "matches are wrong",
         f"{DEFAULT_GATE.min_confidence:g} (`--min_confidence`)",
     ),
     Rule(
@@ -403,27 +421,29 @@ RULES = (
     ),
     Rule(
         _another_pose,
-        "not be contradicted by another pose that is nearly as likely: with other intrinsics, by "
-        "other matches (a rival), or by other images, as of another floor",
-        f"farther apart than {_words(SAME_POSE)} ({_words(RIVALS)} by other matches or images), "
-        "with a confidence above "
-        + ", ".join(
-            f"{100 * limit.ratio:g} % ({kind.replace('_', ' ')})"
-            for kind, limit in ALTERNATIVES.items()
-        ),
+        "not be contradicted by another pose",
+        f"another is farther away than {_words(SAME_POSE)} ({_words(RIVALS)} by other matches or "
+        "images), and has more than a share of its confidence:",
+        tuple((f"... by {one.found}", f"{100 * one.ratio:g} %") for one in ALTERNATIVES.values()),
     ),
     Rule(
         _imprecise,
-        f"be determined by its inliers: standard deviations. More than {INDEPENDENT} inliers count "
-        f"as {INDEPENDENT}, because neighbors err alike",
-        f"{_words(PRECISE)}; with all intrinsics free, if the photo may be cropped or its listed "
-        f"principal point is more than {100 * OFF_CENTRE:g} % of the size off the centre: "
-        f"{_words(CROPPED)}",
+        f"be fixed by its inliers, of which at most {INDEPENDENT} count, because neighbours err "
+        "alike",
+        f"standard deviations of at most {_words(PRECISE)}",
+        (
+            (
+                "... also with all intrinsics free, if the photo may be cropped or its listed "
+                f"principal point is more than {100 * OFF_CENTRE:g} % of the size off the centre",
+                _words(CROPPED),
+            ),
+        ),
     ),
     Rule(
         _improbable,
-        "be by the right matches: `probability`, by its confidence and its `agreement`, the "
-        "largest share of a map image's matches that are inliers, less a standard deviation",
+        "come from the right matches: `probability`, computed from its confidence and its "
+        "`agreement`, the largest share of a map image's matches that are inliers, less a standard "
+        "deviation",
         f"{MATCH_KINDS['ratio'].default_min_probability:g} with a strict ratio test, "
         f"{MATCH_KINDS['lightglue'].default_min_probability:g} for LightGlue, else "
         f"{MATCH_KINDS['mutual'].default_min_probability:g} (`--min_probability`)",
@@ -432,8 +452,9 @@ RULES = (
         _mirrored,
         f"fit much better than its mirror image, if its probability is below {SURE:g} and its "
         "intrinsics are not given",
-        f"confidence of the mirror image: {100 * MATCH_KINDS['ratio'].max_mirrored:g} % with a "
-        f"strict ratio test, else {100 * MATCH_KINDS['mutual'].max_mirrored:g} %",
+        f"the mirror image has at most {100 * MATCH_KINDS['ratio'].max_mirrored:g} % of its "
+        "confidence with a strict ratio test, else "
+        f"{100 * MATCH_KINDS['mutual'].max_mirrored:g} %",
     ),
 )
 

@@ -28,7 +28,7 @@ def as_certain_as_right_ones(monkeypatch):
     """The wrong pose is uncertain by 3.3 %, a skew fits a bit better, and most matches agree."""
     monkeypatch.setattr(gates, "SURE", 2.0)
     monkeypatch.setattr(gates, "PRECISE", gates.Tolerance(0.05, 2.0))
-    monkeypatch.setitem(gates.ALTERNATIVES, "skew", gates.Limit(1.5, "it may be warped"))
+    monkeypatch.setitem(gates.ALTERNATIVES, "skew", gates.ALTERNATIVES["skew"]._replace(ratio=1.5))
 
 
 def mirror(path, of):
