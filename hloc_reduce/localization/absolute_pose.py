@@ -44,6 +44,7 @@ def estimate(
     gate: Gate,
     thorough: bool = True,
     workers: int = 1,
+    likely: np.ndarray | None = None,
 ) -> Pose:
     """Estimate an absolute pose and judge it.
 
@@ -68,19 +69,17 @@ def estimate(
         gate: what a pose must have to be trusted.
         thorough: try the matches of single images, too.
         workers: threads that estimate poses; the result does not depend on their number.
+        likely: (M,) bool, the matches that agree with a guess of the pose: it is estimated from
+            these, and refined by all that agree with it. Default: it is found anew.
     """
     near_from_world = colmap.near_from_world(points3D)
     matches = Matches(points2D, colmap.transformed(near_from_world, points3D), camera, config)
-    number = len(matches)
     with ThreadPoolExecutor(workers) as pool:
-        poses = [_estimate(matches, likeliest(images, number))]
-        is_certain = poses[0].confidence >= CERTAIN
-        if number > SAMPLE and not is_certain:
-            poses.insert(0, _estimate(matches, np.arange(number)))
-        if thorough and not is_certain and poses[0].num_inliers < CLEAR * number:
-            tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
-            poses += pool.map(lambda chosen: _estimate(matches, chosen[:MOST_SIMILAR]), tried)
-        first = _unbent(matches, max(poses, key=quality))
+        if likely is None:
+            poses = _found_anew(matches, images, thorough, pool)
+            first = _unbent(matches, max(poses, key=quality))
+        else:
+            poses = [first := _near(matches, images, likely)]
         outliers = pool.submit(_of_outliers, matches, first) if workers > 1 else None
         best, others = with_other_intrinsics(matches, first)
         poses += outliers.result() if outliers and best is first else _of_outliers(matches, best)
@@ -93,6 +92,50 @@ def estimate(
         return best
     world_from_near = near_from_world.inverse()
     return replace(best, cam_from_world=world_from_near.transform_camera_world(best.cam_from_world))
+
+
+def _found_anew(
+    matches: Matches, images: list[np.ndarray], thorough: bool, pool: ThreadPoolExecutor
+) -> list[Pose]:
+    """Return poses by RANSAC, see `estimate`."""
+    number = len(matches)
+    poses = [_estimate(matches, likeliest(images, number))]
+    is_certain = poses[0].confidence >= CERTAIN
+    if number > SAMPLE and not is_certain:
+        poses.insert(0, _estimate(matches, np.arange(number)))
+    if thorough and not is_certain and poses[0].num_inliers < CLEAR * number:
+        tried = [chosen for chosen in images if MIN_MATCHES <= len(chosen) < number]
+        poses += pool.map(lambda chosen: _estimate(matches, chosen[:MOST_SIMILAR]), tried)
+    return poses
+
+
+def _near(matches: Matches, images: list[np.ndarray], likely: np.ndarray) -> Pose:
+    """Estimate a pose from matches (M,) bool that are likely, then refine it by all that agree.
+
+    As in `_unbent`, a refinement by matches that agree better may be likelier.
+    """
+    which = [chosen[likely[chosen]] for chosen in images]
+    sample = likeliest(which, len(matches), min(SAMPLE, int(likely.sum())))
+    pose = _found(matches, sample, LEAST_RATIO, 0, rounds=1)
+    for share in (1.0, STRICT):
+        pose = max(pose, _refined(matches, pose, share * matches.max_error), key=quality)
+    return pose
+
+
+def _refined(matches: Matches, pose: Pose, max_error: float) -> Pose:
+    """Refine a pose by the matches that agree within a number of pixels."""
+    if pose.cam_from_world is None:
+        return pose
+    view = pose.cam_from_world, copy.deepcopy(pose.camera)
+    errors, _ = reprojection_errors(matches.points2D, matches.points3D, *view)
+    refinement = matches.config.get("refinement", {})
+    found = colmap.refine_pose(
+        view[0], matches.points2D, matches.points3D, errors <= max_error, view[1], refinement
+    )
+    if found is None:
+        return pose
+    errors, _ = reprojection_errors(matches.points2D, matches.points3D, found, view[1])
+    return _judged(matches, Pose(found, view[1], errors <= matches.max_error))
 
 
 def likeliest(images: list[np.ndarray], number: int, most: int = SAMPLE) -> np.ndarray:
@@ -208,12 +251,18 @@ def _estimate(
     return _judged(matches, _found(matches, chosen, least_ratio, least))
 
 
-def _found(matches: Matches, chosen: np.ndarray, least_ratio: float, least: float) -> Pose:
-    """Return the pose of `_estimate` without its confidence."""
+def _found(
+    matches: Matches,
+    chosen: np.ndarray,
+    least_ratio: float,
+    least: float,
+    rounds: int = REESTIMATIONS,
+) -> Pose:
+    """Return the pose of `_estimate` without its confidence, after some rounds at most."""
     points2D, points3D, number = matches.points2D, matches.points3D, len(matches)
     ransac = {"min_inlier_ratio": least_ratio}
     pose = none = Pose(None, matches.camera, np.zeros(number, bool))
-    for _ in range(1 if len(chosen) == number else REESTIMATIONS):
+    for _ in range(1 if len(chosen) == number else rounds):
         camera = copy.deepcopy(pose.camera)
         chosen_points = points2D[chosen], points3D[chosen]
         found = colmap.estimate_pose(*chosen_points, camera, matches.config, ransac)

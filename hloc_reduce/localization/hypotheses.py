@@ -8,7 +8,7 @@ from ..utils import colmap
 from . import gate, resection
 from .lenses import is_bent
 from .measures import INDEPENDENT_IF_BENT, Alternative, confidence, uncertainty
-from .pose import Matches, Pose, apart, quality
+from .pose import Matches, Pose, apart, differ, quality
 from .projection import ALL, FOCAL, RADIAL, SKEW, reprojection_errors
 from .resection import Resection, View
 
@@ -103,7 +103,7 @@ def _contradicting(matches: Matches, pose: Pose, image: np.ndarray, start: View)
     if not resection.is_plain(pose.camera):
         starts += [(matches.points2D, resection.centred(pose.cam_from_world, pose.camera))]
     for points2D, begin in starts:
-        other = _resect(matches, points2D, begin, FOCAL)
+        other = _contradiction(matches, pose, points2D, begin, FOCAL)
         if other is None or other.confidence <= pose.confidence:
             continue
         found = alternative(pose, other, matches.points3D, other.camera.mean_focal_length())
@@ -115,11 +115,21 @@ def _contradicting(matches: Matches, pose: Pose, image: np.ndarray, start: View)
                 continue
         if "focal_length" not in others or found.position > others["focal_length"].position:
             others["focal_length"] = found
-    if other := _resect(matches, image, start, ALL):
+    if other := _contradiction(matches, pose, image, start, ALL):
         others["principal_point"] = alternative(pose, other, matches.points3D)
     if matches.is_lens_by_size and (refined := _refined(matches, pose)):
         others["lens_by_size"] = alternative(pose, refined, matches.points3D)
     return others
+
+
+def _contradiction(
+    matches: Matches, pose: Pose, points2D: np.ndarray, start: View, freedom: int
+) -> Pose | None:
+    """Return what `_resect` does if it is another pose, None if it is about the same."""
+    found = resection.resect(points2D, matches.points3D, *start, matches.max_error, freedom)
+    if found is None or not differ(pose, Pose(*found[:3]), matches.points3D, gate.SAME_POSE):
+        return None
+    return _judged(matches, found, freedom)
 
 
 def _refined(matches: Matches, pose: Pose) -> Pose | None:

@@ -22,6 +22,7 @@ def estimate(
     gate: Gate,
     thorough: bool = True,
     workers: int = 1,
+    likely: np.ndarray | None = None,
 ) -> Pose:
     """Estimate a pose with a camera and with each other lens that may have taken the photo.
 
@@ -38,13 +39,14 @@ def estimate(
         gate: what a pose must have to be trusted.
         thorough: as in `absolute_pose.estimate`.
         workers: as in `absolute_pose.estimate`.
+        likely: as in `absolute_pose.estimate`.
     """
     photo = config.get("photo", {})
     if reason := photo.get("refusal"):
         return Pose(None, camera, np.zeros(len(points2D), bool), refusal=reason)
     tried = [Matches(points2D, points3D, camera, config)]
     tried += [tried[0].with_lens(from_list(lens)) for lens in photo.get("lenses", ())]
-    options = gate, thorough, workers
+    options = gate, thorough, workers, likely
     poses = [
         absolute_pose.estimate(points2D, points3D, images, matches.camera, matches.config, *options)
         for matches in tried

@@ -10,6 +10,7 @@ from . import gate as gates
 from . import lens_choice
 from .gate import DEFAULT_GATE, Gate
 from .measures import Alternative, covariance
+from .near import Guess
 from .pose import Pose, apart
 from .projection import POSE, photo_scale
 from .references import Reference
@@ -24,6 +25,7 @@ def localize(
     gate: Gate = DEFAULT_GATE,
     thorough: bool = True,
     workers: int = 1,
+    guess: Guess | None = None,
 ) -> tuple[pycolmap.Rigid3d | None, dict]:
     """Localize a query.
 
@@ -38,6 +40,7 @@ def localize(
         gate: what a pose must have to be trusted.
         thorough: where few matches agree with a pose, try those of single images, too.
         workers: threads that estimate poses.
+        guess: of the pose; RANSAC begins with the matches that fit it, but all matches decide.
 
     Returns:
         The pose (camera from world) or None, and info on the cluster of map images with the best
@@ -54,7 +57,9 @@ def localize(
     for names in reference.clusters(list(matches)) if matches else [[]]:
         info, images = correspondences(reference, names, matches)
         points = keypoints[info["keypoints"]], info["points3D"]
-        found = lens_choice.estimate(*points, images, camera, config, gate, thorough, workers)
+        likely = None if guess is None else guess.fits(*points, camera)
+        settings = camera, config, gate, thorough, workers, likely
+        found = lens_choice.estimate(points[0], points[1], images, *settings)
         info |= {
             **gates.verdict(found.measures, gate),
             "reason": _reason(len(keypoints), names, info) or found.refusal,

@@ -225,7 +225,7 @@ def _refined(sights: Sequence[Sight], start: pycolmap.Rigid3d) -> pycolmap.Rigid
     points2D, points3D, cameras = _together(sights, everything)
     for _ in range(absolute_pose.REESTIMATIONS):
         mask = np.concatenate(inliers)
-        if mask.sum() < colmap.MIN_OF_RIG:
+        if mask.sum() < colmap.MIN_OF_POSE:
             break
         refined = colmap.refine_rig_pose(pose, points2D, points3D, mask, *cameras)
         if refined is None:

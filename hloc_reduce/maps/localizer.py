@@ -1,10 +1,9 @@
 """Localize one photo at a time in a map that is held in memory."""
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -12,34 +11,30 @@ import pycolmap
 from ..localization import gate as gates
 from ..localization import intrinsics, mirrored, query, rig_pose, stage, views
 from ..localization.gate import DEFAULT_GATE, Gate
+from ..localization.near import Guess, Surroundings
 from ..localization.query import merged, ransac_options
 from ..localization.records import nearness
 from ..localization.views import View
 from ..localize_sfm import RANSAC_THRESH
 from ..retrieval.ranking import rank
 from ..runtime import parallel
+from ..runtime.laps import Laps
 from ..utils.cli import InputError
 from ..utils.codes import FLOATS, restore, store
 from ..utils.feature_files import to_colmap
 from .contents import read
+from .given import check_pose, check_rig, pixels_or_file
+from .tracker import Tracker
 
 
-class Laps:
-    """Times the stages of a query.
+class _Query(NamedTuple):
+    """A photo, its intrinsics and options, and how it is shown, with its features."""
 
-    Attributes:
-        seconds: by stage.
-    """
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._begin = time.perf_counter()
-
-    def end(self, stage: str) -> None:
-        """Add the time since the last stage ended to that of a stage."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._begin
-        self._begin = now
+    image: Path | np.ndarray
+    camera: pycolmap.Camera
+    refinement: dict
+    view: View
+    features: dict
 
 
 class Localizer:
@@ -98,10 +93,15 @@ class Localizer:
         ]
         self.engine, self.reference = contents.engine, contents.reference
         self.names = contents.names
+        self._surroundings = Surroundings(self.reference, self.names)
         self._describe, self._similarity = contents.describe, contents.similarity
 
     def localize(
-        self, image: Path | str | np.ndarray, camera: pycolmap.Camera | None = None
+        self,
+        image: Path | str | np.ndarray,
+        camera: pycolmap.Camera | None = None,
+        near: pycolmap.Rigid3d | None = None,
+        radius: float | None = None,
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Localize a photo.
 
@@ -112,6 +112,11 @@ class Localizer:
             camera: its intrinsics; default: those of the map's camera if it took the photo, by its
                 EXIF data; else from EXIF data or guessed, and estimated with the pose, or those of
                 the map's photos if these fit a guess.
+            near: about its pose, camera from world, as of a moment ago: the photo is matched with
+                the map images that see the same instead of those that look alike. If it cannot be
+                localized so, it is as without `near`.
+            radius: how far off the position of `near` may be, in the units of the map; default: a
+                fifth of the distance to what it sees. Its rotation may be off by 10 degrees.
 
         Returns:
             The pose, camera from world, in the units of the map, or None if the photo cannot be
@@ -119,21 +124,27 @@ class Localizer:
             with `points2D` (M, 2) in COLMAP's pixels, `again`, whether its matches are those of a
             second matcher, `turned`, by how many degrees, counterclockwise, beyond what its EXIF
             data say, the photo had to be turned to look like the map's, `retrieved`, names of map
-            images, best first, `intrinsics`, "given" or their source (`intrinsics.infer`),
-            `map_doubts`, why the map, and the pose with it, may be wrong, in a few words each, and
-            `seconds` by stage.
+            images, best first, `near`, whether these are those about `near`, `intrinsics`, "given"
+            or their source (`intrinsics.infer`), `map_doubts`, why the map, and the pose with it,
+            may be wrong, in a few words each, and `seconds` by stage.
 
         Raises:
             UnreadableImage: if the image cannot be read.
-            InputError: if the camera has another size.
+            InputError: if the camera has another size, or `near` is far from the map.
         """
-        image = _pixels_or_file(image)
+        image = pixels_or_file(image)
         laps, source, refinement = Laps(), "given", {}
         if camera is None:
             camera, source = intrinsics.infer(image, self.cameras)
             refinement = intrinsics.refinement(camera, source, self.cameras)
+        guess = None
+        if near is not None:
+            check_pose(near)
+            self._surroundings.check(near)
+            guess = self._surroundings.guess(near, radius, camera)
+            laps.end("retrieval")
         best: tuple[pycolmap.Rigid3d | None, dict] | None = None
-        for found in self._tries(image, camera, refinement, laps):
+        for found in self._tries(image, camera, refinement, laps, guess):
             if best is None or nearness(found[1]) > nearness(best[1]):
                 best = found
             if best[1]["reason"] is None or source == "none":  # no other try helps
@@ -143,8 +154,26 @@ class Localizer:
         info |= {"intrinsics": source, "map_doubts": self.doubts, "seconds": laps.seconds}
         return cam_from_world if info["reason"] is None else None, info
 
+    def is_far(self, cam_from_world: pycolmap.Rigid3d) -> bool:
+        """Tell whether a pose is so far from the map that `localize` refuses it as `near`."""
+        return self._surroundings.is_far(cam_from_world)
+
+    def track(self, camera: pycolmap.Camera | None = None, radius: float | None = None) -> Tracker:
+        """Return what localizes the frames of a video near where the one before was.
+
+        Args:
+            camera: intrinsics of all frames; default: see `localize`.
+            radius: see `localize`.
+        """
+        return Tracker(self, camera, radius)
+
     def _tries(
-        self, image: Path | np.ndarray, camera: pycolmap.Camera, refinement: dict, laps: "Laps"
+        self,
+        image: Path | np.ndarray,
+        camera: pycolmap.Camera,
+        refinement: dict,
+        laps: Laps,
+        guess: Guess | None,
     ) -> Iterator[tuple[pycolmap.Rigid3d | None, dict]]:
         """Yield the pose and the info by each matcher, in each way that the photo may be shown.
 
@@ -153,36 +182,61 @@ class Localizer:
             camera: its intrinsics.
             refinement: options of `localization.query.localize`.
             laps: times the stages.
+            guess: of the pose: first, the photo is matched with its images.
         """
         for view in (views.USUAL, *self._other_views(image)):
-            features, retrieved = self._described(image, view, camera, laps)
-            for i, (match, gate) in enumerate(self.steps):
-                matches = match(features, retrieved)
-                laps.end("matching")
-                cam_from_world, info = self._estimate(features, matches, camera, refinement, gate)
-                laps.end("pose")
-                if info["reason"] is None and gates.may_be_mirrored(info["measures"], gate):
-                    flipped = self._extract(image, view, flip=True)
-                    given = mirrored.mirror(camera), mirrored.mirror_options(refinement), gate
-                    matches = match(flipped, retrieved)
-                    _, other = self._estimate(flipped, matches, *given, thorough=False)
-                    measures = replace(info["measures"], mirror_image=other["confidence"])
-                    info |= gates.verdict(measures, gate)
-                    laps.end("mirror_image")
-                info |= {
-                    "points2D": to_colmap(features["keypoints"][info["keypoints"]]),
-                    "retrieved": retrieved,
-                    "again": i > 0,
-                    "turned": 90 * view.turns,
-                }
-                yield cam_from_world, info
+            features = self._described(image, view, camera, laps)
+            query = _Query(image, camera, refinement, view, features)
+            if guess and view == views.USUAL and len(guess.images):
+                yield self._match(query, guess.images, 0, laps, guess)
+            retrieved = self._retrieve(features, image, view)
+            laps.end("retrieval")
+            for i in range(len(self.steps)):
+                yield self._match(query, retrieved, i, laps)
             if not len(features["keypoints"]):
                 return
 
+    def _match(
+        self, query: "_Query", names: list[str], step: int, laps: Laps, guess: Guess | None = None
+    ) -> tuple[pycolmap.Rigid3d | None, dict]:
+        """Localize a photo by a matcher and some map images.
+
+        Args:
+            query: the photo.
+            names: the images, best first.
+            step: index of the matcher.
+            laps: times the stages.
+            guess: of the pose.
+        """
+        (match, gate), features = self.steps[step], query.features
+        matches = match(features, names)
+        laps.end("matching")
+        given = query.camera, query.refinement, gate
+        cam_from_world, info = self._estimate(features, matches, *given, guess=guess)
+        laps.end("pose")
+        if info["reason"] is None and gates.may_be_mirrored(info["measures"], gate):
+            flipped = self._extract(query.image, query.view, flip=True)
+            mirror = mirrored.mirror(query.camera), mirrored.mirror_options(query.refinement), gate
+            _, other = self._estimate(flipped, match(flipped, names), *mirror, thorough=False)
+            measures = replace(info["measures"], mirror_image=other["confidence"])
+            info |= gates.verdict(measures, gate)
+            laps.end("mirror_image")
+        return cam_from_world, info | {
+            "points2D": to_colmap(features["keypoints"][info["keypoints"]]),
+            "retrieved": names,
+            "near": guess is not None,
+            "again": step > 0,
+            "turned": 90 * query.view.turns,
+        }
+
     def _described(
-        self, image: Path | np.ndarray, view: View, camera: pycolmap.Camera, laps: "Laps"
-    ) -> tuple[dict, list[str]]:
-        """Return the features of a photo, and the map images that are most similar to it."""
+        self, image: Path | np.ndarray, view: View, camera: pycolmap.Camera, laps: Laps
+    ) -> dict:
+        """Return the features of a photo.
+
+        Raises:
+            InputError: if its camera has another size.
+        """
         features = self._extract(image, view)
         width, height = map(int, features["image_size"])
         if (camera.width, camera.height) != (width, height):
@@ -191,9 +245,7 @@ class Localizer:
                 f"{width}x{height}."
             )
         laps.end("extraction")
-        retrieved = self._retrieve(features, image, view)
-        laps.end("retrieval")
-        return features, retrieved
+        return features
 
     def localize_rig(
         self,
@@ -227,10 +279,13 @@ class Localizer:
                 camera has another size than its photo.
         """
         number = len(images)
-        _check_rig(images, cameras, cams_from_rig, names or [""] * number)
+        check_rig(images, cameras, cams_from_rig, names or [""] * number)
         laps, photos = Laps(), []
-        for image, camera in zip(images, cameras, strict=True):
-            photos.append(self._described(_pixels_or_file(image), views.USUAL, camera, laps))
+        for one, camera in zip(images, cameras, strict=True):
+            image = pixels_or_file(one)
+            features = self._described(image, views.USUAL, camera, laps)
+            photos.append((features, self._retrieve(features, image, views.USUAL)))
+            laps.end("retrieval")
         named = names or [f"camera {i}" for i in range(number)]
         rig = [*zip(named, cameras, cams_from_rig, strict=True)]
         for again in range(len(self.steps)):
@@ -253,7 +308,7 @@ class Localizer:
         return pose.rig_from_world if pose.refusal is None else None, info
 
     def _try_rig(
-        self, photos: list[tuple[dict, list[str]]], rig: list[tuple], step: tuple, laps: "Laps"
+        self, photos: list[tuple[dict, list[str]]], rig: list[tuple], step: tuple, laps: Laps
     ) -> tuple[rig_pose.RigPose, list[dict]]:
         """Localize a rig by one matcher, and return the pose and the info of each camera.
 
@@ -303,6 +358,7 @@ class Localizer:
         refinement: dict,
         gate: Gate,
         thorough: bool = True,
+        guess: Guess | None = None,
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Estimate the pose of a photo from its matches, see `localization.query.localize`."""
         return query.localize(
@@ -314,6 +370,7 @@ class Localizer:
             gate=gate,
             thorough=thorough,
             workers=self.workers,
+            guess=guess,
         )
 
     @parallel.one_thread()
@@ -321,27 +378,3 @@ class Localizer:
         """Return the names of the map images that are most similar to a photo, best first."""
         query = self._describe(features, image, view.turns)
         return [self.names[j] for j in rank(self._similarity(query)[None], self.num_loc)[0]]
-
-
-def _pixels_or_file(image: Path | str | np.ndarray) -> Path | np.ndarray:
-    """Return pixels, or the path of a file; raise an InputError for what is neither."""
-    if isinstance(image, np.ndarray):
-        return image
-    if not isinstance(image, str | PathLike):
-        said = "cv2.imread returns that for a file that it cannot read" if image is None else image
-        raise InputError(f"An image is a file or an array, not {type(image).__name__}: {said}.")
-    return Path(image)
-
-
-def _check_rig(
-    images: Sequence, cameras: Sequence, cams_from_rig: Sequence, names: Sequence[str]
-) -> None:
-    """Raise an InputError unless there is one of each, of the right type, for every camera."""
-    numbers = [len(images), len(cameras), len(cams_from_rig), len(names)]
-    if not images or len({*numbers}) > 1:
-        said = "{} images, {} cameras, {} poses and {} names".format(*numbers)
-        raise InputError(f"A rig needs one of each for every camera, not {said}.")
-    if not all(isinstance(one, pycolmap.Camera) for one in cameras):
-        raise InputError("The cameras of a rig are pycolmap.Camera: their intrinsics are needed.")
-    if not all(isinstance(one, pycolmap.Rigid3d) for one in cams_from_rig):
-        raise InputError("The poses of the cameras in a rig are pycolmap.Rigid3d, camera from rig.")

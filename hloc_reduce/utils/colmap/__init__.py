@@ -15,7 +15,7 @@ from .databases import (
     write_reference,
 )
 from .estimators import (
-    MIN_OF_RIG,
+    MIN_OF_POSE,
     bundle_adjuster,
     covariance,
     estimate_pose,
@@ -23,6 +23,7 @@ from .estimators import (
     exact,
     incremental_mapping,
     mapper_options,
+    refine_pose,
     refine_rig_pose,
     triangulate_points,
     verify_matches,

@@ -19,7 +19,7 @@ REPROJECTION_LIMITS = (  # options that are the largest reprojection errors of p
     ("triangulation", "complete_max_reproj_error"),
     ("triangulation", "merge_max_reproj_error"),
 )
-MIN_OF_RIG = 4  # matches from which the pose of a rig is estimated
+MIN_OF_POSE = 4  # matches from which a pose is refined, or that of a rig estimated
 _lock = Lock()
 _levels: list[int] = []  # those of COLMAP's log before each running block of `_log`
 
@@ -201,6 +201,31 @@ def estimate_pose(
     return estimate(points2D, points3D, camera, estimation, config.get("refinement", {}))
 
 
+def refine_pose(
+    cam_from_world: pycolmap.Rigid3d,
+    points2D: np.ndarray,
+    points3D: np.ndarray,
+    inliers: np.ndarray,
+    camera: pycolmap.Camera,
+    refinement: dict,
+) -> pycolmap.Rigid3d | None:
+    """Refine an absolute pose by its inliers (M,) bool, and the intrinsics if the options say so.
+
+    Args:
+        cam_from_world: the pose.
+        points2D: (M, 2) image points in COLMAP's pixels.
+        points3D: (M, 3) world points.
+        inliers: (M,) bool.
+        camera: the intrinsics, which change in place.
+        refinement: options of pycolmap's AbsolutePoseRefinementOptions.
+    """
+    if inliers.sum() < MIN_OF_POSE:
+        return None
+    refine: Callable[..., dict | None] = pycolmap.refine_absolute_pose
+    found = refine(cam_from_world, points2D, points3D, inliers, camera, refinement)
+    return None if found is None else found["cam_from_world"]
+
+
 def estimate_rig_pose(
     points2D: np.ndarray,
     points3D: np.ndarray,
@@ -219,7 +244,7 @@ def estimate_rig_pose(
         cameras: their intrinsics.
         max_error: RANSAC's inlier threshold in pixels.
     """
-    if len(points2D) < MIN_OF_RIG:
+    if len(points2D) < MIN_OF_POSE:
         return None
     ransac = {"max_error": max_error, "random_seed": 0}
     estimate: Callable[..., dict | None] = pycolmap.estimate_generalized_absolute_pose

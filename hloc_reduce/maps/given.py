@@ -1,0 +1,40 @@
+"""Check what users give to a `Localizer`."""
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from ..utils.cli import InputError
+
+
+def pixels_or_file(image: Path | str | np.ndarray) -> Path | np.ndarray:
+    """Return pixels, or the path of a file; raise an InputError for what is neither."""
+    if isinstance(image, np.ndarray):
+        return image
+    if not isinstance(image, str | PathLike):
+        said = "cv2.imread returns that for a file that it cannot read" if image is None else image
+        raise InputError(f"An image is a file or an array, not {type(image).__name__}: {said}.")
+    return Path(image)
+
+
+def check_pose(near: object) -> None:
+    """Raise an InputError for what is no pose."""
+    if not isinstance(near, pycolmap.Rigid3d) or not np.isfinite(near.matrix()).all():
+        raise InputError("near is a pose, camera from world, a finite pycolmap.Rigid3d.")
+
+
+def check_rig(
+    images: Sequence, cameras: Sequence, cams_from_rig: Sequence, names: Sequence[str]
+) -> None:
+    """Raise an InputError unless there is one of each, of the right type, for every camera."""
+    numbers = [len(images), len(cameras), len(cams_from_rig), len(names)]
+    if not images or len({*numbers}) > 1:
+        said = "{} images, {} cameras, {} poses and {} names".format(*numbers)
+        raise InputError(f"A rig needs one of each for every camera, not {said}.")
+    if not all(isinstance(one, pycolmap.Camera) for one in cameras):
+        raise InputError("The cameras of a rig are pycolmap.Camera: their intrinsics are needed.")
+    if not all(isinstance(one, pycolmap.Rigid3d) for one in cams_from_rig):
+        raise InputError("The poses of the cameras in a rig are pycolmap.Rigid3d, camera from rig.")
