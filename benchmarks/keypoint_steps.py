@@ -98,17 +98,19 @@ def report(known: list[rows.Row]) -> None:
 
 
 def _main() -> None:
-    parser = cli.Parser(__doc__, "--images datasets/scenes/*/images")
+    parser = cli.Parser(__doc__, "--scenes datasets/scenes")
     add = parser.add_argument
-    add("--images", type=Path, nargs="+", required=True, help="folders of photos")
+    add("--scenes", type=Path, required=True, help="folder of places, <place>/images")
+    add("--place", nargs="+", help="places; default: all")
     add("--fast", action="store_true", help="search by OpenCV, as --keypoints fast")
     rows.add_again_option(parser)
     args = parser.parse_args()
     cv2.setNumThreads(1)
     how = rows.with_keypoints("fast" if args.fast else "adaptive")
     known = [] if args.again else rows.read(NAME)
-    for folder in args.images:
-        names, place = list_images(folder), folder.resolve().parent.name
+    for place in args.place or sorted(path.name for path in args.scenes.iterdir()):
+        folder = args.scenes / place / "images"
+        names = list_images(folder)
         for name in progress(names[:: -(-len(names) // PHOTOS)], place, "photo"):
             cells = {"place": place, "list": name, "feature": how}
             if not rows.select(known, **cells):

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from itertools import product
 from operator import mul
 from pathlib import Path
+from statistics import mean, median
 
 from benchmarks import changed_photos, lightglue_seconds, pose_limits
 from benchmarks.rows import CENTIMETRES, Row, read, select, with_keypoints
@@ -389,6 +390,42 @@ def rigs_table() -> Table:
     return table
 
 
+def own_maps_table() -> Table:
+    """Compare maps of photos alone, and queries in them, of places with known poses."""
+    heads = "photos in the maps", "localized", "far", "median [%]", "inliers"
+    table = [["feature", *heads, "a map [s]", "a query [s]"]]
+    rows = [row for row in read("own_maps") if row["map_s"]]
+    for name, variant in dict.fromkeys((name_of(row), row["variant"]) for row in rows):
+        of_name = [row for row in rows if (name_of(row), row["variant"]) == (name, variant)]
+        queries = total(of_name, "queries")
+        inliers = sum(float(row["inliers"]) * float(row["queries"]) for row in of_name) / queries
+        registered, photos = total(of_name, "registered"), total(of_name, "photos")
+        median_percent = median(float(row["median_percent"]) for row in of_name)
+        table.append(
+            [
+                name + (f", {variant}" if variant else ""),
+                f"{registered:.0f} of {photos:.0f}",
+                f"{total(of_name, 'localized'):.0f} of {queries:.0f}",
+                f"{total(of_name, 'far'):.0f}",
+                f"{median_percent:.2f}",
+                thousands(inliers),
+                f"{mean(float(row['map_s']) for row in of_name):.0f}",
+                f"{mean(float(row['query_s']) for row in of_name):.1f}",
+            ]
+        )
+    return table
+
+
+def extraction_parts_table() -> Table:
+    """Show where the time of extracting the features of a folder goes."""
+    parts = ("import", "start", "copy", "work", "rest")
+    table = [["feature", "photos", *parts, "all"]]
+    for row in sorted(read("extraction_parts"), key=lambda row: int(row["photos"])):
+        cells = [f"{float(row[f'{part}_s']):.1f}" for part in (*parts, "all")]
+        table.append([f"`{row['feature']}`", row["photos"], *cells])
+    return table
+
+
 def pose_limits_table() -> Table:
     """Show what is localized with today's limits of the estimation of poses, then with others."""
     heads = "localized", *(f"within {limit} cm" for limit in CENTIMETRES)
@@ -614,6 +651,8 @@ TABLES: dict[str, Callable[[], Table]] = {
     "runs": runs_table,
     "runs_cpu": runs_cpu_table,
     "extraction": extraction_table,
+    "extraction_parts": extraction_parts_table,
+    "own_maps": own_maps_table,
     "scale": scale_table,
     "compact_scale": compact_scale_table,
     "matching": matching_table,

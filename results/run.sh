@@ -79,6 +79,8 @@ done
 small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.25 0.5 1 "$@"
 
 run rigs --feature colmap_sift_sv64 mini32:uint2 "$@"
+run rigs --feature colmap_sift_sv64 mini32:uint2 "$@" \
+    --halves $data/herz-jesus $data/dark-fountain-P11 $data/dark-sceaux
 mappers= # of photos alone
 for place in fountain-P11 monstree kitchen fox south-building; do mappers="$mappers --map $(scene "$place")"; done
 run mappers $mappers --map $data/demo_town-400/images_upright:$data/demo_town-400/3D-models/aachen_v_1_1 "$@"
@@ -90,6 +92,11 @@ if [ -e $data/strangers ]; then
     run own_maps --photos $web --feature colmap_sift_sv64 --matcher NN "$@"
     run own_maps --photos $web --feature xfeat:float16 xfeat_sv32:uint2 mini32:uint2 "$@"
 fi
+for place in fountain-P11 bronze-statue monstree sceaux cyprus entry-P10; do
+    run own_maps --matcher NN --map "$(scene $place)" "$@" \
+        --feature colmap_sift_sv64 mini64:uint2 mini32:uint2 xfeat_sv32:uint2
+    run own_maps --matcher NN --map "$(scene $place)" --feature mini32:uint2 --keypoints 1024 2048 "$@"
+done
 for feature in mini32:uint2 xfeat_sv32:uint2 colmap_sift_sv64; do
     changed() { run changed_photos --dataset $data/herz-jesus --feature $feature "$@"; }
     changed --size 1 0.5 0.35 0.25 "$@"
@@ -124,6 +131,10 @@ done
 # how fast?
 run extraction --dataset $data/herz-jesus "$@" \
     --feature colmap_sift colmap_sift_sv64 sift_sv64 mini32 mini64 edgepoint2_m32 edgepoint2_m64 xfeat aliked
+run extraction_parts --images $data/demo_town-400/images_upright --photos 30 300 "$@" \
+    --feature colmap_sift_sv64 mini64
+run keypoint_steps --scenes $data/scenes "$@"
+run keypoint_steps --scenes $data/scenes --place cyprus fountain-P11 kitchen sceaux --fast "$@"
 run matching "$@"
 run lightglue_seconds --dataset $data/herz-jesus --feature mini32 --rounds 2 "$@"
 run lightglue_seconds --dataset $data/herz-jesus --feature aliked --keypoints 512 1024 2048 --pairs 2 --rounds 1 "$@"
