@@ -14,6 +14,7 @@ from .databases import (
     write_matches,
     write_reference,
 )
+from .enu import ellipsoid_from_enu, enu_from_ellipsoid
 from .estimators import (
     MIN_OF_POSE,
     bundle_adjuster,
