@@ -182,6 +182,7 @@ def _of_map(built: Map) -> Source:
         built.cameras,
         built.doubts,
         built.retrieval,
+        built.frame,
     )
 
 

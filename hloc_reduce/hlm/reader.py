@@ -14,6 +14,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..localization import intrinsics
+from ..localization.frame import Frame
 from ..localization.projection import reprojection_errors
 from ..projections.layers import Layer
 from ..projections.layers import read as read_layers
@@ -51,6 +52,7 @@ class CompactMap:
         matcher: a key of `confs.matchers`.
         retrieval: a key of `confs.retrieval`.
         cameras: what the map tells about the intrinsics of other photos.
+        frame: its unit, and where on Earth it is.
         camera_number, camera_of: the number of each image's camera, and its intrinsics.
         names: the images, sorted.
         points: the coordinates.
@@ -159,6 +161,7 @@ class CompactMap:
         }
         self.matcher = choose("matcher", metadata["matcher"], matchers_confs.confs)
         self.doubts = [str(doubt) for doubt in metadata.get("doubts", [])]
+        self.frame = Frame.from_json(metadata.get("frame"))
         sizes = {(int(width), int(height)) for width, height in metadata["sizes"]}
         known = metadata["known"].items()
         models, focal = {str(m) for m in metadata["models"]}, metadata.get("focal_lengths")

@@ -12,6 +12,7 @@ from .. import projections
 from ..confs import features as features_confs
 from ..confs import retrieval as retrieval_confs
 from ..localization import intrinsics
+from ..localization.frame import UNKNOWN, Frame
 from ..retrieval.vlad import VOCABULARY, read_vocabulary
 from ..utils.cli import InputError
 from ..utils.codes import QUANTIZED, STORAGES, store
@@ -36,6 +37,7 @@ class Source:
         cameras: what the map tells about the intrinsics of other photos.
         doubts: why the map may be wrong, see `Map.doubts`.
         retrieval: of the global descriptors, a key of `confs.retrieval`.
+        frame: of the map.
     """
 
     model: pycolmap.Reconstruction
@@ -47,6 +49,7 @@ class Source:
     cameras: intrinsics.MapCameras
     doubts: list[str] = field(default_factory=list)
     retrieval: str = retrieval_confs.VLAD
+    frame: Frame = UNKNOWN
 
 
 def encode(
@@ -80,6 +83,7 @@ def encode(
         "orientations": sorted(source.cameras.orientations),
         "doubts": source.doubts,
     }
+    metadata |= {"frame": source.frame.to_json()} if source.frame != UNKNOWN else {}
     _add_images(tensors, metadata, points, source.model)
     _add_points(tensors, metadata, points, source.model)
     _add_descriptors(tensors, metadata, points, source.conf)

@@ -3,8 +3,19 @@
 from ..hlm.reader import is_compact
 from . import from_database
 from .build import main
+from .georeference import align
 from .grow import add, remove
 from .map import Map, is_map
 from .unpack import main as unpack
 
-__all__ = ["Map", "add", "from_database", "is_compact", "is_map", "main", "remove", "unpack"]
+__all__ = [
+    "Map",
+    "add",
+    "align",
+    "from_database",
+    "is_compact",
+    "is_map",
+    "main",
+    "remove",
+    "unpack",
+]

@@ -27,8 +27,9 @@ from ..utils.files import replacing
 from ..utils.images import list_images, stored_size
 from ..utils.match_files import check_distinct
 from ..utils.paths import strings_as_paths
+from . import georeference
 from .attempts import PAIR_ROUNDS, Attempt, Photos, drop_others, of_model, of_photos_alone
-from .map import FINGERPRINTS, FINISHED, PLACE, Map, keep_projection, write
+from .map import FINGERPRINTS, FINISHED, PLACE, Map, keep_projection, write, write_model
 
 MAX_EXHAUSTIVE = 100  # photos without covisibility that are all paired with each other
 
@@ -48,14 +49,15 @@ def main(
     accept_partial: bool = False,
     camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
     retrieval: str = retrieval_confs.VLAD,
+    exif_gps: bool = True,
 ) -> Map:
     """Build a map, or open the one that was made from the same.
 
     Args:
         map_dir: the folder of the map.
         image_dir: folder of the images.
-        model: COLMAP model with their poses; None to reconstruct them, in an arbitrary frame and
-            scale.
+        model: COLMAP model with their poses; None to reconstruct them, in metres if GPS tells
+            these, or in an arbitrary frame and scale.
         feature: name of a feature, or its YAML file.
         projection: projection file to use with the base descriptor of `feature`.
         matcher: a key of `confs.matchers`; default: the feature's.
@@ -71,6 +73,8 @@ def main(
             are in it, or its focal lengths, positions or matches show that it may be wrong.
         camera_mode: which images share a camera, without a model.
         retrieval: a key of `confs.retrieval`.
+        exif_gps: without a model, align a new map with the GPS positions in the EXIF data of its
+            photos, see `georeference.by_exif`.
 
     Returns:
         The map.
@@ -135,8 +139,8 @@ def main(
                 attempt = of_model(photos, conf, model, reference)
                 return _finish(attempt, [], True, feature, keypoints, model=str(model.resolve()))
             attempt, findings = of_photos_alone(photos, conf)
-            mode = camera_mode.name.lower()
-            return _finish(attempt, findings, False, feature, keypoints, camera_mode=mode)
+            content = {"camera_mode": camera_mode.name.lower()}
+            return _finish(attempt, findings, False, feature, keypoints, exif_gps, **content)
         built = Map(map_dir)
         if built.camera_mode not in (None, camera_mode.name.lower()):
             raise InputError(
@@ -170,6 +174,7 @@ def _finish(
     are_poses_given: bool,
     feature: str,
     keypoints: str,
+    exif_gps: bool = False,
     **content: Any,
 ) -> Map:
     """Judge a model and write the map, unless it is refused.
@@ -180,6 +185,7 @@ def _finish(
         are_poses_given: its poses were not reconstructed.
         feature: name of the feature.
         keypoints: the settings of DoG that were asked for.
+        exif_gps: align it with the GPS positions of its photos.
         content: what else map.json says.
     """
     photos, sfm = attempt.photos, attempt.sfm
@@ -198,6 +204,10 @@ def _finish(
     with photos.folder.stage("judge"):
         found = [*staying(run(inputs, judging(not are_poses_given))), *found]
     check_accepted(found, photos.accept_partial)
+    sfm_dir = attempt.sfm_dir
+    if exif_gps and (aligned := georeference.by_exif(sfm, photos.image_dir)):
+        sfm_dir = write_model(photos.folder.path, sfm_dir.name, sfm)
+        content |= aligned
     written = write(
         photos.folder.path,
         attempt.conf,
@@ -208,7 +218,7 @@ def _finish(
         retrieval=photos.retrieval,
         image_dir=str(photos.image_dir.resolve()),
         keypoints=keypoints,
-        sfm=attempt.sfm_dir.name,
+        sfm=sfm_dir.name,
         images=len({*photos.names, *names_in(found, "another_size")}),
         findings=[one.to_json() for one in found],
         seconds=photos.folder.seconds(),

@@ -13,6 +13,7 @@ from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..hlm.reader import CompactMap, check_feature_keys, is_compact
 from ..localization import intrinsics, views
+from ..localization.frame import Frame
 from ..localization.references import Reference, SfmMap
 from ..retrieval import load as load_retrieval
 from ..retrieval.ranking import read_global, similarity
@@ -69,6 +70,7 @@ class Contents:
         dim: of its descriptors.
         cameras: what it tells about the intrinsics of other photos.
         doubts: why it may be wrong, see `Map.doubts`.
+        frame: its unit, and where on Earth it is.
         reference: its points.
         names: its images.
         describe: returns the global descriptor (G,) float32 of a photo, rounded as in files, given
@@ -83,6 +85,7 @@ class Contents:
     dim: int
     cameras: intrinsics.MapCameras
     doubts: list[str]
+    frame: Frame
     reference: Reference
     names: list[str]
     describe: Callable[[dict, Path | np.ndarray, int], np.ndarray]
@@ -157,6 +160,7 @@ def _of_folder(path: Path, matcher: str | None) -> Contents:
         dim=dimension(built.features),
         cameras=built.cameras,
         doubts=built.doubts,
+        frame=built.frame,
         reference=reference,
         names=names,
         describe=_describe(built.retrieval, vocabulary, built.conf["preprocessing"]),
@@ -219,6 +223,7 @@ def _of_file(
         dim=compact.dim,
         cameras=compact.cameras,
         doubts=compact.doubts,
+        frame=compact.frame,
         reference=compact,
         names=compact.names,
         describe=_describe(compact.retrieval, compact.vocabulary, compact.conf["preprocessing"]),

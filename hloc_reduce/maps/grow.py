@@ -20,15 +20,14 @@ from ..mapping.findings import Finding, names_in, staying, warn, without
 from ..mapping.plausibility import focal_length_spread
 from ..runtime import provenance
 from ..runtime.group_writer import merge
-from ..runtime.outputs import CONF, RunFolder
+from ..runtime.outputs import RunFolder
 from ..utils import cli, colmap
 from ..utils.cli import InputError
-from ..utils.files import announce, delete
 from ..utils.h5 import list_h5_names
 from ..utils.images import list_images
 from ..utils.paths import strings_as_paths
 from . import older, placing
-from .map import FINGERPRINTS, FINISHED, PLACE, SFM, Map, models
+from .map import FINGERPRINTS, FINISHED, Map, models, opened, write_model
 from .placing import GROWING, PHOTO_KEYS, Addition, Extended, photo_of
 
 
@@ -67,7 +66,7 @@ def add(
         names = [name for name in names if name in posed]
         if not names:
             raise InputError(f"{model} has a pose of no photo in {image_dir}.")
-    with _opened(built) as folder, folder.stage("add_images"):
+    with opened(built) as folder, folder.stage("add_images"):
         built = Map(built.folder)  # another run may have changed it before it was locked
         addition, sfm = Addition(built, image_dir, refine_map), colmap.read_model(built.sfm)
         new = placing.begin(addition, sfm, names, posed=reference is not None)
@@ -96,7 +95,7 @@ def remove(built: Map, names: Iterable[str]) -> Map:
     """
     _check_whole(built)
     removed = set(names)
-    with _opened(built) as folder, folder.stage("remove_images"):
+    with opened(built) as folder, folder.stage("remove_images"):
         built = Map(built.folder)
         sfm = colmap.read_model(built.sfm)
         inside = {image.name for image in sfm.images.values()}
@@ -125,12 +124,6 @@ def _check_whole(built: Map) -> None:
             f"The map {built.folder} is an unpacked compact one, to which no photo can be added: "
             "change the map that it was made from, and compact that again."
         )
-
-
-def _opened(built: Map) -> RunFolder:
-    """Lock the folder of a map."""
-    conf = provenance.read(built.folder / CONF)
-    return RunFolder(built.folder, conf, overwrite=False, kept=(PLACE, FINGERPRINTS))
 
 
 def _report(built: Map, added: Collection[str], left_out: Mapping[str, str]) -> None:
@@ -185,14 +178,7 @@ def _commit(
     """
     content = json.loads((built.folder / FINISHED).read_text())
     content = {key: value for key, value in content.items() if key not in older.FIELDS}
-    number = 2
-    while built.sfm.name == f"{SFM}-{number}":
-        number += 1
-    folder = built.folder / f"{SFM}-{number}"
-    announce(folder)
-    delete(folder)
-    folder.mkdir()
-    sfm.write_binary(folder)
+    folder = write_model(built.folder, built.sfm.name, sfm)
     sfm = colmap.read_model(folder)  # without images that were removed
     images = content.get("images", built.num_images) + more
     findings = _judge_again(built, sfm, images, {*added, *removed}, content.get("model") is None)

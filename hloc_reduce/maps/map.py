@@ -16,14 +16,15 @@ from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..detectors.dog import KEYPOINT_SETTINGS
 from ..localization import intrinsics, views
+from ..localization.frame import Frame
 from ..mapping.findings import Finding, warn
 from ..runtime import provenance
-from ..runtime.outputs import CONF
+from ..runtime.outputs import CONF, RunFolder
 from ..utils import colmap
 from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import CODED, QUANTIZED, STORAGES
 from ..utils.feature_files import Levels, first_descriptors
-from ..utils.files import replacing
+from ..utils.files import announce, delete, replacing
 from ..utils.h5 import Unavailable, file_provenance, get_dataset, open_h5
 from ..utils.paths import strings_as_paths
 from .older import findings_of
@@ -56,6 +57,8 @@ class Map:
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
         cameras: what the map tells about the intrinsics of other photos.
+        frame: its unit, and where on Earth it is.
+        aligned_to: what its frame was aligned to, see `georeference.align`; else None.
         sfm: folder of the COLMAP model.
         features: feature file of the map images.
         descriptors: h5 file of their global descriptors.
@@ -103,6 +106,8 @@ class Map:
             self.findings = findings_of(content)
         self._doubts = [str(doubt) for doubt in content.get("doubts", [])]
         self.num_points3D = int(content["points3D"])
+        self.frame = Frame.from_json(content.get("frame"))
+        self.aligned_to = content.get("aligned_to")
         self.camera_mode = content.get("camera_mode")
         known = content.get("cameras", {}).items()
         self.cameras = intrinsics.MapCameras(
@@ -326,6 +331,31 @@ def write(
     whole |= {"conf": conf, **intrinsics.to_dict(cameras), **content}
     provenance.write(folder / FINISHED, whole)
     return whole
+
+
+def opened(built: Map) -> RunFolder:
+    """Lock the folder of a finished map, to change it."""
+    conf = provenance.read(built.folder / CONF)
+    return RunFolder(built.folder, conf, overwrite=False, kept=(PLACE, FINGERPRINTS))
+
+
+def write_model(folder: Path, before: str, model: pycolmap.Reconstruction) -> Path:
+    """Write a changed model into a new folder, which map.json is to name then, and return that.
+
+    Args:
+        folder: of the map.
+        before: name of the folder of the model as it was.
+        model: as it is now.
+    """
+    number = 2
+    while before == f"{SFM}-{number}":
+        number += 1
+    written = folder / f"{SFM}-{number}"
+    announce(written)
+    delete(written)
+    written.mkdir()
+    model.write_binary(written)
+    return written
 
 
 def is_map(folder: Path) -> bool:

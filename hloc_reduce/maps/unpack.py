@@ -91,6 +91,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
         image_dir=str(folder / "images"),  # there are none
         keypoints=features_confs.keypoints_of(conf["model"]) or "adaptive",
         doubts=compact.doubts,
+        frame=compact.frame.to_json(),
     )
 
 
