@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from ..localization.frame import UNKNOWN, Frame
 from ..localization.records import pose_of
 from ..utils.codes import storage_of
 from ..utils.feature_files import stored_descriptors
@@ -20,6 +21,7 @@ def query_table(
     lists: Mapping[str, Iterable[str]],
     records: Mapping[str, dict],
     truth: Mapping[str, pycolmap.Rigid3d],
+    frame: Frame = UNKNOWN,
 ) -> list[dict]:
     """Make the rows of queries.csv.
 
@@ -27,20 +29,22 @@ def query_table(
         lists: the queries of each list.
         records: of each query, as from `localization.main`.
         truth: true poses, camera from world, by full name, of all, some or no queries.
+        frame: of the map.
 
     Returns:
         A dict for each query. Its errors are of the submitted pose, even if that is a fallback:
-        infinite without a pose, None without a true pose.
+        infinite without a pose, None without a true pose. Its `Frame.row` has values only if it is
+        localized.
     """
     return [
-        _query_row(name, list_name, records[name], truth.get(name))
+        _query_row(name, list_name, records[name], truth.get(name), frame)
         for list_name, queries in lists.items()
         for name in queries
     ]
 
 
 def _query_row(
-    name: str, list_name: str, record: dict, true: pycolmap.Rigid3d | None
+    name: str, list_name: str, record: dict, true: pycolmap.Rigid3d | None, frame: Frame
 ) -> dict[str, object]:
     correspondences, inliers = record["num_correspondences"], record["num_inliers"]
     pose, rig = pose_of(record), record["rig"]
@@ -60,6 +64,7 @@ def _query_row(
         "agreement": record["agreement"],
         "probability": record["probability"],
         **dict(zip(ERRORS, (None, None) if true is None else pose_error(pose, true), strict=True)),
+        **frame.row(pose if record["localized"] else None),
         "retrieved": record["db"],
         "reason": record["reason"],
     }

@@ -84,7 +84,7 @@ class Localizer:
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.workers = parallel.cores()
         self.preprocessing, self.cameras = contents.preprocessing, contents.cameras
-        self.doubts = contents.doubts
+        self.doubts, self.frame = contents.doubts, contents.frame
         # queries stay floats, rounded as in a feature file
         self.dtype = contents.storage if contents.storage in FLOATS else FLOATS[0]
         # the matchers that photos are tried with, and what each needs to trust a pose
@@ -126,7 +126,9 @@ class Localizer:
             data say, the photo had to be turned to look like the map's, `retrieved`, names of map
             images, best first, `near`, whether these are those about `near`, `intrinsics`, "given"
             or their source (`intrinsics.infer`), `map_doubts`, why the map, and the pose with it,
-            may be wrong, in a few words each, and `seconds` by stage.
+            may be wrong, in a few words each, `wgs84`, where on Earth the camera is and where it
+            looks, see `frame.Frame.wgs84`, None without a pose or if the map does not know, and
+            `seconds` by stage.
 
         Raises:
             UnreadableImage: if the image cannot be read.
@@ -151,8 +153,14 @@ class Localizer:
                 break
         assert best is not None
         cam_from_world, info = best
-        info |= {"intrinsics": source, "map_doubts": self.doubts, "seconds": laps.seconds}
-        return cam_from_world if info["reason"] is None else None, info
+        cam_from_world = cam_from_world if info["reason"] is None else None
+        info |= {
+            "intrinsics": source,
+            "map_doubts": self.doubts,
+            "wgs84": self.frame.wgs84(cam_from_world) if cam_from_world else None,
+            "seconds": laps.seconds,
+        }
+        return cam_from_world, info
 
     def is_far(self, cam_from_world: pycolmap.Rigid3d) -> bool:
         """Tell whether a pose is so far from the map that `localize` refuses it as `near`."""

@@ -192,6 +192,7 @@ def answer(
     if pose is not None:
         x, y, z, w = pose.rotation.quat.tolist()
         found |= {"qvec": [w, x, y, z], "tvec": pose.translation.tolist()}
+        found |= {"wgs84": info["wgs84"]} if info["wgs84"] else {}
         found["covariance"] = None if info["covariance"] is None else info["covariance"].tolist()
     if inliers:
         chosen = info["inliers"]

@@ -17,6 +17,7 @@ from hloc_reduce.evaluation.summaries import (
     write_summary,
 )
 from hloc_reduce.localization import rig_stage
+from hloc_reduce.localization.frame import UNKNOWN, Frame
 from hloc_reduce.localization.mirrored import MirrorImages
 from hloc_reduce.localization.stage import Matched, Try
 from hloc_reduce.maps.mirror_images import mirror_images
@@ -183,6 +184,7 @@ class Run:
         features: Path,
         poses: Path,
         files: Mapping[str, Path | None],
+        frame: Frame = UNKNOWN,
     ) -> dict:
         """Write queries.csv and summary.json.
 
@@ -197,12 +199,13 @@ class Run:
             files: what the report reads: `query_images` and `map_images`, folders; `pairs` and
                 `matches` of the queries; `map_features`; `map`, a COLMAP model or the h5 file of
                 `localize_inloc.lift_keypoints`; and `ground_truth`.
+            frame: of the map.
 
         Returns:
             The summary.
         """
         outputs = self.folder.path
-        rows = query_table(lists, records, truth)
+        rows = query_table(lists, records, truth, frame)
         localized = [row for row in rows if row["status"] == "localized"]
         failed = {name: reason for name, reason in failures(features).items() if name in records}
         if failed:
