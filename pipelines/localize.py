@@ -31,7 +31,7 @@ from hloc_reduce.utils.codes import STORAGES, Storage
 from hloc_reduce.utils.options import Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
-from .common import changes, command, other_views
+from .common import changes, command, metres, other_views
 from .common.options import Matcher, Positive, Retrieval, Rigs
 from .common.queries import LISTED, Photos, Queries, identity, results_folder
 from .common.retrieval import check_retrieval, retrieval_name, retrieve, retrieve_in_map
@@ -54,6 +54,7 @@ def open_map(
     camera_mode: Annotated[str, colmap.CAMERA_MODE] | None = None,
     database: Path | None = None,
     retrieval: Retrieval | None = None,
+    exif_gps: bool = True,
 ) -> Map:
     """Build a map, or open one that was built before.
 
@@ -84,6 +85,7 @@ def open_map(
             map, without photos. Photos, if given, only tell more about the cameras.
         retrieval: a name (those of networks need an installed hloc); or, for the queries only,
             hloc's text file of pairs or h5 file of global descriptors; default: vlad.
+        exif_gps: align a new map of photos alone with the GPS in their EXIF data.
 
     Raises:
         InputError: when an old map was built with other options, or something is missing or wrong.
@@ -120,6 +122,7 @@ def open_map(
         return maps.from_database.main(folder, database, model_or_map, image_dir=map_images, **new)
     if map_images is not None:
         new |= {"num_covis": num_covis, "accept_partial": accept_partial, "camera_mode": mode}
+        new |= {"exif_gps": exif_gps}
         return maps.main(folder, map_images, model_or_map, **new)
     if model_or_map is None:
         raise InputError("Give --map_images, the folder of the photos to build a map of.")
@@ -270,6 +273,7 @@ def main(
             "map_images": built.num_images,
             "map_points3D": built.num_points3D,
             "map_doubts": built.doubts,
+            "map_frame": built.frame.to_json(),
         }
         files = {
             "query_images": query_images,
@@ -280,7 +284,8 @@ def main(
             "map_features": built.features,
             "map": built.sfm,
         }
-        return run.finish(summary, wanted.lists, records, truth, limits, features, poses, files)
+        told = summary, wanted.lists, records, truth, limits, features, poses, files
+        return run.finish(*told, built.frame)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,6 +306,7 @@ def _parser() -> Parser:
     parser.add(open_map, outputs=None)
     parser.add(main, query_images=None)
     parser.add(changes.main)
+    parser.add(metres.main)
     parser.add(Command)
     return parser
 
@@ -310,7 +316,7 @@ def _check(given: dict, is_changed: bool) -> None:
 
     Args:
         given: the options.
-        is_changed: whether photos are added to a map or removed from it.
+        is_changed: whether a map that was built is changed.
     """
     if given["outputs"] is None and (given["query_images"] is not None or not is_changed):
         raise InputError("Give --outputs, a folder.")
@@ -330,9 +336,11 @@ def _check(given: dict, is_changed: bool) -> None:
 
 def _main() -> None:
     given = command.read(_parser())
-    change = taken(changes.main, given)
-    _check(given, any(change.values()))
-    outputs, folder = given["outputs"], given["model_or_map"]
+    change, outputs, folder = taken(changes.main, given), given["outputs"], given["model_or_map"]
+    gps, scale = given["gps"], given["scale"]
+    is_aligned = bool(gps or scale) and folder is not None and maps.is_map(folder)
+    _check(given, any(change.values()) or is_aligned)
+    metres.check(gps, scale, given["map_images"], folder)
     with trace.recording(outputs / "trace.json" if given["profile"] and outputs else None):
         if any(change.values()):
             changes.check(folder, given["map_images"] or given["database"], **change)
@@ -342,13 +350,20 @@ def _main() -> None:
             changes.main(folder, **change)
         if outputs is not None:
             _run(given)
-        elif given["compact"] is not None:
+            return
+        if is_aligned:
+            metres.main(Map(folder), gps, scale)
+            print(f"The map {folder} is in metres.")
+        if given["compact"] is not None:
             compact.main(given["compact"], folder)
 
 
 def _run(given: dict) -> None:
     """Build or open the map, and localize the queries in it."""
-    built = open_map(**taken(open_map, given))
+    gps, scale = given["gps"], given["scale"]
+    built = open_map(**taken(open_map, given), exif_gps=not (gps or scale))
+    strict = given["map_images"] is None or given["model_or_map"] is not None
+    built = metres.main(built, gps, scale, strict)
     if given["map_images"] is None and given["database"] is None:  # others warn as they are built
         built.warn()
     if given["compact"] is not None:

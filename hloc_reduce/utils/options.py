@@ -36,8 +36,9 @@ class Option:
         lower: whether upper case means the same.
         repeated: one value each time that the option is given, not several at once.
         rest: whether all arguments that follow are its values.
+        number: of its values, if it has several; default: any.
         flags: names instead of `--<parameter>`; a name without dashes is given by its position.
-        metavar: stands for the value in the help.
+        metavar: stands for the value in the help; with `number`, a word for each value.
         hidden: whether only Python has the parameter.
     """
 
@@ -49,6 +50,7 @@ class Option:
     lower: bool = False
     repeated: bool = False
     rest: bool = False
+    number: int | None = None
     flags: tuple[str, ...] = ()
     metavar: str | None = None
     hidden: bool = False
@@ -127,10 +129,11 @@ class Parameter:
         if option.lower:
             settings["type"] = str.lower
         if self.several:
-            nargs = "*" if settings.get("default") == [] else "+"
-            nargs = argparse.REMAINDER if option.rest else nargs
+            nargs: int | str = "*" if settings.get("default") == [] else "+"
+            nargs = argparse.REMAINDER if option.rest else option.number or nargs
             settings |= {"action": "append"} if option.repeated else {"nargs": nargs}
-        parser.add_argument(*flags, metavar=metavar, **settings)
+        settings["metavar"] = tuple(metavar.split()) if option.number and metavar else metavar
+        parser.add_argument(*flags, **settings)
 
 
 @cache

@@ -118,3 +118,16 @@ def test_wrong_input(colmap_files, tmp_path, refused):
     reference.write(model)
     assert "has no points" in refused(*given)
     assert not outputs.exists()
+
+
+def test_the_map_is_put_into_metres(colmap_files, tmp_path, run):
+    database, model, _, _ = colmap_files
+    given = ("--map", model, "--database", database, "--outputs", tmp_path / "place")
+    run(*given, "--scale", "db/0.png", "db/3.png", "2.5")
+    built = maps.Map(tmp_path / "place/map")
+    images = {image.name: image for image in pycolmap.Reconstruction(built.sfm).images.values()}
+    ends = [images[f"db/{i}.png"].projection_center() for i in (0, 3)]
+    assert built.frame.units == "m" and np.linalg.norm(ends[1] - ends[0]) == pytest.approx(2.5)
+    written = state(built.folder)
+    run(*given)
+    assert state(built.folder) == written
