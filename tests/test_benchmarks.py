@@ -18,6 +18,7 @@ from benchmarks import (
     against_hloc,
     changed_photos,
     fit_gate,
+    metres,
     photos_alone,
     render,
     rows,
@@ -91,6 +92,19 @@ def test_models_are_aligned_in_spite_of_a_wrong_pose():
         few.deregister_frame(image.frame_id)
     with pytest.raises(InputError, match="share 2 images"):
         photos_alone.align(few, reference)
+
+
+def test_errors_in_metres():
+    """Of a map that is a hundredth too large and turned by two degrees."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 12
+    reference = pycolmap.synthesize_dataset(options)
+    poses = {image.name: image.cam_from_world() for image in reference.images.values()}
+    turn = pycolmap.Rotation3d(np.deg2rad([0, 0, 2.0]))
+    model = moved(reference, pycolmap.Sim3d(10.1, turn, np.array([1.0, 2, 3])))
+    distances, scale, angle = metres.errors(model, poses, factor=10)
+    np.testing.assert_allclose(distances, 1, atol=1e-6)
+    assert (scale, angle) == pytest.approx((1, 2), abs=1e-6)
 
 
 def test_a_table_without_rows_is_an_error():
