@@ -71,16 +71,17 @@ class Frame(NamedTuple):
         """
         if self.origin is None:
             return None
-        latitude, longitude, altitude = self.origin
-        centre = cam_from_world.inverse().translation[None]
-        reference = np.array([latitude, longitude, np.nan_to_num(altitude)])
-        found = colmap.ellipsoid_from_enu(centre, reference)[0].tolist()
-        east, north, _ = cam_from_world.rotation.matrix()[2]
+        centre = cam_from_world.inverse().translation
+        ahead = centre + cam_from_world.rotation.matrix()[2]
+        places = colmap.ellipsoid_from_enu(np.array([centre, ahead]), np.nan_to_num(self.origin))
+        # far from the origin, north is another direction
+        east, north, _ = colmap.enu_from_ellipsoid(places[1:], places[0])[0]
         heading = np.rad2deg(np.arctan2(east, north)) % 360
+        latitude, longitude, altitude = places[0].tolist()
         return {
-            "latitude": found[0],
-            "longitude": found[1],
-            "altitude": None if np.isnan(altitude) else found[2],
+            "latitude": latitude,
+            "longitude": longitude,
+            "altitude": None if np.isnan(self.origin[2]) else altitude,
             "heading": float(heading) if np.hypot(east, north) > LEVEL else None,
         }
 
@@ -91,7 +92,8 @@ class Frame(NamedTuple):
         found = self.wgs84(cam_from_world) if cam_from_world is not None else None
         cells = found or dict.fromkeys(WGS84)
         digits = zip(WGS84, DIGITS, strict=True)
-        return {key: _rounded(cells[key], number) for key, number in digits}
+        row = {key: _rounded(cells[key], number) for key, number in digits}
+        return row | {"heading": 0.0} if row["heading"] == 360 else row
 
 
 UNKNOWN = Frame()

@@ -29,7 +29,11 @@ def looking(forward, at=(0, 0, 0)):
 )
 def test_heading(forward, heading):
     found = FRAME.wgs84(looking(forward))
-    assert found["heading"] == (None if heading is None else pytest.approx(heading, abs=1e-9))
+    if heading is None:
+        assert found["heading"] is None
+    else:
+        assert 0 <= found["heading"] < 360
+        assert np.sin(np.deg2rad(found["heading"] - heading) / 2) == pytest.approx(0, abs=1e-8)
     assert [found[key] for key in ("latitude", "longitude", "altitude")] == pytest.approx(ORIGIN)
 
 
@@ -39,6 +43,13 @@ def test_position():
     assert found["latitude"] == pytest.approx(47.376, abs=2e-6)
     assert found["longitude"] == pytest.approx(8.501, abs=2e-6)
     assert found["altitude"] == pytest.approx(400, abs=0.01)
+
+
+def test_true_north():
+    """Ten kilometres east, the y axis of the frame is not north: meridians converge."""
+    found = FRAME.wgs84(looking(NORTH, at=(10_000, 0, 0)))
+    convergence = (found["longitude"] - ORIGIN[1]) * np.sin(np.deg2rad(ORIGIN[0]))
+    assert found["heading"] == pytest.approx(convergence, abs=1e-3) and convergence > 0.09
 
 
 def test_east_north_up_is_the_inverse():
@@ -60,6 +71,7 @@ def test_rows():
     pose = looking(EAST)
     cells = {"latitude": 47.375, "longitude": 8.5, "altitude": 408.5, "heading": 90}
     assert FRAME.row(pose) == cells
+    assert FRAME.row(looking(NORTH - 1e-6 * EAST)) == cells | {"heading": 0}
     assert FRAME.row(None) == dict.fromkeys(cells)
 
 
