@@ -39,7 +39,7 @@ def steps(image: np.ndarray, fast: bool) -> list[tuple[float, float]]:
         fast: search by OpenCV.
     """
     search = opencv.detect if fast else colmap.detect_dog
-    enough, found = dog.enough(image), []
+    enough, found = dog.enough(image.size), []
     first = tuple(dog.HLOC_OPTIONS.values())
     for first_octave, peak_threshold in (first, *ladder_of(max(image.shape))):
         options = {"first_octave": first_octave, "peak_threshold": peak_threshold}

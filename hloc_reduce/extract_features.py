@@ -23,6 +23,9 @@ from .utils.cli import InputError
 from .utils.codes import FLOATS, STORAGES, Storage, store
 from .utils.files import file_sha256
 from .utils.images import UnreadableImage, check_readable, list_images, with_reasons
+from .utils.masks import Mask
+from .utils.masks import find as find_masks
+from .utils.masks import read as read_mask
 from .utils.options import HIDDEN
 from .utils.parsers import image_names
 from .utils.paths import strings_as_paths
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
     from .extractors import Detect, Extractor
 
 confs = features_confs.confs
+MASK = "mask"  # group attribute: the sha256 of the mask of the image
 CHUNK = 8  # images
 BLACK = np.zeros((32, 32), np.uint8)  # extracted instead of an image that cannot be read
 
@@ -48,6 +52,7 @@ def main(
     executor: Executor = SERIAL,
     strict: bool = True,
     queries: Annotated[Collection[str], HIDDEN] = (),
+    masks: Path | None = None,
 ) -> Path:
     """Extract the features of all images of a folder, or of a list of them.
 
@@ -63,12 +68,15 @@ def main(
         executor: runs the extraction.
         strict: stop at an image that cannot be read, instead of recording the failure.
         queries: images whose descriptors are stored as floats even if `conf` has another storage.
+        masks: folder of masks, as COLMAP's: keypoints of `image_dir`/a/photo.jpg in black pixels of
+            `masks`/a/photo.jpg.png are dropped; or one mask for all photos of its size.
 
     Returns:
         The feature file. Images that it has already are skipped.
 
     Raises:
-        InputError: for an unknown storage or, if `strict`, a missing or unreadable image.
+        InputError: for an unknown storage or, if `strict`, a missing or unreadable image; and for
+            wrong masks (`utils.masks.find`), or others than those of images that the file has.
     """
     if feature_path is None:
         if export_dir is None:
@@ -80,11 +88,12 @@ def main(
         names = list_images(image_dir, image_list)
     else:
         names = image_names(image_list)
+    found = find_masks(masks, image_dir, names)
     if overwrite:
         check_model(conf)
     with GroupWriter(feature_path, provenance(conf, as_half), overwrite) as writer:
         features = {feature_path: (stored, writer)}
-        extract_several(features, image_dir, names, executor, strict, queries)
+        extract_several(features, image_dir, names, executor, strict, queries, found)
     return feature_path
 
 
@@ -95,6 +104,7 @@ def extract_several(
     executor: Executor = SERIAL,
     strict: bool = True,
     queries: Collection[str] = (),
+    masked: Mapping[str, Mask] | None = None,
 ) -> None:
     """Extract several features of images at once.
 
@@ -110,16 +120,24 @@ def extract_several(
             image and a `group_writer.FAILURE`, and a later run tries to read it again.
         queries: images whose descriptors are stored as floats. They are not kept for long, so that
             rounding them would save little.
+        masked: the masks of images by name.
 
     Raises:
         UnreadableImage: if `strict`; it names all images that cannot be read.
+        InputError: if a file has features of images with other masks.
     """
+    masked = masked or {}
+    for path, (_, writer) in features.items():
+        _check_masks(path, writer, names, masked)
     confs = {path: conf for path, (conf, _) in features.items()}
     writers = {path: writer for path, (_, writer) in features.items()}
     missing = [(name, [path for path in writers if name not in writers[path]]) for name in names]
     todo = [(name, paths) for name, paths in missing if paths]
     if todo:
-        extract = partial(_extract, confs, image_dir, strict, frozenset(queries))
+        if masked:
+            number = sum(name in masked for name in names)
+            logger.info("%d of %d photos are masked.", number, len(names))
+        extract = partial(_extract, confs, image_dir, strict, frozenset(queries), masked)
         groups = sum(len(paths) for _, paths in todo)
         try:
             with closing(fill(writers, extract, todo, executor, CHUNK, gpu=True)) as written:
@@ -133,11 +151,30 @@ def extract_several(
         logger.info("Features of %d images are in %s.", len(names), path)
 
 
+def _check_masks(
+    path: Path, writer: GroupWriter, names: Iterable[str], masked: Mapping[str, Mask]
+) -> None:
+    """Raise an InputError if a file has features of images with other masks."""
+    before = writer.texts(MASK)
+    changed = [
+        name
+        for name in names
+        if name in writer and before.get(name) != (masked[name].sha256 if name in masked else None)
+    ]
+    if changed:
+        raise InputError(
+            f"The features of {len(changed)} photos in {path} were made with other masks, or "
+            f"without: {cli.some(changed)}. Give the same --masks, choose another output, or "
+            "--overwrite."
+        )
+
+
 def _extract(
     confs: Mapping[Path, dict],
     image_dir: Path,
     strict: bool,
     queries: Collection[str],
+    masked: Mapping[str, Mask],
     items: Iterable[tuple[str, list[Path]]],
 ) -> Results[tuple[Path, Group]]:
     """Yield the groups of images for those feature files that lack them.
@@ -166,7 +203,7 @@ def _extract(
         extract = partial(
             extractors.extract_several, preprocessing=preprocessing, device=device, detect=detect
         )
-        work = partial(_extract_image, extract, models, stores, image_dir, strict)
+        work = partial(_extract_image, extract, models, stores, image_dir, strict, masked)
         extracted: Iterable[list[tuple[Path, Group]]]
         if workers == 1:
             extracted = map(span("extract")(work), items)
@@ -204,13 +241,16 @@ def _extract_image(
     stores: Mapping[Path, Callable[..., tuple[Arrays, dict[str, dict]]]],
     image_dir: Path,
     strict: bool,
+    masked: Mapping[str, Mask],
     item: tuple[str, list[Path]],
 ) -> list[tuple[Path, Group]]:
     """Extract the features of one image for some feature files, and return their groups."""
     name, paths = item
     wanted, failure = [models[path] for path in paths], None
+    mask = masked.get(name)
     try:
-        extracted = extract(wanted, image_dir / name)
+        kept = None if mask is None else read_mask(mask.path)
+        extracted = extract(wanted, image_dir / name, mask=kept)
     except UnreadableImage as error:
         if strict:
             raise
@@ -226,6 +266,8 @@ def _extract_image(
         attrs["keypoints"] = measured
         if failure is not None:
             attrs[""] = {FAILURE: failure}
+        elif mask is not None:
+            attrs[""] = {MASK: mask.sha256}
         groups.append((path, (name, arrays, attrs)))
     return groups
 

@@ -67,7 +67,7 @@ BLUR_PIXELS = 4.0  # standard deviation of the blur that suppresses noise
 LEAST_SIGNAL = 5.0  # minimum contrast after the blur, relative to that of pure noise
 
 
-def detector(conf: dict) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+def detector(conf: dict) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     """Return what detects keypoints with a configuration like `DEFAULT_CONF`, see `detect`.
 
     Raises:
@@ -101,7 +101,11 @@ def strongest(
 
 
 def detect(
-    image: np.ndarray, options: dict, adaptive: bool = False, fast: bool = False
+    image: np.ndarray,
+    options: dict,
+    adaptive: bool = False,
+    fast: bool = False,
+    mask: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Detect and describe keypoints.
 
@@ -111,13 +115,14 @@ def detect(
         adaptive: try other settings if `options` find too few keypoints, unless the image shows
             nothing but noise.
         fast: detect them by OpenCV.
+        mask: (H, W) bool, which pixels may have keypoints; default: all.
 
     Returns:
         Keypoints and descriptors, see `colmap.detect_dog`.
     """
-    search = opencv.detect if fast else colmap.detect_dog
+    search = partial(_search, opencv.detect if fast else colmap.detect_dog, mask)
     found = more = search(image, options)
-    least = enough(image)
+    least = enough(image.size if mask is None else np.count_nonzero(mask))
     if not adaptive or len(found[0]) >= least or is_noise(image):
         return found
     ladder = LADDERS["small" if max(image.shape) <= SMALL_PHOTO_PIXELS else "large"]
@@ -135,9 +140,24 @@ def detect(
     return found
 
 
-def enough(image: np.ndarray) -> float:
-    """Return how many keypoints of a photo (H, W) are enough."""
-    return min(ENOUGH_KEYPOINTS, image.size / PIXELS_PER_KEYPOINT)
+def enough(pixels: int) -> float:
+    """Return how many keypoints of a photo with a number of pixels are enough."""
+    return min(ENOUGH_KEYPOINTS, pixels / PIXELS_PER_KEYPOINT)
+
+
+def _search(
+    find: Callable[[np.ndarray, dict], tuple[np.ndarray, np.ndarray]],
+    mask: np.ndarray | None,
+    image: np.ndarray,
+    options: dict,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the keypoints that a function finds in pixels of a mask, see `detect`."""
+    keypoints, descriptors = find(image, options)
+    if mask is None:
+        return keypoints, descriptors
+    x, y = np.floor(keypoints[:, :2].T + 0.5).astype(int)
+    kept = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
+    return keypoints[kept], descriptors[kept]
 
 
 def is_noise(image: np.ndarray) -> bool:

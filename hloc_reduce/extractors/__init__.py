@@ -5,6 +5,7 @@ import pkgutil
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from threading import Lock
 
@@ -20,8 +21,9 @@ from ..utils.hloc import is_installed
 from ..utils.images import Frame, in_original, resized
 
 _gpu = Lock()  # of the thread whose image is in a network
-# from an image (H, W) float32 in [0, 1] to what `utils.colmap.detect_dog` returns
-Detect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+# from an image (H, W) float32 in [0, 1], and perhaps a `mask` (H, W) bool, where keypoints may be,
+# to what `utils.colmap.detect_dog` returns
+Detect = Callable[..., tuple[np.ndarray, np.ndarray]]
 
 
 class Extractor(BaseModel):
@@ -31,6 +33,9 @@ class Extractor(BaseModel):
     (1, N, 2) x, y in its pixels, centres at integers, `descriptors` (1, D, N) of unit norm, and
     perhaps `scores`, `scales` (pixels) and `oris` (degrees), all (1, N), and `blur` (1,), the
     standard deviation in pixels of the blur by which it reduced the noise of the image.
+
+    Keypoints of masked pixels are dropped from what it returns. One that chooses the best keypoints
+    leaves them out before, by `mask` (H, W) bool, if the image has one: where keypoints may be.
 
     Attributes:
         detection_noise: standard deviation of the keypoints in pixels.
@@ -109,11 +114,16 @@ class NetworkExtractor(Extractor):
             channels, blur = reduce_noise(image[0].cpu().numpy())
             image = torch.from_numpy(channels)[None].to(image) if blur else image
         with _gpu if image.is_cuda else nullcontext():
-            features = self._extract(image)
+            features = self._extract(image, data.get("mask"))
         return {**features, "blur": torch.tensor([blur])}
 
-    def _extract(self, image: torch.Tensor) -> dict:
-        """Return the features of an image (1, C, H, W), as `_forward` returns them."""
+    def _extract(self, image: torch.Tensor, mask: torch.Tensor | None) -> dict:
+        """Return the features of an image (1, C, H, W), as `_forward` returns them.
+
+        Args:
+            image: the image.
+            mask: (H, W) bool, where keypoints may be; None for everywhere.
+        """
         raise NotImplementedError
 
 
@@ -186,15 +196,21 @@ def _is_ours(name: str) -> bool:
     return name in [module.name for module in pkgutil.iter_modules(__path__)]
 
 
-def load_image(image: Path | np.ndarray, preprocessing: dict) -> tuple[torch.Tensor, Frame]:
+def load_image(
+    image: Path | np.ndarray, preprocessing: dict, mask: np.ndarray | None = None
+) -> tuple[torch.Tensor, Frame]:
     """Return what `utils.images.resized` does, the image as a tensor (1, C, H, W)."""
-    pixels, frame = resized(image, preprocessing)
+    pixels, frame = resized(image, preprocessing, mask)
     pixels = np.atleast_3d(pixels).transpose(2, 0, 1)
     return torch.from_numpy(np.ascontiguousarray(pixels))[None], frame
 
 
 def extract(
-    model: Extractor, image: Path | np.ndarray, preprocessing: dict, device: str = "cpu"
+    model: Extractor,
+    image: Path | np.ndarray,
+    preprocessing: dict,
+    device: str = "cpu",
+    mask: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """Extract the features of one image.
 
@@ -203,6 +219,7 @@ def extract(
         image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
         preprocessing: see `utils.images.resized`.
         device: of the model.
+        mask: (H, W) bool, in which pixels of the original image keypoints may be.
 
     Returns:
         keypoints (N, 2) float32 (x, y) in pixels of the original image, centres at integers;
@@ -211,7 +228,7 @@ def extract(
         the noise, both in pixels; and the quarter turns, counterclockwise, by which the image was
         shown to the model.
     """
-    return extract_several([model], image, preprocessing, device)[0]
+    return extract_several([model], image, preprocessing, device, mask=mask)[0]
 
 
 @torch.no_grad()
@@ -221,6 +238,7 @@ def extract_several(
     preprocessing: dict,
     device: str = "cpu",
     detect: Detect | None = None,
+    mask: np.ndarray | None = None,
 ) -> list[dict[str, np.ndarray]]:
     """Extract several features of one image; what they have in common is computed once.
 
@@ -230,13 +248,17 @@ def extract_several(
         preprocessing: see `utils.images.resized`.
         device: of the models.
         detect: replaces `detect` of the models, for example by a call in another process.
+        mask: (H, W) bool, in which pixels of the original image keypoints may be.
 
     Returns:
         What `extract` returns, for each model.
     """
-    pixels, frame = load_image(image, preprocessing)
+    pixels, frame = load_image(image, preprocessing, mask)
     data: dict = {"image": pixels.to(device)}
     detect = detect or models[0].detect
+    if (near_kept := frame.near_kept(pixels.shape[2:])) is not None:
+        data["mask"] = torch.from_numpy(near_kept).to(device)
+        detect = detect and partial(detect, mask=near_kept)
     if detect is not None:
         data["detected"] = detect(pixels[0, 0].numpy())
     described: dict[str, dict] = {}

@@ -16,7 +16,8 @@ class ALIKED(NetworkExtractor):
     """The features of ALIKED (Zhao et al., IEEE TIM 2023), by kornia.
 
     `model_name` is one of hloc's. Keypoints are those with the `max_keypoints` highest scores; -1
-    keeps all. With `denoise`, the noise of noisy images is reduced first.
+    keeps all. With `denoise`, the noise of noisy images is reduced first. Those of masked pixels
+    are among them before they are dropped.
     """
 
     stride = 32
@@ -38,7 +39,7 @@ class ALIKED(NetworkExtractor):
         """The name of these descriptors in the metadata of projections."""
         return self.conf["model_name"].removesuffix("-n16").replace("-", "_")
 
-    def _extract(self, image: torch.Tensor) -> dict:
+    def _extract(self, image: torch.Tensor, mask: torch.Tensor | None) -> dict:
         (found,) = self.model(image.contiguous(memory_format=torch.channels_last))
         return {
             "keypoints": found.keypoints[None],

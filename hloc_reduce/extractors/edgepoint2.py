@@ -1,6 +1,7 @@
 """EdgePoint2's keypoints and descriptors."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch.nn.functional import grid_sample, interpolate, normalize
@@ -39,12 +40,12 @@ class EdgePoint2(NetworkExtractor):
         """The name of these descriptors in the metadata of projections."""
         return f"edgepoint2_{self.conf['model_name'].lower()}"
 
-    def _extract(self, image: torch.Tensor) -> dict:
+    def _extract(self, image: torch.Tensor, mask: torch.Tensor | None) -> dict:
         given = image.shape[:1:-1]
         width, height = (max(1, side // Network.stride) * Network.stride for side in given)
         if (width, height) != tuple(given):
             image = interpolate(image, (height, width), mode="bilinear", align_corners=True)
-        found = self._compute(image, strongest)
+        found = self._compute(image, partial(strongest, mask=mask))
         ratio = found["keypoints"].new_tensor(given) / image.new_tensor([width, height])
         return {**found, "keypoints": found["keypoints"] * ratio}
 

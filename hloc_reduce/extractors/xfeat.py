@@ -1,6 +1,7 @@
 """XFeat's keypoints and descriptors."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch.nn.functional import grid_sample, interpolate, normalize, pixel_shuffle
@@ -39,10 +40,10 @@ class XFeat(NetworkExtractor):
         load_weights(self.model.net, "xfeat")
         self.model.eval()
 
-    def _extract(self, image: torch.Tensor) -> dict:
+    def _extract(self, image: torch.Tensor, mask: torch.Tensor | None) -> dict:
         height, width = (max(side // self.stride, 1) * self.stride for side in image.shape[2:])
         resized = interpolate(image, (height, width), mode="bilinear", align_corners=False)
-        found = self._compute(resized, self._strongest)
+        found = self._compute(resized, partial(self._strongest, mask=mask))
         size = image.new_tensor(image.shape[:1:-1])
         scale = size / size.new_tensor([width, height])
         return {**found, "keypoints": (found["keypoints"] + 0.5) * scale - 0.5}
@@ -68,10 +69,12 @@ class XFeat(NetworkExtractor):
             "descriptors": normalize(descriptors[:, :, 0], dim=1),
         }
 
-    def _strongest(self, heatmap: torch.Tensor, reliability: torch.Tensor) -> Keypoints:
+    def _strongest(
+        self, heatmap: torch.Tensor, reliability: torch.Tensor, mask: torch.Tensor | None
+    ) -> Keypoints:
         """Return the maxima of a heatmap (H, W) with the highest products with the reliability."""
         threshold, number = self.conf["detection_threshold"], limit(self.conf["max_keypoints"])
-        keypoints, scores = strongest(heatmap, RADIUS, threshold, RADIUS, -1)
+        keypoints, scores = strongest(heatmap, RADIUS, threshold, RADIUS, -1, mask)
         grid = self._grid(keypoints, heatmap)
         scores = scores * grid_sample(reliability, grid, align_corners=False)[0, 0, 0]
         scores, order = scores.topk(min(number, len(scores)))

@@ -36,7 +36,9 @@ class Engine(Protocol):
 
     rotation_invariant: bool  # of its extractor, see `extractors.Extractor`
 
-    def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
+    def extract(
+        self, image: Path | np.ndarray, preprocessing: dict, mask: np.ndarray | None = None
+    ) -> dict:
         """Extract the features of a photo, see `extractors.extract`."""
 
     def matching(self, matcher: dict) -> Matching:

@@ -35,14 +35,16 @@ class NumpyEngine:
         assert self._lightglue is not None
         return self._lightglue
 
-    def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
+    def extract(
+        self, image: Path | np.ndarray, preprocessing: dict, mask: np.ndarray | None = None
+    ) -> dict:
         """Extract the features of a photo, see `extractors.extract`.
 
         Args:
             image: its file, or its pixels (H, W) or (H, W, 3) RGB, uint8.
             preprocessing: see `utils.images.resized`.
+            mask: (H, W) bool, which pixels of the photo may have keypoints.
         """
-        pixels, frame = resized(image, preprocessing)
-        return in_original(
-            self._extract(pixels), pixels.shape, frame, dog.KEYPOINT_UNCERTAINTY_PIXELS
-        )
+        pixels, frame = resized(image, preprocessing, mask)
+        found = self._extract(pixels, frame.near_kept(pixels.shape))
+        return in_original(found, pixels.shape, frame, dog.KEYPOINT_UNCERTAINTY_PIXELS)

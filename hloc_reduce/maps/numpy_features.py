@@ -19,8 +19,13 @@ class Extract(Protocol):
 
     rotation_invariant: bool  # see `extractors.Extractor`
 
-    def __call__(self, image: np.ndarray) -> dict:
+    def __call__(self, image: np.ndarray, mask: np.ndarray | None) -> dict:
         """Return the features of an image (H, W) or (H, W, 3) RGB float32 in [0, 1].
+
+        Args:
+            image: the image.
+            mask: (H, W) bool, which pixels may have keypoints, None for all. Others are dropped
+                later, so that only those that choose the best keypoints need it.
 
         Returns:
             `keypoints` (N, 2) x, y in its pixels, centres at integers; `descriptors` (D, N) of unit
@@ -47,12 +52,12 @@ class ColmapSift:
         self._detect = dog.detector(self._conf)
         self.rotation_invariant = dog.is_rotation_invariant(self._conf)
 
-    def __call__(self, image: np.ndarray) -> dict:
+    def __call__(self, image: np.ndarray, mask: np.ndarray | None) -> dict:
         """Return the features of an image (H, W)."""
         if image.ndim != 2:
             raise InputError("DoG needs grey images: preprocessing: {grayscale: true}.")
         number = self._conf["max_keypoints"]
-        keypoints, descriptors = dog.strongest(*self._detect(image), number)
+        keypoints, descriptors = dog.strongest(*self._detect(image, mask=mask), number)
         if self._layers is not None:
             descriptors = frozen.project(descriptors, self._layers)
         return {"keypoints": keypoints[:, :2], "descriptors": descriptors.T}
@@ -78,8 +83,8 @@ class OnnxNetwork:
             raise InputError(f"{path} has the feature {name}, the map has {feature}.")
         self._stride, self._denoise = int(metadata["stride"]), denoise
 
-    def __call__(self, image: np.ndarray) -> dict:
-        """Return the features of an image (H, W, 3)."""
+    def __call__(self, image: np.ndarray, mask: np.ndarray | None) -> dict:
+        """Return the features of an image (H, W, 3); the file chooses among all keypoints."""
         if image.ndim != 3:
             raise InputError("ONNX files take RGB images: preprocessing: {grayscale: false}.")
         channels, blur = image.transpose(2, 0, 1), 0.0

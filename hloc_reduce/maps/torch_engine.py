@@ -40,9 +40,11 @@ class TorchEngine:
         model = for_features(matcher, self._made_from)
         return TorchMatching(matchers.load(model), self._device)
 
-    def extract(self, image: Path | np.ndarray, preprocessing: dict) -> dict:
+    def extract(
+        self, image: Path | np.ndarray, preprocessing: dict, mask: np.ndarray | None = None
+    ) -> dict:
         """Extract the features of a photo, see `extractors.extract`."""
-        return extractors.extract(self._extractor, image, preprocessing, self._device)
+        return extractors.extract(self._extractor, image, preprocessing, self._device, mask)
 
 
 class TorchMatching:

@@ -3,7 +3,7 @@
 from functools import reduce
 
 import torch
-from torch.nn.functional import pad
+from torch.nn.functional import interpolate, max_pool2d, pad
 
 # A maximum is above its neighbors by more than this: scores of one colour differ by rounding.
 MARGIN = 1e-6
@@ -17,7 +17,12 @@ def limit(max_keypoints: int) -> int:
 
 
 def strongest(
-    scores: torch.Tensor, radius: int, min_score: float, border: int, max_keypoints: int
+    scores: torch.Tensor,
+    radius: int,
+    min_score: float,
+    border: int,
+    max_keypoints: int,
+    mask: torch.Tensor | None = None,
 ) -> Keypoints:
     """Find the highest maxima of a score map.
 
@@ -27,12 +32,17 @@ def strongest(
         min_score: lower ones are dropped.
         border: number of pixels at each border without keypoints, at least `radius`.
         max_keypoints: how many are kept; -1 for all.
+        mask: bool, of any size, where keypoints may be; pixels beside those count, too.
 
     Returns:
         Keypoints (N, 2) float x, y, and their scores (N,), highest first.
     """
     y, x = torch.nonzero(_maxima(scores, radius, min_score, border), as_tuple=True)
     y, x = y + border, x + border
+    if mask is not None:
+        share = interpolate(mask[None, None].float(), scores.shape, mode="area")
+        kept = max_pool2d(share, 3, stride=1, padding=1)[0, 0, y, x] > 0
+        y, x = y[kept], x[kept]
     found = scores[y, x]
     number = len(found) if max_keypoints < 0 else min(max_keypoints, len(found))
     found, order = found.topk(number)

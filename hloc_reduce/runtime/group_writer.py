@@ -79,6 +79,16 @@ class GroupWriter:
     def __contains__(self, name: str) -> bool:
         return name in self.names
 
+    def texts(self, key: str) -> dict[str, str]:
+        """Return an attribute of the groups that are present and have it, by their names."""
+        found: dict[str, str] = {}
+        for part in self._pieces() + [self.path] * self.path.exists():
+            with open_h5(part) as file:
+                for name in iterate_h5_names(file.id):
+                    if h5py.h5a.exists(file.id, key.encode(), obj_name=name.encode()):
+                        found[name] = get_text(file[name], key, "")
+        return found
+
     def begin(self, name: str, piece: str | None = None) -> None:
         """Mark a group as present: it will be added, or another process has put it in a piece."""
         self.names.add(name)

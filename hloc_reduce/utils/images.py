@@ -117,15 +117,42 @@ class Frame(NamedTuple):
     Args:
         size: (2,) int64 width, height in pixels as it is stored.
         turns: by which it is shown, quarter turns, counterclockwise.
+        mask: (H, W) bool, which of these pixels may have keypoints; None for all.
     """
 
     size: np.ndarray
     turns: int = 0
+    mask: np.ndarray | None = None
 
     @property
     def shown(self) -> np.ndarray:
         """The width and height (2,) as it is shown."""
         return self.size[:: -1 if self.turns % 2 else 1]
+
+    def near_kept(self, shape: tuple[int, ...]) -> np.ndarray | None:
+        """Return which pixels of the photo as it is shown may have keypoints, None for all.
+
+        That is for detectors which choose the best keypoints. `keeps` decides about each one: here
+        a pixel counts if it, or one beside it, shows any that is kept.
+
+        Args:
+            shape: height and width as it is shown, resized.
+
+        Returns:
+            (H, W) bool.
+        """
+        if self.mask is None:
+            return None
+        turned_mask = np.rot90(self.mask, self.turns).astype(np.float32)
+        share = cv2.resize(turned_mask, shape[1::-1], interpolation=cv2.INTER_AREA)
+        return cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+    def keeps(self, keypoints: np.ndarray) -> np.ndarray:
+        """Tell which keypoints (N, 2), in pixels as it is stored, are not masked; (N,) bool."""
+        if self.mask is None:
+            return np.ones(len(keypoints), bool)
+        pixels = np.floor(keypoints + 0.5).astype(int).clip(0, self.size - 1)
+        return self.mask[pixels[:, 1], pixels[:, 0]]
 
 
 def turned(keypoints: np.ndarray, size: np.ndarray, turns: int) -> np.ndarray:
@@ -158,7 +185,9 @@ def convert(image: np.ndarray, grayscale: bool) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 and not grayscale else image
 
 
-def resized(image: Path | np.ndarray, preprocessing: Mapping) -> tuple[np.ndarray, Frame]:
+def resized(
+    image: Path | np.ndarray, preprocessing: Mapping, mask: np.ndarray | None = None
+) -> tuple[np.ndarray, Frame]:
     """Read an image and resize its longer side to at most `resize_max` pixels.
 
     Smaller images are enlarged to `resize_min` or, with `resize_force`, to `resize_max` pixels.
@@ -168,24 +197,29 @@ def resized(image: Path | np.ndarray, preprocessing: Mapping) -> tuple[np.ndarra
         preprocessing: `grayscale`, `resize_max`, `resize_force` and `upright`, whether EXIF data
             turn it, of a feature's configuration; and `resize_min`; `turns`, further quarter turns,
             counterclockwise; and `mirrored`, whether to swap left and right.
+        mask: (H, W) bool, which pixels of the image as it is stored may have keypoints.
 
     Returns:
         The image, (H, W) if `grayscale`, else (H, W, 3) RGB, float32 in [0, 1], and how it is
         shown.
 
     Raises:
-        InputError: when it cannot be read.
+        InputError: when it cannot be read, or the mask has another size.
     """
     grayscale = preprocessing.get("grayscale", False)
     pixels = (
         convert(image, grayscale) if isinstance(image, np.ndarray) else read_image(image, grayscale)
     )
+    if mask is not None and mask.shape != pixels.shape[:2]:
+        sizes = [f"{width}x{height}" for height, width in (mask.shape, pixels.shape[:2])]
+        raise InputError(f"The mask has {sizes[0]} pixels, the photo has {sizes[1]}.")
     turns = preprocessing.get("turns", 0)
     if preprocessing.get("upright") and isinstance(image, Path):
         turns += TURNS.get(orientation(image) or 0, 0)
     if preprocessing.get("mirrored"):
         pixels, turns = pixels[:, ::-1], -turns
-    frame = Frame(np.array(pixels.shape[1::-1]), turns % 4)
+        mask = None if mask is None else mask[:, ::-1]
+    frame = Frame(np.array(pixels.shape[1::-1]), turns % 4, mask)
     pixels, size = np.rot90(pixels, frame.turns).astype(np.float32, order="C"), frame.shown
     resize_max = preprocessing.get("resize_max") or size.max()
     resize_min = preprocessing.get("resize_min", 0)
@@ -204,9 +238,11 @@ def resized(image: Path | np.ndarray, preprocessing: Mapping) -> tuple[np.ndarra
 def in_original(features: dict, shape: tuple[int, ...], frame: Frame, noise: float) -> dict:
     """Return the features of a resized image in pixels of the original one, as it is stored.
 
+    Keypoints that the frame masks are dropped.
+
     Args:
-        features: `keypoints` (N, 2), and perhaps `scales` (N,) and `blur`, in pixels, and `oris`
-            (N,) in degrees.
+        features: `keypoints` (N, 2), and perhaps `scales` (N,) and `blur`, in pixels, `oris` (N,)
+            in degrees, `scores` (N,) and `descriptors` (D, N).
         shape: height and width of the resized image, and perhaps more.
         frame: how the original one is shown.
         noise: standard deviation of the keypoints in pixels of the resized image.
@@ -218,6 +254,8 @@ def in_original(features: dict, shape: tuple[int, ...], frame: Frame, noise: flo
     ratio = (frame.shown / np.array(shape[1::-1])).astype(np.float32)
     keypoints = (features["keypoints"] + 0.5) * ratio - 0.5
     features = {**features, "keypoints": turned(keypoints, frame.shown, -frame.turns)}
+    if frame.mask is not None:
+        features = _chosen(features, frame.keeps(features["keypoints"]))
     if "oris" in features and frame.turns:
         features["oris"] = (features["oris"] + 90 * frame.turns) % 360
     if "scales" in features:
@@ -226,6 +264,15 @@ def in_original(features: dict, shape: tuple[int, ...], frame: Frame, noise: flo
     features["uncertainty"] = noise * ratio.mean()
     features["blur"] = features.get("blur", 0.0) * ratio.mean()
     return features
+
+
+def _chosen(features: dict, rows: np.ndarray) -> dict:
+    """Return the features of some keypoints, given which of all (N,) bool."""
+    axes = {key: 0 for key in ("keypoints", "scores", "scales", "oris")} | {"descriptors": 1}
+    return {
+        key: np.compress(rows, value, axes[key]) if key in axes else value
+        for key, value in features.items()
+    }
 
 
 class UnreadableImage(InputError):
