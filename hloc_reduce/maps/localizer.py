@@ -23,14 +23,14 @@ from ..utils.cli import InputError
 from ..utils.codes import FLOATS, restore, store
 from ..utils.feature_files import to_colmap
 from .contents import read
-from .given import check_pose, check_rig, pixels_or_file
+from .given import Image, Photo, check_pose, check_rig
 from .tracker import Tracker
 
 
 class _Query(NamedTuple):
     """A photo, its intrinsics and options, and how it is shown, with its features."""
 
-    image: Path | np.ndarray
+    photo: Photo
     camera: pycolmap.Camera
     refinement: dict
     view: View
@@ -98,8 +98,9 @@ class Localizer:
 
     def localize(
         self,
-        image: Path | str | np.ndarray,
+        image: Image,
         camera: pycolmap.Camera | None = None,
+        mask: Image | None = None,
         near: pycolmap.Rigid3d | None = None,
         radius: float | None = None,
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
@@ -112,6 +113,8 @@ class Localizer:
             camera: its intrinsics; default: those of the map's camera if it took the photo, by its
                 EXIF data; else from EXIF data or guessed, and estimated with the pose, or those of
                 the map's photos if these fit a guess.
+            mask: its file, or its pixels (H, W), bool or uint8, of the size of the photo as it is
+                stored: keypoints where it is 0 are dropped; default: none are.
             near: about its pose, camera from world, as of a moment ago: the photo is matched with
                 the map images that see the same instead of those that look alike. If it cannot be
                 localized so, it is as without `near`.
@@ -132,12 +135,13 @@ class Localizer:
 
         Raises:
             UnreadableImage: if the image cannot be read.
-            InputError: if the camera has another size, or `near` is far from the map.
+            InputError: if the camera or the mask has another size, the mask is all 0, or `near` is
+                far from the map.
         """
-        image = pixels_or_file(image)
+        photo = Photo.of(image, mask)
         laps, source, refinement = Laps(), "given", {}
         if camera is None:
-            camera, source = intrinsics.infer(image, self.cameras)
+            camera, source = intrinsics.infer(photo.image, self.cameras)
             refinement = intrinsics.refinement(camera, source, self.cameras)
         guess = None
         if near is not None:
@@ -146,7 +150,7 @@ class Localizer:
             guess = self._surroundings.guess(near, radius, camera)
             laps.end("retrieval")
         best: tuple[pycolmap.Rigid3d | None, dict] | None = None
-        for found in self._tries(image, camera, refinement, laps, guess):
+        for found in self._tries(photo, camera, refinement, laps, guess):
             if best is None or nearness(found[1]) > nearness(best[1]):
                 best = found
             if best[1]["reason"] is None or source == "none":  # no other try helps
@@ -177,7 +181,7 @@ class Localizer:
 
     def _tries(
         self,
-        image: Path | np.ndarray,
+        photo: Photo,
         camera: pycolmap.Camera,
         refinement: dict,
         laps: Laps,
@@ -186,18 +190,18 @@ class Localizer:
         """Yield the pose and the info by each matcher, in each way that the photo may be shown.
 
         Args:
-            image: its file or pixels.
+            photo: the photo.
             camera: its intrinsics.
             refinement: options of `localization.query.localize`.
             laps: times the stages.
             guess: of the pose: first, the photo is matched with its images.
         """
-        for view in (views.USUAL, *self._other_views(image)):
-            features = self._described(image, view, camera, laps)
-            query = _Query(image, camera, refinement, view, features)
+        for view in (views.USUAL, *self._other_views(photo.image)):
+            features = self._described(photo, view, camera, laps)
+            query = _Query(photo, camera, refinement, view, features)
             if guess and view == views.USUAL and len(guess.images):
                 yield self._match(query, guess.images, 0, laps, guess)
-            retrieved = self._retrieve(features, image, view)
+            retrieved = self._retrieve(features, photo.image, view)
             laps.end("retrieval")
             for i in range(len(self.steps)):
                 yield self._match(query, retrieved, i, laps)
@@ -223,7 +227,7 @@ class Localizer:
         cam_from_world, info = self._estimate(features, matches, *given, guess=guess)
         laps.end("pose")
         if info["reason"] is None and gates.may_be_mirrored(info["measures"], gate):
-            flipped = self._extract(query.image, query.view, flip=True)
+            flipped = self._extract(query.photo, query.view, flip=True)
             mirror = mirrored.mirror(query.camera), mirrored.mirror_options(query.refinement), gate
             _, other = self._estimate(flipped, match(flipped, names), *mirror, thorough=False)
             measures = replace(info["measures"], mirror_image=other["confidence"])
@@ -237,15 +241,13 @@ class Localizer:
             "turned": 90 * query.view.turns,
         }
 
-    def _described(
-        self, image: Path | np.ndarray, view: View, camera: pycolmap.Camera, laps: Laps
-    ) -> dict:
+    def _described(self, photo: Photo, view: View, camera: pycolmap.Camera, laps: Laps) -> dict:
         """Return the features of a photo.
 
         Raises:
             InputError: if its camera has another size.
         """
-        features = self._extract(image, view)
+        features = self._extract(photo, view)
         width, height = map(int, features["image_size"])
         if (camera.width, camera.height) != (width, height):
             raise InputError(
@@ -257,10 +259,11 @@ class Localizer:
 
     def localize_rig(
         self,
-        images: Sequence[Path | str | np.ndarray],
+        images: Sequence[Image],
         cameras: Sequence[pycolmap.Camera],
         cams_from_rig: Sequence[pycolmap.Rigid3d],
         names: Sequence[str] = (),
+        masks: Sequence[Image | None] = (),
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Localize photos that cameras which are fixed to each other took at one moment.
 
@@ -271,6 +274,7 @@ class Localizer:
             cameras: their intrinsics.
             cams_from_rig: their poses in the rig, camera from rig, in the units of the map.
             names: of the cameras, for messages; default: camera 0, camera 1, and so on.
+            masks: of each camera as for `localize`, None for a photo that is not masked.
 
         Returns:
             The pose, rig from world, in the units of the map, or None if the rig cannot be
@@ -284,15 +288,16 @@ class Localizer:
         Raises:
             UnreadableImage: if an image cannot be read.
             InputError: if there is no camera, there are not as many images, cameras and poses, or a
-                camera has another size than its photo.
+                camera or a mask has another size than its photo.
         """
         number = len(images)
-        check_rig(images, cameras, cams_from_rig, names or [""] * number)
+        given = masks or [None] * number
+        check_rig(images, cameras, cams_from_rig, names or [""] * number, given)
         laps, photos = Laps(), []
-        for one, camera in zip(images, cameras, strict=True):
-            image = pixels_or_file(one)
-            features = self._described(image, views.USUAL, camera, laps)
-            photos.append((features, self._retrieve(features, image, views.USUAL)))
+        for image, mask, camera in zip(images, given, cameras, strict=True):
+            photo = Photo.of(image, mask)
+            features = self._described(photo, views.USUAL, camera, laps)
+            photos.append((features, self._retrieve(features, photo.image, views.USUAL)))
             laps.end("retrieval")
         named = names or [f"camera {i}" for i in range(number)]
         rig = [*zip(named, cameras, cams_from_rig, strict=True)]
@@ -349,10 +354,10 @@ class Localizer:
             return []
         return views.others(image, self.cameras, self.preprocessing)
 
-    def _extract(self, image: Path | np.ndarray, view: View, flip: bool = False) -> dict:
+    def _extract(self, photo: Photo, view: View, flip: bool = False) -> dict:
         """Extract features, float32 and rounded as in a feature file, see `matchers.Matcher`."""
         shown = {**self.preprocessing, **view.how, "mirrored": flip}
-        features = self.engine.extract(image, shown)
+        features = self.engine.extract(photo.image, shown, photo.kept)
         stored, _ = store({key: np.asarray(part) for key, part in features.items()}, self.dtype)
         rounded = {key: part.astype(np.float32) for key, part in stored.items()}
         return {**rounded, "descriptors": restore(stored, {}).T}

@@ -265,3 +265,34 @@ def test_numbers_that_are_too_small(tmp_path):
     for wrong in (0.0, float("nan")):
         with pytest.raises(InputError, match="ransac_thresh is .*: it must be above 0"):
             Localizer(tmp_path, ransac_thresh=wrong)
+
+
+@pytest.mark.parametrize("is_compact", [False, True])
+def test_a_masked_photo(is_compact, place, build_map, tmp_path):
+    """By an array or a file: what is black has no keypoint; a wrong mask is refused in a line."""
+    _, images, outputs = place
+    folder = build_map()
+    if is_compact:
+        compact.main(tmp_path / "map.hlm", folder)
+    localizer = Localizer(tmp_path / "map.hlm" if is_compact else folder)
+    photo = images / "query/day/a.png"
+    pose, every = localizer.localize(photo)
+    mask = np.ones((270, 360), np.uint8)
+    mask[135:] = 0
+    masked, info = localizer.localize(photo, mask=mask)
+    assert info["reason"] is None and max(pose_error(masked, pose)) < 0.2
+    assert 0 < info["num_correspondences"] < every["num_correspondences"]
+    assert info["points2D"][:, 1].max() <= 135 < every["points2D"][:, 1].max()
+    cv2.imwrite(str(tmp_path / "mask.png"), 255 * mask)
+    for other in (mask > 0, np.dstack([mask] * 3), tmp_path / "mask.png"):
+        assert localizer.localize(photo, mask=other)[0].translation == pytest.approx(
+            masked.translation, abs=0
+        )
+    with pytest.raises(InputError, match="The mask has 360x135 pixels, the photo has 360x270"):
+        localizer.localize(photo, mask=mask[:135])
+    with pytest.raises(InputError, match="The mask is all black"):
+        localizer.localize(photo, mask=mask * 0)
+    with pytest.raises(InputError, match=r"Cannot read the mask .*gone.png: No such file"):
+        localizer.localize(photo, mask=tmp_path / "gone.png")
+    with pytest.raises(InputError, match="An image is a file or an array, not int: 3"):
+        localizer.localize(photo, mask=3)

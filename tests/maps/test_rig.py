@@ -83,3 +83,19 @@ def test_what_is_no_rig(rig):
     grey = np.full((*cv2.imread(str(photos[0])).shape[:2], 3), 128, np.uint8)
     pose, info = localizer.localize_rig([grey, grey], cameras, cams_from_rig)
     assert pose is None and info["reason"].startswith("too few inliers: 0")
+
+
+def test_a_camera_that_sees_the_robot_is_masked(rig):
+    """Of one camera, and of no other."""
+    path, photos, cameras, cams_from_rig, true = rig
+    localizer = Localizer(path)
+    _, every = localizer.localize_rig(photos, cameras, cams_from_rig)
+    mask = np.ones((270, 360), bool)
+    mask[135:] = False
+    pose, info = localizer.localize_rig(photos, cameras, cams_from_rig, masks=[None, mask])
+    assert info["reason"] is None and pose_error(pose, true)[0] < 0.02
+    before, after = every["cameras"], info["cameras"]
+    assert after[0]["num_correspondences"] == before[0]["num_correspondences"]
+    assert after[1]["points2D"][:, 1].max() <= 135 < before[1]["points2D"][:, 1].max()
+    with pytest.raises(InputError, match="2 images, 2 cameras, 2 poses, 2 names and 1 masks"):
+        localizer.localize_rig(photos, cameras, cams_from_rig, masks=[mask])
