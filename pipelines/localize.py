@@ -26,6 +26,7 @@ from hloc_reduce.runtime.group_writer import failures
 from hloc_reduce.runtime.outputs import RunFolder
 from hloc_reduce.runtime.provenance import MADE_FROM
 from hloc_reduce.utils import cli, colmap
+from hloc_reduce.utils import masks as masks_of
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES, Storage
 from hloc_reduce.utils.options import Option, Parser, taken
@@ -55,6 +56,7 @@ def open_map(
     database: Path | None = None,
     retrieval: Retrieval | None = None,
     exif_gps: bool = True,
+    masks: Path | None = None,
 ) -> Map:
     """Build a map, or open one that was built before.
 
@@ -86,6 +88,9 @@ def open_map(
         retrieval: a name (those of networks need an installed hloc); or, for the queries only,
             hloc's text file of pairs or h5 file of global descriptors; default: vlad.
         exif_gps: align a new map of photos alone with the GPS in their EXIF data.
+        masks: folder of masks of photos, as COLMAP's: keypoints of a/photo.jpg in black pixels of
+            `masks`/a/photo.jpg.png are dropped, in photos of the map, queries, and photos that are
+            added; or one mask for all photos of its size; default: none.
 
     Raises:
         InputError: when an old map was built with other options, or something is missing or wrong.
@@ -123,6 +128,7 @@ def open_map(
     if map_images is not None:
         new |= {"num_covis": num_covis, "accept_partial": accept_partial, "camera_mode": mode}
         new |= {"exif_gps": exif_gps}
+        new["masks"] = masks_of.those_of(masks, map_images)
         return maps.main(folder, map_images, model_or_map, **new)
     if model_or_map is None:
         raise InputError("Give --map_images, the folder of the photos to build a map of.")
@@ -164,6 +170,7 @@ def main(
     retrieval: Retrieval | None = None,
     matcher: Matcher | None = None,
     rigs: Rigs | None = None,
+    masks: Path | None = None,
 ) -> dict:
     """Localize queries in a map and return the summary, as in summary.json.
 
@@ -182,6 +189,7 @@ def main(
         matcher: matcher of queries; default: the map's.
         rigs: COLMAP's file of cameras that are fixed to each other, in the units of the map: photos
             with the same name in the folders of their cameras get their poses together.
+        masks: of the queries, see `open_map`; default: none.
 
     Raises:
         InputError: when something is missing or wrong.
@@ -192,7 +200,8 @@ def main(
     built.check_features(map_names)  # a broken map is found before photos are read
     truth = true_poses(names, ground_truth, True) if ground_truth else {}
 
-    photos = Photos(outputs / MADE_FROM, built, query_images, names)
+    masks = masks_of.those_of(masks, query_images)
+    photos = Photos(outputs / MADE_FROM, built, query_images, names, masks)
     matcher = matcher or built.matcher
     steps = matchers_confs.steps_in(built.matcher, built.conf, matcher)
     for step in {*steps} - {built.matcher}:
@@ -204,7 +213,7 @@ def main(
     retrieval = built.retrieval if retrieval is None else retrieval
     retrieved = f"{retrieval_name(retrieval)}{num_loc}"
     loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
-    inputs = [query_images, *([queries] if queries else [])]
+    inputs = [path for path in (query_images, queries, masks) if path]
     if retrieval != built.retrieval:
         check_retrieval(retrieval, loc_pairs, num_loc, names, map_names)
         conf["retrieval"] = str(Path(retrieval).resolve())
@@ -226,6 +235,7 @@ def main(
                 image_list=names,
                 strict=strict,
                 queries=names,
+                masks=masks,
             )
         photos.forget(failures(features))
         with run.stage("retrieval"):
@@ -237,7 +247,7 @@ def main(
         matches = run.match("match_queries", loc_pairs, features, built.features)
         poses = outputs / f"poses_hloc_{built.feature}+{matcher}_{retrieved}.txt"
         mirror_images = run.mirror_images(
-            built.conf, query_images, loc_pairs, features, built.features
+            built.conf, query_images, loc_pairs, features, built.features, masks
         )
         others = other_views.tries(
             run,
@@ -248,6 +258,7 @@ def main(
             loc_pairs,
             num_loc if retrieval == built.retrieval else None,
             map_names,
+            masks,
         )
         with run.stage("localization"):
             records = localize_sfm.main(
@@ -326,6 +337,15 @@ def _check(given: dict, is_changed: bool) -> None:
     if matcher and given["query_images"] is None and (is_built or matcher == NN_LIGHTGLUE):
         what = f"--matcher {matcher} is for queries"
         raise InputError(f"{what}: give --query_images, or leave out --matcher.")
+    if (masks := given["masks"]) is not None:
+        options = ["query_images", "add_images"]
+        options += (
+            [] if given["database"] else ["map_images"]
+        )  # whose keypoints are in the database
+        folders = [given[option] for option in options if given[option] is not None]
+        if not folders:
+            raise InputError(f"--masks {masks} needs photos to mask, such as --query_images.")
+        masks_of.check(masks, folders)
     if given["compact"] is not None:
         compact.check_output(given["compact"])
         if matcher and matcher != NN_LIGHTGLUE and not is_built:
@@ -347,7 +367,7 @@ def _main() -> None:
             built = open_map(**taken(open_map, given) | {"outputs": folder})
             if outputs is None:  # the map is not opened again
                 built.warn()
-            changes.main(folder, **change)
+            changes.main(folder, **change, masks=masks)
         if outputs is not None:
             _run(given)
             return

@@ -57,6 +57,7 @@ class Photos:
         accept_partial: do without photos that cannot be read.
         camera_mode: which photos share a camera, if their poses are reconstructed.
         retrieval: a key of `confs.retrieval`.
+        masks: of the photos, see `extract_features.main`.
         left_out: photos that are described and matched, but not reconstructed.
     """
 
@@ -69,6 +70,7 @@ class Photos:
     accept_partial: bool
     camera_mode: pycolmap.CameraMode
     retrieval: str
+    masks: Path | None = None
     left_out: frozenset[str] = frozenset()
 
     @property
@@ -198,6 +200,7 @@ def _find_mirrored(best: Attempt) -> list[Finding]:
         descriptors=descriptors,
         folder=photos.folder.path / MIRROR_IMAGES,
         retrieval=retrieval_confs.get(photos.retrieval),
+        masks=photos.masks,
     )
     known = registration.read(best.sfm_dir)
     with photos.folder.stage("mirror_images"):
@@ -315,6 +318,7 @@ def _describe(photos: Photos, conf: dict) -> Described:
             photos.folder.path,
             image_list=photos.names,
             strict=not photos.accept_partial,
+            masks=photos.masks,
         )
         names = keep_readable(features, photos.names, photos.accept_partial)
     with photos.folder.stage("retrieval"):

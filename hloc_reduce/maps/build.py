@@ -21,6 +21,7 @@ from ..retrieval import load as load_retrieval
 from ..runtime import provenance
 from ..runtime.outputs import CONF, RunFolder
 from ..utils import colmap
+from ..utils import masks as masks_of
 from ..utils.cli import InputError
 from ..utils.codes import STORAGES
 from ..utils.files import replacing
@@ -50,6 +51,7 @@ def main(
     camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
     retrieval: str = retrieval_confs.VLAD,
     exif_gps: bool = True,
+    masks: Path | None = None,
 ) -> Map:
     """Build a map, or open the one that was made from the same.
 
@@ -75,15 +77,16 @@ def main(
         retrieval: a key of `confs.retrieval`.
         exif_gps: without a model, align a new map with the GPS positions in the EXIF data of its
             photos, see `georeference.by_exif`.
+        masks: of the images, see `extract_features.main`.
 
     Returns:
         The map.
 
     Raises:
         InputError: if the folder has a map that was made from something else, something is missing
-            or wrong, photos do not have the size of their cameras in the model (`checks.sizes`),
-            or a check refuses the reconstruction; what is finished is kept, for a run with
-            `accept_partial`.
+            or wrong, such as masks, photos do not have the size of their cameras in the model
+            (`checks.sizes`), or a check refuses the reconstruction; what is finished is kept, for a
+            run with `accept_partial`.
     """
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher = matcher or features_confs.matcher_of(conf)
@@ -96,6 +99,7 @@ def main(
     # points without tracks, such as those of scanners, tell nothing of the photos
     has_points = reference is not None and any(i.num_points3D for i in reference.images.values())
     exhaustive = len(names) <= MAX_EXHAUSTIVE
+    masked = masks_of.digests(masks_of.find(masks, image_dir, names))
     if overwrite or not (map_dir / CONF).exists():
         extract_features.check_model(conf)
         match_features.check_model(matchers_confs.confs[matcher], extract_features.provenance(conf))
@@ -117,9 +121,10 @@ def main(
     elif model is None:
         made_from |= {"pairs": f"retrieval, {PAIR_ROUNDS} rounds of verification"}
     made_from |= {"normalized": True} if normalized else {}
+    made_from |= {"masks": masked} if masked else {}
     made_from |= retrieval_confs.provenance(retrieval)
     made_from |= matchers_confs.provenance(made_from["matcher"], made_from["feature"])
-    with claim(map_dir, made_from, overwrite, image_dir, model, projection) as folder:
+    with claim(map_dir, made_from, overwrite, image_dir, model, projection, masks) as folder:
         if not (map_dir / FINISHED).exists():
             begin(map_dir, fingerprints)
             logger.info("Building the map %s of %d images.", map_dir, len(usable))
@@ -133,6 +138,7 @@ def main(
                 accept_partial=accept_partial,
                 camera_mode=camera_mode,
                 retrieval=retrieval,
+                masks=masks,
             )
             conf = keep_projection(_at_one_size(conf, image_dir, usable), map_dir)
             if model is not None and reference is not None:

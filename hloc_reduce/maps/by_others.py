@@ -37,6 +37,7 @@ class ByOthers:
         descriptors: h5 file of their global descriptors.
         folder: for the features and the matches of mirror images.
         retrieval: configuration of the global descriptors.
+        masks: of the photos, see `extract_features.main`.
     """
 
     sfm: pycolmap.Reconstruction
@@ -47,6 +48,7 @@ class ByOthers:
     descriptors: Path
     folder: Path
     retrieval: dict
+    masks: Path | None = None
 
     def __call__(
         self, names: Collection[str], by: Collection[str], mirrored: bool
@@ -114,7 +116,7 @@ class ByOthers:
     def _describe_mirror_images(self, names: list[str]) -> tuple[Path, Path]:
         """Return the files of the features and of the global descriptors of mirror images."""
         features = self.folder / self.features.name
-        mirror_images.extract(self.conf, self.image_dir, names, features)
+        mirror_images.extract(self.conf, self.image_dir, names, features, masks=self.masks)
         return features, aggregate_features.main(
             mirror_images.of_mirror_images(self.retrieval),
             features,

@@ -37,6 +37,7 @@ def add(
     image_dir: Path,
     model: Path | None = None,
     refine_map: bool = False,
+    masks: Path | None = None,
 ) -> Map:
     """Add photos to a map: localize them, extend the points that they see, and triangulate others.
 
@@ -50,6 +51,8 @@ def add(
         model: COLMAP model with their poses in the frame of the map, which are kept; default: they
             are localized, with intrinsics from `localization.intrinsics.infer`.
         refine_map: adjust the poses of the other photos, too.
+        masks: of the photos, see `extract_features.main`; those of photos that are in the map
+            already are not read.
 
     Returns:
         The map with the new photos.
@@ -68,7 +71,8 @@ def add(
             raise InputError(f"{model} has a pose of no photo in {image_dir}.")
     with opened(built) as folder, folder.stage("add_images"):
         built = Map(built.folder)  # another run may have changed it before it was locked
-        addition, sfm = Addition(built, image_dir, refine_map), colmap.read_model(built.sfm)
+        addition = Addition(built, image_dir, refine_map, masks)
+        sfm = colmap.read_model(built.sfm)
         new = placing.begin(addition, sfm, names, posed=reference is not None)
         extended = placing.place(addition, sfm, new.names, reference)
         left_out = new.left_out | extended.left_out

@@ -17,6 +17,7 @@ def mirror_images(
     features: Path,
     match: Callable[[Path, Path], Path],
     executor: Executor = SERIAL,
+    masks: Path | None = None,
 ) -> MirrorImages:
     """Return what extracts and matches mirror images of queries, for a localization stage.
 
@@ -28,18 +29,24 @@ def mirror_images(
         match: matches a list of pairs by the feature file of their first images, with those of the
             map, and returns the match file.
         executor: runs the extraction.
+        masks: of the queries, see `extract_features.main`.
     """
 
     def main(names: list[str]) -> tuple[Path, Path]:
         listed = write_pairs_of(names, pairs, "mirrored")
-        mirrored = extract(conf, image_dir, names, features, executor)
+        mirrored = extract(conf, image_dir, names, features, executor, masks)
         return mirrored, match(listed, mirrored)
 
     return main
 
 
 def extract(
-    conf: dict, image_dir: Path, names: list[str], features: Path, executor: Executor = SERIAL
+    conf: dict,
+    image_dir: Path,
+    names: list[str],
+    features: Path,
+    executor: Executor = SERIAL,
+    masks: Path | None = None,
 ) -> Path:
     """Extract the features of the mirror images of some photos.
 
@@ -49,6 +56,7 @@ def extract(
         names: the photos.
         features: the feature file.
         executor: runs the extraction.
+        masks: of the photos, see `extract_features.main`.
 
     Returns:
         The feature file.
@@ -61,6 +69,7 @@ def extract(
         executor=executor,
         strict=False,
         queries=names,
+        masks=masks,
     )
 
 

@@ -27,7 +27,7 @@ from ..runtime import provenance
 from ..runtime.group_writer import failures, merge
 from ..runtime.outputs import CONF
 from ..triangulation import read_matches
-from ..utils import cli, colmap
+from ..utils import cli, colmap, masks
 from ..utils.cli import InputError
 from ..utils.feature_files import get_image_size
 from ..utils.files import announce, delete, is_readable
@@ -62,11 +62,13 @@ class Addition:
         built: the map.
         image_dir: folder of the photos.
         refine_map: adjust the poses of the other photos, too.
+        masks: of the new photos, see `extract_features.main`.
     """
 
     built: Map
     image_dir: Path
     refine_map: bool
+    masks: Path | None = None
 
     @property
     def folder(self) -> Path:
@@ -138,6 +140,8 @@ def begin(
     check_distinct([*inside, *new])
     images = {name: digests[name] for name in new}
     conf = {"map": built.id, "images": images, "num_loc": NUM_LOC, "posed": posed}
+    if masked := masks.digests(masks.find(addition.masks, image_dir, new)):
+        conf["masks"] = masked
     if provenance.read(addition.folder / CONF) != conf:
         announce(addition.folder)
         delete(addition.folder)
@@ -223,7 +227,12 @@ def _describe(addition: Addition, names: list[str]) -> tuple[list[str], dict[str
     """
     built = addition.built
     features = extract_features.main(
-        built.conf, addition.image_dir, addition.folder / "new", image_list=names, strict=False
+        built.conf,
+        addition.image_dir,
+        addition.folder / "new",
+        image_list=names,
+        strict=False,
+        masks=addition.masks,
     )
     failed = failures(features)
     broken = {name: NOT_READABLE for name in names if name in failed}
@@ -288,6 +297,7 @@ def _place_localized(
                 pairs,
                 addition.folder / "mirrored.h5",
                 partial(_match_mirrored, addition),
+                masks=addition.masks,
             ),
         )
         placed = {}

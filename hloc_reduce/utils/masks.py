@@ -4,6 +4,7 @@ The mask of `a/photo.jpg` is `a/photo.jpg.png` in the folder of masks. A file in
 is the mask of all photos of its size.
 """
 
+import os
 from collections.abc import Collection, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from .cli import InputError
+from .cli import InputError, no_folder
 from .files import file_sha256
 from .images import IMAGE_SUFFIXES, stored_size
 from .progress import progress
@@ -108,22 +109,17 @@ def digests(found: Mapping[str, Mask]) -> dict[str, str]:
     return {name: mask.sha256 for name, mask in found.items()}
 
 
-def applies(masks: Path, image_dir: Path) -> bool:
-    """Tell whether a mask belongs to a photo in a folder; arguments as in `find`."""
-    if not masks.is_dir():
-        size = stored_size(masks)
-        return any(stored_size(photo) == size for photo in _photos(image_dir))
-    found = (mask.relative_to(masks).as_posix() for mask in masks.rglob(f"*{SUFFIX}"))
-    return any((image_dir / name.removesuffix(SUFFIX)).is_file() for name in found)
+def those_of(masks: Path | None, image_dir: Path) -> Path | None:
+    """Return masks if one belongs to a photo in a folder, else None; arguments as in `find`."""
+    return masks if masks is not None and _applies(masks, image_dir) else None
 
 
 def check(masks: Path, image_dirs: Collection[Path]) -> None:
     """Raise an InputError unless there are masks, and one belongs to a photo in these folders."""
-    if not masks.exists():
-        raise InputError(f"There is no folder or file {masks} of masks.")
-    if not masks.is_dir():
-        read(masks)
-    if any(applies(masks, image_dir) for image_dir in image_dirs):
+    for image_dir in image_dirs:
+        if not image_dir.is_dir():
+            raise no_folder(image_dir)
+    if any(_applies(masks, image_dir) for image_dir in image_dirs):
         return
     where = " or ".join(map(str, image_dirs))
     if not masks.is_dir():
@@ -139,11 +135,24 @@ def check(masks: Path, image_dirs: Collection[Path]) -> None:
     raise InputError(f"No mask in {masks} belongs to a photo in {where}.{example}")
 
 
-def _files(masks: Path, image_dir: Path, names: Collection[str]) -> dict[str, Path]:
-    """Return the files of masks by the names of their photos."""
+def _applies(masks: Path, image_dir: Path) -> bool:
+    """Tell whether a mask belongs to a photo in a folder."""
+    if not _is_folder(masks):
+        size = _inspect(masks, *_state(masks)).size
+        return any(stored_size(photo) == size for photo in _photos(image_dir))
+    found = (mask.relative_to(masks).as_posix() for mask in _walk(masks, {SUFFIX}))
+    return any((image_dir / name.removesuffix(SUFFIX)).is_file() for name in found)
+
+
+def _is_folder(masks: Path) -> bool:
     if not masks.exists():
         raise InputError(f"There is no folder or file {masks} of masks.")
-    if masks.is_dir():
+    return masks.is_dir()
+
+
+def _files(masks: Path, image_dir: Path, names: Collection[str]) -> dict[str, Path]:
+    """Return the files of masks by the names of their photos."""
+    if _is_folder(masks):
         files = {name: masks / f"{name}{SUFFIX}" for name in names}
         return {name: path for name, path in files.items() if path.is_file()}
     size = _inspect(masks, *_state(masks)).size
@@ -152,7 +161,13 @@ def _files(masks: Path, image_dir: Path, names: Collection[str]) -> dict[str, Pa
 
 def _photos(image_dir: Path) -> Iterator[Path]:
     """Yield the photos in a folder."""
-    return (path for path in image_dir.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    return _walk(image_dir, IMAGE_SUFFIXES)
+
+
+def _walk(root: Path, suffixes: Collection[str]) -> Iterator[Path]:
+    """Yield the files in a folder, also behind links to folders, whose names end so."""
+    for folder, _, names in os.walk(root, followlinks=True):
+        yield from (Path(folder, n) for n in sorted(names) if Path(n).suffix.lower() in suffixes)
 
 
 def _state(path: Path) -> tuple[int, int]:

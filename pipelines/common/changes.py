@@ -5,6 +5,7 @@ from typing import Annotated
 
 from hloc_reduce import maps
 from hloc_reduce.maps.map import Map
+from hloc_reduce.utils import masks as masks_of
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.options import HIDDEN
 from hloc_reduce.utils.parsers import image_names
@@ -50,6 +51,7 @@ def main(
     add_model: Path | None = None,
     refine_map: bool = False,
     remove_images: Path | None = None,
+    masks: Path | None = None,
 ) -> None:
     """Remove photos from a map, and add others.
 
@@ -60,6 +62,7 @@ def main(
             kept; default: the photos are localized in the map.
         refine_map: also adjust the poses of the photos that are already in the map.
         remove_images: text file of the names of photos to remove from `map`.
+        masks: of `add_images`.
 
     Raises:
         InputError: see `maps.add` and `maps.remove`.
@@ -73,6 +76,7 @@ def main(
             print(f"Photos left in the map {folder}: {built.num_images}.")
     if add_images is not None:
         before = built.num_images
-        built = maps.add(built, add_images, add_model, refine_map=refine_map)
+        masks = masks_of.those_of(masks, add_images)
+        built = maps.add(built, add_images, add_model, refine_map=refine_map, masks=masks)
         added = built.num_images - before
         print(f"Photos added to the map {folder}: {added}. It has {built.num_images} now.")

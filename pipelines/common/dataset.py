@@ -14,6 +14,7 @@ from hloc_reduce.evaluation.summaries import map_bytes
 from hloc_reduce.localization import rigs
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF, RunFolder
+from hloc_reduce.utils import masks
 from hloc_reduce.utils.h5 import get_text, open_h5
 from hloc_reduce.utils.parsers import write_poses
 
@@ -85,6 +86,8 @@ class DatasetRun(Run):
             "retrieval": options.retrieval,
             **options.numbers,
         }
+        found = masks.find(options.masks, self.place.images, [*self.map_names, *self.query_names])
+        conf |= {"masks": masks.digests(found)} if found else {}
         is_file = options.retrieval not in retrieval_confs.confs
         inputs = [Path(options.retrieval)] if is_file else []
         if inputs and outputs.resolve().parent in inputs[0].resolve().parents:
@@ -101,6 +104,7 @@ class DatasetRun(Run):
             for step in steps:
                 match_features.check_model(matchers_confs.confs[step], conf["feature"])
             check_model(options.retrieval)
+        inputs += [options.masks] if options.masks else []
         return RunFolder(outputs, conf, overwrite, inputs)
 
     def extract_features(self) -> Path:
@@ -115,6 +119,7 @@ class DatasetRun(Run):
                     executor=self.executor,
                     strict=self.options.strict,
                     queries=self.query_names,
+                    masks=self.options.masks,
                 )
             kept = extract_features.keep_readable(
                 self.features, self.map_names, self.options.accept_partial

@@ -60,6 +60,9 @@ class DatasetOptions(Method):
         accept_partial: build the map without photos that are missing or unreadable.
         overwrite: recompute existing results.
         executor: where the work is done.
+        masks: folder of masks of photos, as COLMAP's: keypoints of a/photo.jpg in black pixels of
+            `masks`/a/photo.jpg.png are dropped; or one mask for all photos of its size; default:
+            none.
     """
 
     num_loc: Positive = 50
@@ -69,6 +72,7 @@ class DatasetOptions(Method):
     accept_partial: bool = False
     overwrite: bool = False
     executor: Executor = SERIAL
+    masks: Path | None = None
 
     def configured_feature(self) -> tuple[str, dict]:
         """Return the name and the configuration of the feature."""

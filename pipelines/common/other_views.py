@@ -23,6 +23,7 @@ def tries(
     pairs: Path,
     num_loc: int | None,
     map_names: list[str],
+    masks: Path | None = None,
 ) -> list[Try]:
     """Return how queries are tried in other views, if the feature of the map needs that.
 
@@ -36,6 +37,7 @@ def tries(
         num_loc: map images that the map's retrieval finds for a query in another view; None: those
             of `pairs`.
         map_names: images of the map.
+        masks: of the queries.
     """
     if built.is_rotation_invariant:
         return []
@@ -49,7 +51,13 @@ def tries(
 
         def match(names: list[str]) -> Matched:
             extract_features.main(
-                conf, image_dir, feature_path=seen, image_list=names, strict=False, queries=names
+                conf,
+                image_dir,
+                feature_path=seen,
+                image_list=names,
+                strict=False,
+                queries=names,
+                masks=masks,
             )
             if num_loc is None:
                 write_pairs_of(names, pairs, suffix)
@@ -59,7 +67,7 @@ def tries(
                 retrieve_in_map(built, seen, *given)
             return Matched(seen, run.match_pairs(matcher, listed, seen, built.features), listed)
 
-        mirror_images = run.mirror_images(conf, image_dir, listed, seen, built.features)
+        mirror_images = run.mirror_images(conf, image_dir, listed, seen, built.features, masks)
         return Try(
             match,
             {"view": view.how, "matcher": matchers_confs.confs[matcher]["model"]},

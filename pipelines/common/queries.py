@@ -17,6 +17,7 @@ from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils import masks as masks_of
 from hloc_reduce.utils.files import is_readable
 from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.match_files import check_distinct
@@ -133,34 +134,52 @@ def _check_exact(
 
 
 class Photos:
-    """The provenance of results: the map and the photos of the queries.
+    """The provenance of results: the map, the photos of the queries, and their masks.
 
-    Results are stale if a photo that they were made from has changed, or the map was rebuilt.
+    Results are stale if a photo or a mask that they were made from has changed, a mask is new or
+    gone, or the map was rebuilt.
     """
 
-    def __init__(self, path: Path, built: Map, query_images: Path, names: list[str]):
+    def __init__(
+        self,
+        path: Path,
+        built: Map,
+        query_images: Path,
+        names: list[str],
+        masks: Path | None = None,
+    ):
         self._path = path
         before = provenance.read(path)
         known = before.get("queries", {})
         files = {name: query_images / name for name in names}
         found = {name: file for name, file in files.items() if is_readable(file)}
         self._map, self._photos = built.id, provenance.fingerprints(found, known)
+        self._masks = masks_of.digests(masks_of.find(masks, query_images, names))
+        masks_before = before.get("masks", {})
         self.changed = provenance.changed(known, self._photos)
+        self.changed += [
+            f"the mask of {name}"
+            for name in self._photos
+            if name in known and masks_before.get(name) != self._masks.get(name)
+        ]
         if before and before.get("map") != built.id:
             self.changed.append(f"the map {built.folder}")
         if self.changed:
             logger.info("Results are stale, as these changed: %s.", ", ".join(self.changed))
         else:  # photos that are not in this list may be in the next
             self._photos = {**known, **self._photos}
+            self._masks = {**masks_before, **self._masks}
 
     def write(self) -> None:
         """Write the provenance."""
-        provenance.write(self._path, {"map": self._map, "queries": self._photos})
+        content = {"map": self._map, "queries": self._photos}
+        provenance.write(self._path, content | ({"masks": self._masks} if self._masks else {}))
 
     def forget(self, unreadable: Iterable[str]) -> None:
         """Leave out unreadable photos: once readable, they do not make the other results stale."""
         for name in unreadable:
             self._photos.pop(name, None)
+            self._masks.pop(name, None)
         self.write()
 
 

@@ -153,7 +153,13 @@ class Run:
         return Try(match, made_from, mirror_images(matcher) if mirror_images else None)
 
     def mirror_images(
-        self, conf: dict, image_dir: Path, pairs: Path, features: Path, map_features: Path
+        self,
+        conf: dict,
+        image_dir: Path,
+        pairs: Path,
+        features: Path,
+        map_features: Path,
+        masks: Path | None = None,
     ) -> Callable[[str], MirrorImages]:
         """Return what a matcher needs to match mirror images of queries in a localization stage.
 
@@ -163,6 +169,7 @@ class Run:
             pairs: pairs of all queries and map images.
             features: feature file of all queries.
             map_features: feature file of the map images.
+            masks: of the queries.
         """
         mirrored = self._folders[0].path / f"{features.stem}-mirrored.h5"
 
@@ -170,7 +177,7 @@ class Run:
             def match(listed: Path, mirrored: Path) -> Path:
                 return self.match_pairs(matcher, listed, mirrored, map_features)
 
-            return mirror_images(conf, image_dir, pairs, mirrored, match, self.executor)
+            return mirror_images(conf, image_dir, pairs, mirrored, match, self.executor, masks)
 
         return of_matcher
 
