@@ -3,7 +3,7 @@
 from functools import reduce
 
 import torch
-from torch.nn.functional import interpolate, max_pool2d, pad
+from torch.nn.functional import interpolate, pad
 
 # A maximum is above its neighbors by more than this: scores of one colour differ by rounding.
 MARGIN = 1e-6
@@ -32,7 +32,7 @@ def strongest(
         min_score: lower ones are dropped.
         border: number of pixels at each border without keypoints, at least `radius`.
         max_keypoints: how many are kept; -1 for all.
-        mask: bool, of any size, where keypoints may be; pixels beside those count, too.
+        mask: bool, of any size, where keypoints may be; default: everywhere.
 
     Returns:
         Keypoints (N, 2) float x, y, and their scores (N,), highest first.
@@ -41,7 +41,7 @@ def strongest(
     y, x = y + border, x + border
     if mask is not None:
         share = interpolate(mask[None, None].float(), scores.shape, mode="area")
-        kept = max_pool2d(share, 3, stride=1, padding=1)[0, 0, y, x] > 0
+        kept = share[0, 0, y, x] > 0
         y, x = y[kept], x[kept]
     found = scores[y, x]
     number = len(found) if max_keypoints < 0 else min(max_keypoints, len(found))

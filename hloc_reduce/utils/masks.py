@@ -69,7 +69,7 @@ def read(path: Path) -> np.ndarray:
     except OSError as error:
         raise InputError(f"Cannot read the mask {path}: {error.strerror}.") from None
     # at full depth: numbers of objects in 16 bits may be small
-    how = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    how = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = cv2.imdecode(data, how) if data.size else None
     if pixels is None:
         raise InputError(f"The mask {path} is not an image, or it is truncated.")

@@ -6,15 +6,17 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from command import outcome, refused, state
+from command import outcome, refused, state, write
 from command import run as run_pipeline
+from conftest import FOCAL, SIZE
 
+from hloc_reduce import Localizer
 from hloc_reduce.maps.map import Map
 from hloc_reduce.utils import colmap
+from hloc_reduce.utils.parsers import parse_query_list
 from pipelines import aachen, inloc, localize
 
 PIPELINE = localize
-SIZE = 360, 270
 BUMPER = 180  # rows from here on are black
 
 
@@ -192,3 +194,27 @@ def test_inloc(inloc_layout, masks, tmp_path, monkeypatch):
     (features,) = (tmp_path / "out").glob("feats-dog*_sv64.h5")
     names = "query/iphone7/a.JPG", "database/cutouts/PLA1/000/PLA_cutout_000_0_0.jpg"
     assert lowest(features, *names) < BUMPER
+
+
+def test_queries_in_other_views(place, masks, tmp_path, run):
+    """A mask is turned with its photo, and mirrored with it."""
+    build, images, outputs = place
+    queries = tmp_path / "turned"
+    queries.mkdir()
+    photo = cv2.imread(str(images / "query/day/a.png"))
+    cv2.imwrite(str(queries / "a.png"), np.rot90(photo))
+    given = masks("a.png")
+    upright = cv2.imread(str(given / "a.png.png"))
+    cv2.imwrite(str(given / "a.png.png"), np.rot90(upright))
+    listed = write(tmp_path / "turned.txt", f"a.png SIMPLE_PINHOLE 270 360 {FOCAL} 135 180\n")
+    new = "--query_images", queries, "--queries", listed, "--masks", given
+    run(*build, "--feature", "mini32", *new)
+    folder = outputs / "queries-turned"
+    row = outcome(folder)[1]["a.png"]
+    assert row["status"] == "localized" and row["turned"] == "270"
+    with h5py.File(folder / "feats-mini32-turned270.h5") as file:
+        keypoints = file["a.png/keypoints"][()]
+    assert len(keypoints) > 100 and keypoints[:, 0].max() < BUMPER
+    camera = parse_query_list(listed)[0][1]
+    _, info = Localizer(outputs / "map").localize(queries / "a.png", camera, given / "a.png.png")
+    assert info["turned"] == 270 and info["num_inliers"] == int(row["num_inliers"])

@@ -273,3 +273,13 @@ def test_retrieval_of_a_missing_hloc_fails_at_once(aachen_layout, tmp_path, monk
     given = ("--dataset", aachen_layout, "--outputs", tmp_path / "o", "--retrieval", "megaloc")
     assert "hloc is not installed: pip" in refused(monkeypatch, caplog, aachen, *given)
     assert not (tmp_path / "o").exists()
+
+
+def test_keypoints_of_hlocs_extractors_are_masked(double):
+    model = extractors.load({"name": "dots", "number": 3})  # at (0, 1), (2, 3) and (4, 5)
+    mask = np.ones((40, 40), bool)
+    mask[3, 2] = False
+    photo = np.zeros((40, 40, 3), np.uint8)
+    found = extractors.extract(model, photo, {}, mask=mask)
+    assert found["keypoints"].tolist() == [[0, 1], [4, 5]] and found["scores"].shape == (2,)
+    np.testing.assert_allclose(found["descriptors"], np.eye(256)[:, [0, 2]])
