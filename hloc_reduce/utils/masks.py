@@ -42,7 +42,8 @@ def kept(mask: np.ndarray, what: str = "The mask") -> np.ndarray:
         InputError: for arrays of another shape, or without a pixel that is not black; the message
             begins with `what`.
     """
-    if mask.dtype.kind not in "bui" or mask.shape[2:] not in ((), (3,)) or mask.size == 0:
+    is_image = mask.ndim == 2 or mask.shape[2:] == (3,)
+    if mask.dtype.kind not in "bui" or not is_image or mask.size == 0:
         raise InputError(
             f"{what} is not (H, W), bool or uint8, 0 where a photo is ignored, but {mask.dtype} "
             f"{mask.shape}."
@@ -66,11 +67,13 @@ def read(path: Path) -> np.ndarray:
     """
     try:
         data = np.fromfile(path, np.uint8)
+        # at full depth: numbers of objects in 16 bits may be small
+        how = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        pixels = cv2.imdecode(data, how) if data.size else None
     except OSError as error:
         raise InputError(f"Cannot read the mask {path}: {error.strerror}.") from None
-    # at full depth: numbers of objects in 16 bits may be small
-    how = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = cv2.imdecode(data, how) if data.size else None
+    except cv2.error:  # of more pixels than it reads
+        pixels = None
     if pixels is None:
         raise InputError(f"The mask {path} is not an image, or it is truncated.")
     return kept(pixels, f"The mask {path}")

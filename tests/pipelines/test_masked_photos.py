@@ -46,7 +46,7 @@ MAP = [f"db/{i}.png" for i in range(4)]
 
 
 def test_one_folder_for_the_map_and_queries(place, masks, run, refused, caplog):
-    """Names decide; what has changed is noticed; retrieval sees what is left."""
+    """Names decide; what has changed is noticed."""
     build, images, outputs = place
     caplog.set_level("INFO")
     given = masks(*MAP[:3], "a.png")

@@ -259,7 +259,12 @@ def test_wrong_masks(folder, tmp_path, textured, half):
     cv2.imwrite(str(small), np.zeros((240, 320), np.uint8))
     assert "all black" in refused(small)
     assert "not an image" in refused(write(tmp_path / "text.png", "no image"))
-    with pytest.raises(InputError, match="The mask is not .H, W., bool or uint8"):
-        masks.kept(np.ones((240, 320), np.float32))
+    for wrong in (
+        np.ones((240, 320), np.float32),
+        np.ones(240, np.uint8),
+        np.ones((9, 9, 4), bool),
+    ):
+        with pytest.raises(InputError, match="The mask is not .H, W., bool or uint8"):
+            masks.kept(wrong)
     with pytest.raises(InputError, match="The mask has 2x3 pixels, the photo has 320x240"):
         resized(textured, {}, np.ones((3, 2), bool))
