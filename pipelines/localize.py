@@ -357,6 +357,7 @@ def _check(given: dict, is_changed: bool) -> None:
 def _main() -> None:
     given = command.read(_parser())
     change, outputs, folder = taken(changes.main, given), given["outputs"], given["model_or_map"]
+    masks = change.pop("masks")
     gps, scale = given["gps"], given["scale"]
     is_aligned = bool(gps or scale) and folder is not None and maps.is_map(folder)
     _check(given, any(change.values()) or is_aligned)

@@ -122,7 +122,7 @@ def detect(
     """
     search = partial(_search, opencv.detect if fast else colmap.detect_dog, mask)
     found = more = search(image, options)
-    least = enough(image.size if mask is None else np.count_nonzero(mask))
+    least = enough(image.size if mask is None else int(np.count_nonzero(mask)))
     if not adaptive or len(found[0]) >= least or is_noise(image):
         return found
     ladder = LADDERS["small" if max(image.shape) <= SMALL_PHOTO_PIXELS else "large"]

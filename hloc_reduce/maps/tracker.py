@@ -1,10 +1,10 @@
 """Localize the frames of a video one after the other."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pycolmap
+
+from .given import Image
 
 if TYPE_CHECKING:
     from .localizer import Localizer
@@ -38,14 +38,18 @@ class Tracker:
         self.localizer, self.camera, self.radius = localizer, camera, radius
         self._last: list[pycolmap.Rigid3d | None] = []  # of the last frames
 
-    def localize(self, image: Path | str | np.ndarray) -> tuple[pycolmap.Rigid3d | None, dict]:
+    def localize(
+        self, image: Image, mask: Image | None = None
+    ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Localize the next frame, see `Localizer.localize`.
 
         Args:
             image: its file, or its pixels.
+            mask: see `Localizer.localize`.
         """
         near = self._expected()
-        found = self.localizer.localize(image, self.camera, near, self.radius if near else None)
+        radius = self.radius if near else None
+        found = self.localizer.localize(image, self.camera, mask, near, radius)
         self._last = [*self._last, found[0]][-REMEMBERED:]
         return found
 

@@ -16,8 +16,8 @@ from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF
 from hloc_reduce.utils import cli
-from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils import masks as masks_of
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.files import is_readable
 from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.match_files import check_distinct

@@ -32,7 +32,9 @@ def test_matches_that_fit_a_guess():
     # seen 16 degrees off, of which a radius of a tenth of the distance explains 5.6
     for radius, expected in ((0.5, False), (1.5, True)):
         guess = Guess(pycolmap.Rigid3d(), radius, [])
-        assert guess.fits(seen[1:2] + [1.8 * allowed, 0], points3D[1:2], CAMERA).tolist() == [expected]
+        assert guess.fits(seen[1:2] + [1.8 * allowed, 0], points3D[1:2], CAMERA).tolist() == [
+            expected
+        ]
     assert still.fits(np.zeros((0, 2)), np.zeros((0, 3)), CAMERA).shape == (0,)
 
 
