@@ -283,7 +283,8 @@ class Localizer:
             from `localize`; the `covariance` (6, 6) of the pose, see `measures.rig_covariance`,
             None if it is not determined; `cameras`, a dict for each with its `num_matches`,
             `num_correspondences` and `num_inliers`, `points2D` (M, 2), `points3D` (M, 3) and
-            `inliers` (M,) bool, and `retrieved`; `map_doubts`, and `seconds` by stage.
+            `inliers` (M,) bool, and `retrieved`; `map_doubts`; `wgs84` of the rig, as from
+            `localize`; and `seconds` by stage.
 
         Raises:
             UnreadableImage: if an image cannot be read.
@@ -305,6 +306,7 @@ class Localizer:
             pose, of_cameras = self._try_rig(photos, rig, self.steps[again], laps)
             if pose.refusal is None:
                 break
+        rig_from_world = pose.rig_from_world if pose.refusal is None else None
         info = {
             **gates.verdict(pose.measures, self.steps[again][1]),
             "reason": pose.refusal,
@@ -316,9 +318,10 @@ class Localizer:
             "covariance": pose.covariance,
             "cameras": of_cameras,
             "map_doubts": self.doubts,
+            "wgs84": rig_from_world and self.frame.wgs84(rig_from_world),
             "seconds": laps.seconds,
         }
-        return pose.rig_from_world if pose.refusal is None else None, info
+        return rig_from_world, info
 
     def _try_rig(
         self, photos: list[tuple[dict, list[str]]], rig: list[tuple], step: tuple, laps: Laps
