@@ -1,15 +1,29 @@
 """Localize the frames of a video one after the other."""
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import pycolmap
 
 from .given import Image
 
-if TYPE_CHECKING:
-    from .localizer import Localizer
-
 REMEMBERED = 10  # frames, after which a camera whose pose is not known may be anywhere
+
+
+class Localizes(Protocol):
+    """What a `Localizer` does for its tracker."""
+
+    def localize(
+        self,
+        image: Image,
+        camera: pycolmap.Camera | None = None,
+        mask: Image | None = None,
+        near: pycolmap.Rigid3d | None = None,
+        radius: float | None = None,
+    ) -> tuple[pycolmap.Rigid3d | None, dict]:
+        """Localize a photo."""
+
+    def is_far(self, cam_from_world: pycolmap.Rigid3d) -> bool:
+        """Tell whether a pose is too far from the map for `near`."""
 
 
 class Tracker:
@@ -31,7 +45,7 @@ class Tracker:
 
     def __init__(
         self,
-        localizer: "Localizer",
+        localizer: Localizes,
         camera: pycolmap.Camera | None = None,
         radius: float | None = None,
     ):
