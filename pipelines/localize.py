@@ -20,6 +20,7 @@ from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
+from hloc_reduce.maps.pairing import PairsOption
 from hloc_reduce.match_features import check_features, check_model
 from hloc_reduce.runtime import trace
 from hloc_reduce.runtime.group_writer import failures
@@ -57,6 +58,7 @@ def open_map(
     retrieval: Retrieval | None = None,
     exif_gps: bool = True,
     masks: Path | None = None,
+    pairs: PairsOption | None = None,
 ) -> Map:
     """Build a map, or open one that was built before.
 
@@ -91,12 +93,17 @@ def open_map(
         masks: folder of masks of photos, as COLMAP's: keypoints of a/photo.jpg in black pixels of
             `masks`/a/photo.jpg.png are dropped, in photos of the map, queries, and photos that are
             added; or one mask for all photos of its size; default: none.
+        pairs: which photos are matched with each other in a map of photos alone: all, each with
+            the `num_covis` most similar ones, or each with those around it by name and similar
+            ones; default: sequential for a video, else exhaustive for up to 100 photos and
+            retrieval for more.
 
     Raises:
         InputError: when an old map was built with other options, or something is missing or wrong.
     """
-    if camera_mode is not None and (map_images is None or model_or_map is not None):
-        raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
+    for option, value in (("camera_mode", camera_mode), ("pairs", pairs)):
+        if value is not None and (map_images is None or model_or_map is not None):
+            raise InputError(f"--{option} is for maps of photos alone: leave it or --map out.")
     mode = colmap.camera_mode(camera_mode or "auto")
     named = retrieval if retrieval in retrieval_confs.confs else None
     is_built = model_or_map and (maps.is_map(model_or_map) or maps.is_compact(model_or_map))
@@ -129,6 +136,7 @@ def open_map(
         new |= {"num_covis": num_covis, "accept_partial": accept_partial, "camera_mode": mode}
         new |= {"exif_gps": exif_gps}
         new["masks"] = masks_of.those_of(masks, map_images)
+        new["pairs"] = pairs
         return maps.main(folder, map_images, model_or_map, **new)
     if model_or_map is None:
         raise InputError("Give --map_images, the folder of the photos to build a map of.")

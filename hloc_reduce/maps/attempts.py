@@ -13,9 +13,6 @@ from .. import (
     extract_features,
     logger,
     match_features,
-    pairs_from_covisibility,
-    pairs_from_exhaustive,
-    pairs_from_retrieval,
     pairs_from_verification,
     reconstruction,
     triangulation,
@@ -29,7 +26,8 @@ from ..mapping.checks import Inputs, another_size, intrinsics, mirrored
 from ..mapping.findings import Finding, names_in
 from ..runtime.outputs import RunFolder
 from ..utils import cli, colmap
-from ..utils.parsers import parse_pairs, parse_retrieval, write_pairs
+from ..utils.parsers import parse_pairs, write_pairs
+from . import pairing
 from .by_others import ByOthers
 from .map import SFM, Map, models
 
@@ -40,7 +38,6 @@ UNMIRRORED = "-unmirrored"  # without the mirrored photos of another attempt
 ONLY_ALIKE = "-alike"  # without photos whose intrinsics are unlike those of the others
 OWN_CAMERAS = "-per_image"  # with a camera for each photo
 MIRROR_IMAGES = "mirrored"  # folder of what is known of mirror images
-PAIR_ROUNDS = 3  # of additional pairs, in which larger sets of photos get connected
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,7 @@ class Photos:
         names: the photos.
         matcher: a key of `confs.matchers`.
         num_covis: each photo is paired with this number of others.
-        exhaustive: pair photos without covisible ones with all others.
+        pairs: how photos without covisible ones are paired, a key of `pairing.PAIRS`.
         accept_partial: do without photos that cannot be read.
         camera_mode: which photos share a camera, if their poses are reconstructed.
         retrieval: a key of `confs.retrieval`.
@@ -66,7 +63,7 @@ class Photos:
     names: list[str]
     matcher: str
     num_covis: int
-    exhaustive: bool
+    pairs: str
     accept_partial: bool
     camera_mode: pycolmap.CameraMode
     retrieval: str
@@ -119,7 +116,15 @@ def of_model(
     if len(photos.names) < len(reference.images):
         model = colmap.write_part(model, set(photos.names), folder.path / "sfm_reference")
         reference = colmap.read_model(model)
-    pairs = _pairs_of_model(photos, reference, descriptors)
+    with folder.stage("pairs"):
+        pairs = pairing.of_model(
+            folder.path,
+            reference,
+            photos.names,
+            descriptors,
+            photos.pairs,
+            photos.num_covis,
+        )
     matches = _match(photos, pairs, features)
     with folder.stage("triangulation"):
         sfm = triangulation.main(
@@ -270,11 +275,16 @@ def _reconstruct(
         camera_mode: which photos share a camera in the model; default: that of `photos`.
     """
     photos, features, descriptors = _describe(photos, conf)
-    pairs = _pairs(photos, descriptors)
-    matches = _match(photos, pairs, features)
     folder = photos.folder
-    for number in () if photos.exhaustive else range(1, PAIR_ROUNDS + 1):
-        before, pairs = pairs, folder.path / f"pairs-db-{photos.num_covis}-{number}.txt"
+    with folder.stage("pairs"):
+        pairs = pairing.of_photos(
+            folder.path, photos.names, descriptors, photos.pairs, photos.num_covis
+        )
+    first = pairs.stem
+    matches = _match(photos, pairs, features)
+    wanted = pairing.PAIRS[photos.pairs]
+    for number in range(1, wanted.rounds + 1):
+        before, pairs = pairs, folder.path / f"{first}-{number}.txt"
         with folder.stage("verification"):
             pairs_from_verification.main(
                 pairs,
@@ -284,7 +294,7 @@ def _reconstruct(
                 matches,
                 descriptors,
                 num_matched=photos.num_covis,
-                num_covis=photos.num_covis if number == 1 else 0,
+                num_covis=photos.num_covis if wanted.widens and number == 1 else 0,
                 camera_mode=photos.camera_mode,
                 image_list=photos.names,
             )
@@ -327,47 +337,6 @@ def _describe(photos: Photos, conf: dict) -> Described:
             described_by, features, names, image_dir=photos.image_dir
         )
     return Described(replace(photos, names=names), features, descriptors)
-
-
-def _pairs_of_model(photos: Photos, reference: pycolmap.Reconstruction, descriptors: Path) -> Path:
-    """Pair covisible images, and those without any as if the model had no points."""
-    others = dict(pairs_from_covisibility.covisible(reference, photos.num_covis))
-    alone = [name for name, seen in others.items() if not seen]
-    if len(alone) == len(others):
-        return _pairs(photos, descriptors)
-    pairs = photos.folder.path / f"pairs-db-{photos.num_covis}.txt"
-    with photos.folder.stage("pairs"):
-        if alone:
-            logger.info(
-                "%d of %d photos share no point of the model with others, so they are paired "
-                "with %s: %s.",
-                len(alone),
-                len(others),
-                "all others" if photos.exhaustive else "the most similar ones",
-                cli.some(alone),
-            )
-        if photos.exhaustive:
-            others |= {name: [other for other in others if other != name] for name in alone}
-        elif alone:
-            pairs_from_retrieval.main(
-                descriptors, pairs, photos.num_covis, query_list=alone, db_list=[*others]
-            )
-            others |= parse_retrieval(pairs)
-        number = write_pairs(((a, b) for a in others for b in others[a]), pairs)
-    logger.info("Found %d pairs of %d images.", number, len(others))
-    return pairs
-
-
-def _pairs(photos: Photos, descriptors: Path) -> Path:
-    """Pair all images, or of many each with the most similar ones."""
-    with photos.folder.stage("pairs"):
-        if photos.exhaustive:
-            pairs = photos.folder.path / "pairs-db-exhaustive.txt"
-            pairs_from_exhaustive.main(pairs, photos.names)
-        else:
-            pairs = photos.folder.path / f"pairs-db-{photos.num_covis}.txt"
-            pairs_from_retrieval.main(descriptors, pairs, photos.num_covis)
-    return pairs
 
 
 def _match(photos: Photos, pairs: Path, features: Path, matches: Path | None = None) -> Path:

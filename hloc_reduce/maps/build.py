@@ -28,11 +28,9 @@ from ..utils.files import replacing
 from ..utils.images import list_images, stored_size
 from ..utils.match_files import check_distinct
 from ..utils.paths import strings_as_paths
-from . import georeference
-from .attempts import PAIR_ROUNDS, Attempt, Photos, drop_others, of_model, of_photos_alone
+from . import georeference, pairing
+from .attempts import Attempt, Photos, drop_others, of_model, of_photos_alone
 from .map import FINGERPRINTS, FINISHED, PLACE, Map, keep_projection, write, write_model
-
-MAX_EXHAUSTIVE = 100  # photos without covisibility that are all paired with each other
 
 
 @strings_as_paths
@@ -52,6 +50,7 @@ def main(
     retrieval: str = retrieval_confs.VLAD,
     exif_gps: bool = True,
     masks: Path | None = None,
+    pairs: str | None = None,
 ) -> Map:
     """Build a map, or open the one that was made from the same.
 
@@ -64,9 +63,8 @@ def main(
         projection: projection file to use with the base descriptor of `feature`.
         matcher: a key of `confs.matchers`; default: the feature's.
         num_covis: each image is paired with this number of the most covisible ones in the model.
-            Images that share no point of the model with others, and all without a model, are
-            paired with all others, or of more than `MAX_EXHAUSTIVE` with the most similar ones;
-            without a model, pairs are added where these leave images unconnected.
+            Images that share no point of the model with others are paired with all others, or of
+            more than `pairing.MAX_EXHAUSTIVE` with the most similar ones.
         overwrite: rebuild the map.
         storage: how descriptors are stored, one of `utils.codes.STORAGES`.
         keypoints: settings of the DoG detector, one of `detectors.dog.KEYPOINT_SETTINGS`.
@@ -78,6 +76,11 @@ def main(
         exif_gps: without a model, align a new map with the GPS positions in the EXIF data of its
             photos, see `georeference.by_exif`.
         masks: of the images, see `extract_features.main`.
+        pairs: which images are matched with each other, without a model: all ("exhaustive"), each
+            with the `num_covis` most similar ones ("retrieval"), or each with those around it by
+            name and similar ones ("sequential", see `pairs_from_sequence`). But for "exhaustive",
+            pairs are added where these leave images unconnected. Default: "exhaustive" for up to
+            `pairing.MAX_EXHAUSTIVE` images, else "retrieval".
 
     Returns:
         The map.
@@ -98,8 +101,9 @@ def main(
     check_distinct(names)
     # points without tracks, such as those of scanners, tell nothing of the photos
     has_points = reference is not None and any(i.num_points3D for i in reference.images.values())
-    exhaustive = len(names) <= MAX_EXHAUSTIVE
     masked = masks_of.digests(masks_of.find(masks, image_dir, names))
+    if pairs is None or model is not None:
+        pairs = pairing.default(len(names))
     if overwrite or not (map_dir / CONF).exists():
         extract_features.check_model(conf)
         match_features.check_model(matchers_confs.confs[matcher], extract_features.provenance(conf))
@@ -116,10 +120,8 @@ def main(
         "num_covis": num_covis,
         **found,
     }
-    if exhaustive and not has_points:
-        made_from |= {"num_covis": None, "pairs": "exhaustive"}
-    elif model is None:
-        made_from |= {"pairs": f"retrieval, {PAIR_ROUNDS} rounds of verification"}
+    if model is None or (pairs == "exhaustive" and not has_points):
+        made_from |= pairing.provenance(pairs)
     made_from |= {"normalized": True} if normalized else {}
     made_from |= {"masks": masked} if masked else {}
     made_from |= retrieval_confs.provenance(retrieval)
@@ -134,7 +136,7 @@ def main(
                 usable,
                 matcher=matcher,
                 num_covis=num_covis,
-                exhaustive=exhaustive,
+                pairs=pairs,
                 accept_partial=accept_partial,
                 camera_mode=camera_mode,
                 retrieval=retrieval,

@@ -7,7 +7,7 @@ from PIL import Image
 from hloc_reduce import Localizer, maps
 from hloc_reduce.mapping.checks import intrinsics
 from hloc_reduce.mapping.findings import names_in
-from hloc_reduce.maps import build
+from hloc_reduce.maps import pairing
 from pipelines import localize
 
 PIPELINE = localize
@@ -27,7 +27,7 @@ def test_a_photo_of_another_size_by_the_same_camera_is_left_out(
             part = photo.crop((0, 0, 252, 189)) if path.stem == "1" else photo
             part.save(path.with_suffix(".jpg"), quality=95, exif=exif)
         path.unlink()
-    monkeypatch.setattr(build, "MAX_EXHAUSTIVE", most)
+    monkeypatch.setattr(pairing, "MAX_EXHAUSTIVE", most)
     run("--map_images", images, "--outputs", outputs, "--camera_mode", "single")
     built = maps.Map(outputs / "map")
     assert names_in(built.findings, "another_size") == {"1.jpg"}

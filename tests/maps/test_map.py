@@ -313,7 +313,7 @@ def test_a_projection_is_kept_with_the_map(place, tmp_path, run):
 @pytest.mark.parametrize("exhaustive", [4, 3])
 def test_a_model_of_poses_only(place, aachen_layout, monkeypatch, exhaustive, run):
     """Without points nothing is covisible: all images are matched, or if many similar ones."""
-    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", exhaustive)
+    monkeypatch.setattr(maps.pairing, "MAX_EXHAUSTIVE", exhaustive)
     build, images, outputs = place
     model = aachen_layout / "3D-models/aachen_v_1_1"
     reference = pycolmap.Reconstruction(model)
@@ -338,7 +338,7 @@ def test_photos_that_see_no_point_of_the_model(
     blind, numbers, exhaustive, place, aachen_layout, monkeypatch, run
 ):
     """They are paired as without points; those that see some, by these: of a scanner, none do."""
-    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", exhaustive)
+    monkeypatch.setattr(maps.pairing, "MAX_EXHAUSTIVE", exhaustive)
     build, images, outputs = place
     model = aachen_layout / "3D-models/aachen_v_1_1"
     reference = pycolmap.Reconstruction(model)

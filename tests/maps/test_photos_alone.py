@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from command import outcome, state
 from conftest import FOCAL
 from PIL import Image
 
-from hloc_reduce import Localizer, maps
+from hloc_reduce import Localizer, maps, pairs_from_sequence
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.mapping import registration
 from hloc_reduce.mapping.checks import intrinsics
@@ -21,6 +22,7 @@ from hloc_reduce.utils import colmap, parsers
 from pipelines import localize
 
 PIPELINE = localize
+PAIRS = ("--pairs", "sequential")
 
 
 def draw_noise(folder, numbers, size=(270, 360)):
@@ -188,7 +190,7 @@ def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatc
 
 def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch, run):
     """One retrieved photo each leaves two parts; all are in the map in the end."""
-    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", 4)
+    monkeypatch.setattr(maps.pairing, "MAX_EXHAUSTIVE", 4)
     outputs = tmp_path / "outputs"
     build = ("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
     build += ("--num_covis", 1)
@@ -196,7 +198,7 @@ def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch, ru
     def apart(descriptors, output, num_matched):
         parsers.write_pairs([("0.png", "1.png"), ("1.png", "2.png"), ("3.png", "4.png")], output)
 
-    monkeypatch.setattr(maps.attempts.pairs_from_retrieval, "main", apart)
+    monkeypatch.setattr(maps.pairing.pairs_from_retrieval, "main", apart)
     run(*build)
     built = maps.Map(outputs / "map")
     assert len(built.names()) == 5
@@ -216,11 +218,35 @@ def test_a_map_of_other_pairs_is_refused(plane, tmp_path, monkeypatch, run, refu
     run(*build)
     run(*build, "--num_covis", 3)  # of which all pairs know nothing
     assert len(list(parsers.parse_pairs(outputs / "map/pairs-db-exhaustive.txt"))) == 10
-    monkeypatch.setattr(maps.build, "MAX_EXHAUSTIVE", 4)
+    monkeypatch.setattr(maps.pairing, "MAX_EXHAUSTIVE", 4)
     message = refused(*build)
     assert (
         re.search(r"differs: num_covis( \(.*\))? and pairs", message) and "--overwrite" in message
     )
+
+
+def test_sequential_pairs(plane, tmp_path, monkeypatch, run, refused):
+    """Neighbours and loop closures are matched, and where they leave parts, more pairs."""
+    few = partial(pairs_from_sequence.main, num_matched=0, overlap=1)
+    monkeypatch.setattr(maps.pairing.pairs_from_sequence, "main", few)
+    outputs = tmp_path / "outputs"
+    build = ("--map_images", plane / "images", "--outputs", outputs, "--camera_mode", "single")
+    assert "Unknown kind of pairs 'all'" in refused(*build, "--pairs", "all")
+    message = refused(*build[:4], *PAIRS, "--map", plane / "model")
+    assert message == "--pairs is for maps of photos alone: leave it or --map out."
+    assert not (outputs / "map").exists()
+    run(*build, *PAIRS)
+    built = maps.Map(outputs / "map")
+    assert len(built.names()) == 5
+    pairs = {*parsers.parse_pairs(outputs / "map/pairs-db-sequential.txt")}
+    assert pairs == {(f"{i}.png", f"{i + 1}.png") for i in range(4)}
+    assert {*parsers.parse_pairs(outputs / "map/pairs-db-sequential-3.txt")} > pairs
+    written = state(outputs / "map")
+    run(*build, *PAIRS)
+    assert state(outputs / "map") == written
+    message = refused(*build)
+    assert "pairs (sequential, 3 rounds of verification before, exhaustive now)" in message
+    assert "--pairs is for maps" in refused("--map", outputs / "map", *build[2:4], *PAIRS)
 
 
 @pytest.mark.parametrize("named", [True, False])
