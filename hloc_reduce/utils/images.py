@@ -18,7 +18,8 @@ IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 _PHOTOS = "arw avif bmp cr2 cr3 dng gif heic heif jp2 jxl nef orf ppm raf rw2 tif tiff webp"
 _VIDEOS = "3gp avi m4v mkv mov mp4 mpeg mpg mts webm wmv"
 CONVERTIBLE = {f".{name}" for name in _PHOTOS.split()}
-OTHER_SUFFIXES = CONVERTIBLE | {f".{name}" for name in _VIDEOS.split()}
+VIDEO_SUFFIXES = {f".{name}" for name in _VIDEOS.split()}
+OTHER_SUFFIXES = CONVERTIBLE | VIDEO_SUFFIXES
 CONVERT = "Convert photos and keep their EXIF data, for example with: magick mogrify -format jpg"
 # Formats by bytes of a file and where they are. No file of these is read, whatever its name is:
 # COLMAP and OpenCV read some of them, in some versions. ImageMagick converts all but videos.
