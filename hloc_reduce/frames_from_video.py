@@ -4,7 +4,7 @@ import uuid
 from collections import deque
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
@@ -131,31 +131,42 @@ def sharp(frames: Iterable[Frame]) -> Iterator[Frame]:
     tracks: Tracks | None = None
     near = 0.0  # the first one is chosen from the beginning on
     recent = deque[float](maxlen=NEIGHBOURS)
-    best: tuple[float, Frame, np.ndarray] | None = None  # its sharpness, itself, and small and grey
+    best: Candidate | None = None
     later: list[np.ndarray] = []  # frames after the best one, small and grey
     waited = 0
     for frame in frames:
         grey = _small(frame.pixels)
-        sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
-        recent.append(sharpness)
+        now = Candidate(frame, grey, float(cv2.Laplacian(grey, cv2.CV_32F).var()))
+        recent.append(now.sharpness)
         tracks = tracks or Tracks(grey)
         moved = tracks.follow(grey)
-        if best is None and moved < near:
+        if best is not None:
+            later, waited = [*later, grey], waited + 1
+            if moved >= FAR or waited >= WINDOW:
+                yield best.frame
+                tracks, near, best = Tracks(best.grey), NEAR, None
+                moved = [tracks.follow(grey) for grey in later][-1]
+        if moved < near or now.sharpness < MIN_SHARPNESS * np.median(recent):
             continue
-        is_blurred = sharpness < MIN_SHARPNESS * np.median(recent)
-        if not is_blurred and (best is None or sharpness > best[0]) and _has_detail(grey):
-            best, later = (sharpness, frame, grey), []
-        elif best is not None:
-            later.append(grey)
-        waited += best is not None
-        if best is not None and (moved >= FAR or waited >= WINDOW):
-            yield best[1]
-            tracks, near = Tracks(best[2]), NEAR
-            for grey in later:
-                tracks.follow(grey)
-            best, later, waited = None, [], 0
+        if (best is None or now.sharpness > best.sharpness) and _has_detail(grey):
+            waited = 0 if best is None else waited
+            best, later = now, []
     if best is not None:
-        yield best[1]
+        yield best.frame
+
+
+class Candidate(NamedTuple):
+    """A frame that may be chosen.
+
+    Args:
+        frame: itself.
+        grey: its pixels (H, W) uint8, small.
+        sharpness: the variance of their Laplacian.
+    """
+
+    frame: Frame
+    grey: np.ndarray
+    sharpness: float
 
 
 class Tracks:

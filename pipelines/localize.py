@@ -3,7 +3,7 @@
 Builds the map once, from photos and a COLMAP model of them, from photos alone, or from a COLMAP
 model and its database; later runs localize other photos in it. Without --query_images only the map
 is built. A new map has the feature colmap_sift_sv64 and its matcher unless you choose others.
---add_images adds photos to a map.
+--add_images adds photos to a map. Photos are in a folder, or the frames of a video.
 """
 
 from collections import Counter
@@ -18,6 +18,7 @@ from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.confs.matchers import NN_LIGHTGLUE
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
+from hloc_reduce.localization import trajectory
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
 from hloc_reduce.maps.pairing import PairsOption
@@ -30,10 +31,10 @@ from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils import masks as masks_of
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES, Storage
-from hloc_reduce.utils.options import Option, Parser, taken
+from hloc_reduce.utils.options import ABOVE_0, Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
-from .common import changes, command, metres, other_views
+from .common import changes, command, metres, other_views, videos
 from .common.options import Matcher, Positive, Retrieval, Rigs
 from .common.queries import LISTED, Photos, Queries, identity, results_folder
 from .common.retrieval import check_retrieval, retrieval_name, retrieve, retrieve_in_map
@@ -67,7 +68,8 @@ def open_map(
     Args:
         outputs: results folder: the map goes to OUTPUTS/map, poses to OUTPUTS/queries-<name of
             `queries` or `query_images`>.
-        map_images: photos of the map; without `map` they are reconstructed.
+        map_images: photos of the map, a folder or (command line) a video, whose sharp frames are
+            written to OUTPUTS/map_images; without `map` they are reconstructed.
         model_or_map: COLMAP model of `map_images` or `database`, or a folder with one model in it;
             or a map of an earlier run: its folder or .hlm file, which is unpacked.
         feature: local feature, see `list_features`, or a YAML file with its configuration; default:
@@ -184,7 +186,8 @@ def main(
 
     Args:
         built: the map.
-        query_images: folder of the photos to localize.
+        query_images: photos to localize, a folder or (command line) a video, whose frames are
+            written to OUTPUTS/query_images.
         outputs: folder for the results.
         queries: query list with intrinsics, or a glob of several; default: all photos of
             `query_images`, with intrinsics from EXIF data or guessed.
@@ -283,6 +286,8 @@ def main(
                 again=run.again(loc_pairs, features, built.features, mirror_images, others),
                 rigs=wanted.frames,
             )
+        if not trajectory.write(records, outputs):
+            folder.delete((trajectory.TUM, trajectory.CSV))
         limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
         summary = {
             "retrieval": retrieval,
@@ -313,9 +318,12 @@ class Command(command.Command):
 
     Args:
         compact: write the map into one small file, too.
+        fps: frames per second of a video of queries, at a steady rate; default: its sharp frames,
+            whenever the camera has moved.
     """
 
     compact: Annotated[Path, Option(metavar="FILE.hlm")] | None = None
+    fps: Annotated[float, ABOVE_0] | None = None
 
 
 def _parser() -> Parser:
@@ -341,6 +349,7 @@ def _check(given: dict, is_changed: bool) -> None:
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
         raise InputError("--queries is a list of photos: give their folder, --query_images, too.")
+    videos.check(given)
     matcher, is_built = given["matcher"], given["map_images"] is None and given["database"] is None
     if matcher and given["query_images"] is None and (is_built or matcher == NN_LIGHTGLUE):
         what = f"--matcher {matcher} is for queries"
@@ -389,6 +398,7 @@ def _main() -> None:
 
 def _run(given: dict) -> None:
     """Build or open the map, and localize the queries in it."""
+    given = videos.as_folders(given)
     gps, scale = given["gps"], given["scale"]
     built = open_map(**taken(open_map, given), exif_gps=not (gps or scale))
     strict = given["map_images"] is None or given["model_or_map"] is not None

@@ -105,7 +105,7 @@ def test_wrong_input(place, build_map, tmp_path, refused):
     message = refused("--map_images", tmp_path / "nowhere", *build[4:])
     assert "no folder" in message and "nowhere" in message
     message = refused("--map_images", images / "db/1.png", *build[4:])
-    assert message.endswith("1.png is a file, not a folder.")
+    assert "1.png is neither a folder of photos nor a video" in message
     one = tmp_path / "few"
     one.mkdir()
     for number in (1, 2):

@@ -48,13 +48,13 @@ def chosen(pictures):
 
 
 def test_frames_overlap_those_chosen_before(shots):
-    """By nine tenths, however fast the camera moves."""
-    for step in (1, 4):
+    """By nine tenths, however fast the camera moves, or as far as one frame does."""
+    for step in (1, 4, 50):
         shifts = np.array(range(0, 600, step))
         moved = np.diff(shifts[chosen(shots(shifts))]) / SIZE[0]
-        assert len(moved) > 15
+        assert len(moved) > 9
         assert (moved >= frames_from_video.NEAR - 0.01).all()
-        assert (moved <= frames_from_video.FAR + 0.01 + step / SIZE[0]).all()
+        assert (moved <= max(frames_from_video.FAR, step / SIZE[0]) + 0.01).all()
 
 
 def test_a_camera_that_stands_still_gives_one_frame(shots):

@@ -1,0 +1,70 @@
+"""Videos instead of folders of photos: their frames are written into the outputs folder."""
+
+import hashlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hloc_reduce import frames_from_video
+from hloc_reduce.runtime import provenance
+from hloc_reduce.runtime.outputs import Lock
+from hloc_reduce.runtime.provenance import MADE_FROM
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.images import VIDEO_SUFFIXES
+from hloc_reduce.utils.videos import is_video
+
+from .queries import NOT_IN_NAMES
+
+# what a map of a video has unless other options are given
+OF_VIDEO = {"camera_mode": "single", "pairs": "sequential"}
+
+
+def check(given: Mapping[str, Any]) -> None:
+    """Raise an InputError for files that are no videos, and options that are not for videos."""
+    for option in ("map_images", "query_images"):
+        path = given[option]
+        if path is not None and path.is_file() and not is_video(path):
+            suffixes = ", ".join(sorted(VIDEO_SUFFIXES))
+            raise InputError(f"{path} is neither a folder of photos nor a video ({suffixes}).")
+    video, queries = given["map_images"], given["query_images"]
+    source = next((name for name in ("model_or_map", "database") if given[name]), None)
+    if video is not None and is_video(video) and source:
+        option = "map" if source == "model_or_map" else source
+        raise InputError(
+            f"{video} is a video, of which a map is built without --{option}: give the folder of "
+            f"the photos of --{option}, or leave it out."
+        )
+    if given["fps"] is not None and (queries is None or not is_video(queries)):
+        raise InputError("--fps is for a video of queries: give it by --query_images.")
+
+
+def as_folders(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options with folders of frames in place of videos, and the defaults of their maps.
+
+    Raises:
+        InputError: if a video cannot be used.
+    """
+    found, outputs, overwrite = dict(given), given["outputs"], given["overwrite"]
+    map_images, query_images = given["map_images"], given["query_images"]
+    if map_images is not None and is_video(map_images):
+        found["map_images"] = _frames(map_images, outputs / "map_images", overwrite)
+        found |= {key: given[key] or value for key, value in OF_VIDEO.items()}
+    if query_images is not None and is_video(query_images):
+        folder = outputs / "query_images"
+        found["query_images"] = _frames(query_images, folder, overwrite, given["fps"])
+    return found
+
+
+def _frames(video: Path, folder: Path, overwrite: bool, fps: float | None = None) -> Path:
+    """Write the frames of a video into a folder of its name, and return that.
+
+    If another video of that name has it, a digest of the path is appended to the name.
+    """
+    name = video.stem if fps is None else f"{video.stem}-{fps:g}fps"
+    name = re.sub(NOT_IN_NAMES, "_", name).replace(".", "_").strip("_-") or "video"
+    path = str(video.resolve())
+    if provenance.read(folder / name / MADE_FROM).get("path", path) != path:
+        name = f"{name}-{hashlib.sha256(path.encode()).hexdigest()[:8]}"
+    with Lock(folder):
+        return frames_from_video.main(video, folder / name, fps, overwrite)
