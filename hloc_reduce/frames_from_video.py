@@ -66,7 +66,8 @@ def main(
     if not video.is_file():
         raise InputError(f"There is no file {video}.")
     before = provenance.read(output / MADE_FROM)
-    if not before and output.exists() and (not output.is_dir() or any(output.iterdir())):
+    is_free = not output.exists() or (output.is_dir() and not any(output.iterdir()))
+    if "choice" not in before and not is_free:
         raise InputError(f"{output} exists and has no frames of a video: choose another folder.")
     choice = {"fps": fps} if fps else CHOICE
     [(_, known)] = provenance.fingerprints({"video": video}, before).items()

@@ -166,6 +166,7 @@ def test_wrong_options(shots, tmp_path, monkeypatch, caplog):
     photos = tmp_path / "photos"
     photos.mkdir()
     (photos / "mine.jpg").write_bytes(b"")
+    (photos / "made_from.json").write_text('{"map": "of others"}')
     given = ("--video", video, "--output")
     message = refused(monkeypatch, caplog, frames_from_video, *given, photos)
     assert f"{photos} exists and has no frames of a video" in message
