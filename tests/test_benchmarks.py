@@ -1,6 +1,7 @@
 """Rows that benchmarks write, and the documentation that is made from them."""
 
 import csv
+import itertools
 import json
 import re
 from importlib.metadata import version
@@ -25,14 +26,16 @@ from benchmarks import (
     split_place,
     tables,
     trial_rows,
+    video,
 )
 from benchmarks import trials as benchmark_trials
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
+from hloc_reduce.demo import town
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import absolute_pose, gate
-from hloc_reduce.utils import images
+from hloc_reduce.utils import images, videos
 from hloc_reduce.utils.cli import InputError
 from pipelines.batch import jobs
 from pipelines.batch.jobs import Job
@@ -105,6 +108,35 @@ def test_errors_in_metres():
     distances, scale, angle = metres.errors(model, poses, factor=10)
     np.testing.assert_allclose(distances, 1, atol=1e-6)
     assert (scale, angle) == pytest.approx((1, 2), abs=1e-6)
+
+
+def test_the_walk_of_a_video_is_steady_and_closed():
+    """And the camera keeps away from obstacles."""
+    poses = [pose.inverse() for pose in video.walk(400)]
+    positions = np.array([pose.translation for pose in poses])
+    turns = [(a.inverse() * b).rotation.angle() for a, b in itertools.pairwise(poses)]
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    assert steps.max() < 0.3 and max(turns) < np.radians(6)
+    assert np.linalg.norm(positions[-1, :2] - video.ROUTE[1][:2]) < 1e-6
+    for x, y, radius in town.OBSTACLES:
+        assert np.linalg.norm(positions[:, :2] - (x, y), axis=1).min() > radius + 0.1
+
+
+def test_frames_of_a_sequence_are_named_by_time(tmp_path):
+    frames = tmp_path / "place/frames"
+    frames.mkdir(parents=True)
+    np.savetxt(tmp_path / "place/camera-intrinsics.txt", np.diag([500, 500, 1]))
+    for number in (0, 15):
+        cv2.imwrite(str(frames / f"frame-{number:06}.color.jpg"), np.zeros((48, 64, 3), np.uint8))
+        pose = np.eye(4)
+        pose[0, 3] = number
+        np.savetxt(frames / f"frame-{number:06}.pose.txt", pose)
+    model = video.sequence(tmp_path / "place", 0, tmp_path / "photos")
+    centres = {image.name: image.projection_center()[0] for image in model.images.values()}
+    assert centres == {"0000.000.jpg": 0, "0000.500.jpg": 15}
+    assert sorted(path.name for path in (tmp_path / "photos").iterdir()) == sorted(centres)
+    encoded = video.encode(tmp_path / "photos", tmp_path / "video.mp4")
+    assert [round(frame.seconds, 3) for frame in videos.read(encoded)] == [0, 0.1]
 
 
 def test_a_table_without_rows_is_an_error():
