@@ -27,6 +27,12 @@ def check(given: Mapping[str, Any]) -> None:
         if path is not None and path.is_file() and not is_video(path):
             suffixes = ", ".join(sorted(VIDEO_SUFFIXES))
             raise InputError(f"{path} is neither a folder of photos nor a video ({suffixes}).")
+    added = given["add_images"]
+    if added is not None and is_video(added):
+        raise InputError(
+            f"--add_images {added} is a video: write its frames into a folder, and add that: "
+            f"python -m hloc_reduce.frames_from_video --video {added} --output FOLDER"
+        )
     video, queries = given["map_images"], given["query_images"]
     source = next((name for name in ("model_or_map", "database") if given[name]), None)
     if video is not None and is_video(video) and source:

@@ -134,6 +134,8 @@ def test_wrong_input(video, plane, tmp_path, monkeypatch, refused):
     assert "is a video, of which a map is built without --map" in message
     assert "is built without --database" in refused(*build, "--database", text)
     assert "--fps is for a video of queries" in refused(*build, "--fps", 2)
+    message = refused("--map", outputs / "map", "--add_images", video)
+    assert f"frames_from_video --video {video} --output FOLDER" in message
     folder = ("--query_images", plane / "images", "--fps", 2)
     assert "--fps is for a video of queries" in refused(*build, *folder)
     assert "--fps -1: it must be above 0" in refused(*build, "--fps", -1)
