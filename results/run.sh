@@ -141,7 +141,8 @@ run lightglue_seconds --dataset $data/herz-jesus --feature mini32 --rounds 2 "$@
 run lightglue_seconds --dataset $data/herz-jesus --feature aliked --keypoints 512 1024 2048 --pairs 2 --rounds 1 "$@"
 run video --frames 100 "$@"
 run video --sequence $data/7-scenes-redkitchen "$@"
-run video --frames 300 --encode "$@" # exhaustive pairs take more than an hour
+run video --frames 100 --encode "$@"
+run video --frames 300 "$@" # exhaustive pairs may take more than an hour
 run retrieval_scale --dataset $data/demo_town-400 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 64 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 32 --storage uint4 "$@"
