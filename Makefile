@@ -60,7 +60,7 @@ test-long: $(VENV)/installed
 # the reference of the public API, from its docstrings; a warning is an error. Imports of h5py run
 # uname, which pdoc suppresses otherwise.
 API := hloc_reduce '!hloc_reduce\.' hloc_reduce.maps '!hloc_reduce\.maps\.' hloc_reduce.maps.localizer \
-	hloc_reduce.confs.features hloc_reduce.confs.matchers hloc_reduce.compact \
+	hloc_reduce.confs.features hloc_reduce.confs.matchers hloc_reduce.compact hloc_reduce.utils.ros \
 	$(subst /,.,$(basename $(wildcard hloc_reduce/[!_]*.py)))
 
 docs: $(VENV)/installed
