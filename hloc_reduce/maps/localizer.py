@@ -241,8 +241,15 @@ class Localizer:
             "turned": 90 * query.view.turns,
         }
 
-    def _described(self, photo: Photo, view: View, camera: pycolmap.Camera, laps: Laps) -> dict:
-        """Return the features of a photo.
+    def _described(
+        self,
+        photo: Photo,
+        view: View,
+        camera: pycolmap.Camera,
+        laps: Laps,
+        name: str = "The camera",
+    ) -> dict:
+        """Return the features of a photo; the name is that of the camera.
 
         Raises:
             InputError: if its camera has another size.
@@ -251,8 +258,7 @@ class Localizer:
         width, height = map(int, features["image_size"])
         if (camera.width, camera.height) != (width, height):
             raise InputError(
-                f"The camera has {camera.width}x{camera.height} pixels, the photo has "
-                f"{width}x{height}."
+                f"{name} has {camera.width}x{camera.height} pixels, the photo has {width}x{height}."
             )
         laps.end("extraction")
         return features
@@ -295,12 +301,12 @@ class Localizer:
         given = masks or [None] * number
         check_rig(images, cameras, cams_from_rig, names or [""] * number, given)
         laps, photos = Laps(), []
-        for image, mask, camera in zip(images, given, cameras, strict=True):
+        named = names or [f"camera {i}" for i in range(number)]
+        for image, mask, camera, name in zip(images, given, cameras, named, strict=True):
             photo = Photo.of(image, mask)
-            features = self._described(photo, views.USUAL, camera, laps)
+            features = self._described(photo, views.USUAL, camera, laps, name)
             photos.append((features, self._retrieve(features, photo.image, views.USUAL)))
             laps.end("retrieval")
-        named = names or [f"camera {i}" for i in range(number)]
         rig = [*zip(named, cameras, cams_from_rig, strict=True)]
         for again in range(len(self.steps)):
             pose, of_cameras = self._try_rig(photos, rig, self.steps[again], laps)

@@ -72,7 +72,7 @@ def test_what_is_no_rig(rig):
         localizer.localize_rig(photos, [None, None], cams_from_rig)
     with pytest.raises(InputError, match=r"are pycolmap.Rigid3d"):
         localizer.localize_rig(photos, cameras, [np.eye(4), np.eye(4)])
-    with pytest.raises(InputError, match="The camera has"):
+    with pytest.raises(InputError, match="camera 1 has 9x9 pixels, the photo has"):
         smaller = pycolmap.Camera(model="SIMPLE_PINHOLE", width=9, height=9, params=[9, 4, 4])
         localizer.localize_rig(photos, [cameras[0], smaller], cams_from_rig)
     for given in ([photos[0], None], [photos[0], 7]):
