@@ -1,5 +1,6 @@
 """The HTTP service, with a real client."""
 
+import base64
 import json
 import socket
 import sys
@@ -12,6 +13,7 @@ from urllib.parse import quote
 from urllib.request import Request, urlopen
 
 import numpy as np
+import pycolmap
 import pytest
 import uvicorn
 from PIL import Image
@@ -57,6 +59,7 @@ def ask(url, body=None):
         return error.code, json.loads(content) if content.startswith(b"{") else content
 
 
+KNOWN = "camera, inliers, near and radius"
 CAMERA = "?camera=" + quote("SIMPLE_PINHOLE 360 270 375 180 135")
 
 
@@ -90,6 +93,62 @@ def test_a_photo_gets_its_pose(place, build_map, tmp_path, start):
     assert status == 400 and found["error"].startswith("The camera has 10x10 pixels, the photo has")
 
 
+def test_a_photo_is_localized_near_a_pose(place, build_map, start):
+    """As from the Localizer, also from the pose in an answer; another frame's is refused."""
+    _, images, _ = place
+    localizer = Localizer(build_map())
+    url = start(localizer) + "/localize" + CAMERA
+    photo = (images / "query/day/a.png").read_bytes()
+    _, found = ask(url, photo)
+    assert not found["near"] and np.array(found["covariance"]).shape == (6, 6)
+    near = ",".join(map(str, found["qvec"] + found["tvec"]))
+    status, again = ask(f"{url}&near={near}&radius=0.3", photo)
+    assert status == 200 and again["near"] and again["reason"] is None
+    assert again["tvec"] == pytest.approx(found["tvec"], abs=0.02)
+    for wrong, said in (
+        ("&near=1,0,0,0,0,0,1e6", "near is 1e+06 units from the nearest image of the map, which"),
+        ("&near=1,0,0,0,0,0,1e300", "near is "),
+        (f"&near={near}&radius=-1", "radius is -1.0: a distance above 0, in the units of the map."),
+        (f"&near={near}&radius=nan", "radius is nan: a distance above 0"),
+    ):
+        status, answered = ask(url + wrong, photo)
+        assert status == 400 and answered["error"].startswith(said), answered
+
+
+def test_a_rig_gets_its_pose(place, plane, build_map, start):
+    _, images, _ = place
+    model = pycolmap.Reconstruction(plane / "model")
+    by_name = {image.name: image for image in model.images.values()}
+    first, second = by_name["4.png"].cam_from_world(), by_name["0.png"].cam_from_world()
+    cams_from_rig = [pycolmap.Rigid3d(), second * first.inverse()]
+    cameras = []
+    for name, pose in zip(("query/day/a.png", "db/0.png"), cams_from_rig, strict=True):
+        x, y, z, w = pose.rotation.quat.tolist()
+        cameras.append(
+            {
+                "photo": base64.b64encode((images / name).read_bytes()).decode(),
+                "camera": "SIMPLE_PINHOLE,360,270,375,180,135",
+                "cam_from_rig": {"qvec": [w, x, y, z], "tvec": pose.translation.tolist()},
+            }
+        )
+    localizer = Localizer(build_map())
+    url = start(localizer, max_mb=1) + "/localize_rig"
+    status, found = ask(url + "?inliers=1", json.dumps({"cameras": cameras}).encode())
+    assert status == 200 and found["localized"] and found["reason"] is None
+    assert found["tvec"] == pytest.approx(first.translation.tolist(), abs=0.02)
+    numbers = [camera["num_inliers"] for camera in found["cameras"]]
+    assert found["num_inliers"] == sum(numbers) and np.array(found["covariance"]).shape == (6, 6)
+    for number, camera in zip(numbers, found["cameras"], strict=True):
+        assert len(camera["points2D"]) == len(camera["points3D"]) == number and camera["retrieved"]
+    _, short = ask(url, json.dumps({"cameras": cameras}).encode())
+    assert "points2D" not in short["cameras"][0] and short["tvec"] == found["tvec"]
+    wrong = [cameras[0], {**cameras[1], "camera": "SIMPLE_PINHOLE,9,9,9,4,4"}]
+    said = "camera 1 has 9x9 pixels, the photo has 360x270."
+    assert ask(url, json.dumps({"cameras": wrong}).encode()) == (400, {"error": said})
+    assert ask(url, bytes(1_000_001)) == (413, {"error": "a request has at most 1,000,000 bytes"})
+    assert ask(url, b"{}")[0] == 400 and ask(url)[0] == 405
+
+
 def _queries(images):
     from hloc_reduce.utils.parsers import parse_query_lists
 
@@ -105,7 +164,7 @@ class Blocked:
     def __init__(self):
         self.released = threading.Event()
 
-    def localize(self, path, camera):
+    def localize(self, path, *_):
         self.released.wait(30)
         raise InputError(f"Cannot read image {path}: it is truncated.")
 
@@ -166,10 +225,10 @@ def test_photos_of_other_formats_are_refused(kind, start):
 @pytest.mark.parametrize(
     "given, error",
     [
-        ("?foo", "unknown parameters: foo; there are camera and inliers"),
-        ("?Camera=PINHOLE&inliers=1", "unknown parameters: Camera; there are camera and inliers"),
-        ("?b=1&a=2&inliers=0", "unknown parameters: a, b; there are camera and inliers"),
-        ("?" + "x" * 99, f"unknown parameters: {'x' * 20}; there are camera and inliers"),
+        ("?foo", f"unknown parameters: foo; there are {KNOWN}"),
+        ("?Camera=PINHOLE&inliers=1", f"unknown parameters: Camera; there are {KNOWN}"),
+        ("?b=1&a=2&inliers=0", f"unknown parameters: a, b; there are {KNOWN}"),
+        ("?" + "x" * 99, f"unknown parameters: {'x' * 20}; there are {KNOWN}"),
         ("?inliers=0&inliers=1", "inliers: give it once"),
     ],
 )
