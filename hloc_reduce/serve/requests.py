@@ -18,6 +18,7 @@ from ..utils.parsers import parse_camera
 
 MAX_PIXELS = 100_000_000  # of a photo: a small file may be a huge image
 MAX_CAMERAS = 16  # of a rig
+MAX_COMMAS = 64 * MAX_CAMERAS  # in its JSON: 20 MB of brackets would take 500 MB of memory
 PHOTO_FORMATS = ("JPEG", "PNG")
 POSE = "qw,qx,qy,qz,tx,ty,tz"
 CAMERA = "MODEL WIDTH HEIGHT PARAMS"
@@ -132,6 +133,8 @@ def rig(body: bytes) -> list[RigCamera]:
     Raises:
         Refused: if it is not JSON of the form that docs/serve.md has, or a photo is none.
     """
+    if body.count(b",") > MAX_COMMAS:  # photos have none
+        raise Refused(400, f"the body has too many values: a rig has 1 to {MAX_CAMERAS} cameras")
     try:
         found = json.loads(body)
     except (ValueError, RecursionError):

@@ -88,6 +88,12 @@ def test_a_rig_is_read():
     assert first.cam_from_rig.translation.tolist() == [1, 2.5, -3]
 
 
+def test_the_largest_rig_is_read():
+    lens = "FULL_OPENCV,8,6,9,9,4,3,0.1,0.01,0.001,0.001,0.0001,0.0001,0.0001,0.0001"
+    body = json.dumps({"cameras": [of_rig(camera=lens)] * requests.MAX_CAMERAS}, indent=4)
+    assert len(requests.rig(body.encode())) == requests.MAX_CAMERAS
+
+
 NO_OBJECT = "the body is not a JSON object with a list of cameras"
 
 
@@ -98,6 +104,10 @@ NO_OBJECT = "the body is not a JSON object with a list of cameras"
         (photo(), "the body is not JSON"),
         (b"[" * 1_000_000, "the body is not JSON"),
         (b"[" + b"9" * 10_000 + b"]", "the body is not JSON"),
+        (
+            b'{"cameras": [' + b"[]," * 10_000 + b"[]]}",
+            "the body has too many values: a rig has 1 to 16 cameras",
+        ),
         (b"[]", NO_OBJECT),
         (b"{}", NO_OBJECT),
         (b'{"cameras": {}}', NO_OBJECT),
