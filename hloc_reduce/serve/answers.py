@@ -49,7 +49,7 @@ def answer(
     with tempfile.NamedTemporaryFile(suffix=".jpg") as file:
         Path(file.name).write_bytes(photo)
         try:
-            pose, info = localizer.localize(file.name, camera, near, radius)
+            pose, info = localizer.localize(file.name, camera, near=near, radius=radius)
         except InputError as error:
             raise Refused(400, str(error).replace(f" {file.name}", "")) from None
     of_photo = {key: info[key] for key in OF_PHOTOS} | {"camera": to_list(info["camera"])}

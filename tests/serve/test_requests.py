@@ -187,8 +187,8 @@ class Double:
     def __init__(self, pose, **info):
         self.pose, self.info = pose, info
 
-    def localize(self, *given):
-        self.given = given
+    def localize(self, path, camera, **near):
+        self.near = near
         return self.pose, self.info
 
     def localize_rig(self, files, cameras, cams_from_rig):
@@ -206,7 +206,7 @@ def test_the_answer_has_what_the_localizer_tells():
     info |= {"covariance": np.eye(6)}
     localizer = Double(pose, **info)
     found = answer(localizer, photo(), near=pose, radius=2.0)
-    assert localizer.given[2:] == (pose, 2.0)
+    assert localizer.near == {"near": pose, "radius": 2.0}
     assert found["localized"] and found["near"] and "wgs84" not in found
     assert found["qvec"] == [0.8, 0, 0.6, 0] and found["tvec"] == [1, 2, 3]
     assert found["covariance"] == np.eye(6).tolist() and found["retrieved"] == list("abcde")

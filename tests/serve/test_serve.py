@@ -163,7 +163,7 @@ class Blocked:
     def __init__(self):
         self.released = threading.Event()
 
-    def localize(self, path, *_):
+    def localize(self, path, *_, **__):
         self.released.wait(30)
         raise InputError(f"Cannot read image {path}: it is truncated.")
 
