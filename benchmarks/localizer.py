@@ -1,7 +1,8 @@
 """Time a Localizer on photos, one at a time, stage by stage, from the start of Python.
 
 Also prints the memory of the process, and how many photos are localized, with how many inliers. It
-imports torch only if the map's feature needs it.
+imports torch only if the map's feature needs it. With --place, it adds a row to
+results/localizer.csv.
 """
 
 import resource
@@ -33,6 +34,7 @@ def _main() -> None:
     parser.add_argument("--query_images", type=Path, required=True, help="folder of photos")
     parser.add_argument("--queries", type=Path, help="their lists with intrinsics, a glob")
     parser.add_argument("--onnx", type=Path, help="the map's feature, from hloc_reduce.export")
+    parser.add_argument("--place", help="what a row calls the place; default: no row")
     args = parser.parse_args()
     from hloc_reduce import Localizer
     from hloc_reduce.utils.parsers import parse_query_lists
@@ -44,9 +46,10 @@ def _main() -> None:
     localizer = Localizer(args.map, onnx=args.onnx)
     opened = time.perf_counter() - START
     localizer.localize(args.query_images / photos[0][0], photos[0][1])
+    first = time.perf_counter() - START
     print(
         f"Map of {len(localizer.names)} images. Opened {opened:.2f} s after the start of Python, "
-        f"first photo localized after {time.perf_counter() - START:.2f} s, {megabytes():.0f} MB."
+        f"first photo localized after {first:.2f} s, {megabytes():.0f} MB."
     )
     rows, inliers = [], []
     for name, camera in progress(photos, "Localizing", "photo"):
@@ -68,6 +71,24 @@ def _main() -> None:
         ("max", max),
     ):
         print(f"| {name} | {' | '.join(f'{1000 * reduce(column):.0f}' for column in columns)} |")
+    if args.place:
+        resident, means = megabytes(), [1000 * sum(column) / len(column) for column in columns]
+        from benchmarks import rows as results
+        from hloc_reduce.hlm.reader import CompactMap, is_compact
+        from hloc_reduce.maps.map import Map
+        from hloc_reduce.runtime import parallel
+
+        opened_map = CompactMap(args.map) if is_compact(args.map) else Map(args.map)
+        cores = parallel.cores()
+        how = f"{'given' if args.queries else 'inferred'} intrinsics{', ONNX' * bool(args.onnx)}"
+        cells = {"place": args.place, "feature": opened_map.feature, "storage": opened_map.storage}
+        cells["variant"] = f"{how}, {cores} core{'s' * (cores > 1)}"
+        cells |= {"photos": len(localizer.names), "queries": len(photos)}
+        cells |= {"localized": len(inliers), "inliers": mean, "resident_mb": resident}
+        cells |= {"open_s": opened, "first_s": first}
+        names = (*STAGES, "all", "beyond_extraction")
+        cells |= {f"{name}_ms": value for name, value in zip(names, means, strict=True)}
+        results.add("localizer", [cells | results.how(cores=cores)])
 
 
 if __name__ == "__main__":

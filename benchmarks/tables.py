@@ -390,6 +390,36 @@ def rigs_table() -> Table:
     return table
 
 
+def localizer_table() -> Table:
+    """Show what a Localizer takes, from the start of Python to poses."""
+    stages = {"extraction": "extraction", "retrieval": "retrieval", "matching": "matching"}
+    stages |= {"pose": "pose", "mirror_image": "mirror image", "all": "all"}
+    heads = "intrinsics, cores", "map open [s]", "first pose [s]", "memory [MB]"
+    table = [["feature", *heads, *(f"{said} [ms]" for said in stages.values())]]
+    for row in read("localizer"):
+        cells = [name_of(row), row["variant"].replace(" intrinsics", "")]
+        cells += [f"{float(row['open_s']):.1f}", f"{float(row['first_s']):.1f}"]
+        cells += [thousands(row["resident_mb"])]
+        table.append([*cells, *(f"{float(row[f'{stage}_ms']):.0f}" for stage in stages)])
+    return table
+
+
+def tracking_table() -> Table:
+    """Compare frames of a video that are tracked with frames that are localized anew."""
+    heads = "localized", "within 5 cm", "median [cm]", "by the last pose [%]"
+    table = [["feature", "frames", *heads, "beyond extraction [ms]"]]
+    for row in read("tracking"):
+        localized = f"{row['localized']} of {row['queries']}"
+        cells = [name_of(row), row["variant"], localized]
+        if row["median_cm"]:
+            cells += [row["within_5cm"], f"{float(row['median_cm']):.2f}"]
+        else:
+            cells += ["", ""]
+        near = f"{float(row['near_percent']):.0f}" if row["near_percent"] else ""
+        table.append([*cells, near, f"{float(row['ms']):.0f}"])
+    return table
+
+
 def own_maps_table() -> Table:
     """Compare maps of photos alone, and queries in them, of places with known poses."""
     heads = "photos in the maps", "localized", "far", "median [%]", "inliers"
@@ -652,7 +682,9 @@ TABLES: dict[str, Callable[[], Table]] = {
     "runs_cpu": runs_cpu_table,
     "extraction": extraction_table,
     "extraction_parts": extraction_parts_table,
+    "localizer": localizer_table,
     "own_maps": own_maps_table,
+    "tracking": tracking_table,
     "scale": scale_table,
     "compact_scale": compact_scale_table,
     "matching": matching_table,

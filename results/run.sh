@@ -79,6 +79,7 @@ done
 small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.25 0.5 1 "$@"
 
 run metres --map "$(scene fountain-P11)" --map "$(scene entry-P10)" --map $herz_jesus "$@"
+run tracking --feature colmap_sift_sv32:uint4 mini32:uint2 --strangers $data/strangers "$@"
 run rigs --feature colmap_sift_sv64 mini32:uint2 "$@"
 run rigs --feature colmap_sift_sv64 mini32:uint2 "$@" \
     --halves $data/herz-jesus $data/dark-fountain-P11 $data/dark-sceaux
