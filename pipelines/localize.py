@@ -18,6 +18,7 @@ from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.confs.matchers import NN_LIGHTGLUE
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
+from hloc_reduce.localization import rigs as rig_files
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
 from hloc_reduce.match_features import check_features, check_model
@@ -28,6 +29,7 @@ from hloc_reduce.runtime.provenance import MADE_FROM
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES, Storage
+from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.options import Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
@@ -54,6 +56,7 @@ def open_map(
     camera_mode: Annotated[str, colmap.CAMERA_MODE] | None = None,
     database: Path | None = None,
     retrieval: Retrieval | None = None,
+    rigs: Rigs | None = None,
 ) -> Map:
     """Build a map, or open one that was built before.
 
@@ -84,12 +87,20 @@ def open_map(
             map, without photos. Photos, if given, only tell more about the cameras.
         retrieval: a name (those of networks need an installed hloc); or, for the queries only,
             hloc's text file of pairs or h5 file of global descriptors; default: vlad.
+        rigs: COLMAP's file of cameras that are fixed to each other: a map of photos alone that they
+            took is in the units of the file; queries with the same name in the folders of their
+            cameras get their poses together.
 
     Raises:
         InputError: when an old map was built with other options, or something is missing or wrong.
     """
     if camera_mode is not None and (map_images is None or model_or_map is not None):
         raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
+    if rigs is not None and (map_images is None or model_or_map is not None):
+        raise InputError(
+            "--rigs is for queries and maps of photos alone: a COLMAP model has its own rigs. Give "
+            "--query_images, or --map_images without --map."
+        )
     mode = colmap.camera_mode(camera_mode or "auto")
     named = retrieval if retrieval in retrieval_confs.confs else None
     is_built = model_or_map and (maps.is_map(model_or_map) or maps.is_compact(model_or_map))
@@ -120,6 +131,7 @@ def open_map(
         return maps.from_database.main(folder, database, model_or_map, image_dir=map_images, **new)
     if map_images is not None:
         new |= {"num_covis": num_covis, "accept_partial": accept_partial, "camera_mode": mode}
+        new["rigs"] = rigs
         return maps.main(folder, map_images, model_or_map, **new)
     if model_or_map is None:
         raise InputError("Give --map_images, the folder of the photos to build a map of.")
@@ -346,9 +358,18 @@ def _main() -> None:
             compact.main(given["compact"], folder)
 
 
+def _rigs_of_map(given: dict) -> Path | None:
+    """Return --rigs unless it is for the queries only."""
+    rigs, photos = given["rigs"], given["map_images"]
+    if rigs is None or given["query_images"] is None:
+        return rigs
+    is_alone = photos is not None and given["model_or_map"] is None
+    return rigs if is_alone and rig_files.are_of(rigs, list_images(photos)) else None
+
+
 def _run(given: dict) -> None:
     """Build or open the map, and localize the queries in it."""
-    built = open_map(**taken(open_map, given))
+    built = open_map(**taken(open_map, given | {"rigs": _rigs_of_map(given)}))
     if given["map_images"] is None and given["database"] is None:  # others warn as they are built
         built.warn()
     if given["compact"] is not None:

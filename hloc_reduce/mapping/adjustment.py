@@ -33,6 +33,14 @@ def with_own_cameras(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return colmap.with_cameras(sfm, own)
 
 
+def without_rigs(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return a model with a pose of its own for each image: itself, or a copy if it has rigs."""
+    if all(rig.num_sensors() == 1 for rig in sfm.rigs.values()):
+        return sfm
+    cameras = {i: copy.deepcopy(camera) for i, camera in sfm.cameras.items()}
+    return colmap.with_cameras(sfm, lambda i: cameras[sfm.images[i].camera_id])
+
+
 def with_one_camera(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Copy a model of cameras of one kind and size, with one for all images: their median."""
     cameras = [sfm.cameras[sfm.images[i].camera_id] for i in sfm.reg_image_ids()]
@@ -80,6 +88,7 @@ def focal_length_deviations(sfm: pycolmap.Reconstruction) -> dict[int, float]:
         From camera to the standard deviation of its focal length, as a share, to first order from
         the reprojection errors; infinite if the adjustment does not determine all parameters.
     """
+    sfm = without_rigs(sfm)  # COLMAP computes no covariance of rigs
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     cameras = {image.camera_id: sfm.cameras[image.camera_id] for image in images}
     cameras = {i: camera for i, camera in cameras.items() if camera.model in ESTIMATED_MODELS}

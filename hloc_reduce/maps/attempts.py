@@ -57,6 +57,7 @@ class Photos:
         accept_partial: do without photos that cannot be read.
         camera_mode: which photos share a camera, if their poses are reconstructed.
         retrieval: a key of `confs.retrieval`.
+        rigs: COLMAP's `rig_config.json` of cameras that are fixed to each other.
         left_out: photos that are described and matched, but not reconstructed.
     """
 
@@ -69,6 +70,7 @@ class Photos:
     accept_partial: bool
     camera_mode: pycolmap.CameraMode
     retrieval: str
+    rigs: Path | None = None
     left_out: frozenset[str] = frozenset()
 
     @property
@@ -209,7 +211,7 @@ def _fitting(best: Attempt) -> tuple[Attempt, list[Finding]]:
 
     First with a camera for each photo, if they share some; then without the fewer than half whose
     intrinsics are unlike those of the others. A new model is used if it has all other photos, which
-    fit.
+    fit. The cameras of rigs stay.
 
     Returns:
         The model, and what was found of photos that are left out, or that do not fit.
@@ -217,6 +219,8 @@ def _fitting(best: Attempt) -> tuple[Attempt, list[Finding]]:
     fit, photos = _fit(best), best.photos
     if fit.gain <= intrinsics.GAIN_OF_FREE:
         return best, []
+    if photos.rigs is not None:
+        return best, [intrinsics.finding(fit)]
     cameras = {best.sfm.images[i].camera_id for i in best.sfm.reg_image_ids()}
     is_auto = photos.camera_mode == pycolmap.CameraMode.AUTO
     if len(cameras) < best.sfm.num_reg_images() and is_auto:
@@ -284,6 +288,7 @@ def _reconstruct(
                 num_covis=photos.num_covis if number == 1 else 0,
                 camera_mode=photos.camera_mode,
                 image_list=photos.names,
+                rigs=photos.rigs,
             )
         _match(photos, pairs, features, matches)
     kept = photos.kept
@@ -302,6 +307,7 @@ def _reconstruct(
             image_list=kept,
             once=once,
             checked=False,
+            rigs=photos.rigs,
         )
     return Attempt(photos, conf, matches, folder.path / name, sfm)
 

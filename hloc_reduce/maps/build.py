@@ -14,6 +14,7 @@ from ..confs import retrieval as retrieval_confs
 from ..detectors.dog import KEYPOINT_SETTINGS
 from ..extract_features import keep_present, without
 from ..localization import intrinsics, views
+from ..localization import rigs as rig_files
 from ..mapping import registration
 from ..mapping.checks import Inputs, judging, run, sizes
 from ..mapping.findings import Finding, check_accepted, names_in, staying
@@ -48,6 +49,7 @@ def main(
     accept_partial: bool = False,
     camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
     retrieval: str = retrieval_confs.VLAD,
+    rigs: Path | None = None,
 ) -> Map:
     """Build a map, or open the one that was made from the same.
 
@@ -71,6 +73,8 @@ def main(
             are in it, or its focal lengths, positions or matches show that it may be wrong.
         camera_mode: which images share a camera, without a model.
         retrieval: a key of `confs.retrieval`.
+        rigs: COLMAP's `rig_config.json` of cameras that are fixed to each other, without a model:
+            their photos share one camera each, and the map is in the units of the file.
 
     Returns:
         The map.
@@ -89,6 +93,8 @@ def main(
         raise InputError(f"The model {model} has no images.")
     names = _list(image_dir, reference, accept_partial)
     check_distinct(names)
+    if rigs is not None:
+        rig_files.frames(rigs, names)  # raises for a wrong one
     # points without tracks, such as those of scanners, tell nothing of the photos
     has_points = reference is not None and any(i.num_points3D for i in reference.images.values())
     exhaustive = len(names) <= MAX_EXHAUSTIVE
@@ -101,7 +107,8 @@ def main(
         usable = _of_fitting_size(image_dir, names, reference, accept_partial)
     images = {name: image_dir / name for name in names}
     parts = {path.name: path for path in (colmap.model_files(model) if model else [])}
-    fingerprints, found = digests(map_dir, {"images": images, "model": parts})
+    groups = {"images": images, "model": parts} | ({"rigs": {"file": rigs}} if rigs else {})
+    fingerprints, found = digests(map_dir, groups)
     made_from = {
         "feature": extract_features.provenance(conf),
         "matcher": matchers_confs.confs[matcher]["model"],
@@ -115,7 +122,7 @@ def main(
     made_from |= {"normalized": True} if normalized else {}
     made_from |= retrieval_confs.provenance(retrieval)
     made_from |= matchers_confs.provenance(made_from["matcher"], made_from["feature"])
-    with claim(map_dir, made_from, overwrite, image_dir, model, projection) as folder:
+    with claim(map_dir, made_from, overwrite, image_dir, model, projection, rigs) as folder:
         if not (map_dir / FINISHED).exists():
             begin(map_dir, fingerprints)
             logger.info("Building the map %s of %d images.", map_dir, len(usable))
@@ -129,6 +136,7 @@ def main(
                 accept_partial=accept_partial,
                 camera_mode=camera_mode,
                 retrieval=retrieval,
+                rigs=rigs,
             )
             conf = keep_projection(_at_one_size(conf, image_dir, usable), map_dir)
             if model is not None and reference is not None:
@@ -136,7 +144,8 @@ def main(
                 return _finish(attempt, [], True, feature, keypoints, model=str(model.resolve()))
             attempt, findings = of_photos_alone(photos, conf)
             mode = camera_mode.name.lower()
-            return _finish(attempt, findings, False, feature, keypoints, camera_mode=mode)
+            content = {"camera_mode": mode, **({"rigs": True} if rigs else {})}
+            return _finish(attempt, findings, False, feature, keypoints, **content)
         built = Map(map_dir)
         if built.camera_mode not in (None, camera_mode.name.lower()):
             raise InputError(

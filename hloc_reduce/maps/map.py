@@ -55,6 +55,7 @@ class Map:
         findings: what may be wrong with it, and which photos were left out.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
+        has_rigs: whether a file of rigs gave poses of its cameras.
         cameras: what the map tells about the intrinsics of other photos.
         sfm: folder of the COLMAP model.
         features: feature file of the map images.
@@ -104,6 +105,7 @@ class Map:
         self._doubts = [str(doubt) for doubt in content.get("doubts", [])]
         self.num_points3D = int(content["points3D"])
         self.camera_mode = content.get("camera_mode")
+        self.has_rigs = bool(content.get("rigs"))
         known = content.get("cameras", {}).items()
         self.cameras = intrinsics.MapCameras(
             {name: intrinsics.from_list(values) for name, values in known},
