@@ -18,6 +18,7 @@ from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.confs.matchers import NN_LIGHTGLUE
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
+from hloc_reduce.localization import panoramas as panorama_files
 from hloc_reduce.localization import rigs as rig_files
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
@@ -35,7 +36,7 @@ from hloc_reduce.utils.paths import strings_as_paths
 
 from .common import changes, command, other_views
 from .common.options import Matcher, Positive, Retrieval, Rigs
-from .common.queries import LISTED, Photos, Queries, identity, results_folder
+from .common.queries import LISTED, Photos, find_queries, identity, results_folder
 from .common.retrieval import check_retrieval, retrieval_name, retrieve, retrieve_in_map
 from .common.run import Run, readable
 
@@ -173,6 +174,7 @@ def main(
     retrieval: Retrieval | None = None,
     matcher: Matcher | None = None,
     rigs: Rigs | None = None,
+    panoramas: bool = False,
 ) -> dict:
     """Localize queries in a map and return the summary, as in summary.json.
 
@@ -191,17 +193,19 @@ def main(
         matcher: matcher of queries; default: the map's.
         rigs: COLMAP's file of cameras that are fixed to each other, in the units of the map: photos
             with the same name in the folders of their cameras get their poses together.
+        panoramas: photos that are twice as wide as high are panoramas of all directions; default:
+            those whose XMP data say so.
 
     Raises:
         InputError: when something is missing or wrong.
     """
-    wanted = Queries.find(query_images, queries, built, strict, rigs)
+    wanted = find_queries(query_images, queries, built, strict, rigs, panoramas)
     names = wanted.names
     map_names = built.names()
     built.check_features(map_names)  # a broken map is found before photos are read
-    truth = true_poses(names, ground_truth, True) if ground_truth else {}
+    truth = true_poses(wanted.photos, ground_truth, True) if ground_truth else {}
 
-    photos = Photos(outputs / MADE_FROM, built, query_images, names)
+    photos = Photos(outputs / MADE_FROM, built, query_images, wanted.photos)
     matcher = matcher or built.matcher
     steps = matchers_confs.steps_in(built.matcher, built.conf, matcher)
     for step in {*steps} - {built.matcher}:
@@ -210,6 +214,7 @@ def main(
         check_features(built.features, conf)
     conf = {"map": built.place, **identity(outputs, query_images, queries), "num_loc": num_loc}
     conf |= {"matcher": matcher} if matcher != built.matcher else {}
+    conf |= {"panoramas": panorama_files.VIEWS} if wanted.panoramas else {}
     retrieval = built.retrieval if retrieval is None else retrieval
     retrieved = f"{retrieval_name(retrieval)}{num_loc}"
     loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
@@ -227,10 +232,15 @@ def main(
         photos.write()
         listed = queries or wanted.write(outputs / LISTED)
         wanted.log()
+        seen = query_images  # where the queries are
+        if wanted.panoramas:
+            with run.stage("panoramas"):
+                given = query_images, wanted.panoramas, outputs / "views"
+                seen = panorama_files.write_views(*given)
         with run.stage("extract_features"):
             features = extract_features.main(
                 built.conf,
-                query_images,
+                seen,
                 outputs,
                 image_list=names,
                 strict=strict,
@@ -238,21 +248,20 @@ def main(
             )
         photos.forget(failures(features))
         with run.stage("retrieval"):
-            wanted_pairs = loc_pairs, num_loc, readable(features, names), map_names, query_images
+            wanted_pairs = loc_pairs, num_loc, readable(features, names), map_names, seen
             if retrieval == built.retrieval:
                 retrieve_in_map(built, features, *wanted_pairs)
             else:
                 retrieve(retrieval, features, *wanted_pairs)
         matches = run.match("match_queries", loc_pairs, features, built.features)
         poses = outputs / f"poses_hloc_{built.feature}+{matcher}_{retrieved}.txt"
-        mirror_images = run.mirror_images(
-            built.conf, query_images, loc_pairs, features, built.features
-        )
+        of_views = poses.with_name(f"views_{poses.name}") if wanted.panoramas else poses
+        mirror_images = run.mirror_images(built.conf, seen, loc_pairs, features, built.features)
         others = other_views.tries(
             run,
             built,
-            query_images,
-            [name for name in names if wanted.sources.get(name) != "none"],
+            seen,
+            [name for name in names if wanted.sources.get(name) not in ("none", "panorama")],
             features,
             loc_pairs,
             num_loc if retrieval == built.retrieval else None,
@@ -265,7 +274,7 @@ def main(
                 loc_pairs,
                 features,
                 matches,
-                poses,
+                of_views,
                 refinements=wanted.refinements,
                 full_names=True,
                 gate=gate,
@@ -273,6 +282,8 @@ def main(
                 again=run.again(loc_pairs, features, built.features, mirror_images, others),
                 rigs=wanted.frames,
             )
+            if wanted.panoramas:
+                records = panorama_files.write_records(wanted.frames, records, poses)
         limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
         summary = {
             "retrieval": retrieval,
@@ -292,7 +303,9 @@ def main(
             "map_features": built.features,
             "map": built.sfm,
         }
-        return run.finish(summary, wanted.lists, records, truth, limits, features, poses, files)
+        return run.finish(
+            summary, wanted.photo_lists, records, truth, limits, features, poses, files
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
