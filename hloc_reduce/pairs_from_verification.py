@@ -43,6 +43,7 @@ def main(
     camera_mode: colmap.CameraMode = pycolmap.CameraMode.AUTO,
     image_list: Path | str | Iterable[str] | None = None,
     rigs: Annotated[Path, Option(metavar="rig_config.json")] | None = None,
+    image_options: dict | None = None,
 ) -> Path:
     """Write a list of pairs, and more pairs of poorly connected images.
 
@@ -66,6 +67,7 @@ def main(
         image_list: text file of names, one per line (in Python, also the names); default: the
             images of `features`.
         rigs: COLMAP's file of cameras that are fixed to each other, which may tell intrinsics.
+        image_options: of pycolmap's ImageReaderOptions.
 
     Returns:
         `output`.
@@ -84,7 +86,9 @@ def main(
     listed = list(dict.fromkeys(_unordered(*pair) for pair in parse_pairs(pairs)))
     if unknown := {name for pair in listed for name in pair}.difference(names):
         raise InputError(f"{pairs}: {min(unknown)} is not in the list of images.")
-    verified = _verify(image_dir, names, listed, features, matches, camera_mode, rigs)
+    verified = _verify(
+        image_dir, names, listed, features, matches, camera_mode, rigs, image_options
+    )
     connected = {pair: verified[pair] for pair in listed if verified[pair] >= MIN_INLIERS}
     global_descriptors = read_global(descriptors, names)
     new = more_pairs(names, set(listed), connected, global_descriptors, num_matched, num_covis)
@@ -183,6 +187,7 @@ def _verify(
     matches: Path,
     camera_mode: pycolmap.CameraMode,
     rigs: Path | None,
+    image_options: dict | None,
 ) -> dict[Pair, int]:
     """Return the number of verified matches of each pair, of known pairs from the file."""
     path = matches.with_name(f"{matches.stem}_verified.json")
@@ -193,6 +198,7 @@ def _verify(
             "camera_mode": camera_mode.name,
             "inferred": INFERRED_CAMERAS,
             **({"rigs": file_sha256(rigs)} if rigs else {}),
+            **({"image_options": image_options} if image_options else {}),
         }
     before = provenance.read(path)
     known = before.get("pairs", {}) if before.get("made_from") == made_from else {}
@@ -203,7 +209,7 @@ def _verify(
             database, listed = Path(folder, "database.db"), Path(folder, "pairs.txt")
             write_pairs(todo, listed)
             images = sorted({name for pair in todo for name in pair})
-            import_images(database, image_dir, images, camera_mode, rigs=rigs)
+            import_images(database, image_dir, images, camera_mode, image_options, rigs)
             keypoints, _, found = read_matches(images, listed, features, matches, None)
             found = drop_overlays(keypoints, found)
             unverified: Verified = {pair: (indices, None) for pair, indices in found.items()}

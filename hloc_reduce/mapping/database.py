@@ -9,10 +9,12 @@ import pycolmap
 
 from ..localization import rigs as rig_files
 from ..localization.exif import correct, exif_camera
+from ..localization.gate import PERSPECTIVE
 from ..localization.intrinsics import GUESSED_FOCAL
 from ..utils import colmap
 
 # what the provenance of what is made from such a database says of its cameras
+GUESSED_FISHEYE = 0.45  # its focal length in longer sides: 127 degrees across
 INFERRED_CAMERAS = (
     "of zooms, crops and squares: their own; of photos that were made smaller: scaled"
 )
@@ -46,7 +48,7 @@ def import_images(
     Raises:
         InputError: for an unknown option, an image that COLMAP skips, or a wrong file of rigs.
     """
-    options = image_options or {}
+    options = _guessing(image_options or {})
     if rigs is not None and rig_files.are_of(rigs, names):
         names = _import_rigs(database, image_dir, names, rigs, options)
     if options.get("camera_params"):
@@ -72,9 +74,20 @@ def import_images(
                 params[camera.focal_length_idxs()] = guess * max(camera.width, camera.height)
                 camera.params = params.tolist()
                 camera.has_prior_focal_length = False
-            elif exif is None or not correct(camera, exif):
+            elif (exif is None or not correct(camera, exif)) and camera.model.name in PERSPECTIVE:
                 continue
+            # a fundamental matrix explains no fisheye, whereas an essential one by a guess does
+            camera.has_prior_focal_length |= camera.model.name not in PERSPECTIVE
             opened.update_camera(camera)
+
+
+def _guessing(options: dict) -> dict:
+    """Return options of pycolmap's ImageReaderOptions with the guess of a fisheye."""
+    model = str(options.get("camera_model", PERSPECTIVE[0]))
+    is_told = {"camera_params", "default_focal_length_factor"} & options.keys()
+    if model in PERSPECTIVE or is_told:
+        return options
+    return {**options, "default_focal_length_factor": GUESSED_FISHEYE}
 
 
 def _import_rigs(

@@ -2,7 +2,7 @@
 
 import shutil
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,6 +58,7 @@ class Photos:
         camera_mode: which photos share a camera, if their poses are reconstructed.
         retrieval: a key of `confs.retrieval`.
         rigs: COLMAP's `rig_config.json` of cameras that are fixed to each other.
+        lens: of pycolmap's ImageReaderOptions, see `colmap.lens_options`.
         left_out: photos that are described and matched, but not reconstructed.
     """
 
@@ -71,6 +72,7 @@ class Photos:
     camera_mode: pycolmap.CameraMode
     retrieval: str
     rigs: Path | None = None
+    lens: dict[str, str] = field(default_factory=dict)
     left_out: frozenset[str] = frozenset()
 
     @property
@@ -289,6 +291,7 @@ def _reconstruct(
                 camera_mode=photos.camera_mode,
                 image_list=photos.names,
                 rigs=photos.rigs,
+                image_options=photos.lens,
             )
         _match(photos, pairs, features, matches)
     kept = photos.kept
@@ -308,6 +311,7 @@ def _reconstruct(
             once=once,
             checked=False,
             rigs=photos.rigs,
+            image_options=photos.lens,
         )
     return Attempt(photos, conf, matches, folder.path / name, sfm)
 

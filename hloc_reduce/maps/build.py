@@ -50,6 +50,8 @@ def main(
     camera_mode: pycolmap.CameraMode = pycolmap.CameraMode.AUTO,
     retrieval: str = retrieval_confs.VLAD,
     rigs: Path | None = None,
+    camera_model: str = "SIMPLE_RADIAL",
+    camera_params: str | None = None,
 ) -> Map:
     """Build a map, or open the one that was made from the same.
 
@@ -75,6 +77,8 @@ def main(
         retrieval: a key of `confs.retrieval`.
         rigs: COLMAP's `rig_config.json` of cameras that are fixed to each other, without a model:
             their photos share one camera each, and the map is in the units of the file.
+        camera_model: COLMAP's model of the cameras, without a model.
+        camera_params: about its parameters, separated by commas, see `colmap.lens_options`.
 
     Returns:
         The map.
@@ -88,6 +92,7 @@ def main(
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher = matcher or features_confs.matcher_of(conf)
     described_by = retrieval_confs.get(retrieval)
+    lens = colmap.lens_options(camera_model, camera_params)
     reference, normalized = (None, False) if model is None else colmap.read_normalized(model)
     if reference is not None and not reference.images:
         raise InputError(f"The model {model} has no images.")
@@ -120,6 +125,7 @@ def main(
     elif model is None:
         made_from |= {"pairs": f"retrieval, {PAIR_ROUNDS} rounds of verification"}
     made_from |= {"normalized": True} if normalized else {}
+    made_from |= lens
     made_from |= retrieval_confs.provenance(retrieval)
     made_from |= matchers_confs.provenance(made_from["matcher"], made_from["feature"])
     with claim(map_dir, made_from, overwrite, image_dir, model, projection, rigs) as folder:
@@ -137,6 +143,7 @@ def main(
                 camera_mode=camera_mode,
                 retrieval=retrieval,
                 rigs=rigs,
+                lens=lens,
             )
             conf = keep_projection(_at_one_size(conf, image_dir, usable), map_dir)
             if model is not None and reference is not None:
