@@ -19,7 +19,6 @@ from hloc_reduce.confs.matchers import NN_LIGHTGLUE
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
 from hloc_reduce.localization import panoramas as panorama_files
-from hloc_reduce.localization import rigs as rig_files
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
 from hloc_reduce.match_features import check_features, check_model
@@ -30,11 +29,10 @@ from hloc_reduce.runtime.provenance import MADE_FROM
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES, Storage
-from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.options import Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
-from .common import changes, command, other_views
+from .common import changes, command, map_photos, other_views
 from .common.options import Matcher, Positive, Retrieval, Rigs
 from .common.queries import LISTED, Photos, find_queries, identity, results_folder
 from .common.retrieval import check_retrieval, retrieval_name, retrieve, retrieve_in_map
@@ -55,9 +53,12 @@ def open_map(
     keypoints: KeypointSettings | None = None,
     accept_partial: bool = False,
     camera_mode: Annotated[str, colmap.CAMERA_MODE] | None = None,
+    camera_model: Annotated[str, colmap.CAMERA_MODEL] | None = None,
+    camera_params: str | None = None,
     database: Path | None = None,
     retrieval: Retrieval | None = None,
     rigs: Rigs | None = None,
+    panoramas: bool = False,
 ) -> Map:
     """Build a map, or open one that was built before.
 
@@ -84,6 +85,10 @@ def open_map(
             photos alone, not reconstructed; and use a map whose focal lengths, positions or matches
             show that it may be wrong.
         camera_mode: which photos share a camera; default: auto.
+        camera_model: the model of the cameras, of fisheyes for example OPENCV_FISHEYE; default:
+            SIMPLE_RADIAL.
+        camera_params: about their parameters, as COLMAP has them, such as fx,fy,cx,cy,k1,k2,k3,k4;
+            default: from EXIF data or guessed.
         database: COLMAP database that `map` was made from: its keypoints and descriptors make the
             map, without photos. Photos, if given, only tell more about the cameras.
         retrieval: a name (those of networks need an installed hloc); or, for the queries only,
@@ -91,17 +96,17 @@ def open_map(
         rigs: COLMAP's file of cameras that are fixed to each other: a map of photos alone that they
             took is in the units of the file; queries with the same name in the folders of their
             cameras get their poses together.
+        panoramas: photos that are twice as wide as high are panoramas of all directions; default:
+            those whose XMP data say so.
 
     Raises:
         InputError: when an old map was built with other options, or something is missing or wrong.
     """
-    if camera_mode is not None and (map_images is None or model_or_map is not None):
-        raise InputError("--camera_mode is for maps of photos alone: leave it or --map out.")
-    if rigs is not None and (map_images is None or model_or_map is not None):
-        raise InputError(
-            "--rigs is for queries and maps of photos alone: a COLMAP model has its own rigs. Give "
-            "--query_images, or --map_images without --map."
-        )
+    lens = {"camera_model": camera_model, "camera_params": camera_params}
+    seen = {"camera_mode": camera_mode, "rigs": rigs, "panoramas": panoramas}
+    map_photos.check(map_images, model_or_map, **lens, **seen)
+    if camera_params is not None and camera_model is None:
+        raise InputError("Give --camera_model, whose parameters --camera_params are.")
     mode = colmap.camera_mode(camera_mode or "auto")
     named = retrieval if retrieval in retrieval_confs.confs else None
     is_built = model_or_map and (maps.is_map(model_or_map) or maps.is_compact(model_or_map))
@@ -131,8 +136,11 @@ def open_map(
             )
         return maps.from_database.main(folder, database, model_or_map, image_dir=map_images, **new)
     if map_images is not None:
+        if model_or_map is None and (views := map_photos.views(map_images, outputs, panoramas)):
+            map_images, rigs = views
         new |= {"num_covis": num_covis, "accept_partial": accept_partial, "camera_mode": mode}
-        new["rigs"] = rigs
+        new |= {"rigs": rigs, "camera_params": camera_params}
+        new |= {"camera_model": camera_model} if camera_model else {}
         return maps.main(folder, map_images, model_or_map, **new)
     if model_or_map is None:
         raise InputError("Give --map_images, the folder of the photos to build a map of.")
@@ -337,6 +345,8 @@ def _check(given: dict, is_changed: bool) -> None:
         given: the options.
         is_changed: whether photos are added to a map or removed from it.
     """
+    if is_changed and given["panoramas"]:
+        raise InputError("--panoramas cannot be added to a map: leave out --panoramas.")
     if given["outputs"] is None and (given["query_images"] is not None or not is_changed):
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
@@ -371,18 +381,11 @@ def _main() -> None:
             compact.main(given["compact"], folder)
 
 
-def _rigs_of_map(given: dict) -> Path | None:
-    """Return --rigs unless it is for the queries only."""
-    rigs, photos = given["rigs"], given["map_images"]
-    if rigs is None or given["query_images"] is None:
-        return rigs
-    is_alone = photos is not None and given["model_or_map"] is None
-    return rigs if is_alone and rig_files.are_of(rigs, list_images(photos)) else None
-
-
 def _run(given: dict) -> None:
     """Build or open the map, and localize the queries in it."""
-    built = open_map(**taken(open_map, given | {"rigs": _rigs_of_map(given)}))
+    where = given["map_images"], given["model_or_map"], given["query_images"]
+    special = map_photos.of_map(*where, given["rigs"], given["panoramas"])
+    built = open_map(**taken(open_map, given | special._asdict()))
     if given["map_images"] is None and given["database"] is None:  # others warn as they are built
         built.warn()
     if given["compact"] is not None:
@@ -392,6 +395,8 @@ def _run(given: dict) -> None:
         print(f"The map {built.folder} is ready. Localize photos in it with --query_images.")
         return
     results = results_folder(given["outputs"], query_images, queries)
+    are_panoramas = given["panoramas"], special.panoramas
+    given["panoramas"] = map_photos.of_queries(query_images, *are_panoramas)
     summary = main(built, **taken(main, given) | {"outputs": results})
     if built.doubts:
         logger.warning(

@@ -4,6 +4,7 @@ A panorama's pose is that of a camera at its place that looks at its centre: x t
 The views look around in a ring. They overlap, so that nothing is cut in all of them.
 """
 
+import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
+from ..runtime import provenance
 from ..utils import cli
 from ..utils.cli import InputError
 from ..utils.files import replacing
@@ -32,6 +34,10 @@ TOLD = re.compile(rb"ProjectionType\s*(?:=|>)\s*[\"']?\s*equirectangular")
 QUALITY = 95  # of JPEG
 # what the provenance of what is made from panoramas says of their views
 VIEWS = f"{NUM_VIEWS} views of {FIELD_OF_VIEW} degrees, at most {MAX_VIEW} pixels"
+
+NONE = (
+    "No photo in {} is a panorama of all directions, twice as wide as high: leave out --panoramas."
+)
 
 Size = tuple[int, int]  # width and height in pixels
 
@@ -105,7 +111,8 @@ def views_of(size: Size) -> list[View]:
         )
         camera.has_prior_focal_length = True
         turn = pycolmap.Rotation3d(np.array([0, -angle, 0]))
-        name = f"view{round(np.degrees(angle)):03}/"
+        # panoramas of another size have other cameras
+        name = f"view{round(np.degrees(angle)):03}-{side}/"
         found.append(View(name, camera, pycolmap.Rigid3d(turn, np.zeros(3))))
     return found
 
@@ -169,6 +176,59 @@ def write_views(image_dir: Path, sizes: Mapping[str, Size], folder: Path) -> Pat
                     temporary, format="JPEG", quality=QUALITY, subsampling=0, exif=exif
                 )
     return folder
+
+
+def write_rigs(image_dir: Path, sizes: Mapping[str, Size], folder: Path) -> tuple[Path, Path]:
+    """Write the views of panoramas and COLMAP's `rig_config.json` of them; drop stale ones.
+
+    Args:
+        image_dir: folder of the panoramas.
+        sizes: of the panoramas, by name.
+        folder: for the files.
+
+    Returns:
+        The folder of the views, with no others, and the file.
+
+    Raises:
+        UnreadableImage: if a panorama cannot be read.
+    """
+    images, made_from = folder / "images", folder / provenance.MADE_FROM
+    before = provenance.read(made_from)
+    known = before.get("panoramas", {}) if before.get("views") == VIEWS else {}
+    files = {name: image_dir / name for name in sizes}
+    found = provenance.fingerprints(files, known)
+    kept = {
+        images / view
+        for name, size in sizes.items()
+        if name in known and known[name][2] == found[name][2]
+        for view in view_names(name, views_of(size))
+    }
+    for path in images.rglob("*"):
+        if path.is_file() and path not in kept:
+            path.unlink()
+    provenance.write(made_from, {"views": VIEWS, "panoramas": found})
+    write_views(image_dir, sizes, images)
+    rigs = {view[0].name: view for view in map(views_of, sizes.values())}
+    with replacing(folder / "rig_config.json") as temporary:
+        temporary.write_text(json.dumps([{"cameras": _cameras(one)} for one in rigs.values()]))
+    return images, folder / "rig_config.json"
+
+
+def _cameras(views: list[View]) -> list[dict]:
+    """Return the cameras of the rig of views, as COLMAP's file has them."""
+    found: list[dict] = []
+    for view in views:
+        x, y, z, w = view.cam_from_rig.rotation.quat.tolist()
+        pose = {"cam_from_rig_rotation": [w, x, y, z], "cam_from_rig_translation": [0.0, 0.0, 0.0]}
+        found.append(
+            {
+                "image_prefix": view.name,
+                "camera_model_name": view.camera.model.name,
+                "camera_params": view.camera.params.tolist(),
+                **(pose if found else {"ref_sensor": True}),
+            }
+        )
+    return found
 
 
 def write_records(

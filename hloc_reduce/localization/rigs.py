@@ -161,6 +161,12 @@ def frames(path: Path, names: Iterable[str]) -> dict[str, dict[str, pycolmap.Rig
     return several
 
 
+def know_all(path: Path, names: Iterable[str]) -> bool:
+    """Tell whether a rig configuration has the intrinsics of all photos."""
+    took = cameras_of(path, names := [*names])
+    return all(name in took and took[name].camera is not None for name in names)
+
+
 def configurations(path: Path, names: Iterable[str]) -> list[pycolmap.RigConfig]:
     """Return the rigs of a rig configuration as pycolmap takes them, without intrinsics.
 

@@ -24,6 +24,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..extract_features import keep_readable
+from ..localization.rigs import know_all
 from ..mapping import findings, mapper, plausibility, registration
 from ..mapping.checks import Inputs, another_size, intrinsics, mirrored
 from ..mapping.findings import Finding, names_in
@@ -213,12 +214,15 @@ def _fitting(best: Attempt) -> tuple[Attempt, list[Finding]]:
 
     First with a camera for each photo, if they share some; then without the fewer than half whose
     intrinsics are unlike those of the others. A new model is used if it has all other photos, which
-    fit. The cameras of rigs stay.
+    fit. The cameras of rigs stay; nothing is done if a file gives the intrinsics of all photos.
 
     Returns:
         The model, and what was found of photos that are left out, or that do not fit.
     """
-    fit, photos = _fit(best), best.photos
+    photos = best.photos
+    if photos.rigs is not None and know_all(photos.rigs, best.names):
+        return best, []
+    fit = _fit(best)
     if fit.gain <= intrinsics.GAIN_OF_FREE:
         return best, []
     if photos.rigs is not None:

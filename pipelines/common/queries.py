@@ -183,10 +183,7 @@ def find_queries(
     if sizes:
         return Queries.of_panoramas(query_images, sizes)
     if are_panoramas:
-        raise InputError(
-            f"No photo in {query_images} is a panorama of all directions, twice as wide as high: "
-            "leave out --panoramas."
-        )
+        raise InputError(panorama_files.NONE.format(query_images))
     return Queries.find(query_images, queries, built, strict, rigs)
 
 

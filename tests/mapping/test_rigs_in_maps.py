@@ -10,8 +10,9 @@ import pycolmap
 import pytest
 
 from hloc_reduce import match_features, reconstruction
+from hloc_reduce.localization.rigs import know_all
 from hloc_reduce.mapping import database
-from hloc_reduce.mapping.checks import Inputs, few_points
+from hloc_reduce.mapping.checks import Inputs, copies, few_points
 from hloc_reduce.mapping.plausibility import keep_plausible
 from hloc_reduce.utils import colmap, parsers
 from hloc_reduce.utils.cli import InputError
@@ -119,6 +120,8 @@ def test_cameras_without_intrinsics_share_one_each(rig):
     assert (left.model.name, right.model.name) == ("PINHOLE", "SIMPLE_RADIAL")
     assert (left.width, left.height) == (640, 480)
     assert database.fixed_cameras(path, rigs) == {ids["left/0.jpg"]}
+    assert know_all(rigs, ["left/0.jpg"]) and not know_all(rigs, ["left/0.jpg", "right/0.jpg"])
+    assert not know_all(rigs, ["left/0.jpg", "other.jpg"])
 
 
 def test_photos_of_a_moment_are_judged_together(rig):
@@ -138,6 +141,20 @@ def test_photos_of_a_moment_are_judged_together(rig):
     (found,), dropped = keep_plausible([Inputs(model)])
     assert found.num_reg_images() == 9
     assert [{*one.names} for one in dropped] == [{"left/3.jpg", "right/3.jpg"}]
+
+
+@pytest.mark.parametrize(("less", "found"), [("right/3.jpg", True), ("left/3.jpg", False)])
+def test_copies_are_frames(less, found, rig, monkeypatch):
+    """If the photos in the group see most of what the frame does."""
+    model = reconstruction.main(rig.root / "sfm", *rig.given, rigs=write(config(), rig.root))
+    image = model.find_image_with_name(less)
+    for i in image.get_observation_point2D_idxs()[:250]:
+        model.delete_observation(image.image_id, i)
+    inputs = Inputs(model)
+    index = [one.name for one in inputs.images].index("left/3.jpg")
+    monkeypatch.setattr(copies.groups, "contradicting", lambda *_: [index])
+    names = [name for one in copies.find(inputs) for name in one.names]
+    assert names == (["left/3.jpg", "right/3.jpg"] if found else [])
 
 
 @pytest.mark.parametrize(

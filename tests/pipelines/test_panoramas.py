@@ -12,6 +12,7 @@ from hloc_reduce import Localizer
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import panoramas
 from hloc_reduce.localization.records import read_records
+from hloc_reduce.localization.rigs import frames
 from hloc_reduce.utils import parsers
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize
@@ -66,7 +67,7 @@ def test_a_view_to_the_right():
     image[:, 512:] = 255
     views = panoramas.views_of((1024, 512))
     shown = dict(zip([view.name for view in views], panoramas.render(image, views), strict=True))
-    assert shown["view060/"].mean() > 200 > 55 > shown["view300/"].mean()
+    assert shown["view060-326/"].mean() > 200 > 55 > shown["view300-326/"].mean()
 
 
 @pytest.fixture
@@ -104,7 +105,7 @@ def test_panoramas_are_queries(panorama, run):
             pose_error(
                 pose,
                 parsers.parse_poses(results / f"views_{summary['poses']}")[
-                    "view000/lobby/1.png.jpg"
+                    "view000-652/lobby/1.png.jpg"
                 ],
             )
         )
@@ -180,7 +181,7 @@ def test_records_of_panoramas(tmp_path):
         told = {"num_inliers": inliers, "confidence": 9.0, "covariance": np.eye(6).tolist()}
         return numbers | pose | told | {"reason": None, "localized": True, "rig": said}
 
-    for best, reason in (("view240/", None), ("view060/", "the rig contradicts")):
+    for best, reason in (("view240-326/", None), ("view060-326/", "the rig contradicts")):
         records = {
             name: record(pose * true, 50 if name == best else 3, reason)
             for name, pose in views.items()
@@ -193,3 +194,45 @@ def test_records_of_panoramas(tmp_path):
         assert max(pose_error(pose, true)) < 1e-6
     lines = (tmp_path / "poses.txt_logs.jsonl").read_text().splitlines()
     assert json.loads(lines[1])[0] == "a.jpg" and len(lines) == 2
+
+
+def test_views_are_a_rig(tmp_path):
+    """As COLMAP has it; those of panoramas that have changed, or are not there, are dropped."""
+    images, folder = tmp_path / "images", tmp_path / "views"
+    images.mkdir()
+    sizes = {"a.jpg": (1024, 512), "b.jpg": (1024, 512), "c.jpg": (2048, 1024)}
+    for name, (width, height) in sizes.items():
+        cv2.imwrite(str(images / name), np.zeros((height, width), np.uint8))
+    shown, rigs = panoramas.write_rigs(images, sizes, folder)
+    names = sorted(path.relative_to(shown).as_posix() for path in shown.rglob("*.jpg"))
+    assert len(names) == 3 * panoramas.NUM_VIEWS
+    found = frames(rigs, names)
+    assert sorted(found) == ["view000-326/a.jpg", "view000-326/b.jpg", "view000-652/c.jpg"]
+    for frame, views in found.items():
+        expected = panoramas.views_of(sizes[frame.partition("/")[2]])
+        for view, pose in zip(expected, views.values(), strict=True):
+            assert np.allclose(pose.matrix(), view.cam_from_rig.matrix())
+    before = state(folder)
+    panoramas.write_rigs(images, sizes, folder)
+    assert state(folder) == before
+    cv2.imwrite(str(images / "a.jpg"), np.full((512, 1024), 200, np.uint8))
+    del sizes["c.jpg"]
+    panoramas.write_rigs(images, sizes, folder)
+    assert len([*shown.rglob("*.jpg")]) == 2 * panoramas.NUM_VIEWS
+    assert cv2.imread(str(shown / "view060-326/a.jpg")).mean() > 190
+
+
+def test_options_of_panoramas(panorama, place, plane, tmp_path, refused):
+    """Which are for the map, the queries, or both."""
+    folder, _, outputs = panorama
+    new = tmp_path / "new"
+    given = "--panoramas", "--outputs", new, "--map_images", plane / "images"
+    assert "is a panorama of all directions" in refused(*given)
+    assert "--panoramas is for queries and maps" in refused(*given, "--map", plane / "model")
+    assert not (new / "map").exists()
+    add = "--map", outputs / "map", "--add_images", folder, "--panoramas"
+    assert "--panoramas cannot be added" in refused(*add)
+    one = "--panoramas", "--outputs", new, "--map_images", folder
+    assert "COLMAP could not reconstruct" in refused(*one)
+    assert len([*(new / "map-views/images").rglob("*.jpg")]) == panoramas.NUM_VIEWS
+    assert (new / "map-views/rig_config.json").exists()
