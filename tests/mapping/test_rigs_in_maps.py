@@ -4,17 +4,17 @@ import json
 from types import SimpleNamespace
 
 import cv2
-import h5py
+import matched_scene
 import numpy as np
 import pycolmap
 import pytest
 
-from hloc_reduce import match_features, reconstruction
+from hloc_reduce import reconstruction
 from hloc_reduce.localization.rigs import know_all
 from hloc_reduce.mapping import database
 from hloc_reduce.mapping.checks import Inputs, copies, few_points
 from hloc_reduce.mapping.plausibility import keep_plausible
-from hloc_reduce.utils import colmap, parsers
+from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
 
 PARAMS = [500.0, 500.0, 320.0, 240.0]
@@ -39,10 +39,6 @@ def config(**of_right):
 @pytest.fixture
 def rig(tmp_path):
     """Five moments of two cameras around random points, another photo, and all pairs matched."""
-    generator = np.random.default_rng(1)
-    points = generator.uniform(-1, 1, (300, 3))
-    descriptors = generator.standard_normal((300, 64))
-    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=PARAMS)
     poses = {}
     for i in range(6):
@@ -50,22 +46,8 @@ def rig(tmp_path):
         left = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.array([0.1 * i, 0, 4.0]))
         of_rig = {f"left/{i}.jpg": left, f"right/{i}.jpg": RIGHT_FROM_LEFT * left}
         poses |= of_rig if i < 5 else {"other.jpg": left}
-    features, photo = tmp_path / "features.h5", cv2.imencode(".jpg", np.full((480, 640), 99))[1]
-    with h5py.File(features, "w") as file:
-        for name, pose in poses.items():
-            pixels = camera.img_from_cam(points @ pose.rotation.matrix().T + pose.translation)
-            order = generator.permutation(len(points))
-            group = file.create_group(name)
-            group["keypoints"] = (pixels[order] - 0.5).astype(np.float32)
-            group["descriptors"] = descriptors[order].T.astype(np.float16)
-            path = tmp_path / "images" / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(photo.tobytes())
-    pairs, matches, names = tmp_path / "pairs.txt", tmp_path / "matches.h5", sorted(poses)
-    parsers.write_pairs([(a, b) for a in names for b in names if a < b], pairs)
-    match_features.main(match_features.confs["NN-ratio"], pairs, features, matches=matches)
-    given = tmp_path / "images", pairs, features, matches
-    return SimpleNamespace(root=tmp_path, poses=poses, given=given, names=names)
+    given = matched_scene.write(tmp_path, poses, camera)
+    return SimpleNamespace(root=tmp_path, poses=poses, given=given, names=sorted(poses))
 
 
 def write(rigs, folder):
