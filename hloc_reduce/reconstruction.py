@@ -112,7 +112,7 @@ def main(
     }
     if rigs is not None:
         rig_files.frames(rigs, names)  # raises for a wrong one
-        chosen["rigs"] = file_sha256(rigs)
+        chosen |= {"rigs": file_sha256(rigs), "scale": "by rigs"}
     made_from = provenance.of_inputs({**options, **chosen}, [pairs, features, matches])
     is_whole = bool(provenance.read(sfm_dir / registration.REGISTRATION))
     is_current = provenance.is_current(sfm_dir / provenance.MADE_FROM, made_from)

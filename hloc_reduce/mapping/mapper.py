@@ -17,7 +17,7 @@ from ..runtime import parallel
 from ..utils import cli, colmap
 from ..utils.interrupts import interruptible
 from . import database as databases
-from .adjustment import adjusted_error, with_one_camera
+from .adjustment import adjusted_error, scale_by_rigs, with_one_camera
 from .checks import Inputs, copies, lenses
 from .checks.focal_lengths import FEW_IMAGES, SPREAD, SPREAD_OF_FEW, are_alike, of_spread
 from .checks.partial import ENOUGH_REGISTERED
@@ -198,6 +198,8 @@ class Mapper:
                 found = colmap.incremental_mapping(
                     own, self.image_dir, Path(folder) / "models", options, self.verbose
                 )
+            for model in found if self.rigs else ():
+                scale_by_rigs(model, fixed.intersection(model.cameras))
             cameras = [camera for model in found for camera in _cameras(model)]
             is_narrow = any(_is_narrow(camera) for camera in cameras)
             is_distorted = any(lenses.is_distorted(camera) for camera in cameras)

@@ -112,7 +112,9 @@ def main(
         usable = _of_fitting_size(image_dir, names, reference, accept_partial)
     images = {name: image_dir / name for name in names}
     parts = {path.name: path for path in (colmap.model_files(model) if model else [])}
-    groups = {"images": images, "model": parts} | ({"rigs": {"rig_config.json": rigs}} if rigs else {})
+    groups = {"images": images, "model": parts} | (
+        {"rigs": {"rig_config.json": rigs}} if rigs else {}
+    )
     fingerprints, found = digests(map_dir, groups)
     made_from = {
         "feature": extract_features.provenance(conf),

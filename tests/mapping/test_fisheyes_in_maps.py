@@ -23,7 +23,8 @@ def test_fisheyes_alone(params, tmp_path):
         rotation = cv2.Rodrigues(np.array([0.2 * np.cos(2 * i), 0.2 * i - 0.7, 0.05]))[0]
         place = np.array([0.1 * i, 0.05 * (i % 3), 3.4])
         poses[f"{i}.jpg"] = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), place)
-    given = matched_scene.write(tmp_path, poses, camera, reach=1.4)
+    points = np.random.default_rng(1).uniform(-1.4, 1.4, (300, 3))
+    given = matched_scene.write(tmp_path, poses, camera, points)
     options = {
         "camera_mode": pycolmap.CameraMode.SINGLE,
         "image_options": colmap.lens_options("OPENCV_FISHEYE", params),
