@@ -79,6 +79,7 @@ done
 small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.25 0.5 1 "$@"
 
 run rigs --feature colmap_sift_sv64 mini32:uint2 "$@"
+run panoramas --feature colmap_sift_sv64 "$@"
 mappers= # of photos alone
 for place in fountain-P11 monstree kitchen fox south-building; do mappers="$mappers --map $(scene "$place")"; done
 run mappers $mappers --map $data/demo_town-400/images_upright:$data/demo_town-400/3D-models/aachen_v_1_1 "$@"
