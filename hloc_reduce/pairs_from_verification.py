@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated
 
 import numpy as np
 import pycolmap
@@ -17,8 +18,10 @@ from .runtime import provenance
 from .triangulation import Pair, Verified, read_matches
 from .utils import cli, colmap, options
 from .utils.cli import InputError
+from .utils.files import file_sha256
 from .utils.h5 import file_provenance, list_h5_names, open_h5
 from .utils.images import list_images
+from .utils.options import Option
 from .utils.parsers import parse_pairs, write_pairs
 from .utils.paths import strings_as_paths
 
@@ -39,6 +42,8 @@ def main(
     num_covis: int = 0,
     camera_mode: colmap.CameraMode = pycolmap.CameraMode.AUTO,
     image_list: Path | str | Iterable[str] | None = None,
+    rigs: Annotated[Path, Option(metavar="rig_config.json")] | None = None,
+    image_options: dict | None = None,
 ) -> Path:
     """Write a list of pairs, and more pairs of poorly connected images.
 
@@ -61,6 +66,8 @@ def main(
         camera_mode: which photos share a camera.
         image_list: text file of names, one per line (in Python, also the names); default: the
             images of `features`.
+        rigs: COLMAP's file of cameras that are fixed to each other, which may tell intrinsics.
+        image_options: of pycolmap's ImageReaderOptions.
 
     Returns:
         `output`.
@@ -79,7 +86,9 @@ def main(
     listed = list(dict.fromkeys(_unordered(*pair) for pair in parse_pairs(pairs)))
     if unknown := {name for pair in listed for name in pair}.difference(names):
         raise InputError(f"{pairs}: {min(unknown)} is not in the list of images.")
-    verified = _verify(image_dir, names, listed, features, matches, camera_mode)
+    verified = _verify(
+        image_dir, names, listed, features, matches, camera_mode, rigs, image_options
+    )
     connected = {pair: verified[pair] for pair in listed if verified[pair] >= MIN_INLIERS}
     global_descriptors = read_global(descriptors, names)
     new = more_pairs(names, set(listed), connected, global_descriptors, num_matched, num_covis)
@@ -177,6 +186,8 @@ def _verify(
     features: Path,
     matches: Path,
     camera_mode: pycolmap.CameraMode,
+    rigs: Path | None,
+    image_options: dict | None,
 ) -> dict[Pair, int]:
     """Return the number of verified matches of each pair, of known pairs from the file."""
     path = matches.with_name(f"{matches.stem}_verified.json")
@@ -186,6 +197,8 @@ def _verify(
             "matches": file_provenance(match_file),
             "camera_mode": camera_mode.name,
             "inferred": INFERRED_CAMERAS,
+            **({"rigs": file_sha256(rigs)} if rigs else {}),
+            **({"image_options": image_options} if image_options else {}),
         }
     before = provenance.read(path)
     known = before.get("pairs", {}) if before.get("made_from") == made_from else {}
@@ -196,7 +209,7 @@ def _verify(
             database, listed = Path(folder, "database.db"), Path(folder, "pairs.txt")
             write_pairs(todo, listed)
             images = sorted({name for pair in todo for name in pair})
-            import_images(database, image_dir, images, camera_mode)
+            import_images(database, image_dir, images, camera_mode, image_options, rigs)
             keypoints, _, found = read_matches(images, listed, features, matches, None)
             found = drop_overlays(keypoints, found)
             unverified: Verified = {pair: (indices, None) for pair, indices in found.items()}

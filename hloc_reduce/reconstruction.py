@@ -7,6 +7,7 @@ from typing import Annotated
 import pycolmap
 
 from . import logger
+from .localization import rigs as rig_files
 from .mapping import checks, findings, registration
 from .mapping.checks.overlays import drop_overlays
 from .mapping.mapper import MODEL_CHOICE, Mapper, attempts_for
@@ -14,9 +15,10 @@ from .runtime import provenance
 from .triangulation import read_matches, replacing_map
 from .utils import cli, colmap, options
 from .utils.cli import InputError
+from .utils.files import file_sha256
 from .utils.h5 import list_h5_names
 from .utils.images import list_images
-from .utils.options import HIDDEN
+from .utils.options import HIDDEN, Option
 from .utils.paths import strings_as_paths
 
 # COLMAP would drop parts of fewer than 10 images
@@ -41,6 +43,7 @@ def main(
     accept_partial: bool = False,
     once: Annotated[bool, HIDDEN] = False,
     checked: bool = True,
+    rigs: Annotated[Path, Option(metavar="rig_config.json")] | None = None,
 ) -> pycolmap.Reconstruction:
     """Reconstruct poses, intrinsics and points with COLMAP's incremental mapper.
 
@@ -77,6 +80,8 @@ def main(
             differ too much.
         once: make one attempt only.
         checked: report missing images and focal lengths that differ, see `mapping.checks`.
+        rigs: COLMAP's file of cameras that are fixed to each other. Their poses in the rig, and
+            intrinsics if the file has any, are exact, and the model is in its units.
 
     Returns:
         The model with the most images. It has the keypoints of the feature file, in the same order.
@@ -105,6 +110,9 @@ def main(
         **MODEL_CHOICE,
         "once": once,
     }
+    if rigs is not None:
+        rig_files.frames(rigs, names)  # raises for a wrong one
+        chosen |= {"rigs": file_sha256(rigs), "scale": "by rigs"}
     made_from = provenance.of_inputs({**options, **chosen}, [pairs, features, matches])
     is_whole = bool(provenance.read(sfm_dir / registration.REGISTRATION))
     is_current = provenance.is_current(sfm_dir / provenance.MADE_FROM, made_from)
@@ -126,6 +134,7 @@ def main(
                 attempts=[{**options, **changed} for changed in attempts],
                 once=once,
                 verbose=verbose,
+                rigs=rigs,
             ).reconstruct(camera_mode)
         sfm = colmap.read_model(sfm_dir)
         logger.info("The map %s:\n%s", sfm_dir, sfm.summary())

@@ -18,6 +18,7 @@ from hloc_reduce.confs import retrieval as retrieval_confs
 from hloc_reduce.confs.matchers import NN_LIGHTGLUE
 from hloc_reduce.datasets import DAY_THRESHOLDS, true_poses
 from hloc_reduce.detectors.dog import KEYPOINT_SETTINGS, KeypointSettings
+from hloc_reduce.localization import panoramas as panorama_files
 from hloc_reduce.localization import trajectory
 from hloc_reduce.localization.gate import DEFAULT_GATE, Gate
 from hloc_reduce.maps.map import Map
@@ -34,9 +35,9 @@ from hloc_reduce.utils.codes import STORAGES, Storage
 from hloc_reduce.utils.options import ABOVE_0, Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
 
-from .common import changes, command, metres, other_views, videos
+from .common import changes, command, map_photos, metres, other_views, videos
 from .common.options import Matcher, Positive, Retrieval, Rigs
-from .common.queries import LISTED, Photos, Queries, identity, results_folder
+from .common.queries import LISTED, Photos, find_queries, identity, results_folder
 from .common.retrieval import check_retrieval, retrieval_name, retrieve, retrieve_in_map
 from .common.run import Run, readable
 
@@ -55,11 +56,15 @@ def open_map(
     keypoints: KeypointSettings | None = None,
     accept_partial: bool = False,
     camera_mode: Annotated[str, colmap.CAMERA_MODE] | None = None,
+    camera_model: Annotated[str, colmap.CAMERA_MODEL] | None = None,
+    camera_params: str | None = None,
     database: Path | None = None,
     retrieval: Retrieval | None = None,
     exif_gps: bool = True,
     masks: Path | None = None,
     pairs: PairsOption | None = None,
+    rigs: Rigs | None = None,
+    panoramas: bool = False,
 ) -> Map:
     """Build a map, or open one that was built before.
 
@@ -87,6 +92,10 @@ def open_map(
             photos alone, not reconstructed; and use a map whose focal lengths, positions or matches
             show that it may be wrong.
         camera_mode: which photos share a camera; default: auto.
+        camera_model: the model of the cameras, of fisheyes for example OPENCV_FISHEYE; default:
+            SIMPLE_RADIAL.
+        camera_params: about their parameters, as COLMAP has them, such as fx,fy,cx,cy,k1,k2,k3,k4;
+            default: from EXIF data or guessed.
         database: COLMAP database that `map` was made from: its keypoints and descriptors make the
             map, without photos. Photos, if given, only tell more about the cameras.
         retrieval: a name (those of networks need an installed hloc); or, for the queries only,
@@ -99,13 +108,21 @@ def open_map(
             the `num_covis` most similar ones, or each with those around it by name and similar
             ones; default: sequential for a video, else exhaustive for up to 100 photos and
             retrieval for more.
+        rigs: COLMAP's file of cameras that are fixed to each other: a map of photos alone that they
+            took is in the units of the file; queries with the same name in the folders of their
+            cameras get their poses together.
+        panoramas: photos that are twice as wide as high are panoramas of all directions; default:
+            those whose XMP data say so.
 
     Raises:
         InputError: when an old map was built with other options, or something is missing or wrong.
     """
-    for option, value in (("camera_mode", camera_mode), ("pairs", pairs)):
-        if value is not None and (map_images is None or model_or_map is not None):
-            raise InputError(f"--{option} is for maps of photos alone: leave it or --map out.")
+    lens = {"camera_model": camera_model, "camera_params": camera_params}
+    seen = {"camera_mode": camera_mode, "rigs": rigs, "panoramas": panoramas}
+    seen["pairs"] = pairs
+    map_photos.check(map_images, model_or_map, **lens, **seen)
+    if camera_params is not None and camera_model is None:
+        raise InputError("Give --camera_model, whose parameters --camera_params are.")
     mode = colmap.camera_mode(camera_mode or "auto")
     named = retrieval if retrieval in retrieval_confs.confs else None
     is_built = model_or_map and (maps.is_map(model_or_map) or maps.is_compact(model_or_map))
@@ -135,10 +152,14 @@ def open_map(
             )
         return maps.from_database.main(folder, database, model_or_map, image_dir=map_images, **new)
     if map_images is not None:
+        if model_or_map is None and (views := map_photos.views(map_images, outputs, panoramas)):
+            map_images, rigs = views
         new |= {"num_covis": num_covis, "accept_partial": accept_partial, "camera_mode": mode}
         new |= {"exif_gps": exif_gps}
         new["masks"] = masks_of.those_of(masks, map_images)
         new["pairs"] = pairs
+        new |= {"rigs": rigs, "camera_params": camera_params}
+        new |= {"camera_model": camera_model} if camera_model else {}
         return maps.main(folder, map_images, model_or_map, **new)
     if model_or_map is None:
         raise InputError("Give --map_images, the folder of the photos to build a map of.")
@@ -181,6 +202,7 @@ def main(
     matcher: Matcher | None = None,
     rigs: Rigs | None = None,
     masks: Path | None = None,
+    panoramas: bool = False,
 ) -> dict:
     """Localize queries in a map and return the summary, as in summary.json.
 
@@ -201,18 +223,22 @@ def main(
         rigs: COLMAP's file of cameras that are fixed to each other, in the units of the map: photos
             with the same name in the folders of their cameras get their poses together.
         masks: of the queries, see `open_map`; default: none.
+        panoramas: photos that are twice as wide as high are panoramas of all directions; default:
+            those whose XMP data say so.
 
     Raises:
         InputError: when something is missing or wrong.
     """
-    wanted = Queries.find(query_images, queries, built, strict, rigs)
+    wanted = find_queries(query_images, queries, built, strict, rigs, panoramas)
     names = wanted.names
     map_names = built.names()
     built.check_features(map_names)  # a broken map is found before photos are read
-    truth = true_poses(names, ground_truth, True) if ground_truth else {}
+    truth = true_poses(wanted.photos, ground_truth, True) if ground_truth else {}
 
     masks = masks_of.those_of(masks, query_images)
-    photos = Photos(outputs / MADE_FROM, built, query_images, names, masks)
+    if masks and wanted.panoramas:
+        raise InputError(f"Panoramas are not masked: leave out --masks {masks}.")
+    photos = Photos(outputs / MADE_FROM, built, query_images, wanted.photos, masks)
     matcher = matcher or built.matcher
     steps = matchers_confs.steps_in(built.matcher, built.conf, matcher)
     for step in {*steps} - {built.matcher}:
@@ -221,6 +247,7 @@ def main(
         check_features(built.features, conf)
     conf = {"map": built.place, **identity(outputs, query_images, queries), "num_loc": num_loc}
     conf |= {"matcher": matcher} if matcher != built.matcher else {}
+    conf |= {"panoramas": panorama_files.VIEWS} if wanted.panoramas else {}
     retrieval = built.retrieval if retrieval is None else retrieval
     retrieved = f"{retrieval_name(retrieval)}{num_loc}"
     loc_pairs = outputs / f"pairs-query-{retrieved}.txt"
@@ -238,10 +265,15 @@ def main(
         photos.write()
         listed = queries or wanted.write(outputs / LISTED)
         wanted.log()
+        seen = query_images  # where the queries are
+        if wanted.panoramas:
+            with run.stage("panoramas"):
+                given = query_images, wanted.panoramas, outputs / "views"
+                seen = panorama_files.write_views(*given)
         with run.stage("extract_features"):
             features = extract_features.main(
                 built.conf,
-                query_images,
+                seen,
                 outputs,
                 image_list=names,
                 strict=strict,
@@ -250,21 +282,22 @@ def main(
             )
         photos.forget(failures(features))
         with run.stage("retrieval"):
-            wanted_pairs = loc_pairs, num_loc, readable(features, names), map_names, query_images
+            wanted_pairs = loc_pairs, num_loc, readable(features, names), map_names, seen
             if retrieval == built.retrieval:
                 retrieve_in_map(built, features, *wanted_pairs)
             else:
                 retrieve(retrieval, features, *wanted_pairs)
         matches = run.match("match_queries", loc_pairs, features, built.features)
         poses = outputs / f"poses_hloc_{built.feature}+{matcher}_{retrieved}.txt"
+        of_views = poses.with_name(f"views_{poses.name}") if wanted.panoramas else poses
         mirror_images = run.mirror_images(
-            built.conf, query_images, loc_pairs, features, built.features, masks
+            built.conf, seen, loc_pairs, features, built.features, masks
         )
         others = other_views.tries(
             run,
             built,
-            query_images,
-            [name for name in names if wanted.sources.get(name) != "none"],
+            seen,
+            [name for name in names if wanted.sources.get(name) not in ("none", "panorama")],
             features,
             loc_pairs,
             num_loc if retrieval == built.retrieval else None,
@@ -278,7 +311,7 @@ def main(
                 loc_pairs,
                 features,
                 matches,
-                poses,
+                of_views,
                 refinements=wanted.refinements,
                 full_names=True,
                 gate=gate,
@@ -286,6 +319,8 @@ def main(
                 again=run.again(loc_pairs, features, built.features, mirror_images, others),
                 rigs=wanted.frames,
             )
+            if wanted.panoramas:
+                records = panorama_files.write_records(wanted.frames, records, poses)
         if not trajectory.write(records, outputs):
             folder.delete((trajectory.TUM, trajectory.CSV))
         limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
@@ -308,7 +343,7 @@ def main(
             "map_features": built.features,
             "map": built.sfm,
         }
-        told = summary, wanted.lists, records, truth, limits, features, poses, files
+        told = summary, wanted.photo_lists, records, truth, limits, features, poses, files
         return run.finish(*told, built.frame)
 
 
@@ -345,6 +380,8 @@ def _check(given: dict, is_changed: bool) -> None:
         given: the options.
         is_changed: whether a map that was built is changed.
     """
+    if is_changed and given["panoramas"]:
+        raise InputError("--panoramas cannot be added to a map: leave out --panoramas.")
     if given["outputs"] is None and (given["query_images"] is not None or not is_changed):
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
@@ -399,8 +436,11 @@ def _main() -> None:
 def _run(given: dict) -> None:
     """Build or open the map, and localize the queries in it."""
     given = videos.as_folders(given)
+    where = given["map_images"], given["model_or_map"], given["query_images"]
+    special = map_photos.of_map(*where, given["rigs"], given["panoramas"])
     gps, scale = given["gps"], given["scale"]
-    built = open_map(**taken(open_map, given), exif_gps=not (gps or scale))
+    options = taken(open_map, given | special._asdict())
+    built = open_map(**options, exif_gps=not (gps or scale))
     strict = given["map_images"] is None or given["model_or_map"] is not None
     built = metres.main(built, gps, scale, strict)
     if given["map_images"] is None and given["database"] is None:  # others warn as they are built
@@ -412,6 +452,8 @@ def _run(given: dict) -> None:
         print(f"The map {built.folder} is ready. Localize photos in it with --query_images.")
         return
     results = results_folder(given["outputs"], query_images, queries)
+    are_panoramas = given["panoramas"], special.panoramas
+    given["panoramas"] = map_photos.of_queries(query_images, *are_panoramas)
     summary = main(built, **taken(main, given) | {"outputs": results})
     if built.doubts:
         logger.warning(

@@ -1,5 +1,7 @@
 """Taking a photo: the light of its hour, then lens, sensor and JPEG."""
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
@@ -12,17 +14,27 @@ LAMP = np.array([1.0, 0.70, 0.38])  # colour of the lamps, linear
 
 def take(scene: Scene, photo: Photo, seed: int) -> bytes:
     """Return the photo as a JPEG file; it depends only on the scene, the photo and the seed."""
-    rng = np.random.default_rng([seed, 20 + photo.kind, photo.index])
     view = View.of(photo.camera, photo.cam_from_world, SUPERSAMPLING)
+    return expose(lambda light: downsample(render(scene, view, light)), photo, seed)
+
+
+def expose(see: Callable[[Light], np.ndarray], photo: Photo, seed: int) -> bytes:
+    """Return a photo of what a lens sees as a JPEG file.
+
+    Args:
+        see: returns the linear light at every pixel, float32 RGB (H, W, 3).
+        photo: whose kind and index determine light and noise.
+        seed: of the town.
+    """
+    rng = np.random.default_rng([seed, 20 + photo.kind, photo.index])
     if photo.kind == NIGHT:
         # Every degree of difficulty occurs once, whatever the seed.
         ranks = np.random.default_rng([seed, 30]).permutation(MIN_QUERIES)
         rank = (ranks[photo.index % MIN_QUERIES] + rng.uniform(0.2, 0.8)) / MIN_QUERIES
         difficulty = 0.2 + 0.75 * rank
-        image = _night(rng, downsample(render(scene, view, _moonlight(rng))), difficulty)
+        image = _night(rng, see(_moonlight(rng)), difficulty)
     else:
-        image = downsample(render(scene, view, _daylight(rng)))
-        image = _day(rng, image, phone=photo.kind != MAP)
+        image = _day(rng, see(_daylight(rng)), phone=photo.kind != MAP)
     levels = (np.clip(image, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
     quality = [cv2.IMWRITE_JPEG_QUALITY, 93 if photo.kind == MAP else 90]
     return cv2.imencode(".jpg", levels[..., ::-1], quality)[1].tobytes()

@@ -12,6 +12,9 @@ from ..utils.options import Option
 from .measures import INDEPENDENT, Alternative, Measures, Uncertainty
 
 FOCAL_LENGTHS = 0.3, 5.0  # range of estimated ones, in longer sides: 11 to 180 mm on 35 mm film
+# that of fisheyes whose image of 180 degrees fills half of the longer side
+SHORTEST_OF_FISHEYES = 0.15
+PERSPECTIVE = "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"
 REFINED = 2.0  # factor by which a focal length from EXIF data may change
 LISTED = 0.1, 50.0  # range of listed focal lengths, in longer sides
 # distances of the principal point from the centre, as shares of the size
@@ -500,4 +503,5 @@ def focal_lengths(camera: pycolmap.Camera, guessed: bool) -> tuple[float, float]
     """
     size, given = max(camera.width, camera.height), camera.mean_focal_length()
     low, high = FOCAL_LENGTHS
+    low = low if camera.model.name in PERSPECTIVE else SHORTEST_OF_FISHEYES
     return (low * size, high * size) if guessed else (given / REFINED, given * REFINED)

@@ -32,6 +32,7 @@ _GUESSED = {"estimation": {"estimate_focal_length": True}, **_REFINED}
 REFINEMENTS = {
     "list": {},
     "rig": {},
+    "panorama": {},
     "map": {"photo": {"of_map": True}},
     "lens": {"photo": OF_SIZE},
     "EXIF": _REFINED,
@@ -39,7 +40,12 @@ REFINEMENTS = {
     "unknown": {**_GUESSED, "photo": {"cropped": True}},
     "none": {},
 }
-EXACT = "rig", "map", "lens"  # sources of intrinsics that are not estimated with the pose
+EXACT = (
+    "rig",
+    "panorama",
+    "map",
+    "lens",
+)  # sources of intrinsics that are not estimated with the pose
 
 
 class Lens(NamedTuple):

@@ -88,7 +88,7 @@ def to_record(
         "confidence": info["confidence"],
         "agreement": info["agreement"],
         "probability": info["probability"],
-        **_written(cam_from_world),
+        **written(cam_from_world),
         "camera": info["camera"] and to_list(info["camera"]),
         "max_error": info["max_error"],
         **{key: info[key] for key in NUMBERS},
@@ -98,7 +98,7 @@ def to_record(
     }
 
 
-def _written(cam_from_world: pycolmap.Rigid3d | None) -> dict:
+def written(cam_from_world: pycolmap.Rigid3d | None) -> dict:
     """Return the written pose of a record."""
     if cam_from_world is None:
         return {"qvec": None, "tvec": None}
@@ -128,7 +128,7 @@ def with_mirror_image(
         return record
     fallback = reference.fallback(names) or pose_of(record)
     first = next(iter(names), None)
-    return record | _written(fallback) | {"localized": False, "db": first, "covariance": None}
+    return record | written(fallback) | {"localized": False, "db": first, "covariance": None}
 
 
 def refused(

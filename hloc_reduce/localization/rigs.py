@@ -98,10 +98,13 @@ def cameras_of(path: Path, names: Iterable[str]) -> dict[str, RigCamera]:
             f"{path}: no photo is of a camera of a rig; their names begin with "
             f"{cli.some(prefixes)}, not as {names[0] if names else 'none'}."
         )
-    took_none = set(prefixes) - {camera.prefix for camera in found.values()}
-    if took_none:
-        logger.warning("No photo is of the cameras %s of %s.", cli.some(sorted(took_none)), path)
     return found
+
+
+def are_of(path: Path, names: Iterable[str]) -> bool:
+    """Tell whether a camera of a rig configuration took any photo; raise as `read`."""
+    prefixes = tuple(camera.prefix for rig in read(path) for camera in rig)
+    return any(name.startswith(prefixes) for name in names)
 
 
 def of_rig(
@@ -142,7 +145,10 @@ def frames(path: Path, names: Iterable[str]) -> dict[str, dict[str, pycolmap.Rig
     """
     first = {camera.prefix: rig[0].prefix for rig in read(path) for camera in rig}
     found: dict[str, dict[str, pycolmap.Rigid3d]] = {}
-    for name, camera in cameras_of(path, names).items():
+    took = cameras_of(path, names)
+    if took_none := first.keys() - {camera.prefix for camera in took.values()}:
+        logger.warning("No photo is of the cameras %s of %s.", cli.some(sorted(took_none)), path)
+    for name, camera in took.items():
         frame = first[camera.prefix] + name.removeprefix(camera.prefix)
         found.setdefault(frame, {})[name] = camera.cam_from_rig
     several = {frame: photos for frame, photos in found.items() if len(photos) > 1}
@@ -153,6 +159,40 @@ def frames(path: Path, names: Iterable[str]) -> dict[str, dict[str, pycolmap.Rig
             f"name in the folders of their cameras, as {example}."
         )
     return several
+
+
+def know_all(path: Path, names: Iterable[str]) -> bool:
+    """Tell whether a rig configuration has the intrinsics of all photos."""
+    took = cameras_of(path, names := [*names])
+    return all(name in took and took[name].camera is not None for name in names)
+
+
+def configurations(path: Path, names: Iterable[str]) -> list[pycolmap.RigConfig]:
+    """Return the rigs of a rig configuration as pycolmap takes them, without intrinsics.
+
+    Cameras that took none of the photos, and rigs of a single camera, are left out.
+
+    Raises:
+        InputError: as `cameras_of`, or if the reference camera of a rig took none.
+    """
+    prefixes = {camera.prefix for camera in cameras_of(path, names).values()}
+    found = []
+    for rig in read(path):
+        some = [camera for camera in rig if camera.prefix in prefixes]
+        if some and some[0] is not rig[0]:
+            raise InputError(
+                f"{path}: no photo is of {rig[0].prefix}, the reference camera of {some[0].prefix}."
+            )
+        cameras = [
+            pycolmap.RigConfigCamera(
+                ref_sensor=camera is rig[0],
+                image_prefix=camera.prefix,
+                cam_from_rig=None if camera is rig[0] else camera.cam_from_rig,
+            )
+            for camera in some
+        ]
+        found += [pycolmap.RigConfig(cameras=cameras)] if len(cameras) > 1 else []
+    return found
 
 
 def written(rigs: Frames) -> dict[str, dict[str, list[float]]]:

@@ -33,6 +33,32 @@ def with_own_cameras(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return colmap.with_cameras(sfm, own)
 
 
+def without_rigs(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return a model with a pose of its own for each image: itself, or a copy if it has rigs."""
+    if all(rig.num_sensors() == 1 for rig in sfm.rigs.values()):
+        return sfm
+    cameras = {i: copy.deepcopy(camera) for i, camera in sfm.cameras.items()}
+    return colmap.with_cameras(sfm, lambda i: cameras[sfm.images[i].camera_id])
+
+
+def scale_by_rigs(sfm: pycolmap.Reconstruction, known: Iterable[int]) -> None:
+    """Adjust a model, in place, so that its scale is that of its rigs, if these have a baseline.
+
+    COLMAP's mapper holds two images where they are when it adjusts a model, and with them the scale
+    of its first points. It is off by some percent if the cameras of the rigs see different points.
+
+    Args:
+        sfm: of the mapper.
+        known: ids of cameras whose intrinsics stay.
+    """
+    rigs = {sfm.frames[sfm.images[i].frame_id].rig_id for i in sfm.reg_image_ids()}
+    poses = [pose for i in rigs for pose in sfm.rigs[i].non_ref_sensors.values()]
+    if not any(pose is not None and pose.translation.any() for pose in poses):
+        return
+    _adjuster(sfm, known=known, is_scale_fixed=False).solve()
+    sfm.update_point_3d_errors()
+
+
 def with_one_camera(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Copy a model of cameras of one kind and size, with one for all images: their median."""
     cameras = [sfm.cameras[sfm.images[i].camera_id] for i in sfm.reg_image_ids()]
@@ -80,6 +106,7 @@ def focal_length_deviations(sfm: pycolmap.Reconstruction) -> dict[int, float]:
         From camera to the standard deviation of its focal length, as a share, to first order from
         the reprojection errors; infinite if the adjustment does not determine all parameters.
     """
+    sfm = without_rigs(sfm)  # COLMAP computes no covariance of rigs
     images = [sfm.images[i] for i in sfm.reg_image_ids()]
     cameras = {image.camera_id: sfm.cameras[image.camera_id] for image in images}
     cameras = {i: camera for i, camera in cameras.items() if camera.model in ESTIMATED_MODELS}
@@ -112,8 +139,12 @@ def _adjuster(
     sfm: pycolmap.Reconstruction,
     refine_principal_point: bool = False,
     known: Iterable[int] = (),
+    is_scale_fixed: bool = True,
 ) -> Any:
-    """Prepare the adjustment of a whole model, but for the intrinsics of known cameras."""
+    """Prepare the adjustment of a whole model, but for the intrinsics of known cameras.
+
+    One frame stays where it is, and, if its scale is fixed, a coordinate of another.
+    """
     options = colmap.exact(OPTIONS.get_global_bundle_adjustment())
     options.refine_principal_point = refine_principal_point
     options.print_summary = False
@@ -122,5 +153,8 @@ def _adjuster(
         config.add_image(image_id)
     for camera_id in known:
         config.set_constant_cam_intrinsics(camera_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    if is_scale_fixed:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    else:
+        config.set_constant_rig_from_world_pose(sfm.images[min(sfm.reg_image_ids())].frame_id)
     return colmap.bundle_adjuster(sfm, options, config)

@@ -1,15 +1,20 @@
 """A COLMAP database of images, their keypoints and their verified matches."""
 
+from collections.abc import Iterable
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from ..localization import rigs as rig_files
 from ..localization.exif import correct, exif_camera
+from ..localization.gate import PERSPECTIVE
 from ..localization.intrinsics import GUESSED_FOCAL
 from ..utils import colmap
 
 # what the provenance of what is made from such a database says of its cameras
+GUESSED_FISHEYE = 0.45  # its focal length in longer sides: 127 degrees across
 INFERRED_CAMERAS = (
     "of zooms, crops and squares: their own; of photos that were made smaller: scaled"
 )
@@ -21,8 +26,11 @@ def import_images(
     names: list[str],
     camera_mode: pycolmap.CameraMode,
     image_options: dict | None = None,
+    rigs: Path | None = None,
 ) -> None:
     """Create a COLMAP database with images, and cameras guessed from their EXIF data.
+
+    Photos of each camera of `rigs` share one camera, with the intrinsics of the file if it has any.
 
     In the mode AUTO, images with a digital zoom, or of another shape than their EXIF data say, get
     guessed cameras of their own: the focal lengths in EXIF data may be those without the zoom. The
@@ -35,13 +43,17 @@ def import_images(
         names: of the images.
         camera_mode: which images share a camera.
         image_options: of pycolmap's ImageReaderOptions.
+        rigs: COLMAP's `rig_config.json`.
 
     Raises:
-        InputError: for an unknown option, or an image that COLMAP skips.
+        InputError: for an unknown option, an image that COLMAP skips, or a wrong file of rigs.
     """
-    options = image_options or {}
+    options = _guessing(image_options or {})
+    if rigs is not None and rig_files.are_of(rigs, names):
+        names = _import_rigs(database, image_dir, names, rigs, options)
     if options.get("camera_params"):
-        colmap.import_images(database, image_dir, names, camera_mode, options)
+        if names:
+            colmap.import_images(database, image_dir, names, camera_mode, options)
         return
     found = {name: exif_camera(image_dir / name) for name in names}
     is_auto = camera_mode == pycolmap.CameraMode.AUTO
@@ -53,7 +65,8 @@ def import_images(
         colmap.import_images(database, image_dir, sorted(untold), mode, options)
     guess = options.get("default_focal_length_factor") or GUESSED_FOCAL
     with colmap.open_database(database) as opened:
-        first = {image.camera_id: image.name for image in reversed(opened.read_all_images())}
+        images = [image for image in opened.read_all_images() if image.name in found]
+        first = {image.camera_id: image.name for image in reversed(images)}
         for camera_id, name in first.items():
             camera, exif = opened.read_camera(camera_id), found[name]
             if name in untold:
@@ -61,9 +74,49 @@ def import_images(
                 params[camera.focal_length_idxs()] = guess * max(camera.width, camera.height)
                 camera.params = params.tolist()
                 camera.has_prior_focal_length = False
-            elif exif is None or not correct(camera, exif):
+            elif (exif is None or not correct(camera, exif)) and camera.model.name in PERSPECTIVE:
                 continue
+            # a fundamental matrix explains no fisheye, whereas an essential one by a guess does
+            camera.has_prior_focal_length |= camera.model.name not in PERSPECTIVE
             opened.update_camera(camera)
+
+
+def _guessing(options: dict) -> dict:
+    """Return options of pycolmap's ImageReaderOptions with the guess of a fisheye."""
+    model = str(options.get("camera_model", PERSPECTIVE[0]))
+    is_told = {"camera_params", "default_focal_length_factor"} & options.keys()
+    if model in PERSPECTIVE or is_told:
+        return options
+    return {**options, "default_focal_length_factor": GUESSED_FISHEYE}
+
+
+def _import_rigs(
+    database: Path, image_dir: Path, names: Iterable[str], rigs: Path, options: dict
+) -> list[str]:
+    """Import the photos of the cameras of rigs, and return the other ones."""
+    took = rig_files.cameras_of(rigs, names)
+    single = pycolmap.CameraMode.SINGLE
+    for _, group in groupby(sorted(took, key=lambda name: took[name].prefix), took.get):
+        of_camera = [*group]
+        import_images(database, image_dir, of_camera, single, options)
+        with colmap.open_database(database) as opened:
+            ids = {image.name: image.camera_id for image in opened.read_all_images()}
+            camera = opened.read_camera(ids[of_camera[0]])
+            known = rig_files.of_rig(rigs, {of_camera[0]: (camera, "")})
+            for given, _ in known.values():
+                given.camera_id, given.has_prior_focal_length = camera.camera_id, True
+                opened.update_camera(given)
+    return [name for name in names if name not in took]
+
+
+def fixed_cameras(database: Path, rigs: Path | None) -> set[int]:
+    """Return the ids of the cameras of a database whose intrinsics a file of rigs gives."""
+    if rigs is None:
+        return set()
+    with colmap.open_database(database) as opened:
+        images = {image.name: image.camera_id for image in opened.read_all_images()}
+    took = rig_files.cameras_of(rigs, images)
+    return {images[name] for name, one in took.items() if one.camera is not None}
 
 
 def write(
@@ -75,6 +128,7 @@ def write(
     camera_mode: pycolmap.CameraMode,
     image_options: dict | None = None,
     verbose: bool = False,
+    rigs: Path | None = None,
 ) -> None:
     """Write a new database.
 
@@ -88,11 +142,16 @@ def write(
         camera_mode: which images share a camera.
         image_options: of pycolmap's ImageReaderOptions.
         verbose: show COLMAP's log.
+        rigs: COLMAP's `rig_config.json`.
 
     Raises:
-        InputError: for an unknown option, or an image that COLMAP skips.
+        InputError: for an unknown option, an image that COLMAP skips, or a wrong file of rigs.
     """
-    import_images(database, image_dir, list(keypoints), camera_mode, image_options)
+    import_images(database, image_dir, list(keypoints), camera_mode, image_options, rigs)
+    if rigs is not None:
+        found = rig_files.configurations(rigs, keypoints)
+        with colmap.open_database(database) as opened:
+            pycolmap.apply_rig_config(found, opened)
     verified = {pair: (rows, None if unverified else rows) for pair, rows in matches.items()}
     colmap.write_matches(database, keypoints, verified)
     if unverified:

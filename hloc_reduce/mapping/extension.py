@@ -13,7 +13,8 @@ from ..utils import colmap
 from .epipolar import agreeing
 
 COMPLETIONS = 2  # of completing tracks, adjusting and filtering
-REPEATABLE = {"num_threads": 1, "random_seed": 0}
+# the poses of cameras in rigs are given
+REPEATABLE = {"num_threads": 1, "random_seed": 0, "ba_refine_sensor_from_rig": False}
 OPTIONS = colmap.mapper_options(REPEATABLE)  # without a scale
 
 Pair = tuple[str, str]

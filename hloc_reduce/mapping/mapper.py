@@ -17,7 +17,7 @@ from ..runtime import parallel
 from ..utils import cli, colmap
 from ..utils.interrupts import interruptible
 from . import database as databases
-from .adjustment import adjusted_error, with_one_camera
+from .adjustment import adjusted_error, scale_by_rigs, with_one_camera
 from .checks import Inputs, copies, lenses
 from .checks.focal_lengths import FEW_IMAGES, SPREAD, SPREAD_OF_FEW, are_alike, of_spread
 from .checks.partial import ENOUGH_REGISTERED
@@ -93,6 +93,7 @@ class Mapper:
     attempts: list[dict]  # of pycolmap's IncrementalPipelineOptions
     once: bool  # make the first attempt only, unless images fit with one camera
     verbose: bool
+    rigs: Path | None = None  # COLMAP's rig_config.json, whose poses and intrinsics are exact
     seconds: float = field(default=0.0, init=False)  # spent on further attempts
     left_out: int = field(default=0, init=False)  # attempts that were not made for lack of time
 
@@ -100,9 +101,8 @@ class Mapper:
         """Write the best model, its database and its registration."""
         database = self.write_database(camera_mode)
         models, dropped = self.run(database, self.once)
-        alike = camera_mode == pycolmap.CameraMode.AUTO and are_alike(
-            colmap.read_cameras(database).values()
-        )
+        is_auto = camera_mode == pycolmap.CameraMode.AUTO and self.rigs is None
+        alike = is_auto and are_alike(colmap.read_cameras(database).values())
         if alike and (shared := self._with_one_camera(models, database)):
             (models, dropped), database = shared
             alike = False
@@ -169,6 +169,7 @@ class Mapper:
             camera_mode=mode,
             image_options=self.image_options,
             verbose=self.verbose,
+            rigs=self.rigs,
         )
         return path
 
@@ -182,18 +183,23 @@ class Mapper:
             cameras=colmap.read_cameras(database),
             verified=colmap.read_verified(database),
         )
+        exact = {"ba_refine_sensor_from_rig": False} if self.rigs else {}
+        fixed = databases.fixed_cameras(database, self.rigs)
         number = len(self.names)
         enough = number if number <= FEW_IMAGES else ENOUGH_REGISTERED * number
         enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
 
         def attempted(changed: dict, alone: bool = True) -> Models:
-            options = colmap.mapper_options(changed)
+            options = colmap.mapper_options(changed | exact)
+            options.constant_cameras = fixed
             with TemporaryDirectory(dir=self.folder) as folder:
                 # the mapper opens it for writing
                 own = database if alone else Path(shutil.copy(database, folder))
                 found = colmap.incremental_mapping(
                     own, self.image_dir, Path(folder) / "models", options, self.verbose
                 )
+            for model in found if self.rigs else ():
+                scale_by_rigs(model, fixed.intersection(model.cameras))
             cameras = [camera for model in found for camera in _cameras(model)]
             is_narrow = any(_is_narrow(camera) for camera in cameras)
             is_distorted = any(lenses.is_distorted(camera) for camera in cameras)

@@ -20,6 +20,8 @@ Models = tuple[list[pycolmap.Reconstruction], list[Finding]]  # see `keep_plausi
 def keep_plausible(models: list[Inputs]) -> Models:
     """Drop images from models: implausible lenses, misplaced ones, copies, and with few points.
 
+    Photos that a rig took at one moment are dropped together.
+
     Args:
         models: of COLMAP's mapper, changed in place.
 
@@ -32,8 +34,9 @@ def keep_plausible(models: list[Inputs]) -> Models:
         for kind in DROPPING:
             while found := CHECKS[kind].find(replace(one)):  # the model has changed
                 dropped += found
-                # in place: the mapper's images have their own frames
-                colmap.remove_images(one.model, names_in(found))
+                names = names_in(found)
+                for frame_id in {image.frame_id for image in one.images if image.name in names}:
+                    one.model.deregister_frame(frame_id)
                 _keep_connected(one.model)
     whole = []
     for model in (one.model for one in models):
@@ -72,18 +75,21 @@ def count_viewpoints(model: pycolmap.Reconstruction) -> int:
 
 
 def _keep_connected(model: pycolmap.Reconstruction) -> None:
-    """Keep only the largest set of images that common points connect."""
+    """Keep only the largest set of frames that common points connect."""
     from scipy.sparse.csgraph import connected_components
 
-    ids = sorted(model.reg_image_ids())
-    if not ids or not model.num_points3D():
+    seen: dict[int, list[np.ndarray]] = {}
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.images[image_id]
+        seen.setdefault(image.frame_id, []).append(colmap.point3D_ids(image))
+    if not seen or not model.num_points3D():
         return
-    sees = colmap.visibility(colmap.point3D_ids(model.images[i]) for i in ids)
+    sees = colmap.visibility(map(np.concatenate, seen.values()))
     _, label = connected_components(sees @ sees.T, directed=False)
     largest = np.bincount(label).argmax()
-    for image_id, part in zip(ids, label, strict=True):
+    for frame_id, part in zip(seen, label, strict=True):
         if part != largest:
-            model.deregister_frame(model.images[image_id].frame_id)
+            model.deregister_frame(frame_id)
 
 
 def size(model: pycolmap.Reconstruction) -> tuple[int, int]:

@@ -2,7 +2,7 @@
 
 import shutil
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..extract_features import keep_readable
+from ..localization.rigs import know_all
 from ..mapping import findings, mapper, plausibility, registration
 from ..mapping.checks import Inputs, another_size, intrinsics, mirrored
 from ..mapping.findings import Finding, names_in
@@ -55,6 +56,8 @@ class Photos:
         camera_mode: which photos share a camera, if their poses are reconstructed.
         retrieval: a key of `confs.retrieval`.
         masks: of the photos, see `extract_features.main`.
+        rigs: COLMAP's `rig_config.json` of cameras that are fixed to each other.
+        lens: of pycolmap's ImageReaderOptions, see `colmap.lens_options`.
         left_out: photos that are described and matched, but not reconstructed.
     """
 
@@ -68,6 +71,8 @@ class Photos:
     camera_mode: pycolmap.CameraMode
     retrieval: str
     masks: Path | None = None
+    rigs: Path | None = None
+    lens: dict[str, str] = field(default_factory=dict)
     left_out: frozenset[str] = frozenset()
 
     @property
@@ -217,14 +222,19 @@ def _fitting(best: Attempt) -> tuple[Attempt, list[Finding]]:
 
     First with a camera for each photo, if they share some; then without the fewer than half whose
     intrinsics are unlike those of the others. A new model is used if it has all other photos, which
-    fit.
+    fit. The cameras of rigs stay; nothing is done if a file gives the intrinsics of all photos.
 
     Returns:
         The model, and what was found of photos that are left out, or that do not fit.
     """
-    fit, photos = _fit(best), best.photos
+    photos = best.photos
+    if photos.rigs is not None and know_all(photos.rigs, best.names):
+        return best, []
+    fit = _fit(best)
     if fit.gain <= intrinsics.GAIN_OF_FREE:
         return best, []
+    if photos.rigs is not None:
+        return best, [intrinsics.finding(fit)]
     cameras = {best.sfm.images[i].camera_id for i in best.sfm.reg_image_ids()}
     is_auto = photos.camera_mode == pycolmap.CameraMode.AUTO
     if len(cameras) < best.sfm.num_reg_images() and is_auto:
@@ -297,6 +307,8 @@ def _reconstruct(
                 num_covis=photos.num_covis if wanted.widens and number == 1 else 0,
                 camera_mode=photos.camera_mode,
                 image_list=photos.names,
+                rigs=photos.rigs,
+                image_options=photos.lens,
             )
         _match(photos, pairs, features, matches)
     kept = photos.kept
@@ -315,6 +327,8 @@ def _reconstruct(
             image_list=kept,
             once=once,
             checked=False,
+            rigs=photos.rigs,
+            image_options=photos.lens,
         )
     return Attempt(photos, conf, matches, folder.path / name, sfm)
 

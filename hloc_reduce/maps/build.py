@@ -14,6 +14,7 @@ from ..confs import retrieval as retrieval_confs
 from ..detectors.dog import KEYPOINT_SETTINGS
 from ..extract_features import keep_present, without
 from ..localization import intrinsics, views
+from ..localization import rigs as rig_files
 from ..mapping import registration
 from ..mapping.checks import Inputs, judging, run, sizes
 from ..mapping.findings import Finding, check_accepted, names_in, staying
@@ -51,6 +52,9 @@ def main(
     exif_gps: bool = True,
     masks: Path | None = None,
     pairs: str | None = None,
+    rigs: Path | None = None,
+    camera_model: str = "SIMPLE_RADIAL",
+    camera_params: str | None = None,
 ) -> Map:
     """Build a map, or open the one that was made from the same.
 
@@ -81,6 +85,10 @@ def main(
             name and similar ones ("sequential", see `pairs_from_sequence`). But for "exhaustive",
             pairs are added where these leave images unconnected. Default: "exhaustive" for up to
             `pairing.MAX_EXHAUSTIVE` images, else "retrieval".
+        rigs: COLMAP's `rig_config.json` of cameras that are fixed to each other, without a model:
+            their photos share one camera each, and the map is in the units of the file.
+        camera_model: COLMAP's model of the cameras, without a model.
+        camera_params: about its parameters, separated by commas, see `colmap.lens_options`.
 
     Returns:
         The map.
@@ -94,11 +102,14 @@ def main(
     feature, conf = features_confs.get(feature, projection, storage, keypoints)
     matcher = matcher or features_confs.matcher_of(conf)
     described_by = retrieval_confs.get(retrieval)
+    lens = colmap.lens_options(camera_model, camera_params)
     reference, normalized = (None, False) if model is None else colmap.read_normalized(model)
     if reference is not None and not reference.images:
         raise InputError(f"The model {model} has no images.")
     names = _list(image_dir, reference, accept_partial)
     check_distinct(names)
+    if rigs is not None:
+        rig_files.frames(rigs, names)  # raises for a wrong one
     # points without tracks, such as those of scanners, tell nothing of the photos
     has_points = reference is not None and any(i.num_points3D for i in reference.images.values())
     masked = masks_of.digests(masks_of.find(masks, image_dir, names))
@@ -113,7 +124,10 @@ def main(
         usable = _of_fitting_size(image_dir, names, reference, accept_partial)
     images = {name: image_dir / name for name in names}
     parts = {path.name: path for path in (colmap.model_files(model) if model else [])}
-    fingerprints, found = digests(map_dir, {"images": images, "model": parts})
+    groups = {"images": images, "model": parts} | (
+        {"rigs": {"rig_config.json": rigs}} if rigs else {}
+    )
+    fingerprints, found = digests(map_dir, groups)
     made_from = {
         "feature": extract_features.provenance(conf),
         "matcher": matchers_confs.confs[matcher]["model"],
@@ -124,9 +138,11 @@ def main(
         made_from |= pairing.provenance(pairs)
     made_from |= {"normalized": True} if normalized else {}
     made_from |= {"masks": masked} if masked else {}
+    made_from |= lens
     made_from |= retrieval_confs.provenance(retrieval)
     made_from |= matchers_confs.provenance(made_from["matcher"], made_from["feature"])
-    with claim(map_dir, made_from, overwrite, image_dir, model, projection, masks) as folder:
+    inputs = image_dir, model, projection, masks, rigs
+    with claim(map_dir, made_from, overwrite, *inputs) as folder:
         if not (map_dir / FINISHED).exists():
             begin(map_dir, fingerprints)
             logger.info("Building the map %s of %d images.", map_dir, len(usable))
@@ -141,13 +157,16 @@ def main(
                 camera_mode=camera_mode,
                 retrieval=retrieval,
                 masks=masks,
+                rigs=rigs,
+                lens=lens,
             )
             conf = keep_projection(_at_one_size(conf, image_dir, usable), map_dir)
             if model is not None and reference is not None:
                 attempt = of_model(photos, conf, model, reference)
                 return _finish(attempt, [], True, feature, keypoints, model=str(model.resolve()))
             attempt, findings = of_photos_alone(photos, conf)
-            content = {"camera_mode": camera_mode.name.lower()}
+            content: dict[str, object] = {"camera_mode": camera_mode.name.lower()}
+            content |= {"rigs": True} if rigs else {}
             return _finish(attempt, findings, False, feature, keypoints, exif_gps, **content)
         built = Map(map_dir)
         if built.camera_mode not in (None, camera_mode.name.lower()):

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from ..localization import gate as gates
-from ..localization import intrinsics, mirrored, query, rig_pose, stage, views
+from ..localization import intrinsics, mirrored, panoramas, query, rig_pose, stage, views
 from ..localization.gate import DEFAULT_GATE, Gate
 from ..localization.near import Guess, Surroundings
 from ..localization.query import merged, ransac_options
@@ -22,6 +22,7 @@ from ..runtime.laps import Laps
 from ..utils.cli import InputError
 from ..utils.codes import FLOATS, restore, store
 from ..utils.feature_files import to_colmap
+from ..utils.images import read_image
 from .contents import read
 from .given import Image, Photo, check_pose, check_rig
 from .tracker import Tracker
@@ -328,6 +329,31 @@ class Localizer:
             "seconds": laps.seconds,
         }
         return rig_from_world, info
+
+    def localize_panorama(
+        self, image: Path | str | np.ndarray
+    ) -> tuple[pycolmap.Rigid3d | None, dict]:
+        """Localize a panorama of all directions, an equirectangular photo, by views of it.
+
+        Args:
+            image: its file, or its pixels (H, 2 H) or (H, 2 H, 3) RGB, uint8; upright.
+
+        Returns:
+            The pose of a camera that looks at the centre of the panorama, from world, and info of
+            its views, both as from `localize_rig`; and their poses `cams_from_rig` in info.
+
+        Raises:
+            UnreadableImage: if the image cannot be read.
+            InputError: if it is not twice as wide as high, or too small.
+        """
+        given = Photo.of(image, None).image
+        pixels = given if isinstance(given, np.ndarray) else read_image(given)
+        panoramas.check(pixels.shape)
+        views = panoramas.views_of(pixels.shape[1::-1])
+        names, cameras, cams_from_rig = zip(*views, strict=True)
+        shown = panoramas.render(pixels, views)
+        pose, info = self.localize_rig(shown, cameras, cams_from_rig, names)
+        return pose, info | {"cams_from_rig": cams_from_rig}
 
     def _try_rig(
         self, photos: list[tuple[dict, list[str]]], rig: list[tuple], step: tuple, laps: Laps

@@ -56,6 +56,7 @@ class Map:
         findings: what may be wrong with it, and which photos were left out.
         num_points3D: 3D points.
         camera_mode: which images share a camera, None for the cameras of a given model.
+        has_rigs: whether a file of rigs gave poses of its cameras.
         cameras: what the map tells about the intrinsics of other photos.
         frame: its unit, and where on Earth it is.
         aligned_to: what its frame was aligned to, see `georeference.align`; else None.
@@ -109,6 +110,7 @@ class Map:
         self.frame = Frame.from_json(content.get("frame"))
         self.aligned_to = content.get("aligned_to")
         self.camera_mode = content.get("camera_mode")
+        self.has_rigs = bool(content.get("rigs"))
         known = content.get("cameras", {}).items()
         self.cameras = intrinsics.MapCameras(
             {name: intrinsics.from_list(values) for name, values in known},

@@ -11,7 +11,8 @@ import pycolmap
 
 from hloc_reduce import logger
 from hloc_reduce.localization import intrinsics
-from hloc_reduce.localization.rigs import Frames, frames, of_rig
+from hloc_reduce.localization import panoramas as panorama_files
+from hloc_reduce.localization.rigs import Frames, are_of, frames, of_rig
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF
@@ -27,6 +28,7 @@ from .run import check_queries
 
 SOURCES = {
     "rig": "those of the cameras of --rigs",
+    "panorama": "those of views of panoramas",
     "map": "those of the map's camera, according to their EXIF data",
     "lens": "those of the map's photos of their size",
     "none": "not known, as photos of the map are by a fisheye or the like: give them by --queries",
@@ -48,12 +50,15 @@ class Queries:
             photos; None if the lists have intrinsics.
         refinements: which of these are refined with the pose, see `intrinsics.refinement`.
         frames: those of rigs that have several photos.
+        panoramas: sizes of the panoramas that the queries are views of; their frames have the names
+            of the panoramas.
     """
 
     lists: dict[str, list[str]]
     inferred: dict[str, tuple[pycolmap.Camera, str]] | None = None
     refinements: Mapping[str, dict] = field(default_factory=dict)
     frames: Frames = field(default_factory=dict)
+    panoramas: Mapping[str, panorama_files.Size] = field(default_factory=dict)
 
     @classmethod
     def find(
@@ -71,7 +76,8 @@ class Queries:
             queries: query list with intrinsics, or a glob of several; None for the whole folder.
             built: the map.
             strict: stop at an unreadable photo.
-            rigs: COLMAP's `rig_config.json`, whose intrinsics count if there is no list.
+            rigs: COLMAP's `rig_config.json`, whose intrinsics count if there is no list; it may be
+                for the photos of the map only.
 
         Raises:
             InputError: when a list is wrong, a photo is missing, or, if `strict`, unreadable; or
@@ -82,9 +88,13 @@ class Queries:
             lists = {stem: [name for name, _ in part] for stem, part in given.items()}
             names = [name for part in lists.values() for name in part]
             check_queries(query_images, names, strict)
+            if rigs and built.has_rigs and not are_of(rigs, names):
+                rigs = None
             return cls(lists, frames=frames(rigs, names) if rigs else {})
         names = list_images(query_images)
         check_distinct(names)
+        if rigs and built.has_rigs and not are_of(rigs, names):
+            rigs = None
         inferred = intrinsics.infer_all(query_images, names, built.cameras, strict)
         of_rigs = frames(rigs, names) if rigs else {}
         if rigs:
@@ -95,10 +105,34 @@ class Queries:
         }
         return cls({query_images.resolve().name: names}, inferred, refinements, of_rigs)
 
+    @classmethod
+    def of_panoramas(cls, query_images: Path, sizes: Mapping[str, panorama_files.Size]) -> Self:
+        """Return the views of panoramas, see `localization.panoramas.find`."""
+        inferred: dict[str, tuple[pycolmap.Camera, str]] = {}
+        frames: dict[str, dict[str, pycolmap.Rigid3d]] = {}
+        for panorama, size in sizes.items():
+            views = panorama_files.views_of(size)
+            names = panorama_files.view_names(panorama, views)
+            inferred |= {n: (v.camera, "panorama") for n, v in zip(names, views, strict=True)}
+            frames[panorama] = {n: v.cam_from_rig for n, v in zip(names, views, strict=True)}
+        check_distinct([*inferred])
+        lists = {query_images.resolve().name: [*inferred]}
+        return cls(lists, inferred, {}, frames, sizes)
+
     @property
     def names(self) -> list[str]:
         """The names of all queries."""
         return [name for part in self.lists.values() for name in part]
+
+    @property
+    def photos(self) -> list[str]:
+        """The names of the photos: those of the queries, or of the panoramas."""
+        return [*self.panoramas] or self.names
+
+    @property
+    def photo_lists(self) -> dict[str, list[str]]:
+        """The names of the photos of each list."""
+        return {stem: self.photos for stem in self.lists} if self.panoramas else self.lists
 
     @property
     def sources(self) -> dict[str, str]:
@@ -119,6 +153,39 @@ class Queries:
         for source, said in SOURCES.items():
             if some := [name for name in sources if sources[name] == source]:
                 logger.info("Intrinsics of %d queries are %s: %s", len(some), said, cli.some(some))
+
+
+def find_queries(
+    query_images: Path,
+    queries: Path | None,
+    built: Map,
+    strict: bool,
+    rigs: Path | None,
+    are_panoramas: bool,
+) -> Queries:
+    """Find the queries of a run, see `Queries.find`; those of a folder may be panoramas.
+
+    Args:
+        query_images: folder of the photos.
+        queries: query list, or a glob of several; None for the whole folder.
+        built: the map.
+        strict: stop at an unreadable photo.
+        rigs: COLMAP's `rig_config.json`.
+        are_panoramas: see `localization.panoramas.find`.
+
+    Raises:
+        InputError: as `Queries.find` and `panoramas.find`; or if there is no panorama.
+    """
+    if queries is not None:
+        if are_panoramas:
+            raise InputError("--panoramas have no intrinsics: leave out --queries.")
+        return Queries.find(query_images, queries, built, strict, rigs)
+    sizes = panorama_files.find(query_images, list_images(query_images), are_panoramas)
+    if sizes:
+        return Queries.of_panoramas(query_images, sizes)
+    if are_panoramas:
+        raise InputError(panorama_files.NONE.format(query_images))
+    return Queries.find(query_images, queries, built, strict, rigs)
 
 
 def _check_exact(

@@ -8,6 +8,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from hloc_reduce.mapping import database
 from hloc_reduce.utils import colmap
+from hloc_reduce.utils.cli import InputError
 
 ZOOMS = {"a.jpg": None, "b.jpg": 1.0, "c.jpg": 2.0, "d.jpg": 2.0}
 
@@ -89,3 +90,44 @@ def test_what_is_asked_for_comes_first(photos, mode, options, number):
     path = photos / "database.db"
     database.import_images(path, photos, [*ZOOMS], pycolmap.CameraMode.__members__[mode], options)
     assert len({camera.camera_id for camera in cameras(path).values()}) == number
+
+
+FISHEYE = {"camera_model": "OPENCV_FISHEYE"}
+
+
+def test_a_fisheye_is_guessed_unless_somebody_knows_it(photos):
+    """Its guess counts as known: no fundamental matrix explains its image."""
+    for name in ZOOMS:
+        Image.new("RGB", (40, 30)).save(photos / name)
+    single = pycolmap.CameraMode.SINGLE
+    database.import_images(photos / "1.db", photos, [*ZOOMS], single, FISHEYE)
+    [camera] = colmap.read_cameras(photos / "1.db").values()
+    assert camera.model.name == "OPENCV_FISHEYE" and camera.has_prior_focal_length
+    assert camera.mean_focal_length() == database.GUESSED_FISHEYE * 40
+    given = colmap.lens_options("OPENCV_FISHEYE", "17,18,20,15,0.1,0,0,0")
+    database.import_images(photos / "2.db", photos, [*ZOOMS], single, given)
+    [camera] = colmap.read_cameras(photos / "2.db").values()
+    assert list(camera.params) == [17, 18, 20, 15, 0.1, 0, 0, 0] and camera.has_prior_focal_length
+
+
+def test_the_focal_length_of_a_fisheye_by_exif_data(photos):
+    database.import_images(photos / "1.db", photos, ["a.jpg"], pycolmap.CameraMode.AUTO, FISHEYE)
+    [camera] = colmap.read_cameras(photos / "1.db").values()
+    assert round(camera.mean_focal_length(), 1) == 41.6 and camera.has_prior_focal_length
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (("FISH", None), "Unknown camera model 'FISH'. There are: .*OPENCV_FISHEYE"),
+        (("EQUIRECTANGULAR", None), "Unknown camera model"),
+        (("OPENCV_FISHEYE", "1,2"), "OPENCV_FISHEYE has 8, fx, fy, cx, cy, k1, k2, k3, k4"),
+        (("PINHOLE", "a,b,c,d"), "PINHOLE has 4, fx, fy, cx, cy"),
+        (("PINHOLE", "9,9,nan,4"), "PINHOLE has 4"),
+        (("SIMPLE_RADIAL", "-9,9,4,0"), "focal lengths above 0"),
+    ],
+)
+def test_what_is_no_lens(given, message):
+    with pytest.raises(InputError, match=message):
+        colmap.lens_options(*given)
+    assert colmap.lens_options("SIMPLE_RADIAL") == {}  # as without it

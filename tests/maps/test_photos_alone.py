@@ -282,3 +282,25 @@ def test_enlarged_photos_get_cameras_of_their_own(named, plane, tmp_path, monkey
     caplog.clear()
     run(*build)  # opens it
     assert "Trying again" not in caplog.text
+
+
+def test_options_of_lenses(plane, tmp_path, monkeypatch, run, refused):
+    """They reach the mapper, and wrong ones are told before any work is done."""
+    images, outputs = plane / "images", tmp_path / "outputs"
+    build = ("--map_images", images, "--outputs", outputs)
+    assert "Unknown camera model 'FISH'" in refused(*build, "--camera_model", "FISH")
+    fisheye = ("--camera_model", "OPENCV_FISHEYE", "--camera_params")
+    assert "OPENCV_FISHEYE has 8, fx, fy" in refused(*build, *fisheye, "9,9")
+    assert "Give --camera_model" in refused(*build, "--camera_params", "9,9")
+    assert "photos alone" in refused(*build, *fisheye, "9,9", "--map", plane / "model")
+    assert not outputs.exists()
+    given = {}
+
+    def stop(*_, **options):
+        given.update(options["image_options"])
+        raise registration.NoModelError("stopped")
+
+    monkeypatch.setattr(maps.attempts.reconstruction, "main", stop)
+    params = "375,375,180,135,0,0,0,0"
+    assert "stopped" in refused(*build, *fisheye, params)
+    assert given == {"camera_model": "OPENCV_FISHEYE", "camera_params": params}

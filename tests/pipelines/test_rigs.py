@@ -11,6 +11,7 @@ from command import outcome, state
 
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization.records import pose_of, read_records
+from hloc_reduce.utils.cli import InputError
 from pipelines import localize
 
 PIPELINE = localize
@@ -160,3 +161,31 @@ def test_a_missing_configuration(rig, tmp_path, refused):
     folder, _, _, outputs = rig
     given = "--map", outputs / "map", "--query_images", folder, "--outputs", outputs
     assert "is missing" in refused(*given, "--rigs", tmp_path / "none.json")
+
+
+def test_what_is_no_map_of_a_rig(rig, plane, tmp_path, refused):
+    """Before any work is done."""
+    _, rigs, _, _ = rig
+    path, outputs = write(rigs, tmp_path), tmp_path / "new"
+    given = "--map_images", plane / "images", "--outputs", outputs, "--rigs", path
+    assert "no photo is of a camera of a rig" in refused(*given)
+    message = refused(*given, "--map", plane / "model")
+    assert "--rigs is for queries and maps of photos alone" in message
+    assert not outputs.exists()
+
+
+def test_rigs_of_the_map_or_the_queries(rig, plane, tmp_path, monkeypatch, refused):
+    """The map is built with them if cameras of theirs took its photos."""
+    folder, rigs, _, _ = rig
+    path, outputs = write(rigs, tmp_path), tmp_path / "new"
+    given = "--query_images", folder, "--outputs", outputs
+    options = {}
+
+    def stop(*_, **given):
+        options.update(given)
+        raise InputError("stopped")
+
+    monkeypatch.setattr(localize.maps, "main", stop)
+    for images, expected in ((plane / "images", None), (folder, path)):
+        assert "stopped" in refused("--map_images", images, *given, "--rigs", path)
+        assert options["rigs"] == expected

@@ -7,6 +7,7 @@ import numpy as np
 
 from ...localization import absolute_pose, intrinsics
 from ...localization.gate import DEFAULT_GATE, Tolerance
+from ...localization.lenses import is_bent
 from ...localization.pose import MAX_ERROR, Pose, differ
 from ...localization.projection import photo_scale, reprojection_errors
 from ...localization.query import merged, ransac_options
@@ -140,6 +141,8 @@ def _contradicts(
     enough = pose.num_inliers >= DEFAULT_GATE.min_inliers
     if enough and pose.confidence >= DEFAULT_GATE.min_confidence and elsewhere(pose):
         return True
+    if is_bent(image.camera):
+        return False  # a guess is none
     size = np.empty((image.camera.height, image.camera.width), np.uint8)
     guess, source = intrinsics.infer(size, intrinsics.MapCameras({}, set()))
     config = merged(config, intrinsics.REFINEMENTS[source])

@@ -34,7 +34,8 @@ MAX_TESTS = 2e8  # of points in photos: above, only some of the points are used
 def find(inputs: Inputs) -> list[Finding]:
     """Find the photos that show another side of the place, or a copy of it.
 
-    They are the smaller one of two groups that contradict each other.
+    They are the smaller one of two groups that contradict each other. Photos that a rig took at one
+    moment are found together, if those in the group see most of their points.
     """
     images = inputs.images
     if len(images) < 4:
@@ -54,7 +55,12 @@ def find(inputs: Inputs) -> list[Finding]:
         "match few of them. Make a map of each side, because other photos may be at the wrong "
         "side, too, or add photos all the way from one side to the other."
     )
-    names = tuple(sorted(images[i].name for i in found))
+    points = np.array([image.num_points3D for image in images])
+    inside = np.isin(np.arange(len(images)), found)
+    most = 2 * np.bincount(inputs.frames, points * inside) > np.bincount(inputs.frames, points)
+    names = tuple(sorted(images[i].name for i in np.flatnonzero(most[inputs.frames])))
+    if not names:
+        return []
     doubt = "photos that others place elsewhere"
     return [Finding("copies", text, names, {}, "drop", doubt)]
 

@@ -13,10 +13,17 @@ HINGE_POINTS, HINGE_SHARE = 30, 1 / 8
 
 
 def find(inputs: Inputs) -> list[Finding]:
-    """Find the photos that too few points hold: those with the fewest, as others share these."""
-    number = {image.name: image.num_points3D for image in inputs.images}
-    if not number:
+    """Find the photos that too few points hold: those with the fewest, as others share these.
+
+    Photos that a rig took at one moment are held by the points of all.
+    """
+    if not inputs.images:
         return []
+    of_frames = np.bincount(inputs.frames, [image.num_points3D for image in inputs.images])
+    number = {
+        image.name: int(of_frames[frame])
+        for image, frame in zip(inputs.images, inputs.frames, strict=True)
+    }
     median = np.median(list(number.values()))
     least = max(DEFAULT_GATE.min_inliers, min(HINGE_POINTS, HINGE_SHARE * median))
     fewest = min(number.values())

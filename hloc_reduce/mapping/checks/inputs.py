@@ -65,6 +65,11 @@ class Inputs:
         return sorted(image.name for image in self.images)
 
     @cached_property
+    def frames(self) -> np.ndarray:
+        """The frame of each image (N,), from 0: photos that a rig took at one moment share one."""
+        return np.unique([image.frame_id for image in self.images], return_inverse=True)[1]
+
+    @cached_property
     def keypoints(self) -> dict[str, np.ndarray]:
         """The keypoints (N, 2) of each image, COLMAP's pixels."""
         return {

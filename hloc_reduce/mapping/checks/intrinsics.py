@@ -6,7 +6,13 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from ..adjustment import GAIN_OF_FREE, MAX_ADJUSTED_IMAGES, adjusted_error, with_own_cameras
+from ..adjustment import (
+    GAIN_OF_FREE,
+    MAX_ADJUSTED_IMAGES,
+    adjusted_error,
+    with_own_cameras,
+    without_rigs,
+)
 from ..findings import Finding
 from .inputs import MIN_TELLING_POINTS, Inputs
 
@@ -54,7 +60,8 @@ def measure(sfm: pycolmap.Reconstruction) -> Fit:
     residuals = 2 * sfm.compute_num_observations() - 3 * sfm.num_points3D() - 6 * len(images)
     if len(images) > MAX_ADJUSTED_IMAGES or residuals <= 2 * own:
         return NOT_TRIED
-    adjusted = copy.deepcopy(sfm)
+    # photos of rigs by themselves, so that nothing but intrinsics makes a difference
+    adjusted = copy.deepcopy(without_rigs(sfm))
     error = adjusted_error(adjusted)
 
     def gain(freed: pycolmap.Reconstruction, parameters: int) -> float:

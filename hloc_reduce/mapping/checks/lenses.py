@@ -24,6 +24,8 @@ def find(inputs: Inputs) -> list[Finding]:
     for image in inputs.images:
         camera, number = inputs.model.cameras[image.camera_id], shared[image.camera_id]
         initial = (inputs.cameras or {}).get(image.camera_id)
+        if initial and initial.model == camera.model and (initial.params == camera.params).all():
+            continue  # it was not estimated: somebody gave it
         low, high = focal_lengths(
             initial or camera,
             initial is None or not initial.has_prior_focal_length or number >= WELL_KNOWN,

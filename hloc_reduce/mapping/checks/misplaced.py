@@ -14,24 +14,25 @@ def find(inputs: Inputs) -> list[Finding]:
     A mapper may place an image, or a group of images, by a few wrong matches, in spite of all the
     other ones. Those are then far from their epipolar lines. The image that contradicts its matches
     most is taken away, or, if none does, the smaller one of two groups whose matches with each
-    other do; and so on with the others.
+    other do; and so on with the others. Photos that a rig took at one moment count as one.
     """
     if inputs.verified is None:
         return []
-    images = inputs.images
-    row = {image.name: i for i, image in enumerate(images)}
-    agree, number = np.zeros((2, len(images), len(images)))
+    images, frames = inputs.images, inputs.frames
+    row = {image.name: frame for image, frame in zip(images, frames, strict=True)}
+    agree, number = np.zeros((2, *[frames.max(initial=-1) + 1] * 2))
     evidence = {
         pair: rows for pair, rows in inputs.verified.items() if len(rows) >= MIN_VERIFIED_MATCHES
     }
     for (name0, name1), valid in agreeing(images, inputs.keypoints, evidence).items():
         i, j = row[name0], row[name1]
-        agree[i, j] = agree[j, i] = valid.sum()
-        number[i, j] = number[j, i] = len(valid)
-    left = np.arange(len(images))
+        if i != j:
+            agree[[i, j], [j, i]] += valid.sum()
+            number[[i, j], [j, i]] += len(valid)
+    left = np.arange(len(agree))
     while len(left) and (found := _worst(agree[np.ix_(left, left)], number[np.ix_(left, left)])):
         left = np.delete(left, found)
-    names = sorted({*row}.difference(images[i].name for i in left))
+    names = sorted(name for name, frame in row.items() if frame not in left)
     if not names:
         return []
     text = (

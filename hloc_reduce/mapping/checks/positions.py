@@ -121,6 +121,11 @@ def measure(sfm: pycolmap.Reconstruction) -> dict[str, float]:
             if image.name in deviations and image.camera_id not in several:
                 together = BENT_TOGETHER * deviations[image.name]
                 found[image.name] = max(found[image.name], together)
+    frames = {image.name: image.frame_id for image in images}
+    least: dict[int, float] = {}  # photos that a rig took at one moment are placed by the best one
+    for name, share in found.items():
+        least[frames[name]] = min(share, least.get(frames[name], np.inf))
+    found = {name: least[frames[name]] for name in found}
     uncertain = {name: min(share, 1.0) for name, share in found.items() if share > MAX_DEVIATION}
     return dict(sorted(uncertain.items(), key=lambda item: -item[1]))
 

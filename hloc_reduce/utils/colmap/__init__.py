@@ -4,10 +4,13 @@ import pycolmap
 
 from .databases import (
     CAMERA_MODE,
+    CAMERA_MODEL,
+    CAMERA_MODELS,
     CameraMode,
     camera_mode,
     count_verified,
     import_images,
+    lens_options,
     open_database,
     read_cameras,
     read_verified,

@@ -28,6 +28,13 @@ CAMERA_MODE = Option(
     "and tell of no digital zoom and no crop",
     lower=True,
 )
+# those that photos may have: one of all directions has no focal length
+CAMERA_MODELS = [
+    name
+    for name in pycolmap.CameraModelId.__members__
+    if name not in ("INVALID", "EQUIRECTANGULAR")
+]
+CAMERA_MODEL = Option("camera model", CAMERA_MODELS, "COLMAP's")
 CameraMode = Annotated[pycolmap.CameraMode, CAMERA_MODE]
 FULL = 2**16  # free bytes, below which COLMAP cannot even open a database
 
@@ -92,6 +99,38 @@ def camera_mode(name: str) -> pycolmap.CameraMode:
         InputError: for an unknown name.
     """
     return CAMERA_MODES[choose("camera mode", name.lower(), CAMERA_MODES)]
+
+
+def lens_options(model: str, params: str | None = None) -> dict[str, str]:
+    """Return pycolmap's options to import photos by a kind of lens; none for COLMAP's default.
+
+    Args:
+        model: one of `CAMERA_MODELS`.
+        params: its parameters, separated by commas, as COLMAP's `--ImageReader.camera_params`.
+
+    Raises:
+        InputError: for an unknown model, or parameters that are not as many positive or finite
+            numbers as it has.
+    """
+    choose("camera model", model, CAMERA_MODELS)
+    if params is None:
+        return (
+            {} if model == pycolmap.ImageReaderOptions().camera_model else {"camera_model": model}
+        )
+    camera = pycolmap.Camera()
+    camera.model = pycolmap.CameraModelId.__members__[model]
+    number = len(camera.params_info.split(","))
+    try:
+        values = [float(value) for value in params.split(",")]
+    except ValueError:
+        values = []
+    is_lens = len(values) == number and np.isfinite(values).all()
+    if not is_lens or min(values[i] for i in camera.focal_length_idxs()) <= 0:
+        raise InputError(
+            f"--camera_params {params}: {model} has {number}, "
+            f"{camera.params_info}: numbers with commas between, focal lengths above 0."
+        )
+    return {"camera_model": model, "camera_params": params}
 
 
 def parse_options(kind: Callable[[dict], Options], options: dict, what: str) -> Options:
