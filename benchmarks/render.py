@@ -21,7 +21,6 @@ PAGES = (
     "docs/localize.md",
     "docs/maps.md",
     "docs/performance.md",
-    "docs/lab.md",
     "docs/robot.md",
 )
 LONGEST_NUMBER = 30  # characters of a cell, with units

@@ -7,8 +7,8 @@ from operator import mul
 from pathlib import Path
 from statistics import mean, median
 
-from benchmarks import changed_photos, lightglue_seconds, pose_limits
-from benchmarks.rows import CENTIMETRES, Row, read, select, with_keypoints
+from benchmarks import changed_photos, lightglue_seconds
+from benchmarks.rows import Row, read, select, with_keypoints
 from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
 from hloc_reduce.confs import features as features_confs
@@ -409,14 +409,12 @@ def tracking_table() -> Table:
     heads = "localized", "within 5 cm", "median [cm]", "by the last pose [%]"
     table = [["feature", "frames", *heads, "beyond extraction [ms]"]]
     for row in read("tracking"):
-        localized = f"{row['localized']} of {row['queries']}"
-        cells = [name_of(row), row["variant"], localized]
-        if row["median_cm"]:
-            cells += [row["within_5cm"], f"{float(row['median_cm']):.2f}"]
-        else:
-            cells += ["", ""]
-        near = f"{float(row['near_percent']):.0f}" if row["near_percent"] else ""
-        table.append([*cells, near, f"{float(row['ms']):.0f}"])
+        if not row["variant"].startswith(("anew, ", "tracked, ")):
+            continue  # that nothing is wrong there is said in words
+        cells = [name_of(row), row["variant"], f"{row['localized']} of {row['queries']}"]
+        cells += [row["within_5cm"], f"{float(row['median_cm']):.2f}"]
+        cells += [f"{float(row['near_percent']):.0f}", f"{float(row['ms']):.0f}"]
+        table.append(cells)
     return table
 
 
@@ -453,18 +451,6 @@ def extraction_parts_table() -> Table:
     for row in sorted(read("extraction_parts"), key=lambda row: int(row["photos"])):
         cells = [f"{float(row[f'{part}_s']):.1f}" for part in (*parts, "all")]
         table.append([f"`{row['feature']}`", row["photos"], *cells])
-    return table
-
-
-def pose_limits_table() -> Table:
-    """Show what is localized with today's limits of the estimation of poses, then with others."""
-    heads = "localized", *(f"within {limit} cm" for limit in CENTIMETRES)
-    table = [[*pose_limits.LIMITS, *heads]]
-    measures = "localized", *(f"within_{limit}cm" for limit in CENTIMETRES)
-    for name, limits in pose_limits.variants().items():
-        if rows := select(read("pose_limits"), variant=name):
-            counts = (f"{total(rows, measure):.0f}" for measure in measures)
-            table.append([*(f"{value:.3g}" for value in limits.values()), *counts])
     return table
 
 
@@ -524,7 +510,9 @@ def name_of(row: Row) -> str:
 def runs_cpu_table() -> Table:
     """Show the CPU seconds of whole runs, and those that no run of the same photos is without."""
     table = [["CPU seconds", *STAGES, "all", "of one pass of the detector", "of the products"]]
-    for row in sorted(select(read("runs"), place=RUN_PLACES[0]), key=lambda row: -cpu_of(row)):
+    runs = select(read("runs"), place=RUN_PLACES[0])
+    runs = [row for row in runs if row["variant"] != with_keypoints(FAST)]
+    for row in sorted(runs, key=lambda row: -cpu_of(row)):
         cells = [f"{float(row[f'{stage}_cpu_s']):.1f}" for stage in STAGES]
         limits = [row["extraction_limit_s"], row["matching_limit_s"]]
         cells += [f"{cpu_of(row):.1f}", *(f"{float(one):.1f}" if one else "" for one in limits)]
@@ -674,7 +662,6 @@ TABLES: dict[str, Callable[[], Table]] = {
     "lightglue": lightglue_table,
     "lightglue_bytes": lightglue_bytes_table,
     "lightglue_seconds": lightglue_seconds_table,
-    "pose_limits": pose_limits_table,
     "retrieval": retrieval_table,
     "changed_photos": changed_photos_table,
     "rigs": rigs_table,
