@@ -62,22 +62,22 @@ def find(image_dir: Path, names: list[str], given: bool = False) -> dict[str, Si
     Args:
         image_dir: the folder.
         names: the photos.
-        given: photos that are twice as wide as high are panoramas; if not, those whose XMP data
-            say so (`GPano:ProjectionType`).
+        given: photos that are twice as wide as high are panoramas; if not, those of them whose XMP
+            data say so (`GPano:ProjectionType`).
 
     Raises:
         InputError: if some are panoramas and others are not, or a panorama is too small.
     """
     sizes = {name: size for name in names if (size := stored_size(image_dir / name))}
     whole = {name for name, (width, height) in sizes.items() if abs(width / height - 2) <= TWICE}
-    found = whole if given else {name for name in sizes if _is_told(image_dir / name)}
+    found = whole if given else {name for name in whole if _is_told(image_dir / name)}
     if not found:
         return {}
-    if others := [name for name in names if name not in found & whole]:
+    if others := [name for name in names if name not in found]:
+        why = "not twice as wide as high, or not readable" if given else "without such XMP data"
         raise InputError(
-            f"Photos in {image_dir} are no panoramas of all directions, because they are not twice "
-            f"as wide as high, or cannot be read: {cli.some(others)}. Put panoramas into a folder "
-            "of their own."
+            f"{image_dir} has panoramas of all directions, {cli.some(sorted(found))}, and other "
+            f"photos, {why}: {cli.some(others)}. Put panoramas into a folder of their own."
         )
     if small := [name for name in names if sizes[name][0] < MIN_WIDTH]:
         raise InputError(

@@ -153,7 +153,7 @@ def test_what_is_no_panorama(panorama, place, tmp_path, refused):
     )
     cv2.imwrite(str(folder / "small.png"), np.zeros((480, 640), np.uint8))
     message = refused(*given, folder, "--panoramas")
-    assert "not twice as wide as high, or cannot be read: small.png" in message
+    assert "not twice as wide as high, or not readable: small.png" in message
     assert not (outputs / "queries-panoramas").exists()
 
 
@@ -165,7 +165,13 @@ def test_xmp_data_tell_panoramas(xmp, tmp_path):
     marker = b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload
     (tmp_path / "1.jpg").write_bytes(data[:2] + marker + data[2:])
     found = panoramas.find(tmp_path, ["1.jpg"])
-    assert found == ({"1.jpg": (1024, 512)} if xmp != b"no" else {})
+    is_told = xmp != b"no"
+    assert found == ({"1.jpg": (1024, 512)} if is_told else {})
+    cv2.imwrite(str(tmp_path / "2.jpg"), np.zeros((512, 1024), np.uint8))
+    if is_told:
+        with pytest.raises(InputError, match=r"1.jpg, and other photos, without .*: 2.jpg"):
+            panoramas.find(tmp_path, ["1.jpg", "2.jpg"])
+    assert len(panoramas.find(tmp_path, ["1.jpg", "2.jpg"], given=True)) == 2
 
 
 def test_records_of_panoramas(tmp_path):
