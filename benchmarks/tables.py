@@ -245,10 +245,11 @@ def schemes_table() -> Table:
     """Compare the paper's descriptors, schemes and dimensions by their matching AP."""
     rows = select(read("matching_ap"), list="photo pairs", storage="float16")
     found = {row["feature"]: f"{float(row['ap']):.1f}" for row in rows}
-    table = [["descriptor", "scheme", "128", *map(str, PAPER_DIMS)]]
+    dims = PAPER_DIMS[0], PAPER_DIMS[-1]
+    table = [["descriptor", "scheme", "128", *map(str, dims)]]
     for base in PAPER:
         for scheme in SCHEMES:
-            cells = [found[f"{base}_{scheme}{dim}"] for dim in PAPER_DIMS]
+            cells = [found[f"{base}_{scheme}{dim}"] for dim in dims]
             table.append([f"`{base}`", f"`{scheme}`", found[base], *cells])
     return table
 
@@ -511,7 +512,8 @@ def runs_cpu_table() -> Table:
     """Show the CPU seconds of whole runs, and those that no run of the same photos is without."""
     table = [["CPU seconds", *STAGES, "all", "of one pass of the detector", "of the products"]]
     runs = select(read("runs"), place=RUN_PLACES[0])
-    runs = [row for row in runs if row["variant"] != with_keypoints(FAST)]
+    usual = "", with_keypoints(KEYPOINT_SETTINGS[0])
+    runs = [row for row in runs if row["variant"] in usual]
     for row in sorted(runs, key=lambda row: -cpu_of(row)):
         cells = [f"{float(row[f'{stage}_cpu_s']):.1f}" for stage in STAGES]
         limits = [row["extraction_limit_s"], row["matching_limit_s"]]
