@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from benchmarks.video import CAMERA, town
 
 from benchmarks import rows
+from benchmarks.video import CAMERA, town
 from hloc_reduce import Localizer, compact, demo, maps
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import FAILED, pose_error
