@@ -34,6 +34,7 @@ from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import STORAGES, Storage
 from hloc_reduce.utils.options import ABOVE_0, Option, Parser, taken
 from hloc_reduce.utils.paths import strings_as_paths
+from hloc_reduce.utils.videos import is_video
 
 from .common import changes, command, map_photos, metres, other_views, videos
 from .common.options import Matcher, Positive, Retrieval, Rigs
@@ -152,11 +153,14 @@ def open_map(
             )
         return maps.from_database.main(folder, database, model_or_map, image_dir=map_images, **new)
     if map_images is not None:
+        masks = masks_of.those_of(masks, map_images)
         if model_or_map is None and (views := map_photos.views(map_images, outputs, panoramas)):
+            if masks:
+                raise InputError(f"Panoramas are not masked: leave out --masks {masks}.")
             map_images, rigs = views
         new |= {"num_covis": num_covis, "accept_partial": accept_partial, "camera_mode": mode}
         new |= {"exif_gps": exif_gps}
-        new["masks"] = masks_of.those_of(masks, map_images)
+        new["masks"] = masks
         new["pairs"] = pairs
         new |= {"rigs": rigs, "camera_params": camera_params}
         new |= {"camera_model": camera_model} if camera_model else {}
@@ -380,7 +384,7 @@ def _check(given: dict, is_changed: bool) -> None:
         given: the options.
         is_changed: whether a map that was built is changed.
     """
-    if is_changed and given["panoramas"]:
+    if is_changed and given["panoramas"] and given["query_images"] is None:
         raise InputError("--panoramas cannot be added to a map: leave out --panoramas.")
     if given["outputs"] is None and (given["query_images"] is not None or not is_changed):
         raise InputError("Give --outputs, a folder.")
@@ -399,7 +403,8 @@ def _check(given: dict, is_changed: bool) -> None:
         folders = [given[option] for option in options if given[option] is not None]
         if not folders:
             raise InputError(f"--masks {masks} needs photos to mask, such as --query_images.")
-        masks_of.check(masks, folders)
+        if not any(map(is_video, folders)):  # whose frames are not there yet
+            masks_of.check(masks, folders)
     if given["compact"] is not None:
         compact.check_output(given["compact"])
         if matcher and matcher != NN_LIGHTGLUE and not is_built:
@@ -419,7 +424,8 @@ def _main() -> None:
     with trace.recording(outputs / "trace.json" if given["profile"] and outputs else None):
         if any(change.values()):
             changes.check(folder, given["map_images"] or given["database"], **change)
-            built = open_map(**taken(open_map, given) | {"outputs": folder})
+            of_queries = {"rigs": None, "panoramas": False}
+            built = open_map(**taken(open_map, given) | {"outputs": folder} | of_queries)
             if outputs is None:  # the map is not opened again
                 built.warn()
             changes.main(folder, **change, masks=masks)
@@ -435,7 +441,11 @@ def _main() -> None:
 
 def _run(given: dict) -> None:
     """Build or open the map, and localize the queries in it."""
+    photos = "map_images", "query_images"
+    has_video = any(given[option] and is_video(given[option]) for option in photos)
     given = videos.as_folders(given)
+    if given["masks"] is not None and has_video:  # whose frames are there now
+        masks_of.check(given["masks"], [given[option] for option in photos if given[option]])
     where = given["map_images"], given["model_or_map"], given["query_images"]
     special = map_photos.of_map(*where, given["rigs"], given["panoramas"])
     gps, scale = given["gps"], given["scale"]

@@ -28,6 +28,9 @@ from .projection import reprojection_errors
 from .query import correspondences
 from .references import Reference
 
+# kinds of alternatives of the own pose of a camera that speak against its intrinsics
+OTHER_INTRINSICS = "focal_length", "principal_point", "skew"
+
 
 @dataclass(frozen=True)
 class Sight:
@@ -118,8 +121,8 @@ def estimate(sights: Sequence[Sight], gate: Gate) -> RigPose:
 
     Candidates are the pose that each camera has by itself, and one from minimal samples of all
     cameras (GP3P), each refined by all matches that agree with it; the likeliest is taken. A camera
-    whose own pose would be trusted, but has few inliers in the rig, contradicts the rest: its
-    intrinsics or its place in the rig are wrong, and the pose is not trusted.
+    whose own pose would be trusted, but has few inliers in the rig, contradicts the rest, and so
+    does one that other intrinsics fit better: the pose is not trusted.
 
     Args:
         sights: what each camera sees.
@@ -334,10 +337,20 @@ def _shares_few(best: RigPose, other: RigPose) -> bool:
 
 
 def _contradiction(sights: Sequence[Sight], own: Sequence[Pose], best: RigPose) -> str | None:
-    """Name the cameras whose own poses would be trusted, but have few of their inliers in the rig.
+    """Say what the own poses of cameras have against the rig, None if they have nothing.
 
-    However near these poses are: a camera that is turned by a degree has hardly an inlier left.
+    Those with other intrinsics are likelier, and differ; or the poses would be trusted, but have
+    few of their inliers in the rig, however near they are: a camera that is turned by a degree has
+    hardly an inlier left.
     """
+    for one, pose in zip(sights, own, strict=True):
+        if pose.cam_from_world is None or pose.confidence < one.gate.min_confidence:
+            continue
+        for kind in OTHER_INTRINSICS:
+            other = pose.measures.alternatives.get(kind)
+            if other and gates.is_doubtful(kind, other):
+                reason = gates.ALTERNATIVES[kind].reason
+                return f"{one.name}: {reason.format(detail=other.detail, inliers=0)}"
     names = [
         one.name
         for one, pose, inliers in zip(sights, own, best.inliers, strict=True)

@@ -77,6 +77,11 @@ def _camera(camera: pycolmap.RigConfigCamera, path: Path) -> RigCamera:
     return RigCamera(prefix, pycolmap.Rigid3d(rotation, pose.translation), camera.camera)
 
 
+def have_baseline(path: Path) -> bool:
+    """Tell whether cameras of a rig configuration are apart, so that they tell a scale."""
+    return any(camera.cam_from_rig.translation.any() for rig in read(path) for camera in rig)
+
+
 def cameras_of(path: Path, names: Iterable[str]) -> dict[str, RigCamera]:
     """Return which camera of a rig configuration took each photo, of those that any took.
 

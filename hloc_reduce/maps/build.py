@@ -167,7 +167,9 @@ def main(
             attempt, findings = of_photos_alone(photos, conf)
             content: dict[str, object] = {"camera_mode": camera_mode.name.lower()}
             content |= {"rigs": True} if rigs else {}
-            return _finish(attempt, findings, False, feature, keypoints, exif_gps, **content)
+            # the map is in the units of its rigs
+            aligned = exif_gps and not (rigs and rig_files.have_baseline(rigs))
+            return _finish(attempt, findings, False, feature, keypoints, aligned, **content)
         built = Map(map_dir)
         if built.camera_mode not in (None, camera_mode.name.lower()):
             raise InputError(

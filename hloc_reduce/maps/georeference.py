@@ -116,6 +116,11 @@ def align(built: Map, gps: Path | None = None, scale: Sequence[str | float] | No
         wanted = {"scale": [*distance]}
     if built.aligned_to == wanted:
         return built
+    if built.has_rigs and _has_baseline(colmap.read_model(built.sfm)):
+        raise InputError(
+            f"The map {built.folder} is in the units of its rigs, as queries of rigs are: leave "
+            "out --gps and --scale."
+        )
     with opened(built) as folder, folder.stage("align"):
         built = Map(built.folder)
         model = colmap.read_model(built.sfm)
@@ -129,6 +134,12 @@ def align(built: Map, gps: Path | None = None, scale: Sequence[str | float] | No
         provenance.write(built.folder / FINISHED, content)
         folder.delete(models(folder.written) - {written.name})
     return Map(built.folder)
+
+
+def _has_baseline(model: pycolmap.Reconstruction) -> bool:
+    """Tell whether cameras of a rig are apart, so that the rigs tell the scale of a model."""
+    poses = [pose for rig in model.rigs.values() for pose in rig.non_ref_sensors.values()]
+    return any(pose is not None and pose.translation.any() for pose in poses)
 
 
 def _known(positions: Positions, built: Map, path: Path) -> Positions:

@@ -4,9 +4,12 @@ from pathlib import Path
 from typing import Annotated
 
 from hloc_reduce import maps
+from hloc_reduce.localization import panoramas
 from hloc_reduce.maps.map import Map
+from hloc_reduce.utils import cli
 from hloc_reduce.utils import masks as masks_of
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.images import list_images
 from hloc_reduce.utils.options import HIDDEN
 from hloc_reduce.utils.parsers import image_names
 
@@ -28,6 +31,12 @@ def check(
         add_model: COLMAP model of their poses.
         refine_map: also adjust the poses of the photos that are in the map.
     """
+    if add_images is not None and add_images.is_dir():
+        found = panoramas.find(add_images, list_images(add_images), given=False)
+        if found:
+            raise InputError(
+                f"Panoramas cannot be added to a map: leave {cli.some(found)} out of {add_images}."
+            )
     if add_images is None and (add_model is not None or refine_map):
         raise InputError(
             "--add_model and --refine_map are for photos that are added: --add_images."

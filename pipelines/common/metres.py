@@ -11,6 +11,7 @@ from hloc_reduce.maps import georeference
 from hloc_reduce.maps.map import Map
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.options import HIDDEN, Option
+from hloc_reduce.utils.videos import is_video
 
 
 def check(
@@ -38,9 +39,10 @@ def check(
         gps_positions.read_csv(gps)
     if scale is not None:
         first, second, _ = georeference.parse_scale(scale)
-        for name in (first, second) if map_images else ():
-            if map_images and not (map_images / name).is_file():
-                raise InputError(f"--scale: there is no photo {name} in {map_images}.")
+        photos = None if map_images is None or is_video(map_images) else map_images
+        for name in (first, second) if photos else ():
+            if photos and not (photos / name).is_file():
+                raise InputError(f"--scale: there is no photo {name} in {photos}.")
 
 
 def main(

@@ -147,3 +147,24 @@ def test_the_covariance_is_that_of_repeated_estimates():
         said.append(found.covariance)
     measured, expected = np.std(twists, axis=0), np.sqrt(np.diag(np.mean(said, axis=0)))
     np.testing.assert_allclose(measured, expected, rtol=0.35)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_wrong_intrinsics_contradict_the_map(factor, cameras):
+    """The other matches agree with a pose a fifth of the depth away: it is not the right one."""
+    wrong = pycolmap.Camera(
+        model="PINHOLE",
+        width=640,
+        height=480,
+        params=[500 * factor, 500 * factor, 320, 240],
+    )
+    sights = [replace(sight(i, 150, 30), camera=wrong) for i in range(cameras)]
+    found = rig_pose.estimate(sights, GATE)
+    assert found.refusal is not None
+    assert "camera0: its intrinsics contradict the map" in found.refusal or cameras > 1
+
+
+def test_right_intrinsics_do_not():
+    sights = [sight(i, 150, 30) for i in range(3)]
+    assert rig_pose.estimate(sights, GATE).refusal is None
