@@ -339,18 +339,16 @@ def _shares_few(best: RigPose, other: RigPose) -> bool:
 def _contradiction(sights: Sequence[Sight], own: Sequence[Pose], best: RigPose) -> str | None:
     """Say what the own poses of cameras have against the rig, None if they have nothing.
 
-    Those with other intrinsics are likelier, and differ; or the poses would be trusted, but have
-    few of their inliers in the rig, however near they are: a camera that is turned by a degree has
-    hardly an inlier left.
+    Those with other intrinsics are likelier, and differ, and no other camera supports the rig; or
+    the poses would be trusted, but have few of their inliers in the rig, however near they are: a
+    camera that is turned by a degree has hardly an inlier left.
     """
-    for one, pose in zip(sights, own, strict=True):
-        if pose.cam_from_world is None or pose.confidence < one.gate.min_confidence:
-            continue
-        for kind in OTHER_INTRINSICS:
-            other = pose.measures.alternatives.get(kind)
-            if other and gates.is_doubtful(kind, other):
-                reason = gates.ALTERNATIVES[kind].reason
-                return f"{one.name}: {reason.format(detail=other.detail, inliers=0)}"
+    doubts = [_doubt(one, pose) for one, pose in zip(sights, own, strict=True)]
+    support = [
+        inliers.sum() for doubt, inliers in zip(doubts, best.inliers, strict=True) if doubt is None
+    ]
+    if any(doubts) and max(support, default=0) < sights[0].gate.min_inliers:
+        return next(doubt for doubt in doubts if doubt)
     names = [
         one.name
         for one, pose, inliers in zip(sights, own, best.inliers, strict=True)
@@ -362,6 +360,18 @@ def _contradiction(sights: Sequence[Sight], own: Sequence[Pose], best: RigPose) 
         f"{' and '.join(names)}: their own matches contradict the rig; is it calibrated, in the "
         "units of the map, and are its photos of one moment?"
     )
+
+
+def _doubt(one: Sight, own: Pose) -> str | None:
+    """Return why the intrinsics of a camera may be wrong, by its own pose; None if they fit."""
+    if own.cam_from_world is None or own.confidence < one.gate.min_confidence:
+        return None
+    for kind in OTHER_INTRINSICS:
+        other = own.measures.alternatives.get(kind)
+        if other and gates.is_doubtful(kind, other):
+            reason = gates.ALTERNATIVES[kind].reason
+            return f"{one.name}: {reason.format(detail=other.detail, inliers=own.num_inliers)}"
+    return None
 
 
 def _none(sights: Sequence[Sight], gate: Gate) -> str | None:

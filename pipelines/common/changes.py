@@ -31,12 +31,6 @@ def check(
         add_model: COLMAP model of their poses.
         refine_map: also adjust the poses of the photos that are in the map.
     """
-    if add_images is not None and add_images.is_dir():
-        found = panoramas.find(add_images, list_images(add_images), given=False)
-        if found:
-            raise InputError(
-                f"Panoramas cannot be added to a map: leave {cli.some(found)} out of {add_images}."
-            )
     if add_images is None and (add_model is not None or refine_map):
         raise InputError(
             "--add_model and --refine_map are for photos that are added: --add_images."
@@ -52,6 +46,12 @@ def check(
             "--add_images and --remove_images change a map that was built before: give its folder, "
             "--map, without --map_images and --database."
         )
+    if add_images is not None and add_images.is_dir():
+        found = panoramas.find(add_images, list_images(add_images), given=False)
+        if found:
+            raise InputError(
+                f"Panoramas cannot be added to a map: leave {cli.some(found)} out of {add_images}."
+            )
 
 
 def main(
