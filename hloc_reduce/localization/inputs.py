@@ -10,7 +10,7 @@ import pycolmap
 
 from .. import logger
 from ..confs.matchers import OF_HLOC, confs
-from ..runtime.executors import Executor
+from ..runtime.executors import SERIAL, Executor
 from ..utils.cli import InputError
 from ..utils.feature_files import dimension, get_colmap_keypoints
 from ..utils.h5 import open_h5
@@ -28,7 +28,7 @@ class Settings(NamedTuple):
             intrinsics.
         skip_matches: leave out retrieved images with fewer matches.
         gate: what a pose must have to be trusted.
-        executor: does the work; the functions are pickled for other processes.
+        executor: does the work.
     """
 
     load_reference: Callable[[], Reference]
@@ -36,6 +36,11 @@ class Settings(NamedTuple):
     skip_matches: int
     gate: Gate
     executor: Executor
+
+    def of_files(self, features: Path, matches: Path) -> "Settings":
+        """Return the settings for files, without the executor, which cannot be pickled."""
+        gate = of_matches(self.gate, features, matches)
+        return self._replace(gate=gate, executor=SERIAL)
 
 
 def of_matches(gate: Gate, features: Path, matches: Path) -> Gate:

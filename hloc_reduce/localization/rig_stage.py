@@ -16,7 +16,7 @@ from ..utils.h5 import open_h5
 from ..utils.progress import progress
 from . import gate as gates
 from . import rig_pose
-from .inputs import Settings, of_matches, read_matches
+from .inputs import Settings, read_matches
 from .records import to_record
 from .references import Reference
 from .rigs import Frames
@@ -88,8 +88,8 @@ def localize_frames(
         The records are of the photos, as `stage.main` returns them, with the pose that the rig
         gives each, and the measures of all of them together.
     """
-    settings = settings._replace(gate=of_matches(settings.gate, features, matches))
-    work = partial(_localize_chunk, settings, features, matches)
+    of_files = settings.of_files(features, matches)
+    work = partial(_localize_chunk, of_files, features, matches)
     with closing(settings.executor.map(work, frames, CHUNK)) as found:
         yield from progress(found, "Localizing rigs", "frame", len(frames))
 

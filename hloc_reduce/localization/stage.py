@@ -358,8 +358,8 @@ def localize_all(
         thorough: also try matches of single images, as `absolute_pose.estimate` does.
         said: what the progress bar says.
     """
-    settings = settings._replace(gate=of_matches(settings.gate, features, matches))
-    work = partial(_localize_chunk, settings, features, matches, thorough)
+    of_files = settings.of_files(features, matches)
+    work = partial(_localize_chunk, of_files, features, matches, thorough)
     with closing(settings.executor.map(work, tasks, CHUNK)) as found:
         yield from progress(found, said, "query", len(tasks))
 
