@@ -86,7 +86,7 @@ def look_around(
 ) -> np.ndarray:
     """Return the linear light of the town along rays (H, W, 3), float32 RGB (H, W, 3).
 
-    It is resampled from the faces, with so many pixels across, of a cube.
+    It is resampled from the faces of a cube, whose width in pixels is given.
     """
     focal_length, size = side / 2, side + 4  # two pixels more on each side, to interpolate
     camera = pycolmap.Camera(

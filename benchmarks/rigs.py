@@ -3,11 +3,11 @@
 A rig stands where a query by night was taken; its cameras look ahead, to the left, back and to the
 right, and are 20 cm apart. Adds rows to results/rigs.csv, leaving out what has rows unless --again
 is given: the first one to four cameras, and the one of these that is localized with the most
-inliers by itself. Errors are of the rig's pose.
+inliers by itself. Position errors are those of the rig.
 
-With --halves, each photo by night of data sets in the layout of Aachen is cut into a left and a
-right half, as if two cameras had taken them: their pose is to be that of the whole photo, from
-which it is at most `apart_cm` away.
+With --halves, each night photo of data sets in the layout of Aachen is cut into a left and a right
+half, as if two cameras had taken them. `apart_cm` is the largest distance between the pose of the
+halves and that of the whole photo.
 """
 
 import copy

@@ -119,10 +119,9 @@ class RigPose:
 def estimate(sights: Sequence[Sight], gate: Gate) -> RigPose:
     """Estimate the pose of a rig and judge it by the measures of a single photo, over all cameras.
 
-    Candidates are the pose that each camera has by itself, and one from minimal samples of all
-    cameras (GP3P), each refined by all matches that agree with it; the likeliest is taken. A camera
-    whose own pose would be trusted, but has few inliers in the rig, contradicts the rest, and so
-    does one that other intrinsics fit better: the pose is not trusted.
+    Each camera gives a candidate by its own matches, and minimal samples of all cameras (GP3P) give
+    another. Each is refined by all matches that agree with it, and the likeliest is taken. It is
+    not trusted if cameras contradict it, see `_contradiction`.
 
     Args:
         sights: what each camera sees.

@@ -178,7 +178,7 @@ class Localizer:
             camera: intrinsics of all frames; default: see `localize`.
             radius: see `localize`.
         """
-        return Tracker(self, camera, radius)
+        return Tracker(self.localize, self.is_far, camera, radius)
 
     def _tries(
         self,

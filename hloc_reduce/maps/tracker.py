@@ -1,29 +1,12 @@
 """Localize the frames of a video one after the other."""
 
-from typing import Protocol
+from collections.abc import Callable
 
 import pycolmap
 
 from .given import Image
 
 REMEMBERED = 10  # frames, after which a camera whose pose is not known may be anywhere
-
-
-class Localizes(Protocol):
-    """What a `Localizer` does for its tracker."""
-
-    def localize(
-        self,
-        image: Image,
-        camera: pycolmap.Camera | None = None,
-        mask: Image | None = None,
-        near: pycolmap.Rigid3d | None = None,
-        radius: float | None = None,
-    ) -> tuple[pycolmap.Rigid3d | None, dict]:
-        """Localize a photo."""
-
-    def is_far(self, cam_from_world: pycolmap.Rigid3d) -> bool:
-        """Tell whether a pose is too far from the map for `near`."""
 
 
 class Tracker:
@@ -33,7 +16,8 @@ class Tracker:
     first. So nothing is smoothed, and a frame after a jump is localized like any photo.
 
     Args:
-        localizer: the map.
+        localize: that of a `Localizer`.
+        is_far: that of the same `Localizer`.
         camera: intrinsics of all frames; default: see `Localizer.localize`.
         radius: see `Localizer.localize`.
 
@@ -45,11 +29,13 @@ class Tracker:
 
     def __init__(
         self,
-        localizer: Localizes,
+        localize: Callable[..., tuple[pycolmap.Rigid3d | None, dict]],
+        is_far: Callable[[pycolmap.Rigid3d], bool],
         camera: pycolmap.Camera | None = None,
         radius: float | None = None,
     ):
-        self.localizer, self.camera, self.radius = localizer, camera, radius
+        self._localize, self._is_far = localize, is_far
+        self.camera, self.radius = camera, radius
         self._last: list[pycolmap.Rigid3d | None] = []  # of the last frames
 
     def localize(
@@ -63,7 +49,7 @@ class Tracker:
         """
         near = self._expected()
         radius = self.radius if near else None
-        found = self.localizer.localize(image, self.camera, mask, near, radius)
+        found = self._localize(image, self.camera, mask, near, radius)
         self._last = [*self._last, found[0]][-REMEMBERED:]
         return found
 
@@ -76,4 +62,4 @@ class Tracker:
         if None not in self._last[-2:] and len(known) > 1:
             expected = expected * known[-2].inverse() * expected
         candidates = (expected, known[-1])
-        return next((one for one in candidates if not self.localizer.is_far(one)), None)
+        return next((one for one in candidates if not self._is_far(one)), None)
