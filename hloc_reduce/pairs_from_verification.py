@@ -4,22 +4,21 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import numpy as np
 import pycolmap
 
 from . import logger
+from .mapping import database as databases
 from .mapping.checks.overlays import drop_overlays
-from .mapping.database import INFERRED_CAMERAS, import_images
+from .mapping.database import verified_by
 from .retrieval.ranking import rank, read_global, similarity
-from .runtime import provenance
-from .triangulation import Pair, Verified, read_matches
+from .triangulation import Pair, read_matches
 from .utils import cli, colmap, options
 from .utils.cli import InputError
-from .utils.files import file_sha256
-from .utils.h5 import file_provenance, list_h5_names, open_h5
+from .utils.files import replacing
+from .utils.h5 import list_h5_names
 from .utils.images import list_images
 from .utils.options import Option
 from .utils.parsers import parse_pairs, write_pairs
@@ -51,7 +50,8 @@ def main(
     are paired with the most similar images of other components, and images with few verified pairs
     with any similar ones. Images with common verified neighbours probably see the same points, so
     they are paired too.
-    `<matches>_verified.json` keeps the results, so that a second call verifies only new pairs.
+    `<matches>_verified.db` keeps the results, so that neither a second call nor `reconstruction`
+    verifies a pair again.
 
     Args:
         output: text file of pairs: those of `pairs`, then the new ones.
@@ -86,10 +86,21 @@ def main(
     listed = list(dict.fromkeys(_unordered(*pair) for pair in parse_pairs(pairs)))
     if unknown := {name for pair in listed for name in pair}.difference(names):
         raise InputError(f"{pairs}: {min(unknown)} is not in the list of images.")
-    verified = _verify(
-        image_dir, names, listed, features, matches, camera_mode, rigs, image_options
-    )
-    connected = {pair: verified[pair] for pair in listed if verified[pair] >= MIN_INLIERS}
+    keypoints, _, found = read_matches(names, pairs, features, matches, None)
+    database = verified_by(matches)
+    with replacing(database) as temporary:
+        databases.write(
+            temporary,
+            image_dir,
+            keypoints,
+            drop_overlays(keypoints, found),
+            camera_mode,
+            known=database,
+            image_options=image_options,
+            rigs=rigs,
+        )
+    verified = colmap.count_verified(database)
+    connected = {_unordered(*pair): n for pair, n in verified.items() if n >= MIN_INLIERS}
     global_descriptors = read_global(descriptors, names)
     new = more_pairs(names, set(listed), connected, global_descriptors, num_matched, num_covis)
     write_pairs([*listed, *new], output)
@@ -177,49 +188,6 @@ def _by_neighbours(
 def _unordered(name0: str, name1: str) -> Pair:
     """Return a pair in the order of the names."""
     return (name0, name1) if name0 < name1 else (name1, name0)
-
-
-def _verify(
-    image_dir: Path,
-    names: list[str],
-    pairs: list[Pair],
-    features: Path,
-    matches: Path,
-    camera_mode: pycolmap.CameraMode,
-    rigs: Path | None,
-    image_options: dict | None,
-) -> dict[Pair, int]:
-    """Return the number of verified matches of each pair, of known pairs from the file."""
-    path = matches.with_name(f"{matches.stem}_verified.json")
-    with open_h5(features) as feature_file, open_h5(matches) as match_file:
-        made_from = {
-            "features": file_provenance(feature_file),
-            "matches": file_provenance(match_file),
-            "camera_mode": camera_mode.name,
-            "inferred": INFERRED_CAMERAS,
-            **({"rigs": file_sha256(rigs)} if rigs else {}),
-            **({"image_options": image_options} if image_options else {}),
-        }
-    before = provenance.read(path)
-    known = before.get("pairs", {}) if before.get("made_from") == made_from else {}
-    todo = [pair for pair in pairs if "\t".join(pair) not in known]
-    if todo:
-        logger.info("Verifying %d pairs...", len(todo))
-        with TemporaryDirectory(dir=matches.parent, prefix=".", suffix=".tmp") as folder:
-            database, listed = Path(folder, "database.db"), Path(folder, "pairs.txt")
-            write_pairs(todo, listed)
-            images = sorted({name for pair in todo for name in pair})
-            import_images(database, image_dir, images, camera_mode, image_options, rigs)
-            keypoints, _, found = read_matches(images, listed, features, matches, None)
-            found = drop_overlays(keypoints, found)
-            unverified: Verified = {pair: (indices, None) for pair, indices in found.items()}
-            colmap.write_matches(database, keypoints, unverified)
-            colmap.verify_matches(database, listed, False)
-            counts = colmap.count_verified(database)
-        counts = {_unordered(*pair): number for pair, number in counts.items()}
-        known |= {"\t".join(pair): counts.get(pair, 0) for pair in todo}
-        provenance.write(path, {"made_from": made_from, "pairs": known})
-    return {pair: known["\t".join(pair)] for pair in pairs}
 
 
 def _main() -> None:

@@ -10,6 +10,7 @@ from . import logger
 from .localization import rigs as rig_files
 from .mapping import checks, findings, registration
 from .mapping.checks.overlays import drop_overlays
+from .mapping.database import verified_by
 from .mapping.mapper import MODEL_CHOICE, Mapper, attempts_for
 from .runtime import provenance
 from .triangulation import read_matches, replacing_map
@@ -130,7 +131,8 @@ def main(
                 image_options or {},
                 keypoints,
                 found,
-                unverified=None if skip_geometric_verification else pairs,
+                verify=not skip_geometric_verification,
+                known=verified_by(matches),
                 attempts=[{**options, **changed} for changed in attempts],
                 once=once,
                 verbose=verbose,

@@ -68,8 +68,7 @@ def main(
             image_dir,
             keypoints,
             found,
-            unverified=listed,
-            camera_mode=camera_mode,
+            camera_mode,
             verbose=verbose,
         )
         verified = colmap.count_verified(of_pycolmap)

@@ -120,7 +120,7 @@ def main(
         verified = _verify(verification, reference, keypoints, uncertainty, found)
         colmap.write_matches(database, keypoints, verified)
         if any(part is None for _, part in verified.values()):
-            colmap.verify_matches(database, pairs, verbose)
+            colmap.verify_matches(database, found, verbose)
         logger.info("Triangulating...")
         reconstruction = colmap.triangulate_points(
             reference, database, image_dir, building, mapper, verbose

@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from .. import logger
 from ..localization import rigs as rig_files
 from ..localization.exif import correct, exif_camera
 from ..localization.gate import PERSPECTIVE
 from ..localization.intrinsics import GUESSED_FOCAL
 from ..utils import colmap
 
+VERIFIED = "_verified.db"  # ends the name of a database beside a match file
+GUESSED_FISHEYE = 0.45  # focal length of a fisheye in longer sides: 127 degrees across
 # what the provenance of what is made from such a database says of its cameras
-GUESSED_FISHEYE = 0.45  # its focal length in longer sides: 127 degrees across
 INFERRED_CAMERAS = (
     "of zooms, crops and squares: their own; of photos that were made smaller: scaled"
 )
@@ -119,13 +121,19 @@ def fixed_cameras(database: Path, rigs: Path | None) -> set[int]:
     return {images[name] for name, one in took.items() if one.camera is not None}
 
 
+def verified_by(matches: Path) -> Path:
+    """Return the database that keeps the verified pairs of a match file."""
+    return matches.with_name(f"{matches.stem}{VERIFIED}")
+
+
 def write(
     database: Path,
     image_dir: Path,
     keypoints: dict[str, np.ndarray],
     matches: dict[tuple[str, str], np.ndarray],
-    unverified: Path | None,
     camera_mode: pycolmap.CameraMode,
+    verify: bool = True,
+    known: Path | None = None,
     image_options: dict | None = None,
     verbose: bool = False,
     rigs: Path | None = None,
@@ -137,9 +145,10 @@ def write(
         image_dir: folder of the images, whose EXIF data give the intrinsics.
         keypoints: of each image (N, 2), COLMAP's pixels.
         matches: of each pair (M, 2).
-        unverified: text file of the pairs to verify by two-view geometry; None to take all matches
-            for verified ones.
         camera_mode: which images share a camera.
+        verify: verify the matches by two-view geometry, instead of taking all for verified ones.
+        known: a database, whose pairs are not verified again if they are the same; it may be
+            missing.
         image_options: of pycolmap's ImageReaderOptions.
         verbose: show COLMAP's log.
         rigs: COLMAP's `rig_config.json`.
@@ -152,7 +161,15 @@ def write(
         found = rig_files.configurations(rigs, keypoints)
         with colmap.open_database(database) as opened:
             pycolmap.apply_rig_config(found, opened)
-    verified = {pair: (rows, None if unverified else rows) for pair, rows in matches.items()}
-    colmap.write_matches(database, keypoints, verified)
-    if unverified:
-        colmap.verify_matches(database, unverified, verbose)
+    if not verify:
+        colmap.write_matches(database, keypoints, {pair: (m, m) for pair, m in matches.items()})
+        return
+    same = {}
+    if known is not None and known.exists():
+        same = colmap.same_geometries(known, database, keypoints, matches)
+    colmap.write_matches(
+        database, keypoints, {pair: (m, same.get(pair)) for pair, m in matches.items()}
+    )
+    if new := [pair for pair in matches if pair not in same]:
+        logger.info("Verifying %d pairs...", len(new))
+        colmap.verify_matches(database, new, verbose)

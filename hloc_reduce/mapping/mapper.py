@@ -89,7 +89,8 @@ class Mapper:
     image_options: dict  # of pycolmap's ImageReaderOptions
     keypoints: dict[str, np.ndarray]  # from image to (N, 2), COLMAP's pixels
     matches: dict[tuple[str, str], np.ndarray]  # from pair to (M, 2)
-    unverified: Path | None  # text file of pairs to verify by two-view geometry
+    verify: bool  # by two-view geometry
+    known: Path  # database whose pairs are not verified again, if it is there
     attempts: list[dict]  # of pycolmap's IncrementalPipelineOptions
     once: bool  # make the first attempt only, unless images fit with one camera
     verbose: bool
@@ -165,8 +166,9 @@ class Mapper:
             self.image_dir,
             self.keypoints,
             self.matches,
-            unverified=self.unverified,
-            camera_mode=mode,
+            mode,
+            verify=self.verify,
+            known=self.known,
             image_options=self.image_options,
             verbose=self.verbose,
             rigs=self.rigs,

@@ -24,6 +24,7 @@ from ..extract_features import keep_readable
 from ..localization.rigs import know_all
 from ..mapping import findings, mapper, plausibility, registration
 from ..mapping.checks import Inputs, another_size, intrinsics, mirrored
+from ..mapping.database import VERIFIED
 from ..mapping.findings import Finding, names_in
 from ..runtime.outputs import RunFolder
 from ..utils import cli, colmap
@@ -373,4 +374,5 @@ def drop_others(folder: RunFolder, built: Map) -> None:
         )
         begins = f"{name}.h5", f"{name}_matches", f"{described.stem}."
         folder.delete(other for other in folder.written if other.startswith(begins))
+    folder.delete(name for name in {*folder.written} if name.endswith(VERIFIED))
     folder.delete({MIRROR_IMAGES, *models(folder.written)} - {built.sfm.name})

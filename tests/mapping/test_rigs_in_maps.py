@@ -192,7 +192,7 @@ def test_a_rig_needs_photos_of_its_reference_camera(rig):
     keypoints = {name: np.zeros((0, 2)) for name in rig.names}
     mode = pycolmap.CameraMode.AUTO
     with pytest.raises(InputError, match="no photo is of front/, the reference camera of right/"):
-        database.write(rig.root / "1.db", image_dir, keypoints, {}, None, mode, rigs=path)
+        database.write(rig.root / "1.db", image_dir, keypoints, {}, mode, verify=False, rigs=path)
 
 
 def test_photos_of_a_camera_have_one_size(rig):

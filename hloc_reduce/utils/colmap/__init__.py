@@ -14,6 +14,7 @@ from .databases import (
     open_database,
     read_cameras,
     read_verified,
+    same_geometries,
     write_matches,
     write_reference,
 )

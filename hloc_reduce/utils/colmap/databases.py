@@ -5,7 +5,7 @@ import fcntl
 import os
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -19,6 +19,7 @@ from ..locks import has_locks
 from ..options import Option
 
 Options = TypeVar("Options")
+Pair = tuple[str, str]  # names of images
 
 CAMERA_MODES = {name.lower(): mode for name, mode in pycolmap.CameraMode.__members__.items()}
 CAMERA_MODE = Option(
@@ -184,15 +185,15 @@ def import_images(
 def write_matches(
     database: Path,
     keypoints: dict[str, np.ndarray],
-    matches: dict[tuple[str, str], tuple[np.ndarray, np.ndarray | None]],
+    matches: Mapping[Pair, tuple[np.ndarray, np.ndarray | pycolmap.TwoViewGeometry | None]],
 ) -> None:
     """Write the keypoints and matches of images into a COLMAP database.
 
     Args:
         database: has the images.
         keypoints: (N, 2) in COLMAP's pixels, by image name.
-        matches: all and the verified matches (M, 2) of pairs of image names; None instead of the
-            verified ones if `verify_matches` will find them.
+        matches: all and the verified matches (M, 2) of pairs of image names, or their geometry;
+            None instead of the verified ones if `verify_matches` will find them.
     """
     with open_database(database) as opened:
         image_ids = {image.name: image.image_id for image in opened.read_all_images()}
@@ -203,12 +204,62 @@ def write_matches(
             opened.write_matches(*ids, all_matches.astype(np.uint32))
             if verified is None:
                 continue
-            # COLMAP 4.2.1 and later skip geometries with an undefined configuration
-            geometry = pycolmap.TwoViewGeometry(
-                config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
-                inlier_matches=verified.astype(np.uint32),
+            if isinstance(verified, np.ndarray):
+                # COLMAP 4.2.1 and later skip geometries with an undefined configuration
+                verified = pycolmap.TwoViewGeometry(
+                    config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
+                    inlier_matches=verified.astype(np.uint32),
+                )
+            opened.write_two_view_geometry(*ids, verified)
+
+
+def same_geometries(
+    known: Path, database: Path, keypoints: dict[str, np.ndarray], matches: dict[Pair, np.ndarray]
+) -> dict[Pair, pycolmap.TwoViewGeometry]:
+    """Return the geometries of pairs that another database has verified with the same data.
+
+    Args:
+        known: the other database.
+        database: has the images, with their cameras.
+        keypoints: (N, 2) in COLMAP's pixels, by image name.
+        matches: (M, 2) of pairs of image names.
+
+    Returns:
+        From pair to geometry, of those with the same cameras, keypoints and matches in `known`.
+    """
+    with open_database(database) as opened:
+        wanted = _cameras_of_images(opened)
+    found = {}
+    with open_database(known) as opened:
+        cameras = _cameras_of_images(opened)
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        same = {
+            name
+            for name in ids.keys() & keypoints.keys()
+            if cameras[name] == wanted[name]
+            and np.array_equal(
+                opened.read_keypoints(ids[name])[:, :2], keypoints[name].astype(np.float32)
             )
-            opened.write_two_view_geometry(*ids, geometry)
+        }
+        pair_ids, _ = opened.read_two_view_geometry_num_inliers()
+        verified = {pycolmap.pair_id_to_image_pair(pair) for pair in pair_ids}
+        for (a, b), rows in matches.items():
+            if not {a, b} <= same:
+                continue
+            pair = ids[a], ids[b]
+            is_known = pair in verified or pair[::-1] in verified
+            if is_known and np.array_equal(opened.read_matches(*pair), rows):
+                found[a, b] = opened.read_two_view_geometry(*pair)
+    return found
+
+
+def _cameras_of_images(opened: pycolmap.Database) -> dict[str, tuple]:
+    """Return what a database knows of the camera of each image, but for its id."""
+    cameras = {
+        one.camera_id: (one.model, one.width, one.height, [*one.params], one.has_prior_focal_length)
+        for one in opened.read_all_cameras()
+    }
+    return {image.name: cameras[image.camera_id] for image in opened.read_all_images()}
 
 
 def read_cameras(database: Path) -> dict[int, pycolmap.Camera]:
@@ -217,7 +268,7 @@ def read_cameras(database: Path) -> dict[int, pycolmap.Camera]:
         return {camera.camera_id: camera for camera in opened.read_all_cameras()}
 
 
-def read_verified(database: Path) -> dict[tuple[str, str], np.ndarray]:
+def read_verified(database: Path) -> dict[Pair, np.ndarray]:
     """Return the verified matches (M, 2) int of each pair of images that has any."""
     with open_database(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
@@ -229,7 +280,7 @@ def read_verified(database: Path) -> dict[tuple[str, str], np.ndarray]:
     return {(names[pair[0]], names[pair[1]]): rows for pair, rows in found if len(rows)}
 
 
-def count_verified(database: Path) -> dict[tuple[str, str], int]:
+def count_verified(database: Path) -> dict[Pair, int]:
     """Return the number of verified matches of each pair of images that has any."""
     with open_database(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}

@@ -1,6 +1,6 @@
 """COLMAP's estimators: two-view geometries, points, models and the pose of a query."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 
 from ..interrupts import interruptible
-from ..parsers import parse_pairs, write_pairs
-from .databases import full_disk, open_database, parse_options
+from ..parsers import write_pairs
+from .databases import Pair, full_disk, open_database, parse_options
 from .origin import near_origin
 
 REPROJECTION_LIMITS = (  # options that are the largest reprojection errors of points, in pixels
@@ -54,33 +54,34 @@ def exact(options: pycolmap.BundleAdjustmentOptions) -> pycolmap.BundleAdjustmen
     return options
 
 
-def verify_matches(database: Path, pairs: Path, verbose: bool) -> None:
-    """Estimate the two-view geometries of the matches of a database, with hloc's options."""
+def verify_matches(database: Path, pairs: Iterable[Pair], verbose: bool = False) -> None:
+    """Estimate the two-view geometries of pairs of images of a database, with hloc's options."""
     options = {"ransac": {"max_num_trials": 20000, "min_inlier_ratio": 0.1, "random_seed": 0}}
-    with _log(verbose), _named_by_ids(database, pairs) as pairs_by_ids:
-        interruptible(pycolmap.verify_matches, database, pairs_by_ids, options=options)
+    listed = database.with_name(f"{database.stem}-pairs.txt")
+    with _log(verbose), _without_spaces(database) as renamed:
+        write_pairs(((renamed[a], renamed[b]) for a, b in pairs), listed)
+        try:
+            interruptible(pycolmap.verify_matches, database, listed, options=options)
+        finally:
+            listed.unlink()
 
 
 @contextmanager
-def _named_by_ids(database: Path, pairs: Path) -> Iterator[Path]:
+def _without_spaces(database: Path) -> Iterator[dict[str, str]]:
     """In a block, name the images of a database by their ids if any name contains spaces.
 
-    COLMAP cannot read a list of pairs with spaces in names. Yields a list that it can read.
+    COLMAP cannot read a list of pairs with spaces in names. Yields the names in the block.
     """
     with open_database(database) as opened:
         images = opened.read_all_images()
     names = {image.image_id: image.name for image in images}
     if all(name.split() == [name] for name in names.values()):
-        yield pairs
+        yield {name: name for name in names.values()}
         return
-    ids = {name: str(image_id) for image_id, name in names.items()}
-    by_ids = database.with_name("pairs_by_ids.txt")
-    write_pairs(((ids[a], ids[b]) for a, b in parse_pairs(pairs)), by_ids)
     _rename(database, images, {image_id: str(image_id) for image_id in names})
     try:
-        yield by_ids
+        yield {name: str(image_id) for image_id, name in names.items()}
     finally:
-        by_ids.unlink()
         _rename(database, images, names)
 
 
