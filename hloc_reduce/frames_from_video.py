@@ -69,15 +69,31 @@ def main(
     is_free = not output.exists() or (output.is_dir() and not any(output.iterdir()))
     if "choice" not in before and not is_free:
         raise InputError(f"{output} exists and has no frames of a video: choose another folder.")
-    choice = {"fps": fps} if fps else CHOICE
-    [(_, known)] = provenance.fingerprints({"video": video}, before).items()
-    made_from = {"path": str(video.resolve()), "video": known, "choice": choice}
-    is_current = before.get("choice") == choice and before.get("video", [])[2:] == known[2:]
-    if not is_current or overwrite:
+    made_from = _made_from(video, fps, before)
+    if overwrite or not _is_same(made_from, before):
         _replace(video, output, fps, made_from)
     elif before != made_from:
         provenance.write(output / MADE_FROM, made_from)
     return output
+
+
+def is_current(video: Path, output: Path, fps: float | None = None) -> bool:
+    """Tell whether a folder has the frames of a video, as it is now."""
+    before = provenance.read(output / MADE_FROM)
+    return _is_same(_made_from(video, fps, before), before)
+
+
+def _made_from(video: Path, fps: float | None, before: dict) -> dict:
+    """Return the provenance of frames of a video, given an earlier one."""
+    [(_, known)] = provenance.fingerprints({"video": video}, before).items()
+    choice = {"fps": fps} if fps else CHOICE
+    return {"path": str(video.resolve()), "video": known, "choice": choice}
+
+
+def _is_same(made_from: dict, before: dict) -> bool:
+    """Tell whether frames of two provenances are the same, wherever the video is."""
+    same_video = before.get("video", [])[2:] == made_from["video"][2:]
+    return same_video and before.get("choice") == made_from["choice"]
 
 
 def _replace(video: Path, output: Path, fps: float | None, made_from: dict) -> None:

@@ -462,9 +462,8 @@ def _run(given: dict) -> None:
         print(f"The map {built.folder} is ready. Localize photos in it with --query_images.")
         return
     results = results_folder(given["outputs"], query_images, queries)
-    are_panoramas = given["panoramas"], special.panoramas
-    given["panoramas"] = map_photos.of_queries(query_images, *are_panoramas)
-    summary = main(built, **taken(main, given) | {"outputs": results})
+    seen = map_photos.of_queries(query_images, given["rigs"], given["panoramas"], special)
+    summary = main(built, **taken(main, given | seen._asdict()) | {"outputs": results})
     if built.doubts:
         logger.warning(
             "The map may be wrong, and poses in it may be off by a tenth of the distance or more: "

@@ -48,14 +48,19 @@ def of_photos(image_dir: Path, names: Iterable[str]) -> Positions:
 def of_photo(image: Path) -> np.ndarray | None:
     """Return the position in the EXIF data of a photo, see `position`; None without a sound one."""
     try:
-        with Image.open(image) as opened:
-            tags = opened.getexif().get_ifd(GPS)
+        tags = gps_tags(image)
         latitude = _degrees(tags[LATITUDE], tags.get(SOUTH_OR_NORTH), "S")
         longitude = _degrees(tags[LONGITUDE], tags.get(WEST_OR_EAST), "W")
         altitude = _altitude(tags)
     except Exception:  # Pillow raises many types for broken data
         return None
     return position(latitude, longitude, altitude) if on_earth(latitude, longitude) else None
+
+
+def gps_tags(image: Path) -> dict[int, Any]:
+    """Return the EXIF data of a photo that are of GPS, by their tags."""
+    with Image.open(image) as opened:
+        return dict(opened.getexif().get_ifd(GPS))
 
 
 def _degrees(values: Any, side: object, negative: str) -> float:

@@ -6,7 +6,7 @@ The views look around in a ring. They overlap, so that nothing is cut in all of 
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ from ..utils.files import replacing
 from ..utils.images import ORIENTATION, read_image, stored_size
 from ..utils.parsers import write_poses
 from ..utils.progress import progress
+from .gps import GPS, gps_tags
 from .records import NUMBERS, RECORDS, Log, log_file, nearness, pose_of, written
 
 NUM_VIEWS = 6
@@ -32,6 +33,7 @@ TWICE = 0.01  # the ratio of width and height may differ from 2 by rounding
 HEAD = 2**17  # bytes of a file that may have XMP data
 TOLD = re.compile(rb"ProjectionType\s*(?:=|>)\s*[\"']?\s*equirectangular")
 QUALITY = 95  # of JPEG
+OF_VIEW = re.compile(r"^view\d{3}-\d+/")  # begins the name of a view, before that of the panorama
 # what the provenance of what is made from panoramas says of their views
 VIEWS = f"{NUM_VIEWS} views of {FIELD_OF_VIEW} degrees, at most {MAX_VIEW} pixels"
 
@@ -152,8 +154,19 @@ def view_names(panorama: str, views: list[View]) -> list[str]:
     return [f"{view.name}{panorama}{'' if is_jpeg else '.jpg'}" for view in views]
 
 
+def of_views(names: Iterable[str]) -> dict[str, str]:
+    """Return a view of each panorama, by its name, among photos; others are left out."""
+    found: dict[str, str] = {}
+    for name in names:
+        if OF_VIEW.match(name):
+            panorama = OF_VIEW.sub("", name)
+            found.setdefault(panorama, name)
+            found.setdefault(panorama.removesuffix(".jpg"), name)
+    return found
+
+
 def write_views(image_dir: Path, sizes: Mapping[str, Size], folder: Path) -> Path:
-    """Write the views of panoramas that are not there yet, and return their folder.
+    """Write the views of panoramas that are not there yet, with their GPS, and return their folder.
 
     Args:
         image_dir: folder of the panoramas.
@@ -163,13 +176,14 @@ def write_views(image_dir: Path, sizes: Mapping[str, Size], folder: Path) -> Pat
     Raises:
         UnreadableImage: if a panorama cannot be read.
     """
-    exif = Image.Exif()
-    exif[ORIENTATION] = 1
     for name, size in progress([*sizes.items()], "Rendering views of panoramas", "panorama"):
         views = views_of(size)
         paths = [folder / one for one in view_names(name, views)]
         if all(path.exists() for path in paths):
             continue
+        exif = Image.Exif()
+        exif[ORIENTATION] = 1
+        exif.get_ifd(GPS).update(gps_tags(image_dir / name))
         for path, pixels in zip(paths, render(read_image(image_dir / name), views), strict=True):
             with replacing(path) as temporary:
                 Image.fromarray(pixels).save(

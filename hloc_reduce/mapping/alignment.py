@@ -76,7 +76,11 @@ def align(
         NotAligned: if the positions do not determine the alignment, or are not credible.
     """
     images = [model.images[i] for i in sorted(model.reg_image_ids())]
-    images = [image for image in images if image.name in positions]
+    of_frames: dict[int, pycolmap.Image] = {}  # photos of a frame have one position
+    for image in images:
+        if image.name in positions:
+            of_frames.setdefault(image.frame_id, image)
+    images = [*of_frames.values()]
     check_number([image.name for image in images])
     source = np.array([image.projection_center() for image in images])
     given = np.array([positions[image.name] for image in images])

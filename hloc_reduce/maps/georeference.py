@@ -11,6 +11,7 @@ import pycolmap
 
 from .. import logger
 from ..localization import gps as gps_positions
+from ..localization import panoramas
 from ..localization.frame import METRES, Frame
 from ..localization.gps import Positions
 from ..mapping import alignment, gravity
@@ -124,10 +125,14 @@ def align(built: Map, gps: Path | None = None, scale: Sequence[str | float] | No
     with opened(built) as folder, folder.stage("align"):
         built = Map(built.folder)
         model = colmap.read_model(built.sfm)
+        views = panoramas.of_views([image.name for image in model.images.values()])
         if gps is not None:
+            positions = {views.get(name, name): place for name, place in positions.items()}
             found = _by_gps(model, _known(positions, built, gps), built.images)
         else:
-            found = _by_scale(model, distance, built.images)
+            first, second, metres = distance
+            of_photos = Scale(views.get(first, first), views.get(second, second), metres)
+            found = _by_scale(model, of_photos, built.images)
         content = json.loads((built.folder / FINISHED).read_text()) | found
         written = write_model(built.folder, built.sfm.name, model)
         content |= {"id": uuid.uuid4().hex, "sfm": written.name, "aligned_to": wanted}

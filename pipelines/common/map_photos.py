@@ -63,11 +63,16 @@ def of_map(
     return Special(are_panoramas, rigs if rigs and are_of(rigs, names) else None)
 
 
-def of_queries(query_images: Path, are_panoramas: bool, of_map: bool) -> bool:
-    """Return whether queries are panoramas, as --panoramas may be for the map only."""
-    return are_panoramas and not (
-        of_map and not panoramas.find(query_images, list_images(query_images), given=True)
-    )
+def of_queries(
+    query_images: Path, rigs: Path | None, are_panoramas: bool, of_map: Special
+) -> Special:
+    """Return what options say of the photos of queries, as they may be for the map only."""
+    names = list_images(query_images)
+    if of_map.panoramas and not panoramas.find(query_images, names, given=True):
+        are_panoramas = False
+    if of_map.rigs and not are_of(of_map.rigs, names):
+        rigs = None
+    return Special(are_panoramas, rigs)
 
 
 def views(map_images: Path, outputs: Path, are_panoramas: bool) -> tuple[Path, Path] | None:

@@ -12,7 +12,7 @@ import pycolmap
 from hloc_reduce import logger
 from hloc_reduce.localization import intrinsics
 from hloc_reduce.localization import panoramas as panorama_files
-from hloc_reduce.localization.rigs import Frames, are_of, frames, of_rig
+from hloc_reduce.localization.rigs import Frames, frames, of_rig
 from hloc_reduce.maps.map import Map
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import CONF
@@ -76,8 +76,7 @@ class Queries:
             queries: query list with intrinsics, or a glob of several; None for the whole folder.
             built: the map.
             strict: stop at an unreadable photo.
-            rigs: COLMAP's `rig_config.json`, whose intrinsics count if there is no list; it may be
-                for the photos of the map only.
+            rigs: COLMAP's `rig_config.json`, whose intrinsics count if there is no list.
 
         Raises:
             InputError: when a list is wrong, a photo is missing, or, if `strict`, unreadable; or
@@ -88,13 +87,9 @@ class Queries:
             lists = {stem: [name for name, _ in part] for stem, part in given.items()}
             names = [name for part in lists.values() for name in part]
             check_queries(query_images, names, strict)
-            if rigs and built.has_rigs and not are_of(rigs, names):
-                rigs = None
             return cls(lists, frames=frames(rigs, names) if rigs else {})
         names = list_images(query_images)
         check_distinct(names)
-        if rigs and built.has_rigs and not are_of(rigs, names):
-            rigs = None
         inferred = intrinsics.infer_all(query_images, names, built.cameras, strict)
         of_rigs = frames(rigs, names) if rigs else {}
         if rigs:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hloc_reduce import frames_from_video
+from hloc_reduce import frames_from_video, maps
 from hloc_reduce.runtime import provenance
 from hloc_reduce.runtime.outputs import Lock
 from hloc_reduce.runtime.provenance import MADE_FROM
@@ -54,23 +54,35 @@ def as_folders(given: Mapping[str, Any]) -> dict[str, Any]:
     found, outputs, overwrite = dict(given), given["outputs"], given["overwrite"]
     map_images, query_images = given["map_images"], given["query_images"]
     if map_images is not None and is_video(map_images):
-        found["map_images"] = _frames(map_images, outputs / "map_images", overwrite)
+        frames = _folder(map_images, outputs / "map_images")
+        is_built = maps.is_map(outputs / "map") and frames.exists()
+        if is_built and not overwrite and not frames_from_video.is_current(map_images, frames):
+            raise InputError(
+                f"{map_images} has changed since the map in {outputs} was built of it: choose "
+                "other --outputs, or --overwrite."
+            )
+        found["map_images"] = _frames(map_images, frames, overwrite)
         found |= {key: given[key] or value for key, value in OF_VIDEO.items()}
     if query_images is not None and is_video(query_images):
-        folder = outputs / "query_images"
-        found["query_images"] = _frames(query_images, folder, overwrite, given["fps"])
+        frames = _folder(query_images, outputs / "query_images", given["fps"])
+        found["query_images"] = _frames(query_images, frames, overwrite, given["fps"])
     return found
 
 
-def _frames(video: Path, folder: Path, overwrite: bool, fps: float | None = None) -> Path:
-    """Write the frames of a video into a folder of its name, and return that.
+def _folder(video: Path, parent: Path, fps: float | None = None) -> Path:
+    """Return the folder for the frames of a video, which has its name.
 
     If another video of that name has it, a digest of the path is appended to the name.
     """
     name = video.stem if fps is None else f"{video.stem}-{fps:g}fps"
     name = re.sub(NOT_IN_NAMES, "_", name).replace(".", "_").strip("_-") or "video"
     path = str(video.resolve())
-    if provenance.read(folder / name / MADE_FROM).get("path", path) != path:
+    if provenance.read(parent / name / MADE_FROM).get("path", path) != path:
         name = f"{name}-{hashlib.sha256(path.encode()).hexdigest()[:8]}"
-    with Lock(folder):
-        return frames_from_video.main(video, folder / name, fps, overwrite)
+    return parent / name
+
+
+def _frames(video: Path, folder: Path, overwrite: bool, fps: float | None = None) -> Path:
+    """Write the frames of a video into a folder, and return that."""
+    with Lock(folder.parent):
+        return frames_from_video.main(video, folder, fps, overwrite)

@@ -187,3 +187,15 @@ def test_gravity_of_most_cameras():
 def test_a_frame_that_is_upside_down():
     found = gravity.Gravity(np.array([0.0, 0, -1]), 1).level().matrix()
     np.testing.assert_allclose(found @ [0, 0, -1], [0, 0, 1], atol=1e-12)
+
+
+def test_photos_of_a_moment_count_once():
+    """As the views of a panorama, which are at one place."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 3, 2
+    model = pycolmap.synthesize_dataset(options)
+    names = sorted(image.name for image in model.images.values())
+    assert len(names) == 6
+    positions = dict(zip(names, colmap.ellipsoid_from_enu(SPREAD[:6], ORIGIN), strict=True))
+    with pytest.raises(NotAligned, match="GPS position: 2"):
+        alignment.align(model, positions, None)

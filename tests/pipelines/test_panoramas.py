@@ -8,9 +8,10 @@ import pycolmap
 import pytest
 from command import outcome, state
 
+from benchmarks.metres import geotag
 from hloc_reduce import Localizer
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.localization import panoramas
+from hloc_reduce.localization import gps, panoramas
 from hloc_reduce.localization.records import read_records
 from hloc_reduce.localization.rigs import frames
 from hloc_reduce.utils import parsers
@@ -68,6 +69,22 @@ def test_a_view_to_the_right():
     views = panoramas.views_of((1024, 512))
     shown = dict(zip([view.name for view in views], panoramas.render(image, views), strict=True))
     assert shown["view060-326/"].mean() > 200 > 55 > shown["view300-326/"].mean()
+
+
+def test_views_are_where_their_panorama_is(tmp_path):
+    place = np.array([47.375, 8.5, 408.5])
+    cv2.imwrite(str(tmp_path / "untold.jpg"), np.zeros((512, 1024, 3), np.uint8))
+    geotag(tmp_path / "untold.jpg", tmp_path / "a.jpg", place)
+    cv2.imwrite(str(tmp_path / "b.png"), np.zeros((512, 1024, 3), np.uint8))
+    sizes = dict.fromkeys(("a.jpg", "b.png"), (1024, 512))
+    views = panoramas.write_views(tmp_path, sizes, tmp_path / "views")
+    names = sorted(path.relative_to(views).as_posix() for path in views.rglob("*.jpg"))
+    of_views = panoramas.of_views([*names, "photo.jpg"])
+    assert of_views["a.jpg"] == "view000-326/a.jpg"
+    assert of_views["b.png"] == "view000-326/b.png.jpg" and "photo.jpg" not in of_views
+    found = gps.of_photos(views, names)
+    assert [*found] == [name for name in names if name.endswith("a.jpg")]
+    assert all(np.allclose(one, place) for one in found.values())
 
 
 @pytest.fixture

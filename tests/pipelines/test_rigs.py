@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from command import outcome, state
 
+from hloc_reduce import maps
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization.records import pose_of, read_records
 from hloc_reduce.utils.cli import InputError
@@ -161,6 +162,19 @@ def test_a_missing_configuration(rig, tmp_path, refused):
     folder, _, _, outputs = rig
     given = "--map", outputs / "map", "--query_images", folder, "--outputs", outputs
     assert "is missing" in refused(*given, "--rigs", tmp_path / "none.json")
+
+
+def test_rigs_that_took_no_query(rig, tmp_path, refused):
+    """Are refused even if the map was made of rigs."""
+    folder, rigs, _, outputs = rig
+    content = json.loads((outputs / "map/map.json").read_text())
+    (outputs / "map/map.json").write_text(json.dumps(content | {"rigs": "0123"}))
+    assert maps.Map(outputs / "map").has_rigs
+    first, second = rigs[0]["cameras"]
+    others = [first | {"image_prefix": "up/"}, second | {"image_prefix": "down/"}]
+    path = write([{"cameras": others}], tmp_path)
+    given = "--map", outputs / "map", "--query_images", folder, "--outputs", outputs
+    assert "no photo is of a camera of a rig" in refused(*given, "--rigs", path)
 
 
 def test_what_is_no_map_of_a_rig(rig, plane, tmp_path, refused):

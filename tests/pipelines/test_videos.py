@@ -70,8 +70,10 @@ def test_a_map_and_queries_of_videos(video, plane, tmp_path, monkeypatch, run, r
     run("--map", built.folder, "--query_images", video, "--fps", 5, "--outputs", outputs)
     assert "Results are stale" in caplog.text
     assert [*outcome(results)[1]] == [names[0], names[2]]
+    before = state(frames)
     message = refused(*given[:2], *given[4:])
-    assert "differs: images" in message
+    assert "walk.avi has changed since the map" in message
+    assert state(frames) == before  # those of the map
 
 
 def test_photos_whose_names_are_no_times(place, build_map, run):
