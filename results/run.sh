@@ -85,7 +85,9 @@ run rigs --feature colmap_sift_sv64 mini32:uint2 "$@" \
     --halves $data/herz-jesus $data/dark-fountain-P11 $data/dark-sceaux
 run panoramas --feature colmap_sift_sv64 "$@"
 mappers= # of photos alone
-for place in fountain-P11 monstree kitchen fox south-building; do mappers="$mappers --map $(scene "$place")"; done
+for place in bronze-statue cyprus entry-P10 fountain-P11 fox kitchen liberty-statue monstree sceaux south-building; do
+    mappers="$mappers --map $(scene "$place")"
+done
 run mappers $mappers --map $data/demo_town-400/images_upright:$data/demo_town-400/3D-models/aachen_v_1_1 "$@"
 
 # how often wrong?
