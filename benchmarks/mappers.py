@@ -48,28 +48,35 @@ def _main() -> None:
     add = parser.add_argument
     add("--map", action="append", required=True, metavar="IMAGES:MODEL", help="may be repeated")
     add("--feature", default=features_confs.RECOMMENDED, help="name or YAML file")
+    add("--database", type=Path, help="of a map of these photos; default: build one")
+    add("--mapper", nargs="+", default=[*MAPPERS], choices=[*MAPPERS])
     add("--outputs", type=Path, default=Path("outputs/mappers"))
     rows.add_again_option(parser)
     args = parser.parse_args()
+    if args.database and len(args.map) > 1:
+        raise InputError("--database is of one --map.")
     if not hasattr(pycolmap, "global_mapping"):
         raise InputError("pycolmap has no global mapper: install version 4.2 or later.")
     known = [] if args.again else rows.read(NAME)
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     for place, (images, model) in parse_maps(args.map).items():
         cells = {"place": place, "feature": args.feature}
-        todo = [one for one in MAPPERS if not rows.select(known, **cells, variant=one)]
+        todo = [one for one in args.mapper if not rows.select(known, **cells, variant=one)]
         if not todo:
             continue
         reference = colmap.read_model(model)
         names = sorted(image.name for image in reference.images.values())
         folder = args.outputs / f"{place}-{Path(args.feature).stem}"
         photos = link(images, names, folder / "photos")
-        built = maps.main(folder / "map", photos, feature=args.feature, accept_partial=True)
+        verified = args.database
+        if verified is None:
+            built = maps.main(folder / "map", photos, feature=args.feature, accept_partial=True)
+            verified = built.sfm / "database.db"
         for mapper in todo:
             output = folder / mapper
             shutil.rmtree(output, ignore_errors=True)
             output.mkdir()
-            database = Path(shutil.copy(built.sfm / "database.db", folder / f"{mapper}.db"))
+            database = Path(shutil.copy(verified, folder / f"{mapper}.db"))
             start, cpu = time.perf_counter(), time.process_time()
             models = MAPPERS[mapper](database, photos, output)
             seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
