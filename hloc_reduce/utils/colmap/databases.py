@@ -37,6 +37,7 @@ CAMERA_MODELS = [
 ]
 CAMERA_MODEL = Option("camera model", CAMERA_MODELS, "COLMAP's")
 CameraMode = Annotated[pycolmap.CameraMode, CAMERA_MODE]
+NO_GEOMETRY = pycolmap.TwoViewGeometry()  # of matches that fit none, which databases do not have
 FULL = 2**16  # free bytes, below which COLMAP cannot even open a database
 
 
@@ -202,7 +203,7 @@ def write_matches(
         for (name0, name1), (all_matches, verified) in matches.items():
             ids = image_ids[name0], image_ids[name1]
             opened.write_matches(*ids, all_matches.astype(np.uint32))
-            if verified is None:
+            if verified is None or verified is NO_GEOMETRY:
                 continue
             if isinstance(verified, np.ndarray):
                 # COLMAP 4.2.1 and later skip geometries with an undefined configuration
@@ -225,7 +226,8 @@ def same_geometries(
         matches: (M, 2) of pairs of image names.
 
     Returns:
-        From pair to geometry, of those with the same cameras, keypoints and matches in `known`.
+        From pair to geometry, of those with the same cameras, keypoints and matches in `known`,
+        all of whose matches were verified; `NO_GEOMETRY` where COLMAP found none.
     """
     with open_database(database) as opened:
         wanted = _cameras_of_images(opened)
@@ -247,9 +249,10 @@ def same_geometries(
             if not {a, b} <= same:
                 continue
             pair = ids[a], ids[b]
-            is_known = pair in verified or pair[::-1] in verified
-            if is_known and np.array_equal(opened.read_matches(*pair), rows):
-                found[a, b] = opened.read_two_view_geometry(*pair)
+            if not np.array_equal(opened.read_matches(*pair), rows):
+                continue
+            has_any = pair in verified or pair[::-1] in verified
+            found[a, b] = opened.read_two_view_geometry(*pair) if has_any else NO_GEOMETRY
     return found
 
 
