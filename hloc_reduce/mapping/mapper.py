@@ -184,6 +184,7 @@ class Mapper:
             Inputs,
             cameras=colmap.read_cameras(database),
             verified=colmap.read_verified(database),
+            matched=self.matches.keys(),
         )
         exact = {"ba_refine_sensor_from_rig": False} if self.rigs else {}
         fixed = databases.fixed_cameras(database, self.rigs)

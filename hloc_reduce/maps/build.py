@@ -27,7 +27,7 @@ from ..utils.cli import InputError
 from ..utils.codes import STORAGES
 from ..utils.files import replacing
 from ..utils.images import list_images, stored_size
-from ..utils.match_files import check_distinct
+from ..utils.match_files import check_distinct, list_pairs
 from ..utils.paths import strings_as_paths
 from . import georeference, pairing
 from .attempts import Attempt, Photos, drop_others, of_model, of_photos_alone
@@ -223,7 +223,12 @@ def _finish(
     )
     if any(one.kind == "intrinsics" for one in found):
         cameras = cameras._replace(known={}, typical={})  # they may be wrong
-    inputs = Inputs(sfm, matches=attempt.matches, image_dir=photos.image_dir)
+    inputs = Inputs(
+        sfm,
+        matches=attempt.matches,
+        image_dir=photos.image_dir,
+        matched=list_pairs(attempt.matches, photos.names),
+    )
     if not are_poses_given:
         dropped = names_in(one for one in found if one.verdict == "drop")
         known = registration.read(attempt.sfm_dir, dropped)

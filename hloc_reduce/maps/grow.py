@@ -235,7 +235,8 @@ def _judge_again(
     found = partial.of_numbers(sfm.num_reg_images(), images, sorted(missing))
     if "focal_lengths" in before:
         found += focal_lengths.of_spread(focal_length_spread([sfm]), sfm.num_reg_images())
-    found += staying(run(Inputs(sfm), [kind for kind in CHECKS if kind in again]))
+    inputs = Inputs(sfm, matched=built.matched())
+    found += staying(run(inputs, [kind for kind in CHECKS if kind in again]))
     replaced = {"partial", "focal_lengths", *again}
     return found + [one for one in kept if one.kind not in replaced]
 

@@ -1,5 +1,6 @@
 """Maps to localize in: the points, features and global descriptors of photos, kept in a folder."""
 
+import glob
 import json
 import shutil
 import uuid
@@ -25,7 +26,8 @@ from ..utils.cli import InputError, choose, no_folder
 from ..utils.codes import CODED, QUANTIZED, STORAGES
 from ..utils.feature_files import Levels, first_descriptors
 from ..utils.files import announce, delete, replacing
-from ..utils.h5 import Unavailable, file_provenance, get_dataset, open_h5
+from ..utils.h5 import Unavailable, file_provenance, get_dataset, list_h5_names, open_h5
+from ..utils.match_files import list_pairs
 from ..utils.paths import strings_as_paths
 from .older import findings_of
 
@@ -254,6 +256,12 @@ class Map:
     def warn(self) -> None:
         """Warn of what may be wrong with the map, as was found when it was built."""
         warn(self.findings)
+
+    def matched(self) -> list[tuple[str, str]] | None:
+        """Return the pairs of photos that were matched to build it, None if that is not known."""
+        files = [*self.folder.glob(f"{glob.escape(self.features.stem)}_matches*.h5")]
+        names = list_h5_names(self.features)
+        return [pair for file in files for pair in list_pairs(file, names)] if files else None
 
     def names(self) -> list[str]:
         """List the images that have a pose.

@@ -57,6 +57,20 @@ def test_sides_that_share_too_few_points(common, turn, is_found):
     assert names_in(found) in SIDES if is_found else found == []
 
 
+def test_photos_that_were_not_matched_tell_nothing():
+    """As frames of two laps: those that were matched show that they are one side, or two."""
+    for common, is_found in ((0, True), (12, True), (200, False)):
+        sides = two_sides(common)
+        every = [*itertools.combinations(sorted(image.name for image in sides.images.values()), 2)]
+        inside = [pair for pair in every if any({*pair} <= side for side in SIDES)]
+        across = [pair for pair in every if pair not in inside]
+        assert copies.find(Inputs(sides, matched=inside)) == []
+        found = copies.find(Inputs(sides, matched=inside + across[::2]))
+        assert names_in(found) in SIDES if is_found else found == []
+        listed = [pair for pair in every if "9.jpg" not in pair]  # 9.jpg was added later
+        assert bool(copies.find(Inputs(sides, matched=listed))) == is_found
+
+
 def test_photos_that_are_too_far_away_are_not_compared(monkeypatch):
     """What is left out expects no points, here of photos all around some near and far points."""
     model = two_sides(100, turn=120.0)
@@ -120,8 +134,8 @@ def test_sides_that_are_not_joined_directly():
     for values in (shared, expected):
         np.fill_diagonal(values, 0)
 
-    def enough(wanted, first, second):
-        return np.minimum(first, second) > 1
+    def enough(wanted, pairs, smaller):
+        return smaller > 1
 
     assert groups.contradicting(shared, expected, copies.JOINED_SHARE, enough) == []
     found = groups.contradicting(shared, expected, copies.JOINED_SHARE, enough, copies.APART_SHARE)

@@ -163,7 +163,7 @@ def test_copies_are_frames(less, found, rig, monkeypatch):
         model.delete_observation(image.image_id, i)
     inputs = Inputs(model)
     index = [one.name for one in inputs.images].index("left/3.jpg")
-    monkeypatch.setattr(copies.groups, "contradicting", lambda *_: [index])
+    monkeypatch.setattr(copies.groups, "contradicting", lambda *_, **__: [index])
     names = [name for one in copies.find(inputs) for name in one.names]
     assert names == (["left/3.jpg", "right/3.jpg"] if found else [])
 

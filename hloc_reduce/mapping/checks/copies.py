@@ -2,14 +2,18 @@
 
 Two sides of a symmetric building, or two copies of a thing, have some matches, by which a mapper
 may put one upon the other. Then their photos seem to be taken from the same viewpoints, but few
-points are seen by both: what differs between the sides does not match.
+points are seen by both: what differs between the sides does not match. Of photos that were not
+matched with each other, as frames of a video at different times, that tells nothing.
 """
+
+from collections.abc import Collection
 
 import numpy as np
 import pycolmap
 
 from ...localization.projection import reprojection_errors
 from ...utils.colmap import point3D_ids
+from ..epipolar import Pair
 from ..findings import Finding
 from . import groups
 from .inputs import MIN_TELLING_POINTS, Inputs
@@ -41,12 +45,13 @@ def find(inputs: Inputs) -> list[Finding]:
     if len(images) < 4:
         return []
     expected, shared, used = _count(inputs.model, images)
+    compared = None if inputs.matched is None else _compared(images, inputs.matched)
 
-    def enough(wanted: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        several = np.minimum(first, second) > 1
-        return several & (wanted >= MIN_TELLING_POINTS * used * 2 * first * second)
+    def enough(wanted: np.ndarray, pairs: np.ndarray, smaller: np.ndarray) -> np.ndarray:
+        return (smaller > 1) & (wanted >= MIN_TELLING_POINTS * used * 2 * pairs)
 
-    found = groups.contradicting(shared, expected, JOINED_SHARE, enough, APART_SHARE)
+    limits = JOINED_SHARE, enough, APART_SHARE
+    found = groups.contradicting(shared, expected, *limits, compared=compared)
     if not found:
         return []
     text = (
@@ -63,6 +68,17 @@ def find(inputs: Inputs) -> list[Finding]:
         return []
     doubt = "photos that others place elsewhere"
     return [Finding("copies", text, names, {}, "drop", doubt)]
+
+
+def _compared(images: list[pycolmap.Image], matched: Collection[Pair]) -> np.ndarray:
+    """Tell which pairs of photos may share points as they were matched (N, N)."""
+    rows = {image.name: i for i, image in enumerate(images)}
+    pairs = [(rows[a], rows[b]) for a, b in matched if a in rows and b in rows]
+    first, second = np.array(pairs, np.int64).reshape(-1, 2).T
+    compared = np.zeros((len(images), len(images)), bool)
+    compared[first, second] = compared[second, first] = True
+    unlisted = ~compared.any(axis=1, keepdims=True)
+    return compared | unlisted | unlisted.T
 
 
 def _count(

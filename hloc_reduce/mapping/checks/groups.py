@@ -13,6 +13,7 @@ def contradicting(
     share: float,
     enough: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
     apart: float = 0.0,
+    compared: np.ndarray | None = None,
 ) -> list[int]:
     """Return the smaller one of the two groups of photos that contradict each other most.
 
@@ -26,10 +27,11 @@ def contradicting(
         expected: (N, N) what it is expected to have, symmetric.
         share: two groups contradict each other if they have less in common than this share of what
             is expected.
-        enough: whether sums of what is expected of two groups, of these sizes, are evidence: of
-            arrays that broadcast.
+        enough: whether sums of what is expected of two groups are evidence, given also the number
+            of compared pairs of photos between them, and the size of the smaller one: of arrays.
         apart: the same for groups that are not joined to each other, in sets of up to
             `MAX_GROUPED_PHOTOS`.
+        compared: (N, N) bool, symmetric, the pairs of photos that are evidence; default: all.
 
     Returns:
         Indices of the group; none if no groups contradict each other.
@@ -40,18 +42,23 @@ def contradicting(
     number = len(common)
     if number < 2:
         return []
+    compared = np.ones((number, number)) if compared is None else compared.astype(float)
     distance = common.max() - common
     np.fill_diagonal(distance, 0)
     linkage = average(squareform(distance, checks=False))
     joined = linkage[:, :2].astype(int)
     sizes = np.concatenate([np.ones(number), linkage[:, 3]])
 
-    def shares_of(pairs: np.ndarray, sums: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    def shares_of(
+        pairs: np.ndarray, sums: np.ndarray, wanted: np.ndarray, between: np.ndarray
+    ) -> np.ndarray:
         """Return what pairs of groups (P, 2) share of what is expected, inf without evidence."""
-        evident = (wanted > 0) & enough(wanted, *sizes[pairs.T])
+        evident = (wanted > 0) & enough(wanted, between, sizes[pairs].min(axis=1))
         return np.divide(sums, wanted, out=np.full_like(sums, np.inf), where=evident)
 
-    pairs, totals = joined, [_sums(values, joined) for values in (common, expected)]
+    # not what others have in common
+    counted = common * compared, expected * compared, compared
+    pairs, totals = joined, [_sums(values, joined) for values in counted]
     shares = shares_of(pairs, *totals)
     worst = shares.argmin()
     if shares[worst] >= share and apart > 0 and number <= MAX_GROUPED_PHOTOS:
@@ -59,7 +66,7 @@ def contradicting(
         for group in range(len(sizes)):
             belongs[group, _members(group, joined)] = 1
         pairs = np.argwhere(np.triu(belongs @ belongs.T == 0))
-        totals = [(belongs @ values @ belongs.T)[tuple(pairs.T)] for values in (common, expected)]
+        totals = [(belongs @ values @ belongs.T)[tuple(pairs.T)] for values in counted]
         shares = shares_of(pairs, *totals)
         share, worst = apart, np.where(shares < apart, totals[1], 0).argmax()
     if shares[worst] >= share:

@@ -43,6 +43,8 @@ class Inputs:
         typical: sizes (width, height) of photos by a typical lens, see `intrinsics.MapCameras`;
             default: those of the model.
         localize: localizes photos by others.
+        matched: the pairs of photos that were matched, whether they have matches or not; photos in
+            none of them were matched with all others. Default: all pairs.
     """
 
     model: pycolmap.Reconstruction
@@ -53,6 +55,7 @@ class Inputs:
     registration: Registration | None = None
     typical: Collection[tuple[int, int]] | None = None
     localize: Localize | None = None
+    matched: Collection[Pair] | None = None
 
     @cached_property
     def images(self) -> list[pycolmap.Image]:
