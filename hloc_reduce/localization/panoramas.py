@@ -40,6 +40,8 @@ VIEWS = f"{NUM_VIEWS} views of {FIELD_OF_VIEW} degrees, at most {MAX_VIEW} pixel
 NONE = (
     "No photo in {} is a panorama of all directions, twice as wide as high: leave out --panoramas."
 )
+SHOWN = "views"  # folder of the views of queries, in that of the results
+NO_RIGS = "Panoramas are rigs of their own views: leave out --rigs {}."
 
 Size = tuple[int, int]  # width and height in pixels
 
@@ -245,6 +247,11 @@ def _cameras(views: list[View]) -> list[dict]:
     return found
 
 
+def results_of_views(results: Path) -> Path:
+    """Return the text file of the poses of views, beside that of the poses of panoramas."""
+    return results.with_name(f"views_{results.name}")
+
+
 def write_records(
     frames: Mapping[str, Mapping[str, pycolmap.Rigid3d]], records: Mapping[str, dict], results: Path
 ) -> dict[str, dict]:
@@ -257,7 +264,8 @@ def write_records(
 
     Returns:
         A record for each panorama, with its pose, the numbers of all its views and no camera; the
-        rest is that of the view with the most inliers. It is localized if the rig is.
+        rest is that of the view with the most inliers, which is its `view`. It is localized if the
+        rig is.
     """
     found = {name: _record(views, records) for name, views in frames.items()}
     with Log(log_file(results), {"records": RECORDS, "panoramas": VIEWS}, overwrite=True) as log:
@@ -284,6 +292,7 @@ def _record(views: Mapping[str, pycolmap.Rigid3d], records: Mapping[str, dict]) 
         **record,
         **totals,
         **written(pose),
+        "view": best,
         "camera": None,
         "localized": reason is None,
         "reason": reason,

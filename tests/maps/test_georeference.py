@@ -287,6 +287,10 @@ def test_options_that_contradict_each_other(posed, tmp_path, refused):
     message = refused("--map", tmp_path / "map.hlm", *given, "--outputs", tmp_path / "unpacked")
     assert "is a compact map, whose frame cannot be changed" in message
     maps.unpack(tmp_path / "map.hlm", tmp_path / "unpacked/map")
+    rigs = "--rigs", tmp_path / "rigs.json"
+    assert "leave out --rigs" in refused("--map", folder, *scale, *rigs)
+    message = refused("--map", folder, *scale, "--pairs", "sequential")
+    assert "--pairs is for maps of photos alone" in message
     message = refused("--map", tmp_path / "unpacked/map", *scale)
     assert "is an unpacked compact one" in message
 
