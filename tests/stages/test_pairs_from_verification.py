@@ -102,6 +102,13 @@ def test_pairs_are_verified_once(walls, tmp_path, monkeypatch):
     def moved(keypoints, found):
         keypoints["a0.png"][0, 0] += 1
 
+    def wrong(keypoints, found):
+        found[every[0]] = np.random.default_rng(0).permutation(60)[:40].reshape(20, 2)
+
+    unverified = write("wrong", tmp_path / "missing.db", change=wrong)
+    assert every[0] not in colmap.read_verified(unverified)
+    write("wrong again", unverified, change=wrong)
+    assert not asked
     of_first = [pair for pair in every if "a0.png" in pair]
     for change, expected in ((fewer, every[:1]), (moved, of_first)):
         write(change.__name__, known, change=change)

@@ -231,6 +231,8 @@ def same_geometries(
         wanted = _cameras_of_images(opened)
     found = {}
     with open_database(known) as opened:
+        new_name = hasattr(opened, "exists_two_view_geometry")  # not in pycolmap 3.13
+        is_verified = "exists_two_view_geometry" if new_name else "exists_inlier_matches"
         cameras = _cameras_of_images(opened)
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         same = {
@@ -241,13 +243,12 @@ def same_geometries(
                 opened.read_keypoints(ids[name])[:, :2], keypoints[name].astype(np.float32)
             )
         }
-        pair_ids, _ = opened.read_two_view_geometry_num_inliers()
-        verified = {pycolmap.pair_id_to_image_pair(pair) for pair in pair_ids}
         for (a, b), rows in matches.items():
             if not {a, b} <= same:
                 continue
             pair = ids[a], ids[b]
-            is_known = pair in verified or pair[::-1] in verified
+            # also those without inliers, which take longest
+            is_known = getattr(opened, is_verified)(*pair)
             if is_known and np.array_equal(opened.read_matches(*pair), rows):
                 found[a, b] = opened.read_two_view_geometry(*pair)
     return found
