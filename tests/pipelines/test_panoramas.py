@@ -198,6 +198,21 @@ def test_xmp_data_tell_panoramas(xmp, tmp_path):
     assert len(panoramas.find(tmp_path, ["1.jpg", "2.jpg"], given=True)) == 2
 
 
+@pytest.mark.parametrize(("full", "is_whole"), [(1024, True), (2048, False)])
+def test_parts_of_panoramas_are_none(full, is_whole, tmp_path):
+    """Though they are twice as wide as high, as those of 180 degrees are."""
+    xmp = (
+        b'<x GPano:ProjectionType="equirectangular" GPano:CroppedAreaImageWidthPixels="1024" '
+        b'GPano:FullPanoWidthPixels="%d"/>'
+    )
+    _, encoded = cv2.imencode(".jpg", np.zeros((512, 1024), np.uint8))
+    payload = b"http://ns.adobe.com/xap/1.0/\0" + xmp % full
+    marker = b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload
+    (tmp_path / "1.jpg").write_bytes(encoded.tobytes()[:2] + marker + encoded.tobytes()[2:])
+    for given in (False, True):
+        assert bool(panoramas.find(tmp_path, ["1.jpg"], given)) == is_whole
+
+
 def test_records_of_panoramas(tmp_path):
     """The pose of a panorama is that of its place, from any of its views."""
     views = {view.name: view.cam_from_rig for view in panoramas.views_of((1024, 512))}
