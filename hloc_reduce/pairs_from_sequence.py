@@ -68,7 +68,8 @@ def main(
 
 def _following(i: int, overlap: int, number: int) -> list[int]:
     """Return the rows of the frames that a frame is paired with by order."""
-    steps = {*range(1, overlap + 1), *(2**power for power in range(overlap))}
+    powers = min(overlap, number.bit_length())  # larger ones lead beyond the end
+    steps = {*range(1, min(overlap, number) + 1), *(2**power for power in range(powers))}
     return [i + step for step in steps if i + step < number]
 
 

@@ -157,6 +157,10 @@ def open_map(
         if model_or_map is None and (views := map_photos.views(map_images, outputs, panoramas)):
             if masks:
                 raise InputError(f"Panoramas are not masked: leave out --masks {masks}.")
+            if rigs:
+                raise InputError(panorama_files.NO_RIGS.format(rigs))
+            if camera_model:
+                raise InputError("The lens of panoramas is known: leave out --camera_model.")
             map_images, rigs = views
         new |= {"num_covis": num_covis, "accept_partial": accept_partial, "camera_mode": mode}
         new |= {"exif_gps": exif_gps}
@@ -272,7 +276,7 @@ def main(
         seen = query_images  # where the queries are
         if wanted.panoramas:
             with run.stage("panoramas"):
-                given = query_images, wanted.panoramas, outputs / "views"
+                given = query_images, wanted.panoramas, outputs / panorama_files.SHOWN
                 seen = panorama_files.write_views(*given)
         with run.stage("extract_features"):
             features = extract_features.main(
@@ -293,7 +297,7 @@ def main(
                 retrieve(retrieval, features, *wanted_pairs)
         matches = run.match("match_queries", loc_pairs, features, built.features)
         poses = outputs / f"poses_hloc_{built.feature}+{matcher}_{retrieved}.txt"
-        of_views = poses.with_name(f"views_{poses.name}") if wanted.panoramas else poses
+        of_views = panorama_files.results_of_views(poses) if wanted.panoramas else poses
         mirror_images = run.mirror_images(
             built.conf, seen, loc_pairs, features, built.features, masks
         )
@@ -384,8 +388,11 @@ def _check(given: dict, is_changed: bool) -> None:
         given: the options.
         is_changed: whether a map that was built is changed.
     """
-    if is_changed and given["panoramas"] and given["query_images"] is None:
-        raise InputError("--panoramas cannot be added to a map: leave out --panoramas.")
+    if is_changed and given["query_images"] is None:
+        if given["panoramas"]:
+            raise InputError("--panoramas cannot be added to a map: leave out --panoramas.")
+        if given["rigs"]:
+            raise InputError("Photos are added to a map one by one: leave out --rigs.")
     if given["outputs"] is None and (given["query_images"] is not None or not is_changed):
         raise InputError("Give --outputs, a folder.")
     if given["queries"] is not None and given["query_images"] is None:
@@ -421,11 +428,11 @@ def _main() -> None:
     is_aligned = bool(gps or scale) and folder is not None and maps.is_map(folder)
     _check(given, any(change.values()) or is_aligned)
     metres.check(gps, scale, given["map_images"], folder)
+    of_map = taken(open_map, given) | {"outputs": folder, "rigs": None, "panoramas": False}
     with trace.recording(outputs / "trace.json" if given["profile"] and outputs else None):
         if any(change.values()):
             changes.check(folder, given["map_images"] or given["database"], **change)
-            of_queries = {"rigs": None, "panoramas": False}
-            built = open_map(**taken(open_map, given) | {"outputs": folder} | of_queries)
+            built = open_map(**of_map)
             if outputs is None:  # the map is not opened again
                 built.warn()
             changes.main(folder, **change, masks=masks)
@@ -433,7 +440,7 @@ def _main() -> None:
             _run(given)
             return
         if is_aligned:
-            metres.main(Map(folder), gps, scale)
+            metres.main(open_map(**of_map), gps, scale)
             print(f"The map {folder} is in metres.")
         if given["compact"] is not None:
             compact.main(given["compact"], folder)

@@ -1,7 +1,7 @@
 """ALIKED's keypoints and descriptors."""
 
 import torch
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, max_pool2d
 from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from ..networks import ALIKED as MODELS
@@ -16,8 +16,7 @@ class ALIKED(NetworkExtractor):
     """The features of ALIKED (Zhao et al., IEEE TIM 2023), by kornia.
 
     `model_name` is one of hloc's. Keypoints are those with the `max_keypoints` highest scores; -1
-    keeps all. With `denoise`, the noise of noisy images is reduced first. Those of masked pixels
-    are among them before they are dropped.
+    keeps all. With `denoise`, the noise of noisy images is reduced first.
     """
 
     stride = 32
@@ -40,11 +39,20 @@ class ALIKED(NetworkExtractor):
         return self.conf["model_name"].removesuffix("-n16").replace("-", "_")
 
     def _extract(self, image: torch.Tensor, mask: torch.Tensor | None) -> dict:
-        (found,) = self.model(image.contiguous(memory_format=torch.channels_last))
+        image = image.expand(-1, 3, -1, -1).contiguous(memory_format=torch.channels_last)
+        dense, score_map = self.model.extract_dense_map(image)
+        if mask is not None:
+            # scores around each pixel that is kept stay: they tell where its keypoint is
+            around, radius = mask[None, None].float(), self.model.dkd.radius
+            around = max_pool2d(around, 2 * radius + 1, stride=1, padding=radius)
+            score_map = score_map * around
+        found, scores, *_ = self.model.dkd(score_map)
+        descriptors, _ = self.model.desc_head(dense, found)
+        size = image.new_tensor(image.shape[:1:-1]) - 1
         return {
-            "keypoints": found.keypoints[None],
-            "scores": found.keypoint_scores[None],
-            "descriptors": found.descriptors.T[None],
+            "keypoints": size * (found[0] + 1)[None] / 2,
+            "scores": scores[0][None],
+            "descriptors": descriptors[0].T[None],
         }
 
     def fixed(self, image: torch.Tensor) -> dict:

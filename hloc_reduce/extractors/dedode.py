@@ -11,7 +11,8 @@ class DeDoDe(Extractor):
     """The features of DeDoDe (Edstedt et al., 3DV 2024), by kornia, which downloads the weights.
 
     `detector` and `weights` name the weights of the detector and of the descriptor, see
-    `kornia.feature.DeDoDe.from_pretrained`. Keypoints are the `max_keypoints` likeliest pixels.
+    `kornia.feature.DeDoDe.from_pretrained`. Keypoints are the `max_keypoints` likeliest pixels;
+    masked ones are dropped afterwards, as kornia takes no mask.
     """
 
     default_conf = {"detector": "L-C4-v2", "weights": "B-upright", "max_keypoints": 4096}

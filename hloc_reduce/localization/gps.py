@@ -100,6 +100,10 @@ def read_csv(path: Path) -> Positions:
                 [name] = check_names([(row["name"] or "").strip()], place)
                 if name in found:
                     raise InputError(f"{place}: {name} is listed twice.")
+                if "".join(row.pop(None, ())).strip():
+                    raise InputError(
+                        f"{place} has more values than columns: decimals have a point, no comma."
+                    )
                 found[name] = _of_row(row, place)
     except UnicodeDecodeError:
         raise not_text(path, f"{FORM}; save it as UTF-8.") from None

@@ -32,6 +32,7 @@ MIN_WIDTH = 1024  # pixels of a panorama: views of smaller ones have less than 3
 TWICE = 0.01  # the ratio of width and height may differ from 2 by rounding
 HEAD = 2**17  # bytes of a file that may have XMP data
 TOLD = re.compile(rb"ProjectionType\s*(?:=|>)\s*[\"']?\s*equirectangular")
+SIZES = re.compile(rb"(CroppedAreaImage|FullPano)(Width|Height)Pixels\s*(?:=|>)\s*[\"']?\s*(\d+)")
 QUALITY = 95  # of JPEG
 OF_VIEW = re.compile(r"^view\d{3}-\d+/")  # begins the name of a view, before that of the panorama
 # what the provenance of what is made from panoramas says of their views
@@ -40,6 +41,8 @@ VIEWS = f"{NUM_VIEWS} views of {FIELD_OF_VIEW} degrees, at most {MAX_VIEW} pixel
 NONE = (
     "No photo in {} is a panorama of all directions, twice as wide as high: leave out --panoramas."
 )
+SHOWN = "views"  # folder of the views of queries, in that of the results
+NO_RIGS = "Panoramas are rigs of their own views: leave out --rigs {}."
 
 Size = tuple[int, int]  # width and height in pixels
 
@@ -65,18 +68,22 @@ def find(image_dir: Path, names: list[str], given: bool = False) -> dict[str, Si
         image_dir: the folder.
         names: the photos.
         given: photos that are twice as wide as high are panoramas; if not, those of them whose XMP
-            data say so (`GPano:ProjectionType`).
+            data say so (`GPano:ProjectionType`). Those that are only parts of one, by these data,
+            are none.
 
     Raises:
         InputError: if some are panoramas and others are not, or a panorama is too small.
     """
     sizes = {name: size for name in names if (size := stored_size(image_dir / name))}
-    whole = {name for name, (width, height) in sizes.items() if abs(width / height - 2) <= TWICE}
-    found = whole if given else {name for name in whole if _is_told(image_dir / name)}
+    twice = [name for name, (width, height) in sizes.items() if abs(width / height - 2) <= TWICE]
+    heads = {name: _head(image_dir / name) for name in twice}
+    whole = {name for name, head in heads.items() if not _is_part(head)}
+    found = whole if given else {name for name in whole if TOLD.search(heads[name])}
     if not found:
         return {}
     if others := [name for name in names if name not in found]:
         why = "not twice as wide as high, or not readable" if given else "without such XMP data"
+        why = "parts of panoramas" if {*others} <= heads.keys() - whole else why
         raise InputError(
             f"{image_dir} has panoramas of all directions, {cli.some(sorted(found))}, and other "
             f"photos, {why}: {cli.some(others)}. Put panoramas into a folder of their own."
@@ -89,13 +96,23 @@ def find(image_dir: Path, names: list[str], given: bool = False) -> dict[str, Si
     return sizes
 
 
-def _is_told(path: Path) -> bool:
-    """Tell whether the XMP data of a photo say that it is a panorama."""
+def _head(path: Path) -> bytes:
+    """Return the beginning of a file, which may have XMP data; empty if it cannot be read."""
     try:
         with path.open("rb") as file:
-            return TOLD.search(file.read(HEAD)) is not None
+            return file.read(HEAD)
     except OSError:
-        return False
+        return b""
+
+
+def _is_part(head: bytes) -> bool:
+    """Tell whether the XMP data of a photo say that it is only a part of a panorama."""
+    sizes = {(what, side): number for what, side, number in SIZES.findall(head)}
+    return any(
+        number != sizes.get((b"CroppedAreaImage", side), number)
+        for (what, side), number in sizes.items()
+        if what == b"FullPano"
+    )
 
 
 def views_of(size: Size) -> list[View]:
@@ -245,6 +262,11 @@ def _cameras(views: list[View]) -> list[dict]:
     return found
 
 
+def results_of_views(results: Path) -> Path:
+    """Return the text file of the poses of views, beside that of the poses of panoramas."""
+    return results.with_name(f"views_{results.name}")
+
+
 def write_records(
     frames: Mapping[str, Mapping[str, pycolmap.Rigid3d]], records: Mapping[str, dict], results: Path
 ) -> dict[str, dict]:
@@ -257,7 +279,8 @@ def write_records(
 
     Returns:
         A record for each panorama, with its pose, the numbers of all its views and no camera; the
-        rest is that of the view with the most inliers. It is localized if the rig is.
+        rest is that of the view with the most inliers, which is its `view`. It is localized if the
+        rig is.
     """
     found = {name: _record(views, records) for name, views in frames.items()}
     with Log(log_file(results), {"records": RECORDS, "panoramas": VIEWS}, overwrite=True) as log:
@@ -284,6 +307,7 @@ def _record(views: Mapping[str, pycolmap.Rigid3d], records: Mapping[str, dict]) 
         **record,
         **totals,
         **written(pose),
+        "view": best,
         "camera": None,
         "localized": reason is None,
         "reason": reason,

@@ -1,6 +1,7 @@
 """Rigs of cameras that are fixed to each other, as COLMAP's files describe them."""
 
 import copy
+import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from ..utils import cli
 from ..utils.cli import InputError
 from ..utils.parsers import check_camera
 
+LENGTHS = {"cam_from_rig_rotation": 4, "cam_from_rig_translation": 3}
 NOT_UNIT = 0.01  # a quaternion's length may differ from 1 by rounding
 
 # from frame, the photos that a rig took at one moment, to its photos and their poses in the rig
@@ -41,6 +43,7 @@ def read(path: Path) -> list[list[RigCamera]]:
     """
     if not path.is_file():
         raise InputError(f"{path} is missing.")
+    _check_lengths(path)
     try:
         found = pycolmap.read_rig_config(str(path))
         rigs = [sorted(one.cameras, key=lambda camera: not camera.ref_sensor) for one in found]
@@ -53,6 +56,25 @@ def read(path: Path) -> list[list[RigCamera]]:
     if twice := {prefix for prefix in prefixes if prefixes.count(prefix) > 1}:
         raise InputError(f"{path}: several cameras have the image_prefix {min(twice)}.")
     return [[_camera(camera, path) for camera in rig] for rig in rigs]
+
+
+def _check_lengths(path: Path) -> None:
+    """Raise an InputError for poses of too few or too many numbers, which pycolmap does not count.
+
+    What else is wrong with a file, it says.
+    """
+    try:
+        given = [camera for rig in json.loads(path.read_text()) for camera in rig["cameras"]]
+        wrong = [
+            (camera["image_prefix"], key, number)
+            for camera in given
+            for key, number in LENGTHS.items()
+            if key in camera and len(camera[key]) != number
+        ]
+    except (ValueError, TypeError, KeyError, AttributeError):
+        return
+    for prefix, key, number in wrong:
+        raise InputError(f"{path}: the {key} of {prefix} has not {number} numbers.")
 
 
 def _camera(camera: pycolmap.RigConfigCamera, path: Path) -> RigCamera:

@@ -1,6 +1,6 @@
 """Which way is up in a model, by its upright cameras."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -36,17 +36,23 @@ class Gravity(NamedTuple):
         return pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion))
 
 
-def find(model: pycolmap.Reconstruction, orientations: Mapping[str, int | None]) -> Gravity | None:
+def find(
+    model: pycolmap.Reconstruction,
+    orientations: Mapping[str, int | None],
+    unknown: Collection[str] = (),
+) -> Gravity | None:
     """Find which way is up.
 
     Args:
         model: the model.
         orientations: EXIF orientation of each photo by name; others are taken to be upright.
+        unknown: photos that may be stored in any orientation, which tell nothing.
 
     Returns:
-        None unless more than half of the cameras, and at least two, agree to `MAX_TILT`.
+        None unless more than half of the other cameras, and at least two, agree to `MAX_TILT`.
     """
     images = [model.images[i] for i in model.reg_image_ids()]
+    images = [image for image in images if image.name not in unknown]
     if not images:
         return None
     axes = np.array([_upright(image, orientations.get(image.name)) for image in images])

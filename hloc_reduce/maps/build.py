@@ -31,7 +31,7 @@ from ..utils.match_files import check_distinct, list_pairs
 from ..utils.paths import strings_as_paths
 from . import georeference, pairing
 from .attempts import Attempt, Photos, drop_others, of_model, of_photos_alone
-from .map import FINGERPRINTS, FINISHED, PLACE, Map, keep_projection, write, write_model
+from .map import FINGERPRINTS, FINISHED, PLACE, Map, keep_projection, write
 
 
 @strings_as_paths
@@ -240,7 +240,7 @@ def _finish(
     check_accepted(found, photos.accept_partial)
     sfm_dir = attempt.sfm_dir
     if exif_gps and (aligned := georeference.by_exif(sfm, photos.image_dir)):
-        sfm_dir = write_model(photos.folder.path, sfm_dir.name, sfm)
+        sfm_dir = georeference.write_moved(photos.folder.path, sfm_dir.name, sfm)
         content |= aligned
     written = write(
         photos.folder.path,

@@ -1,6 +1,7 @@
 """Put a map into metres: by GPS positions, or by a distance and the cameras that were upright."""
 
 import json
+import shutil
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,10 +18,11 @@ from ..localization.gps import Positions
 from ..mapping import alignment, gravity
 from ..mapping.alignment import Alignment, NotAligned
 from ..mapping.gravity import Gravity
+from ..mapping.registration import REGISTRATION
 from ..runtime import provenance
 from ..utils import cli, colmap
 from ..utils.cli import InputError
-from ..utils.files import file_sha256
+from ..utils.files import file_sha256, is_readable
 from ..utils.h5 import list_h5_names
 from ..utils.images import orientation
 from ..utils.paths import strings_as_paths
@@ -134,11 +136,20 @@ def align(built: Map, gps: Path | None = None, scale: Sequence[str | float] | No
             of_photos = Scale(views.get(first, first), views.get(second, second), metres)
             found = _by_scale(model, of_photos, built.images)
         content = json.loads((built.folder / FINISHED).read_text()) | found
-        written = write_model(built.folder, built.sfm.name, model)
+        written = write_moved(built.folder, built.sfm.name, model)
         content |= {"id": uuid.uuid4().hex, "sfm": written.name, "aligned_to": wanted}
         provenance.write(built.folder / FINISHED, content)
         folder.delete(models(folder.written) - {written.name})
     return Map(built.folder)
+
+
+def write_moved(folder: Path, before: str, model: pycolmap.Reconstruction) -> Path:
+    """Write an aligned model as `write_model` does, with the list of its photos, which stay."""
+    written = write_model(folder, before, model)
+    listed = folder / before / REGISTRATION
+    if listed.is_file():
+        shutil.copyfile(listed, written / REGISTRATION)
+    return written
 
 
 def _has_baseline(model: pycolmap.Reconstruction) -> bool:
@@ -225,7 +236,8 @@ def _by_scale(model: pycolmap.Reconstruction, scale: Scale, image_dir: Path) -> 
         *scale,
         f"As a last resort, z is up as {up.number} of {len(centres)} cameras were held."
         if up
-        else "The cameras do not agree on which way is up, so the axes stay as they were.",
+        else "The cameras do not agree on which way is up, or their photos are no longer in "
+        f"{image_dir}, so the axes stay as they were.",
     )
     frame = Frame(METRES, ("scale", "gravity") if up else ("scale",))
     measured = {"cameras_upright": up.number} if up else {}
@@ -233,6 +245,8 @@ def _by_scale(model: pycolmap.Reconstruction, scale: Scale, image_dir: Path) -> 
 
 
 def _gravity(model: pycolmap.Reconstruction, image_dir: Path) -> Gravity | None:
-    """Return which way is up, as the EXIF data of the photos turn them."""
+    """Return which way is up, as the EXIF data of the photos turn them, if these are there."""
     names = [model.images[i].name for i in model.reg_image_ids()]
-    return gravity.find(model, {name: orientation(image_dir / name) for name in names})
+    gone = {name for name in names if not is_readable(image_dir / name)}
+    turned = {name: orientation(image_dir / name) for name in names if name not in gone}
+    return gravity.find(model, turned, gone)

@@ -8,6 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import pycolmap
 
+from ..localization.rigs import NOT_UNIT
 from ..utils import masks
 from ..utils.cli import InputError
 
@@ -51,8 +52,17 @@ def pixels_or_file(image: Image) -> Path | np.ndarray:
 
 def check_pose(near: object) -> None:
     """Raise an InputError for what is no pose."""
-    if not isinstance(near, pycolmap.Rigid3d) or not np.isfinite(near.matrix()).all():
-        raise InputError("near is a pose, camera from world, a finite pycolmap.Rigid3d.")
+    if not _is_pose(near):
+        raise InputError(
+            "near is a pose, camera from world, a finite pycolmap.Rigid3d with a unit quaternion."
+        )
+
+
+def _is_pose(one: object) -> bool:
+    """Tell whether something is a finite pose with a unit quaternion: pycolmap takes others."""
+    if not isinstance(one, pycolmap.Rigid3d) or not np.isfinite(one.matrix()).all():
+        return False
+    return bool(abs(np.linalg.norm(one.rotation.quat) - 1) <= NOT_UNIT)
 
 
 def check_rig(
@@ -69,5 +79,8 @@ def check_rig(
         raise InputError(f"A rig needs one of each for every camera, not {said}.")
     if not all(isinstance(one, pycolmap.Camera) for one in cameras):
         raise InputError("The cameras of a rig are pycolmap.Camera: their intrinsics are needed.")
-    if not all(isinstance(one, pycolmap.Rigid3d) for one in cams_from_rig):
-        raise InputError("The poses of the cameras in a rig are pycolmap.Rigid3d, camera from rig.")
+    if not all(map(_is_pose, cams_from_rig)):
+        raise InputError(
+            "The poses of the cameras in a rig are pycolmap.Rigid3d, camera from rig, finite and "
+            "with unit quaternions."
+        )

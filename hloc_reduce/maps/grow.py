@@ -51,8 +51,8 @@ def add(
         model: COLMAP model with their poses in the frame of the map, which are kept; default: they
             are localized, with intrinsics from `localization.intrinsics.infer`.
         refine_map: adjust the poses of the other photos, too.
-        masks: of the photos, see `extract_features.main`; those of photos that are in the map
-            already are not read.
+        masks: of the photos, see `extract_features.main`; photos that are in the map already keep
+            theirs.
 
     Returns:
         The map with the new photos.

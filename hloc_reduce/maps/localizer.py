@@ -336,7 +336,8 @@ class Localizer:
         """Localize a panorama of all directions, an equirectangular photo, by views of it.
 
         Args:
-            image: its file, or its pixels (H, 2 H) or (H, 2 H, 3) RGB, uint8; upright.
+            image: its file, or its pixels (H, 2 H) or (H, 2 H, 3) RGB, uint8; upright. It is not
+                masked.
 
         Returns:
             The pose of a camera that looks at the centre of the panorama, from world, and info of

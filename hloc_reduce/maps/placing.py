@@ -17,6 +17,7 @@ from .. import (
     pairs_from_retrieval,
 )
 from ..confs import matchers as matchers_confs
+from ..extract_features import MASK
 from ..localization import intrinsics
 from ..localization.gate import DEFAULT_GATE
 from ..localization.records import camera_of, pose_of
@@ -31,7 +32,7 @@ from ..utils import cli, colmap, masks
 from ..utils.cli import InputError
 from ..utils.feature_files import get_image_size
 from ..utils.files import announce, delete, is_readable
-from ..utils.h5 import open_h5
+from ..utils.h5 import get_text, open_h5
 from ..utils.match_files import check_distinct
 from ..utils.parsers import parse_pairs
 from .by_others import NUM_LOC
@@ -140,13 +141,26 @@ def begin(
     check_distinct([*inside, *new])
     images = {name: digests[name] for name in new}
     conf = {"map": built.id, "images": images, "num_loc": NUM_LOC, "posed": posed}
-    if masked := masks.digests(masks.find(addition.masks, image_dir, new)):
-        conf["masks"] = masked
+    masked = masks.digests(masks.find(addition.masks, image_dir, digests))
+    _check_masks(built, image_dir, {name: masked[name] for name in inside if name in masked})
+    if of_new := {name: masked[name] for name in new if name in masked}:
+        conf["masks"] = of_new
     if provenance.read(addition.folder / CONF) != conf:
         announce(addition.folder)
         delete(addition.folder)
         provenance.write(addition.folder / CONF, conf)
     return New(new, fingerprints, broken | copies)
+
+
+def _check_masks(built: Map, image_dir: Path, masked: Mapping[str, str]) -> None:
+    """Raise an InputError if photos of a map have other masks there than the digests given."""
+    with open_h5(built.features) as file:
+        other = [name for name, digest in masked.items() if get_text(file[name], MASK) != digest]
+    if other:
+        raise InputError(
+            f"{cli.some(other)} are in the map already, with other masks or without: leave them or "
+            f"their masks out of {image_dir}, or first remove them from the map, --remove_images."
+        )
 
 
 def _names(sfm: pycolmap.Reconstruction) -> list[str]:

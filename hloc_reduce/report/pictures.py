@@ -24,6 +24,8 @@ QUALITY = 80  # of JPEG
 def matched(run: Run, query: str) -> dict | None:
     """Find the retrieved map image with the most inliers of a query, and their matches.
 
+    The matches of a panorama are those of a view, see `Run.shown`.
+
     Among scans it is one of the floor that the query was localized on. If the query was not
     localized, it is the first retrieved image.
 
@@ -32,7 +34,7 @@ def matched(run: Run, query: str) -> dict | None:
         centres at integers; and `inliers` (M,) bool: matches whose point reprojects within the
         inlier threshold, none if the query was not localized. None if nothing was retrieved.
     """
-    record = run.records[query]
+    shown, record, _ = run.shown(query)
     if record["db"] is None:
         return None
     names = [record["db"]]
@@ -41,12 +43,12 @@ def matched(run: Run, query: str) -> dict | None:
         clusters = run.reference.clusters(present)
         names = next((part for part in clusters if record["db"] in part), names)
     with open_h5(run.file_of(query, "features")) as file:
-        keypoints, _ = get_keypoints(file, query)
+        keypoints, _ = get_keypoints(file, shown)
     found = []
     with open_h5(run.file_of(query, "matches")) as file:
         for name in names:
             sizes = len(keypoints), run.reference.num_keypoints(name)
-            matches, _ = get_matches(file, query, name, sizes)
+            matches, _ = get_matches(file, shown, name, sizes)
             inliers = _inliers(run, record, name, keypoints[matches[:, 0]], matches[:, 1])
             found.append((name, matches, inliers))
     name, matches, inliers = max(found, key=lambda item: item[2].sum())
@@ -88,7 +90,7 @@ def draw(run: Run, query: str, found: dict) -> np.ndarray:
     Returns:
         (H, W, 3) RGB uint8.
     """
-    first, scale0 = _resized(run.files["query_images"] / query)
+    first, scale0 = _resized(run.shown(query)[2])
     second, scale1 = _resized(run.files["map_images"] / found["name"])
     shift = first.shape[1] + GAP
     gap = np.full((PICTURE_HEIGHT, GAP, 3), 255, np.uint8)

@@ -15,6 +15,7 @@ from .. import logger
 from ..datasets import scans
 from ..evaluation import published
 from ..evaluation.poses import ERRORS, counted_errors
+from ..localization import panoramas
 from ..localization.records import log_file, read_records
 from ..localization.references import ScanMap, SfmMap
 from ..maps.map import is_map
@@ -79,7 +80,7 @@ class Run:
                 self.label, self.family = f"{self.label}, {stored}", f"{self.family}, {stored}"
             self.bytes = int(self.summary["bytes_per_keypoint"]["descriptor"])
             self.seconds = float(sum(self.summary["seconds"].values()))
-            poses = folder / self.summary["poses"]
+            self._poses = folder / self.summary["poses"]
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             why = "a broken file"
             if isinstance(error, FileNotFoundError):
@@ -90,7 +91,7 @@ class Run:
                 f"{folder} is not the outputs folder of a finished run of this version, it has "
                 f"{why}: run its pipeline again, which computes only what is missing."
             ) from None
-        self.records = read_records(log_file(poses))
+        self.records = read_records(log_file(self._poses))
         if self.records.keys() != self.rows.keys():
             raise InputError(f"{folder} is the folder of a run that did not finish: run it again.")
 
@@ -149,7 +150,24 @@ class Run:
 
     def retrieved_for(self, query: str) -> list[str]:
         """Return the map images that were retrieved in the try that a record is of, best first."""
-        return self._retrieved(self.file_of(query, "pairs")).get(query, [])
+        return self._retrieved(self.file_of(query, "pairs")).get(self.shown(query)[0], [])
+
+    def shown(self, query: str) -> tuple[str, dict, Path]:
+        """Return the name, the record and the file of the photo that shows a query.
+
+        Of a panorama it is the view with the most inliers, localized if the panorama is.
+        """
+        record = self.records[query]
+        view = record.get("view")
+        if view is None:
+            return query, record, self.files["query_images"] / query
+        told = {"localized": record["localized"]}
+        return view, self._views[view] | told, self.folder / panoramas.SHOWN / view
+
+    @cached_property
+    def _views(self) -> dict[str, dict]:
+        """The records of the views of panoramas."""
+        return read_records(log_file(panoramas.results_of_views(self._poses)))
 
     def file_of(self, query: str, key: str) -> Path:
         """Return the `features`, `matches` or `pairs` of the try that a record is of."""

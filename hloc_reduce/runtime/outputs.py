@@ -247,7 +247,7 @@ def _changes(before: dict, after: dict) -> dict[str, str]:
     changes = {}
     for key in {**before, **after}:
         if before.get(key) != after.get(key):
-            old, new = _leaves(before.get(key, "not given")), _leaves(after.get(key, "not given"))
+            old, new = (_leaves(one[key]) if key in one else {} for one in (before, after))
             names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
             said = []
             for name in names[:MAX_NAMED_DIFFERENCES]:

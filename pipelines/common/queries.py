@@ -169,7 +169,8 @@ def find_queries(
         are_panoramas: see `localization.panoramas.find`.
 
     Raises:
-        InputError: as `Queries.find` and `panoramas.find`; or if there is no panorama.
+        InputError: as `Queries.find` and `panoramas.find`; or if there is no panorama, or there are
+            some and rigs.
     """
     if queries is not None:
         if are_panoramas:
@@ -177,6 +178,8 @@ def find_queries(
         return Queries.find(query_images, queries, built, strict, rigs)
     sizes = panorama_files.find(query_images, list_images(query_images), are_panoramas)
     if sizes:
+        if rigs is not None:
+            raise InputError(panorama_files.NO_RIGS.format(rigs))
         return Queries.of_panoramas(query_images, sizes)
     if are_panoramas:
         raise InputError(panorama_files.NONE.format(query_images))

@@ -85,6 +85,7 @@ def test_csv(tmp_path):
         (f"{HEADER}a.jpg,98.5,2,3\n", "gps.csv:2: latitude 98.5 and longitude 2"),
         (f"{HEADER}a.jpg,1,181,3\n", "Are they swapped?"),
         (f"{HEADER}a.jpg,1,2,3\na.jpg,1,2,3\n", "gps.csv:3: a.jpg is listed twice"),
+        (f"{HEADER}a.jpg,47,3,8,5\n", "gps.csv:2 has more values than columns"),
         (f"{HEADER}/a.jpg,1,2,3\n", "gps.csv:2: '/a.jpg' cannot be names"),
         (f"{HEADER},1,2,3\n", "gps.csv:2: '' cannot be names"),
     ],

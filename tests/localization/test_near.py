@@ -138,7 +138,10 @@ def test_frames_are_tracked(seen):
     assert used == [False, True, False, True, True]
 
 
-@pytest.mark.parametrize("near", [np.eye(4), 7, "pose"])
+DOUBLE = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0, 0, 2.0])), np.zeros(3))
+
+
+@pytest.mark.parametrize("near", [np.eye(4), 7, "pose", DOUBLE])
 def test_what_is_no_pose(near, seen):
     localizer, photo, camera, *_ = seen
     with pytest.raises(InputError, match="near is a pose, camera from world"):

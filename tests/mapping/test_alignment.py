@@ -184,6 +184,16 @@ def test_gravity_of_most_cameras():
     assert gravity.find(pycolmap.Reconstruction(), {}) is None
 
 
+def test_gravity_of_photos_that_are_gone():
+    """They may be stored turned, whereas the others were held upright."""
+    model = model_of(SPREAD, [upright(i, roll=np.pi / 2 * (i > 3)) for i in range(12)])
+    turned = [f"{i}.jpg" for i in range(4, 12)]
+    found = gravity.find(model, {}, turned)
+    assert found.number == 4
+    np.testing.assert_allclose(found.up, MAP.rotation.matrix()[:, 2], atol=5e-3)
+    assert gravity.find(model, {}, [*turned, "0.jpg", "1.jpg", "2.jpg"]) is None
+
+
 def test_a_frame_that_is_upside_down():
     found = gravity.Gravity(np.array([0.0, 0, -1]), 1).level().matrix()
     np.testing.assert_allclose(found @ [0, 0, -1], [0, 0, 1], atol=1e-12)

@@ -110,6 +110,10 @@ def test_photos_alone(plane, alone, tmp_path, caplog, run):
     written = state(built.folder)
     run(*alone)
     assert state(built.folder) == written
+    run("--map", built.folder, "--scale", "0.jpg", "3.jpg", "1.25")
+    moved = maps.Map(built.folder)
+    for one in (written, state(moved.folder)):  # lists the photos in the map and the missing ones
+        assert [path.name for path in one if "registration" in path.name] == ["registration.json"]
 
 
 def test_few_photos_alone_with_gps(alone, tagged, tmp_path, caplog, run):
@@ -229,6 +233,18 @@ def test_scale(posed, caplog, run):
     assert downs.mean(axis=0)[2] < -0.9  # although they were tilted by up to 34 degrees
 
 
+def test_scale_without_the_photos(posed, tmp_path, caplog, run):
+    """They may be stored turned, and no EXIF data tell: nothing says which way is up."""
+    _, folder, _ = posed
+    caplog.set_level("INFO")
+    content = json.loads((folder / "map.json").read_text())
+    images = tmp_path / "moved"
+    write(folder / "map.json", json.dumps(content | {"image_dir": str(images)}))
+    run("--map", folder, "--scale", "db/0.png", "db/3.png", "1.25")
+    assert maps.Map(folder).frame == Frame("m", ("scale",))
+    assert f"or their photos are no longer in {images}" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("scale", "said"),
     [
@@ -271,6 +287,10 @@ def test_options_that_contradict_each_other(posed, tmp_path, refused):
     message = refused("--map", tmp_path / "map.hlm", *given, "--outputs", tmp_path / "unpacked")
     assert "is a compact map, whose frame cannot be changed" in message
     maps.unpack(tmp_path / "map.hlm", tmp_path / "unpacked/map")
+    rigs = "--rigs", tmp_path / "rigs.json"
+    assert "leave out --rigs" in refused("--map", folder, *scale, *rigs)
+    message = refused("--map", folder, *scale, "--pairs", "sequential")
+    assert "--pairs is for maps of photos alone" in message
     message = refused("--map", tmp_path / "unpacked/map", *scale)
     assert "is an unpacked compact one" in message
 

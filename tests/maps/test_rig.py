@@ -70,8 +70,14 @@ def test_what_is_no_rig(rig):
             localizer.localize_rig(*given)
     with pytest.raises(InputError, match=r"are pycolmap.Camera"):
         localizer.localize_rig(photos, [None, None], cams_from_rig)
-    with pytest.raises(InputError, match=r"are pycolmap.Rigid3d"):
-        localizer.localize_rig(photos, cameras, [np.eye(4), np.eye(4)])
+    quaternion, nowhere = np.array([0, 0, 0, 2.0]), np.array([np.nan, 0, 0])
+    for wrong in (
+        np.eye(4),
+        pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion), np.zeros(3)),
+        pycolmap.Rigid3d(pycolmap.Rotation3d(), nowhere),
+    ):
+        with pytest.raises(InputError, match=r"are pycolmap.Rigid3d"):
+            localizer.localize_rig(photos, cameras, [cams_from_rig[0], wrong])
     with pytest.raises(InputError, match="camera 1 has 9x9 pixels, the photo has"):
         smaller = pycolmap.Camera(model="SIMPLE_PINHOLE", width=9, height=9, params=[9, 4, 4])
         localizer.localize_rig(photos, [cameras[0], smaller], cams_from_rig)

@@ -83,7 +83,7 @@ def test_one_folder_for_the_map_and_queries(place, masks, run, refused, caplog):
     assert "differs: masks (db/0.png" in refused(*build, *new)
     masks(MAP[0], rows=100)
     assert "differs: masks (db/0.png" in refused(*build, *new)
-    assert "differs: masks" in refused(*build, *new[:2])
+    assert "differs: masks (db/0.png, db/1.png" in refused(*build, *new[:2])
     assert state(outputs / "map") == before
     run(*build, *new, "--overwrite")
     assert lowest(Map(outputs / "map").features, MAP[0]) < 100
@@ -162,6 +162,13 @@ def test_photos_that_are_added_are_masked(place, masks, tmp_path, run, refused):
     built = Map(outputs / "map")
     assert MAP[3] in built.names()
     assert lowest(built.features, MAP[3]) < BUMPER < lowest(built.features, *MAP[:3])
+    before = state(outputs / "map")
+    said = "in the map already, with other masks or without"
+    assert f"{MAP[3]} are {said}" in refused(*add, masks(MAP[3], rows=100))
+    shutil.copy(images / MAP[0], tmp_path / "new/db")
+    assert f"{MAP[0]} are {said}" in refused(*add, masks(MAP[0], MAP[3]))
+    after = state(outputs / "map")
+    assert {path.name for path in before if after[path] != before[path]} <= {"stages.json"}
 
 
 def test_data_sets(aachen_layout, masks, tmp_path, monkeypatch, caplog):

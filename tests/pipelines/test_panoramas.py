@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from command import outcome, state
+from command import outcome, state, write
 
 from benchmarks.metres import geotag
 from hloc_reduce import Localizer
@@ -14,12 +14,14 @@ from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import gps, panoramas
 from hloc_reduce.localization.records import read_records
 from hloc_reduce.localization.rigs import frames
+from hloc_reduce.report import pictures, runs
 from hloc_reduce.utils import parsers
 from hloc_reduce.utils.cli import InputError
 from pipelines import localize
 
 PIPELINE = localize
 WIDTH = 2048
+LOBBY = {"image_prefix": "lobby/", "ref_sensor": True}
 
 
 def rays(width):
@@ -131,6 +133,11 @@ def test_panoramas_are_queries(panorama, run):
     before = state(results / "views")
     run(*given)
     assert state(results / "views") == before
+    # reports show the view with the most inliers
+    shown = runs.Run(results)
+    found = pictures.matched(shown, "lobby/1.png")
+    assert 0.3 * max(inliers) < found["inliers"].sum() <= max(inliers)
+    assert pictures.draw(shown, "lobby/1.png", found).ndim == 3
     # the panorama is turned: what is a quarter of a turn to the left is in its centre now
     path = folder / "lobby/1.png"
     cv2.imwrite(str(path), np.roll(cv2.imread(str(path)), WIDTH // 4, axis=1))
@@ -189,6 +196,21 @@ def test_xmp_data_tell_panoramas(xmp, tmp_path):
         with pytest.raises(InputError, match=r"1.jpg, and other photos, without .*: 2.jpg"):
             panoramas.find(tmp_path, ["1.jpg", "2.jpg"])
     assert len(panoramas.find(tmp_path, ["1.jpg", "2.jpg"], given=True)) == 2
+
+
+@pytest.mark.parametrize(("full", "is_whole"), [(1024, True), (2048, False)])
+def test_parts_of_panoramas_are_none(full, is_whole, tmp_path):
+    """Though they are twice as wide as high, as those of 180 degrees are."""
+    xmp = (
+        b'<x GPano:ProjectionType="equirectangular" GPano:CroppedAreaImageWidthPixels="1024" '
+        b'GPano:FullPanoWidthPixels="%d"/>'
+    )
+    _, encoded = cv2.imencode(".jpg", np.zeros((512, 1024), np.uint8))
+    payload = b"http://ns.adobe.com/xap/1.0/\0" + xmp % full
+    marker = b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload
+    (tmp_path / "1.jpg").write_bytes(encoded.tobytes()[:2] + marker + encoded.tobytes()[2:])
+    for given in (False, True):
+        assert bool(panoramas.find(tmp_path, ["1.jpg"], given)) == is_whole
 
 
 def test_records_of_panoramas(tmp_path):
@@ -256,6 +278,12 @@ def test_options_of_panoramas(panorama, place, plane, tmp_path, refused):
     add = "--map", outputs / "map", "--add_images", folder, "--panoramas"
     assert "--panoramas cannot be added" in refused(*add)
     one = "--panoramas", "--outputs", new, "--map_images", folder
+    rigs = write(tmp_path / "rigs.json", json.dumps([{"cameras": [LOBBY]}]))
+    said = "Panoramas are rigs of their own views: leave out --rigs"
+    assert said in refused(*one, "--rigs", rigs)
+    of_queries = "--map", outputs / "map", "--query_images", folder, "--outputs", outputs
+    assert said in refused(*of_queries, "--panoramas", "--rigs", rigs)
+    assert "The lens of panoramas is known" in refused(*one, "--camera_model", "OPENCV")
     assert "COLMAP could not reconstruct" in refused(*one)
     assert len([*(new / "map-views/images").rglob("*.jpg")]) == panoramas.NUM_VIEWS
     assert (new / "map-views/rig_config.json").exists()

@@ -130,6 +130,14 @@ def changed(rigs, **values):
             "right/ is no unit quaternion w, x, y, z: its length is 2.24",
         ),
         (
+            lambda rigs: changed(rigs, cam_from_rig_rotation=[1, 0, 0]),
+            "the cam_from_rig_rotation of right/ has not 4 numbers",
+        ),
+        (
+            lambda rigs: changed(rigs, cam_from_rig_translation=[1, 0, 0, 0]),
+            "the cam_from_rig_translation of right/ has not 3 numbers",
+        ),
+        (
             lambda rigs: changed(rigs, cam_from_rig_translation=[float("inf"), 0, 0]),
             "not a rig configuration|is not finite",
         ),

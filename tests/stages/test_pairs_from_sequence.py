@@ -30,6 +30,8 @@ def test_neighbours_by_number_and_by_powers_of_two(tmp_path):
     found = steps(pairs_from_sequence.main(descriptors, tmp_path / "pairs.txt", 0, overlap=6))
     expected = {(i, i + step) for step in (1, 2, 3, 4, 5, 6, 8, 16, 32) for i in range(40 - step)}
     assert found == expected  # "10.jpg" comes after "9.jpg"
+    every = steps(pairs_from_sequence.main(descriptors, tmp_path / "all.txt", 0, overlap=10**5))
+    assert len(every) == 40 * 39 / 2  # without ado: 2 ** 10**5 is a large number
 
 
 @pytest.mark.parametrize("block", [256, 3])

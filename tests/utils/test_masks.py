@@ -121,6 +121,18 @@ def test_what_is_masked_uses_up_no_keypoints(textured, half):
         assert 37 <= len(masked["keypoints"]) <= 40 and inside(half, masked["keypoints"]).all()
 
 
+def test_what_is_masked_uses_up_no_keypoints_of_aliked(textured, half, base_weights):
+    """Others are where they are without a mask."""
+    base_weights("aliked_t16")
+    photo, shown = np.dstack([textured] * 3), features_confs.confs["mini32"]["preprocessing"]
+    model = {"name": "aliked", "model_name": "aliked-t16", "max_keypoints": 40}
+    masked = extractors.extract(extractors.load(model).eval(), photo, shown, mask=half)
+    every = extractors.extract(extractors.load(model | {"max_keypoints": -1}).eval(), photo, shown)
+    assert 35 <= len(masked["keypoints"]) <= 40 and inside(half, masked["keypoints"]).all()
+    all_points = {tuple(point) for point in every["keypoints"].tolist()}
+    assert {tuple(point) for point in masked["keypoints"].tolist()} <= all_points
+
+
 def test_dog_looks_on_where_too_few_keypoints_are_kept(textured):
     """A bumper full of keypoints does not end the search in a photo that has few."""
     photo = (0.5 + (textured / 255 - 0.5) * 0.1).astype(np.float32)
