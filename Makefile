@@ -57,15 +57,10 @@ check: $(VENV)/installed $(OLD)/installed
 test-long: $(VENV)/installed
 	$(BIN)/python -m pytest -m long
 
-# the reference of the public API, from its docstrings; a warning is an error. Imports of h5py run
-# uname, which pdoc suppresses otherwise.
-API := hloc_reduce '!hloc_reduce\.' hloc_reduce.maps '!hloc_reduce\.maps\.' hloc_reduce.maps.localizer \
-	hloc_reduce.confs.features hloc_reduce.confs.matchers hloc_reduce.compact hloc_reduce.utils.ros \
-	$(subst /,.,$(basename $(wildcard hloc_reduce/[!_]*.py)))
-
+# the site, with the reference of the API; a warning is an error
 docs: $(VENV)/installed
-	PDOC_ALLOW_EXEC=1 $(BIN)/python -W error::UserWarning -m pdoc --docformat google \
-		--output-directory build/api $(API)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -c docs . build/docs
+	cp build/docs/README.html build/docs/index.html
 
 # all that the documentation shows, in hours; rows of results/ that exist are kept
 results: $(VENV)/installed

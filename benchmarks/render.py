@@ -1,4 +1,4 @@
-"""Write the tables and figures of the documentation from the rows of results/.
+"""Write the tables and figures of the documentation from the rows of results/ and from weights.
 
 A page has a table between the lines `<!-- table: NAME -->` and `<!-- end -->`; `benchmarks.tables`
 makes it. A figure is a file that `benchmarks.figures` draws.
@@ -20,6 +20,7 @@ PAGES = (
     "docs/features.md",
     "docs/localize.md",
     "docs/maps.md",
+    "docs/models.md",
     "docs/performance.md",
     "docs/robot.md",
 )

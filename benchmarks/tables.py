@@ -1,5 +1,6 @@
 """Tables of the documentation, made from the rows of results/."""
 
+import json
 from collections import Counter
 from collections.abc import Callable
 from itertools import product
@@ -7,10 +8,13 @@ from operator import mul
 from pathlib import Path
 from statistics import mean, median
 
+from safetensors import safe_open
+
 from benchmarks import changed_photos, lightglue_seconds
 from benchmarks.rows import Row, read, select, with_keypoints
 from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
+from hloc_reduce import projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs.features import matcher_of
 from hloc_reduce.detectors.dog import FAST, KEYPOINT_SETTINGS
@@ -30,6 +34,9 @@ from hloc_reduce.mapping.checks import (
 )
 from hloc_reduce.mapping.plausibility import SAME_VIEWPOINT
 from hloc_reduce.mapping.registration import MIN_VIEWPOINTS
+from hloc_reduce.networks import MINI
+from hloc_reduce.networks import WEIGHTS as NETWORKS
+from hloc_reduce.projections.files import WEIGHTS
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import FLOATS
 
@@ -651,7 +658,57 @@ def map_limits_table() -> Table:
     ]
 
 
+def projections_table() -> Table:
+    """List the projections that ship, by what they project, from their metadata."""
+    by_base: dict[str, list[tuple[dict, int]]] = {}
+    for name in projections.names():
+        metadata = projections.load(name).metadata
+        size = (WEIGHTS / f"{name}.safetensors").stat().st_size
+        by_base.setdefault(metadata["descriptor"], []).append((metadata, size))
+    rows = [["of", "schemes", "KB", "layers", "places", "observations"]]
+    for base, files in by_base.items():
+        schemes = sorted({f"`{metadata['scheme']}`" for metadata, _ in files})
+        layers = max((metadata["layers"] for metadata, _ in files), key=len)
+        data = files[0][0]["training_data"]
+        assert all(metadata["training_data"].keys() == data.keys() for metadata, _ in files)
+        rows.append(
+            [
+                f"`{base}`",
+                ", ".join(schemes),
+                f"{sum(size for _, size in files) / 1e3:,.0f}",
+                "-".join([*map(str, layers[:-1]), "D"]),
+                str(len(data)),
+                f"{sum(place['observations'] for place in data.values()):,}",
+            ]
+        )
+    return rows
+
+
+def networks_table() -> Table:
+    """List the networks that ship, from their metadata."""
+    rows = [["file", "KB", "what", "photos", "steps"]]
+    for name in (*MINI, *(f"lightglue/{mini}" for mini in MINI)):
+        path = NETWORKS / f"{name}.safetensors"
+        with safe_open(path, "np") as file:
+            metadata = file.metadata()
+        told = json.loads(metadata.get("metadata") or metadata["training"])
+        is_mini = "architecture" in told
+        what = f"{told['architecture']}; teacher {told['teacher']}" if is_mini else "LighterGlue"
+        photos = told["photos"] if is_mini else sum(told["maps"].values())
+        rows.append(
+            [
+                f"`{name}`",
+                f"{path.stat().st_size / 1e3:,.0f}",
+                what,
+                *(str(number) for number in (photos, told["steps"])),
+            ]
+        )
+    return rows
+
+
 TABLES: dict[str, Callable[[], Table]] = {
+    "projections": projections_table,
+    "networks": networks_table,
     "features": features_table,
     "readme": readme_table,
     "keypoints": keypoints_table,

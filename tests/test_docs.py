@@ -2,6 +2,7 @@
 
 import io
 import re
+import subprocess
 import sys
 from collections import Counter
 from functools import cache
@@ -82,6 +83,24 @@ def test_options_of_commands_exist(page):
             given = re.findall(r" (--\w+)", arguments)
             unknown += [(module, option) for option in given if option not in known]
     assert not unknown
+
+
+@pytest.mark.check
+@pytest.mark.skipif(
+    None in map(find_spec, ("sphinx", "myst_parser", "furo")), reason="needs the docs extra"
+)
+def test_the_site_is_built_without_a_warning(tmp_path):
+    """And has all pages."""
+    command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet"]
+    options = ["-c", ROOT / "docs", "-d", tmp_path / "cache", ROOT, tmp_path / "site"]
+    done = subprocess.run([*command, *options], capture_output=True, text=True)
+    assert not done.returncode, done.stderr
+    for page in PAGES:
+        name = page.relative_to(ROOT).with_suffix(".html")
+        assert (tmp_path / "site" / name).exists(), name
+    reference = (tmp_path / "site/docs/api.html").read_text()
+    assert 'id="hloc_reduce.maps.localizer.Localizer.localize"' in reference
+    assert 'id="hloc_reduce.extract_features.main"' in reference
 
 
 @pytest.mark.parametrize("name", ["CONTRIBUTING.md", "docs/architecture.md", "docs/map-format.md"])

@@ -15,23 +15,28 @@ import numpy as np
 @cache
 def _library() -> ctypes.CDLL | None:
     """Load the compiled code, if it was built for this machine."""
-    for suffix in EXTENSION_SUFFIXES:
+    for suffix in reversed(EXTENSION_SUFFIXES):  # what serves all versions of Python first
         path = Path(__file__).with_name(f"_best_two{suffix}")
         if path.exists():
             try:
-                library = ctypes.CDLL(str(path))
+                return _load(path)
             except OSError:  # built on another machine
                 return None
-            library.best_two_name.restype = ctypes.c_char_p
-            matrix = np.ctypeslib.ndpointer(np.int16, ndim=2, flags="C_CONTIGUOUS")
-            found = np.ctypeslib.ndpointer(np.int32, ndim=1, flags="C_CONTIGUOUS")
-            size = ctypes.c_int64
-            arguments: list[Any] = [ctypes.c_int, matrix, size, matrix, size, size]
-            for search in (library.best_two, library.best_both):
-                search.argtypes = [*arguments, found, found, found]
-                search.restype = None
-            return library
     return None
+
+
+def _load(path: Path) -> ctypes.CDLL:
+    """Load a compiled best_two.cpp."""
+    library = ctypes.CDLL(str(path))
+    library.best_two_name.restype = ctypes.c_char_p
+    matrix = np.ctypeslib.ndpointer(np.int16, ndim=2, flags="C_CONTIGUOUS")
+    found = np.ctypeslib.ndpointer(np.int32, ndim=1, flags="C_CONTIGUOUS")
+    size = ctypes.c_int64
+    arguments: list[Any] = [ctypes.c_int, matrix, size, matrix, size, size]
+    for search in (library.best_two, library.best_both):
+        search.argtypes = [*arguments, found, found, found]
+        search.restype = None
+    return library
 
 
 @cache

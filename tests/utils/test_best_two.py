@@ -1,5 +1,10 @@
 """The best products of integers: compiled code, NumPy and the definition agree."""
 
+import platform
+import shutil
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -63,6 +68,25 @@ def test_the_best_rows_of_both_sides_agree_with_the_definition(kind, instruction
             right, highest, _ = by_definition(rows0, rows1)
             assert index.tolist() == right.tolist() and best.tolist() == highest.tolist()
             assert back.tolist() == by_definition(rows1, rows0)[0].tolist()
+
+
+@pytest.mark.check
+@pytest.mark.skipif(
+    platform.machine() not in ("x86_64", "AMD64") or not shutil.which("c++"),
+    reason="needs a C++ compiler on x86-64",
+)
+def test_the_code_for_compilers_without_vector_types(tmp_path, monkeypatch):
+    """Such as MSVC's, as far as another compiler can tell."""
+    source, library = Path(best_two.__file__).with_suffix(".cpp"), tmp_path / "best_two.so"
+    flags = "-shared -fPIC -O3 -std=c++17 -DWITHOUT_VECTOR_TYPES -mavx2 -Wall -Wextra -Werror"
+    subprocess.run(["c++", *flags.split(), source, "-o", library], check=True)
+    monkeypatch.setattr(best_two, "_library", lambda: best_two._load(library))
+    monkeypatch.setattr(best_two, "_numbers", best_two._numbers.__wrapped__)
+    assert best_two.instructions() in (["AVX2", "plain"], ["plain"])
+    for instruction_set in best_two.instructions():
+        for kind in KINDS:
+            test_each_instruction_set_agrees_with_the_definition(kind, instruction_set)
+            test_the_best_rows_of_both_sides_agree_with_the_definition(kind, instruction_set)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -140,7 +140,10 @@ def test_names_of_lists_round_trip(tmp_path, names):
 )
 def test_queries_round_trip(tmp_path, name, model, size, seed):
     path = tmp_path / "queries.txt"
-    camera = pycolmap.Camera.create_from_model_name(1, model, 500.0, *size)
+    kind = getattr(pycolmap.CameraModelId, model)
+    new = hasattr(pycolmap.Camera, "create_from_model_id")  # pycolmap 4
+    make = pycolmap.Camera.create_from_model_id if new else pycolmap.Camera.create
+    camera = make(1, kind, 500.0, *size)
     camera.params = camera.params * np.random.default_rng(seed).uniform(0.5, 2, len(camera.params))
     intrinsics.write_queries({name: (camera, "guess")}, path)
     ((read_name, read),) = parsers.parse_query_list(path)
