@@ -71,6 +71,27 @@ def test_photos_that_were_not_matched_tell_nothing():
         assert bool(copies.find(Inputs(sides, matched=listed))) == is_found
 
 
+def test_what_is_before_a_point_hides_it():
+    """A pillar passes by, in the right half of a photo: what is behind it is not expected there."""
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=640, height=480, params=[500, 320, 240], camera_id=1
+    )
+    pixels = np.random.default_rng(0).uniform(5, [635, 475], (400, 2))
+    rays = np.pad(camera.cam_from_img(pixels), ((0, 0), (0, 1)), constant_values=1)
+    is_right = pixels[:, 0] > 320
+    for depth_of_pillar, is_hidden in ((3.0, True), (7.0, False)):
+        wall, pillar = 9 * rays[:300], depth_of_pillar * rays[300:][is_right[300:]]
+        xyz = np.concatenate([wall, pillar])
+        seen = np.concatenate([~is_right[:300], np.ones(len(pillar), bool)])
+        image = pycolmap.Image(name="a.jpg", camera_id=1, image_id=1)
+        model = pycolmap.Reconstruction()
+        colmap.add_image(model, camera, image, pycolmap.Rigid3d())
+        visible = copies._visible(model.images[1], seen, xyz)
+        assert visible[seen].all()
+        behind = visible[:300][pixels[:300, 0] > 400]  # not at the pillar's edge
+        assert not behind.any() if is_hidden else behind.all()
+
+
 def test_photos_that_are_too_far_away_are_not_compared(monkeypatch):
     """What is left out expects no points, here of photos all around some near and far points."""
     model = two_sides(100, turn=120.0)
@@ -103,7 +124,7 @@ def test_points_are_expected_from_similar_directions_and_distances():
         angle = np.degrees(np.arccos((rays[i] * rays[j]).sum(axis=1) / length[i] / length[j]))
         ratio = np.maximum(length[i] / length[j], length[j] / length[i])
         wanted = seen[i] & (angle < copies.MAX_ANGLE_DEGREES) & (ratio < copies.MAX_DISTANCE_RATIO)
-        expected[i, j] = (wanted & copies._inside(images[j], xyz)).sum()
+        expected[i, j] = (wanted & copies._visible(images[j], seen[j], xyz)).sum()
     counted, _, _ = copies._count(model, images)
     assert 0 < (expected > 0).sum() < len(images) ** 2 - len(images)
     assert np.array_equal(counted, expected + expected.T)

@@ -19,7 +19,8 @@ from . import groups
 from .inputs import MIN_TELLING_POINTS, Inputs
 
 # a point is expected in a photo if another photo sees it from a direction that differs by at most
-# as many degrees, and from a distance that differs by at most this factor
+# as many degrees, and from a distance that differs by at most this factor; and if what the photo
+# sees there is not nearer by more than this factor, such as a pillar that passes by
 MAX_ANGLE_DEGREES, MAX_DISTANCE_RATIO = 15.0, 1.5
 # the largest distance between two such photos, in distances from the first one to the point
 REACH = np.sqrt(
@@ -97,7 +98,7 @@ def _count(
     xyz = np.array([points[i].xyz for i in ids.tolist()]).reshape(-1, 3)
     centres = np.array([image.projection_center() for image in images])
     seen = np.array([np.isin(ids, point3D_ids(image)) for image in images])
-    inside = np.array([_inside(image, xyz) for image in images])
+    visible = np.array([_visible(*one, xyz) for one in zip(images, seen, strict=True)])
     expected, shared = np.zeros((2, number, number))
     for i in range(number):
         its = np.flatnonzero(seen[i])
@@ -112,7 +113,7 @@ def _count(
         alike = (product > 0) & (product**2 > least)
         ratio = MAX_DISTANCE_RATIO**2
         alike &= (its_squared > squared / ratio) & (its_squared < squared * ratio)
-        wanted = alike & inside[np.ix_(near, its)]
+        wanted = alike & visible[np.ix_(near, its)]
         expected[i, near] = np.count_nonzero(wanted, axis=1)
         shared[i, near] = np.count_nonzero(wanted & seen[np.ix_(near, its)], axis=1)
     np.fill_diagonal(expected, 0)
@@ -120,11 +121,26 @@ def _count(
     return expected + expected.T, shared + shared.T, used
 
 
-def _inside(image: pycolmap.Image, xyz: np.ndarray) -> np.ndarray:
-    """Return which points (P, 3) are within a photo (P,)."""
+def _visible(image: pycolmap.Image, seen: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    """Return which points (P, 3) a photo may see (P,).
+
+    They are within it, and nothing is before them: the point that it sees next to each, of those
+    (P,) that it sees, is not so much nearer.
+    """
+    from scipy.spatial import cKDTree
+
     camera = image.camera
     assert camera is not None  # the image belongs to a model
     _, projected = reprojection_errors(np.zeros((len(xyz), 2)), xyz, image.cam_from_world(), camera)
     # comparisons with NaN, behind the camera, are false
     size = np.array([camera.width, camera.height])
-    return np.all((projected > 0) & (projected < size), axis=1)
+    visible = np.all((projected > 0) & (projected < size), axis=1)
+    if not (visible & seen).any():
+        return visible
+    distances = np.linalg.norm(xyz - image.projection_center(), axis=1)
+    own = np.flatnonzero(visible & seen)
+    inside = np.flatnonzero(visible)
+    _, nearest = cKDTree(projected[own]).query(projected[inside])
+    hidden = distances[inside] > MAX_DISTANCE_RATIO * distances[own[nearest]]
+    visible[inside[hidden]] = False
+    return visible
