@@ -96,8 +96,7 @@ def _check(
         verified, cameras = opened.verified(), opened.cameras()
         known = _registration(opened, reference, verified, cameras)
         localize = None if images is None else _by_others(opened, reference, images, Path(folder))
-        given = reference, verified, None, images, cameras, known, None, localize
-        return _run(Inputs(*given, matched=opened.matched() or None))
+        return _run(Inputs(reference, verified, None, images, cameras, known, None, localize))
 
 
 def _run(inputs: Inputs) -> tuple[list[Finding], dict[str, set[str]]]:
