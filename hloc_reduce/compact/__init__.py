@@ -17,7 +17,8 @@ from ..aggregate_features import output_of, vocabulary_if_any
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
-from ..hlm import points, writer
+from ..hlm import points, signs, writer
+from ..hlm.images import Images
 from ..hlm.reader import SUFFIX, check_feature_keys
 from ..hlm.writer import Source
 from ..localization import intrinsics
@@ -31,6 +32,7 @@ from ..utils.files import MEGABYTE, replacing
 from ..utils.options import ABOVE_0, Option
 from ..utils.paths import strings_as_paths
 
+IMAGES_AT_ONCE = 1024  # whose global descriptors are in memory
 MAX_TRIES = 12  # of sizes, to come close to a limit
 AIMED_SHARE = 0.998  # of the limit
 CLOSE_SHARE = 0.995  # of the limit, which is close enough
@@ -130,21 +132,20 @@ def write(
     source = replace(source, matcher=matcher, conf=conf)
     everything = points.collect(source.model, features)
     _check_dim(source, features, everything.descriptors.shape[1])
-    rows = read_global(source.global_descriptors, everything.names)
-    encode = partial(_encode, everything, source, rows)
-    if max_mb is None:
-        number = len(everything)
-        content, parts = encode(number)
-    else:
-        number, content, parts = _fit(encode, len(everything), max_mb)
+    described = _global_signs(source.global_descriptors, everything.names)
+    images = Images.of(source.model)
     with replacing(output) as temporary:
-        temporary.write_bytes(content)
+        encode = partial(_encode, temporary, everything, source, images, described)
+        if max_mb is None:
+            number, parts = len(everything), encode(len(everything))
+        else:
+            number, parts = _fit(encode, len(everything), max_mb)
     logger.info(
         "%s has %s of %s points and %s bytes: %s.",
         output,
         f"{number:,}",
         f"{len(everything):,}",
-        f"{len(content):,}",
+        f"{sum(parts.values()):,}",
         ", ".join(f"{part} {size:,}" for part, size in parts.items()),
     )
     return parts
@@ -228,29 +229,62 @@ def _storage(conf: dict, storage: str | None) -> str:
 
 
 def _encode(
-    everything: points.Points, source: Source, rows: np.ndarray, number: int
-) -> tuple[bytes, dict[str, int]]:
-    """Encode the points that images need most."""
+    path: Path,
+    everything: points.Points,
+    source: Source,
+    images: Images,
+    described: tuple[np.ndarray, int],
+    number: int,
+) -> dict[str, int]:
+    """Write the points that images need most; return the bytes of each part.
+
+    Args:
+        path: the file.
+        everything: all points.
+        source: what the map is made from.
+        images: of the map.
+        described: from `_global_signs`.
+        number: of points that are written.
+    """
     chosen = everything.only(points.select(everything, number))
-    return writer.encode(chosen, source, rows)
+    step = points.precision(chosen, source.model)
+    with path.open("wb") as file:
+        return writer.write(file, points.Sorted(chosen), images, source, *described, step)
+
+
+def _global_signs(path: Path, names: list[str]) -> tuple[np.ndarray, int]:
+    """Return the packed signs (I, B) of the global descriptors of images, and their dimension."""
+    packed, dims = [], set()
+    for start in range(0, len(names), IMAGES_AT_ONCE):
+        rows = read_global(path, names[start : start + IMAGES_AT_ONCE])
+        packed.append(signs.pack(rows)[0])
+        dims.add(rows.shape[1])
+    if len(dims) > 1:
+        raise InputError(f"The global descriptors in {path} differ in size.")
+    return np.concatenate(packed), dims.pop()
 
 
 def _fit(
-    encode: Callable[[int], tuple[bytes, dict[str, int]]], number: int, max_mb: float
-) -> tuple[int, bytes, dict[str, int]]:
-    """Encode about as many points as fit into a limit.
+    encode: Callable[[int], dict[str, int]], number: int, max_mb: float
+) -> tuple[int, dict[str, int]]:
+    """Write about as many points as fit into a limit.
+
+    Args:
+        encode: writes a number of points, and returns the bytes of each part.
+        number: of all points.
+        max_mb: the limit in 1,000,000 bytes.
 
     Returns:
-        Their number, the content and the bytes of each part.
+        The number of points that were written last, and the bytes of each part.
     """
-    limit, best = max_mb * MEGABYTE, (0, b"", dict[str, int]())
+    limit, best, parts = max_mb * MEGABYTE, 0, dict[str, int]()
     low, high, tried = 0, number + 1, number  # the first number fits, the second one does not
     for _ in range(MAX_TRIES):
-        content, parts = encode(tried)
-        size = len(content)
+        parts = encode(tried)
+        size = sum(parts.values())
         fixed = size - sum(parts[part] for part in ("coordinates", "descriptors", "visible"))
         if size <= limit:
-            low, best = tried, (tried, content, parts)
+            low = best = tried
             if tried == number or size >= CLOSE_SHARE * limit:
                 break
         else:
@@ -260,8 +294,8 @@ def _fit(
         # points that many images show come first, so that fewer take more than their share
         guess = int(AIMED_SHARE * tried * (limit - fixed) / (size - fixed))
         tried = guess if low < guess < high else (low + high) // 2
-    if not low:
+    if not best:
         raise InputError(
             f"--max_mb {max_mb:g} is too small: a point and {fixed:,} bytes are needed."
         )
-    return best
+    return best, parts if tried == best else encode(best)

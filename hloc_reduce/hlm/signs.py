@@ -53,7 +53,7 @@ class Signs:
 
     def descriptors(self) -> np.ndarray:
         """Return the descriptors (I, G) float32 of unit norm that the signs tell."""
-        found = hadamard(_signs(self._columns.T, self._count), self._number)
+        found = hadamard(unpack(self._columns.T, self._count), self._number)
         return found[:, : self._number] * self._scale(found.shape[1])
 
     def similarity(self, descriptor: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ class Signs:
         transformed = hadamard(descriptor[None], self._number)[0]
         parts = np.zeros(8 * len(self._columns), np.float32)
         parts[: self._count] = transformed[: self._count]
-        tables = parts.reshape(-1, 8) @ _signs(BYTES, 8).T
+        tables = parts.reshape(-1, 8) @ unpack(BYTES, 8).T
         found = np.zeros(self._columns.shape[1], np.float32)
         for table, column in zip(tables, self._columns, strict=True):
             found += table.take(column)
@@ -75,7 +75,7 @@ class Signs:
         return np.float32(1 / np.sqrt(self._count * size))
 
 
-def _signs(packed: np.ndarray, number: int) -> np.ndarray:
-    """Unpack signs (N, B): (N, S) float32, -1 and 1."""
+def unpack(packed: np.ndarray, number: int | None = None) -> np.ndarray:
+    """Unpack signs (N, B): (N, S) float32, -1 and 1; by default, all eight of each byte."""
     bits = np.unpackbits(packed, axis=1, count=number, bitorder="little")
     return 2 * bits.astype(np.float32) - 1

@@ -1,6 +1,6 @@
 """A map in memory, read from a folder or a compact file."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +16,7 @@ from ..localization import intrinsics, views
 from ..localization.frame import Frame
 from ..localization.references import Reference, SfmMap
 from ..retrieval import load as load_retrieval
-from ..retrieval.ranking import read_global, similarity
+from ..retrieval.ranking import rank, read_global, similarity
 from ..retrieval.vlad import read_vocabulary
 from ..runtime import parallel
 from ..utils import cli, colmap
@@ -74,10 +74,12 @@ class Contents:
         doubts: why it may be wrong, see `Map.doubts`.
         frame: its unit, and where on Earth it is.
         reference: its points.
-        names: its images.
+        names: its images, sorted.
+        views: returns the positions (I, 3) and the optical axes (I, 3) of its images.
         describe: returns the global descriptor (G,) float32 of a photo, rounded as in files, given
             its features, its file or pixels, and by how many quarter turns it is shown.
-        similarity: returns the similarity (I,) of a global descriptor (G,) to those of its images.
+        retrieve: returns the names of the images, at most a number, that are most similar to a
+            global descriptor (G,), best first.
     """
 
     engine: Engine
@@ -89,9 +91,10 @@ class Contents:
     doubts: list[str]
     frame: Frame
     reference: Reference
-    names: list[str]
+    names: Sequence[str]
+    views: Callable[[], tuple[np.ndarray, np.ndarray]]
     describe: Callable[[dict, Path | np.ndarray, int], np.ndarray]
-    similarity: Callable[[np.ndarray], np.ndarray]
+    retrieve: Callable[[np.ndarray, int], list[str]]
 
 
 def read(
@@ -165,8 +168,11 @@ def _of_folder(path: Path, matcher: str | None) -> Contents:
         frame=built.frame,
         reference=reference,
         names=names,
+        views=reference.views,
         describe=_describe(built.retrieval, vocabulary, built.conf["preprocessing"]),
-        similarity=lambda descriptor: similarity(descriptor[None], global_descriptors)[0],
+        retrieve=lambda descriptor, number: [
+            names[row] for row in rank(similarity(descriptor[None], global_descriptors), number)[0]
+        ],
     )
 
 
@@ -228,8 +234,11 @@ def _of_file(
         frame=compact.frame,
         reference=compact,
         names=compact.names,
+        views=compact.views,
         describe=_describe(compact.retrieval, compact.vocabulary, compact.conf["preprocessing"]),
-        similarity=compact.similarity,
+        retrieve=lambda descriptor, number: [
+            compact.names[row] for row in compact.retrieve(descriptor, number)[0]
+        ],
     )
 
 

@@ -16,7 +16,6 @@ from ..localization.query import merged, ransac_options
 from ..localization.records import nearness
 from ..localization.views import View
 from ..localize_sfm import RANSAC_THRESH
-from ..retrieval.ranking import rank
 from ..runtime import parallel
 from ..runtime.laps import Laps
 from ..utils.cli import InputError
@@ -94,8 +93,8 @@ class Localizer:
         ]
         self.engine, self.reference = contents.engine, contents.reference
         self.names = contents.names
-        self._surroundings = Surroundings(self.reference, self.names)
-        self._describe, self._similarity = contents.describe, contents.similarity
+        self._surroundings = Surroundings(self.reference, self.names, contents.views)
+        self._describe, self._find = contents.describe, contents.retrieve
 
     def localize(
         self,
@@ -424,5 +423,4 @@ class Localizer:
     @parallel.one_thread()
     def _retrieve(self, features: dict, image: Path | np.ndarray, view: View) -> list[str]:
         """Return the names of the map images that are most similar to a photo, best first."""
-        query = self._describe(features, image, view.turns)
-        return [self.names[j] for j in rank(self._similarity(query)[None], self.num_loc)[0]]
+        return self._find(self._describe(features, image, view.turns), self.num_loc)

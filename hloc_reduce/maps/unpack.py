@@ -37,6 +37,7 @@ def main(path: Path, map_dir: Path, overwrite: bool = False) -> Map:
         InputError: when the file is broken, or the folder has another map.
     """
     compact = CompactMap(path)
+    compact.check_names()
     before = provenance.read(map_dir / CONF)
     if before and before != DELETING and COMPACT not in before:
         raise InputError(f"{map_dir} is a map of photos, not an unpacked one: use other --outputs.")
@@ -60,7 +61,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
         for i, name in enumerate(progress(compact.names, "Unpacking", "image")):
             keypoints = _add_image(model, compact, i)
             arrays, attrs = compact.stored(name)
-            camera = compact.camera_of[name]
+            camera = compact.camera(name)
             arrays |= {
                 "keypoints": (keypoints - 0.5).astype(np.float32),  # hloc's pixels
                 "image_size": np.array([camera.width, camera.height]),
@@ -98,8 +99,8 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
 def _add_image(model: pycolmap.Reconstruction, compact: CompactMap, number: int) -> np.ndarray:
     """Add an image; return the projections of its points (M, 2), COLMAP's pixels."""
     name = compact.names[number]
-    camera, pose, projected = compact.camera_of[name], compact.pose(name), compact.projections(name)
-    camera.camera_id = compact.camera_number[name] + 1
+    camera, pose, projected = compact.camera(name), compact.pose(name), compact.projections(name)
+    camera.camera_id = compact.camera_number(name) + 1
     image = pycolmap.Image(
         name=name, keypoints=projected, camera_id=camera.camera_id, image_id=number + 1
     )
