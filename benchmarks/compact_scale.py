@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -61,23 +62,26 @@ def unit(generator: np.random.Generator, number: int) -> np.ndarray:
 
 
 @lru_cache(8)
-def block(number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coordinates (BLOCK, 3) and descriptors (BLOCK, D) of a block of points."""
-    generator = np.random.default_rng([0, number])
-    ids = np.arange(BLOCK) + number * BLOCK
+def coordinates_of(block: int) -> np.ndarray:
+    """Return the coordinates (BLOCK, 3) of a block of points."""
+    generator = np.random.default_rng([0, block])
+    ids = np.arange(BLOCK) + block * BLOCK
     height, relief = generator.uniform(-3, 3, BLOCK), generator.uniform(-1, 1, BLOCK)
-    xyz = np.stack([ids / STEP - SEEN / STEP / 2, height, DEPTH + SPREAD * relief], axis=1)
-    return xyz, unit(generator, BLOCK)
+    return np.stack([ids / STEP - SEEN / STEP / 2, height, DEPTH + SPREAD * relief], axis=1)
 
 
-def wall(first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coordinates (P, 3) and the descriptors (P, D) of points from first to last."""
-    xyz, descriptors = [], []
-    for number in range(first // BLOCK, (last - 1) // BLOCK + 1):
-        part = slice(max(0, first - number * BLOCK), last - number * BLOCK)
-        xyz.append(block(number)[0][part])
-        descriptors.append(block(number)[1][part])
-    return np.concatenate(xyz), np.concatenate(descriptors)
+@lru_cache(8)
+def descriptors_of(block: int) -> np.ndarray:
+    """Return the descriptors (BLOCK, D) of a block of points."""
+    return unit(np.random.default_rng([1, block]), BLOCK)
+
+
+def wall(first: int, last: int, of_block: Callable[[int], np.ndarray]) -> np.ndarray:
+    """Return the rows of points from first to last, which a function returns by blocks."""
+    parts = []
+    for block in range(first // BLOCK, (last - 1) // BLOCK + 1):
+        parts.append(of_block(block)[max(0, first - block * BLOCK) : last - block * BLOCK])
+    return np.concatenate(parts)
 
 
 def num_points(images: int) -> int:
@@ -94,10 +98,10 @@ def seen(place: float) -> tuple[np.ndarray, ...]:
     """Return the points that are seen from a place, their pixels (M, 2) and descriptors (M, D)."""
     generator = np.random.default_rng([1, int(10 * place)])
     ids = np.arange(SEEN) + int(place) * STEP
-    xyz, descriptors = wall(ids[0], ids[-1] + 1)
-    pixels = CAMERA.img_from_cam(view(place) * xyz)
+    shown = int(ids[0]), int(ids[-1]) + 1
+    pixels = CAMERA.img_from_cam(view(place) * wall(*shown, coordinates_of))
     pixels += generator.normal(0, 0.5, pixels.shape)
-    views = descriptors + NOISE * unit(generator, SEEN)
+    views = wall(*shown, descriptors_of) + NOISE * unit(generator, SEEN)
     return ids, pixels, views / np.linalg.norm(views, axis=1, keepdims=True)
 
 
@@ -135,7 +139,7 @@ def synthesize(names: list[str], folder: Path) -> None:
 
 def write_points(number: int, path: Path) -> None:
     """Write the points of a number of images, with their tracks, as COLMAP does."""
-    xyz, _ = wall(0, num_points(number))
+    xyz = wall(0, num_points(number), coordinates_of)
     ids = np.arange(len(xyz))
     first = np.maximum(0, -(-(ids - SEEN + 1) // STEP))
     lengths = np.minimum(ids // STEP, number - 1) - first + 1
@@ -160,16 +164,13 @@ class Wall:
     def __len__(self) -> int:
         return self._number
 
-    def _part(self, part: slice) -> tuple[np.ndarray, np.ndarray]:
-        return wall(part.start, min(part.stop, self._number))
-
     def xyz(self, part: slice) -> np.ndarray:
         """Return the coordinates (K, 3) of some points."""
-        return self._part(part)[0]
+        return wall(part.start, min(part.stop, self._number), coordinates_of)
 
     def descriptors(self, part: slice) -> np.ndarray:
         """Return the descriptors (K, D) of some points."""
-        return self._part(part)[1]
+        return wall(part.start, min(part.stop, self._number), descriptors_of)
 
     def visible(self, image: int) -> np.ndarray:
         """Return the points that an image shows."""
@@ -186,7 +187,7 @@ def global_signs(images: int, words: np.ndarray) -> np.ndarray:
     packed, shown = [], -(-SEEN // STEP)  # metres that an image shows
     for start in progress(range(0, images, 1000), "Global descriptors", "block"):
         metres = min(1000, images - start) + shown - 1
-        _, described = wall(start * STEP, (start + metres) * STEP)
+        described = wall(start * STEP, (start + metres) * STEP, descriptors_of)
         nearest = (2 * described @ words.T - (words**2).sum(axis=1)).argmax(axis=1)
         of_word = np.repeat(np.arange(metres), STEP) * len(words) + nearest
         order = np.argsort(of_word, kind="stable")
@@ -208,7 +209,7 @@ def stream(names: list[str], folder: Path) -> dict:
 
     start, number = time.perf_counter(), len(names)
     vlad = VLAD({})
-    vlad.fit(wall(0, 100 * STEP)[1])
+    vlad.fit(wall(0, 100 * STEP, descriptors_of))
     vocabulary = folder / "vocabulary.safetensors"
     save_file({"vocabulary": vlad.vocabulary.astype(np.float32)}, vocabulary)
     camera, unturned = np.zeros(number, int), np.tile([0.0, 0.0, 0.0, 1.0], (number, 1))
@@ -269,7 +270,8 @@ def localize(number: int, folder: Path) -> dict:
     opened, open_cpu = time.perf_counter(), time.process_time() - cpu
     resident, open_mb = current(), touched(file)
     queries = [synthetic_query(place) for place in places(number)]
-    block.cache_clear()
+    coordinates_of.cache_clear()
+    descriptors_of.cache_clear()
     before = current()
     touching: list[float] = []
     for again in (False, True):
