@@ -1,12 +1,13 @@
 """The images of a compact map: a row of a table for each, and another table of their cameras."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 
 from ..localization import intrinsics
+from ..utils.cli import InputError, some
 from ..utils.parsers import CAMERA_MODELS
 
 WHOLE = 2**31 - 1  # what stands for 1 in rotations, and for the largest distance in centers
@@ -33,13 +34,21 @@ class Images:
     camera: np.ndarray
 
     @classmethod
-    def of(cls, model: pycolmap.Reconstruction) -> "Images":
-        """Return the images of a COLMAP model."""
-        ids = sorted(model.images, key=lambda i: model.images[i].name)
+    def of(cls, model: pycolmap.Reconstruction, names: Collection[str] | None = None) -> "Images":
+        """Return images of a COLMAP model, by default all.
+
+        Raises:
+            InputError: for one that it does not have.
+        """
+        numbers = {image.name: i for i, image in model.images.items()}
+        listed = sorted(numbers if names is None else set(names))
+        if missing := [name for name in listed if name not in numbers]:
+            raise InputError(f"The map has no image {some(missing)}.")
+        ids = [numbers[name] for name in listed]
         used = sorted({model.images[i].camera_id for i in ids})
         poses = [model.images[i].cam_from_world() for i in ids]
         return cls(
-            [model.images[i].name for i in ids],
+            listed,
             np.array([pose.rotation.quat for pose in poses]),
             np.array([pose.inverse().translation for pose in poses]),
             [model.cameras[i] for i in used],

@@ -1,5 +1,6 @@
 """The points of a map as a compact file keeps them: a descriptor each, coordinates in few bits."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -37,7 +38,7 @@ class Points:
 
     xyz: np.ndarray
     descriptors: np.ndarray
-    names: list[str]
+    names: Sequence[str]
     visible: list[np.ndarray]
     cells: list[np.ndarray]
 
@@ -93,19 +94,22 @@ class Sorted:
         return np.sort(self._number[self._points.visible[image]])
 
 
-def collect(sfm: pycolmap.Reconstruction, features: Path) -> Points:
+def collect(
+    sfm: pycolmap.Reconstruction, features: Path, names: Sequence[str] | None = None
+) -> Points:
     """Collect the points of a map.
 
     Args:
         sfm: the map.
         features: feature file of its images.
+        names: the images that show them, sorted; default: all.
 
     Raises:
         InputError: when an image has other features, or the map has no points.
     """
     ids = np.sort(np.fromiter(sfm.points3D, np.int64))
     images = {image.name: image for image in sfm.images.values()}
-    names = sorted(images)
+    names = sorted(images) if names is None else names
     visible, cells, sums = [], [], np.zeros((len(ids), dimension(features)), np.float32)
     for name in progress(names, "Collecting points", "image"):
         image = images[name]

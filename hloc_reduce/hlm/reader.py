@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path, PurePath
 from typing import Any
@@ -90,7 +90,9 @@ class CompactMap:
         number, shipped = int(metadata["points"]), dict(metadata.get("shipped", {}))
         table = _array(arrays, "images", np.uint8, (None, images.ROW.itemsize))
         self._table = np.ascontiguousarray(table).view(images.ROW)[:, 0]
-        self.names = Names(_array(arrays, "names", np.uint8, (None,)), len(table), self.path)
+        packed = _array(arrays, "names", np.uint8, (None,))
+        self._names = Names(packed, len(table), self.path)
+        self.names: Sequence[str] = self._names
         self._cameras = _array(arrays, "cameras", np.uint8, (None, None))
         bits, step = [int(number) for number in metadata["bits"]], float(metadata["step"])
         self._grid = Grid(np.array(metadata["least"], np.float64), step, bits)
@@ -291,7 +293,7 @@ class CompactMap:
 
     def row(self, name: str) -> int:
         """Return the row of an image."""
-        row = self.names.row(name)
+        row = self._names.row(name)
         if row is None:
             raise InputError(f"{self.path} has no image {name}, or is broken.")
         return row
@@ -321,6 +323,11 @@ class CompactMap:
             if not begin <= end <= len(self._packed):
                 raise ValueError(f"visible points from {begin} to {end}")
             return visible.unpack(self._packed[begin:end], len(self.points))
+
+    @property
+    def num_cameras(self) -> int:
+        """The number of different intrinsics."""
+        return len(self._cameras)
 
     def camera_number(self, name: str) -> int:
         """Return the number of the camera of an image."""
@@ -443,6 +450,6 @@ def check_feature_keys(matcher: str, feature_keys: Iterable[str]) -> None:
         )
 
 
-def is_compact(path: Path) -> bool:
-    """Tell whether a path is that of a compact map."""
-    return path.suffix == SUFFIX
+def is_compact(path: Path | Sequence[Path]) -> bool:
+    """Tell whether a path is that of a compact map, or all of several are."""
+    return all(one.suffix == SUFFIX for one in ([path] if isinstance(path, Path) else path))

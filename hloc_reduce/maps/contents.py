@@ -11,6 +11,7 @@ import numpy as np
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
+from ..hlm.joined import opened
 from ..hlm.reader import CompactMap, check_feature_keys, is_compact
 from ..localization import intrinsics, views
 from ..localization.frame import Frame
@@ -98,7 +99,7 @@ class Contents:
 
 
 def read(
-    path: Path,
+    path: Path | Sequence[Path],
     onnx: Path | None = None,
     matcher: str | None = None,
     matcher_onnx: Path | None = None,
@@ -106,7 +107,7 @@ def read(
     """Read a map.
 
     Args:
-        path: folder of a map of `maps.main`, or file of `hloc_reduce.compact`.
+        path: folder of a map of `maps.main`, or file of `hloc_reduce.compact`, or several.
         onnx: file of its feature from `hloc_reduce.export`, in which features are extracted from
             photos; only for a file.
         matcher: one of `confs.matchers.names`; default: the map's.
@@ -122,6 +123,8 @@ def read(
         raise InputError("An ONNX file of LightGlue needs one of the feature, too.")
     if is_compact(path):
         return _of_file(path, onnx, matcher, matcher_onnx)
+    if not isinstance(path, Path):
+        raise InputError(f"Several maps must be compact ones: {', '.join(map(str, path))}.")
     if onnx is not None:
         raise InputError(f"An ONNX file needs a compact map, a file; {path} is none.")
     _check_torch(path, "a map folder")
@@ -209,9 +212,10 @@ def _match_images(
 
 
 def _of_file(
-    path: Path, onnx: Path | None, matcher: str | None, matcher_onnx: Path | None
+    paths: Path | Sequence[Path], onnx: Path | None, matcher: str | None, matcher_onnx: Path | None
 ) -> Contents:
-    compact = CompactMap(path)
+    compact = opened(paths)
+    path = compact.path
     if retrieval_confs.get(compact.retrieval)["model"]["name"] == "hloc":
         _check_torch(path, f"a map with the retrieval {compact.retrieval}")
     names = matchers_confs.steps_in(compact.matcher, compact.conf, matcher)

@@ -44,7 +44,7 @@ class Localizer:
 
     Args:
         map_dir: the folder of a map from `maps.main` or `pipelines.localize`, or a file from
-            `hloc_reduce.compact`.
+            `hloc_reduce.compact`, or several files of one place.
         num_loc: the number of most similar map images that a photo is matched with.
         ransac_thresh: RANSAC inlier threshold in pixels; larger in proportion in photos whose
             longer side exceeds 1,600 pixels.
@@ -66,7 +66,7 @@ class Localizer:
 
     def __init__(
         self,
-        map_dir: Path | str,
+        map_dir: Path | str | Sequence[Path | str],
         num_loc: int = 50,
         ransac_thresh: float = RANSAC_THRESH,
         gate: Gate = DEFAULT_GATE,
@@ -80,7 +80,11 @@ class Localizer:
         feature_file, matcher_file = (
             None if path is None else Path(path) for path in (onnx, matcher_onnx)
         )
-        contents = read(Path(map_dir), feature_file, matcher, matcher_file)
+        if isinstance(map_dir, Path | str):
+            path: Path | list[Path] = Path(map_dir)
+        else:
+            path = [Path(file) for file in map_dir]
+        contents = read(path, feature_file, matcher, matcher_file)
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.workers = parallel.cores()
         self.preprocessing, self.cameras = contents.preprocessing, contents.cameras

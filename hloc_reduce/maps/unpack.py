@@ -1,5 +1,6 @@
 """Unpack a compact map into the folder of a map, in which pipelines localize as in any other."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pycolmap
 from ..aggregate_features import output_of, vocabulary_of
 from ..confs import features as features_confs
 from ..confs import retrieval as retrieval_confs
+from ..hlm.joined import opened
 from ..hlm.reader import CompactMap
 from ..runtime import provenance
 from ..runtime.group_writer import GroupWriter
@@ -23,26 +25,26 @@ COMPACT = "compact"  # in the configuration of a folder: the sha256 of the file
 
 
 @strings_as_paths
-def main(path: Path, map_dir: Path, overwrite: bool = False) -> Map:
+def main(path: Path | Sequence[Path], map_dir: Path, overwrite: bool = False) -> Map:
     """Unpack a compact map, unless it is unpacked already.
 
     The keypoints of an image are the projections of the points that it shows.
 
     Args:
-        path: file of `hloc_reduce.compact`.
+        path: file of `hloc_reduce.compact`, or several of one place.
         map_dir: the folder of the map.
         overwrite: replace another map in it.
 
     Raises:
         InputError: when the file is broken, or the folder has another map.
     """
-    compact = CompactMap(path)
+    compact, paths = opened(path), [path] if isinstance(path, Path) else [*path]
     compact.check_names()
     before = provenance.read(map_dir / CONF)
     if before and before != DELETING and COMPACT not in before:
         raise InputError(f"{map_dir} is a map of photos, not an unpacked one: use other --outputs.")
-    digest = file_sha256(path)
-    with RunFolder(map_dir, {COMPACT: digest}, overwrite, inputs=[path]) as folder:
+    digest = " ".join(map(file_sha256, paths))
+    with RunFolder(map_dir, {COMPACT: digest}, overwrite, inputs=paths) as folder:
         if not (map_dir / FINISHED).exists():
             with folder.stage("unpack"):
                 _write(compact, map_dir, digest)
