@@ -550,13 +550,14 @@ def scale_table() -> Table:
 
 
 def compact_scale_table() -> Table:
-    """Show what compact maps of parts of Aachen's size cost."""
-    columns = {"build_s": "build [s]", "build_mb": "build [MB]", "mb": "file [MB]"}
-    columns |= {"open_s": "open [s]", "resident_mb": "resident [MB]"}
-    columns |= {f"{stage}_s": f"{stage} [s]" for stage in ("retrieval", "matching", "pose")}
+    """Show what compact maps of parts and of multiples of Aachen's size cost."""
+    columns = {"mb": "file [MB]", "build_cpu_s": "build [s]", "build_mb": "build [MB]"}
+    columns |= {"open_cpu_s": "open [s]", "resident_mb": "resident [MB]"}
+    columns |= {"first_query_file_mb": "first query, touched [MB]"}
+    columns |= {"query_file_mb": "a query, touched [MB]", "query_cpu_s": "a query [s]"}
     table = [["images", "points", *columns.values(), "localized"]]
-    for row in read("compact_scale"):
-        cells = [f"{float(row[key]):,.3g}" for key in columns]
+    for row in sorted(read("compact_scale"), key=lambda row: int(row["photos"])):
+        cells = [f"{float(f'{float(row[key]):.3g}'):,}".removesuffix(".0") for key in columns]
         counts = thousands(row["photos"]), thousands(row["points"])
         table.append([*counts, *cells, f"{row['localized']} of {row['queries']}"])
     return table

@@ -27,7 +27,7 @@ from ..utils.feature_files import upright
 from ..utils.files import file_sha256, replacing
 from ..utils.images import TURNS
 from ..utils.parsers import check_names
-from . import images, lists, older, signs, tensors, visible
+from . import images, older, signs, tensors, visible
 from .broken import reading
 from .names import Names
 from .points import Coordinates, Grid
@@ -190,25 +190,22 @@ class CompactMap:
         if not 0 < number <= MAX_GLOBAL:
             raise ValueError(f"global descriptors of {number} numbers")
         self._global_dim, width = number, -(-signs.count(number) // 8)
-        listed = len(arrays["retrieval_images"]) if "lists" in arrays else len(self.names)
-        self._signs = _array(arrays, "retrieval", np.uint8, (listed, width))
-        self._lists: signs.Signs | None = None
-        if "lists" in arrays:
-            self._listed = _array(arrays, "retrieval_images", np.uint32, (listed,))
-            centers = _array(arrays, "lists", np.uint8, (None, width))
-            self._lists = signs.Signs(centers, number)
-            self._list_ends = _array(arrays, "list_ends", np.uint32, (len(centers),)).astype(int)
-            if not len(centers) or (np.diff([0, *self._list_ends, listed]) < 0).any():
-                raise ValueError("lists of images that do not exist")
+        self._signs = _array(arrays, "retrieval", np.uint8, (len(self.names), width))
+        self._coarse: signs.Signs | None = None
+        if "coarse" in arrays:
+            columns = _array(
+                arrays, "coarse", np.uint8, (min(signs.COARSE, width), len(self.names))
+            )
+            self._coarse = signs.Signs(columns, number)
 
     @cached_property
     def _every_sign(self) -> signs.Signs:
-        return signs.Signs(self._signs, self._global_dim)
+        return signs.Signs(signs.columns(self._signs), self._global_dim)
 
-    @cached_property
-    def _is_blind(self) -> np.ndarray:
-        """Which images show no point (I,) bool."""
-        return np.diff(self._table["end"].astype(np.int64), prepend=0) == 0
+    def _is_blind(self, rows: np.ndarray) -> np.ndarray:
+        """Return which images (N,) show no point (N,) bool."""
+        ends = self._table["end"]
+        return np.where(rows > 0, ends[rows - 1], 0) == ends[rows]
 
     def global_descriptors(self) -> np.ndarray:
         """Return those of the images (I, G) float32 as their signs tell them.
@@ -216,11 +213,7 @@ class CompactMap:
         Norms are 1, or 0 for images without points.
         """
         found = self._every_sign.descriptors()
-        if self._lists is not None:
-            listed, found = found, np.zeros((len(self.names), self._global_dim), np.float32)
-            with reading(self.path):
-                found[self._listed] = listed
-        found[self._is_blind] = 0
+        found[self._is_blind(np.arange(len(found)))] = 0
         return found
 
     def retrieve(self, descriptor: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -233,17 +226,16 @@ class CompactMap:
         Returns:
             Their rows (N,), best first, and similarity (N,), -inf for images without points.
         """
-        if self._lists is None:
+        if self._coarse is None:
+            rows = np.arange(len(self.names))
             similarity = self._every_sign.similarity(descriptor)
-            similarity[self._is_blind] = -np.inf
-            best = rank(similarity[None], number)[0]
-            return best, similarity[best]
-        parts = lists.visited(self._lists.similarity(descriptor), self._list_ends)
-        rows = np.concatenate([self._listed[part] for part in parts]).astype(np.int64)
-        if len(rows) and rows.max() >= len(self.names):
-            raise InputError(f"{self.path} is broken: it retrieves images that do not exist.")
-        packed = np.concatenate([self._signs[part] for part in parts])
-        similarity = signs.Signs(packed, self._global_dim).similarity(descriptor)
+        else:
+            rough = self._coarse.similarity(descriptor)
+            some = min(len(rough), signs.CANDIDATES * number)
+            rows = np.sort(np.argpartition(-rough, some - 1)[:some])
+            packed = signs.columns(self._signs[rows])
+            similarity = signs.Signs(packed, self._global_dim).similarity(descriptor)
+        similarity[self._is_blind(rows)] = -np.inf
         best = rank(similarity[None], number)[0]
         return rows[best], similarity[best]
 

@@ -3,6 +3,9 @@
 import numpy as np
 
 SIGNS = 1024  # bits of a descriptor, at most
+# of more images than this, a query is compared with the first signs of all, `COARSE` bytes of each,
+# and with all signs of the most similar ones, `CANDIDATES` for each image that is wanted
+FEW, COARSE, CANDIDATES = 100_000, 32, 20
 BYTES = np.arange(256, dtype=np.uint8)[:, None]
 
 
@@ -39,17 +42,22 @@ def pack(descriptors: np.ndarray) -> tuple[np.ndarray, int]:
     return np.packbits(positive, axis=1, bitorder="little"), positive.shape[1]
 
 
+def columns(packed: np.ndarray) -> np.ndarray:
+    """Return packed signs (I, B) byte by byte (B, I), as `Signs` takes them."""
+    return np.ascontiguousarray(packed.T)
+
+
 class Signs:
     """Packed signs of global descriptors.
 
     Args:
-        packed: (I, B) uint8 from `pack`.
+        columns: (B, I) uint8 from `columns`, or the first ones of these.
         number: dimensions of the descriptors.
     """
 
-    def __init__(self, packed: np.ndarray, number: int):
-        self._columns = np.ascontiguousarray(packed.T)  # (B, I): `similarity` reads byte by byte
-        self._number, self._count = number, count(number)
+    def __init__(self, columns: np.ndarray, number: int):
+        self._columns = columns
+        self._number, self._count = number, min(count(number), 8 * len(columns))
 
     def descriptors(self) -> np.ndarray:
         """Return the descriptors (I, G) float32 of unit norm that the signs tell."""

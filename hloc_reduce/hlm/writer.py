@@ -19,15 +19,15 @@ from ..retrieval.vlad import VOCABULARY, read_vocabulary
 from ..utils.cli import InputError
 from ..utils.codes import CODED, FLOATS, STORAGES, encode, pack, quantize
 from ..utils.files import file_sha256
-from . import lists, names, tensors, visible
+from . import names, signs, tensors, visible
 from .images import Images, pack_cameras
 from .points import PADDING, Grid, parts
 from .reader import MAX_GLOBAL, VERSION, check_model
 from .tensors import Blocks
 
 SPOOLED = 2**26  # bytes of visible points that are kept in memory
-PARTS = {"images": "poses", "cameras": "poses", "lists": "retrieval", "list_ends": "retrieval"}
-PARTS |= {"retrieval_images": "retrieval", "vocabulary": "retrieval"}  # what logs call arrays
+# what logs call arrays
+PARTS = {"images": "poses", "cameras": "poses", "coarse": "retrieval", "vocabulary": "retrieval"}
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def write(
         grid = _grid(points, step)
         metadata |= {"least": grid.least.tolist(), "step": grid.step, "bits": grid.bits}
         arrays["images"], metadata["center_step"] = images.pack(grid.least, ends)
-        _add_retrieval(arrays, metadata, source, global_signs, global_dim, ends)
+        _add_retrieval(arrays, metadata, source, global_signs, global_dim)
         arrays["descriptors"] = _descriptors(arrays, metadata, points, source.conf)
         arrays["cameras"] = pack_cameras(images.cameras)
         arrays["names"] = names.pack(images.names)
@@ -201,18 +201,13 @@ def _add_retrieval(
     source: Source,
     global_signs: np.ndarray,
     global_dim: int,
-    ends: np.ndarray,
 ) -> None:
     """Add the signs of global descriptors and their vocabulary, if any, or name one that ships."""
     if global_dim > MAX_GLOBAL:
         raise InputError(f"Global descriptors of {global_dim} numbers, of at most {MAX_GLOBAL}.")
     arrays["retrieval"] = global_signs
-    if len(global_signs) > lists.LEAST:
-        shown = np.flatnonzero(np.diff(ends, prepend=0))
-        centers, ends_of_lists, order = lists.build(global_signs[shown])
-        arrays["retrieval"] = global_signs[shown[order]]
-        arrays |= {"retrieval_images": shown[order].astype(np.uint32), "lists": centers}
-        arrays["list_ends"] = ends_of_lists.astype(np.uint32)
+    if len(global_signs) > signs.FEW:
+        arrays["coarse"] = signs.columns(global_signs[:, : signs.COARSE])
     if source.retrieval != retrieval_confs.VLAD:
         metadata |= {"retrieval": source.retrieval, "global_dim": global_dim}
     if source.vocabulary is None:

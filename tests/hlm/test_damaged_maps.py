@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hloc_reduce import compact
-from hloc_reduce.hlm import lists, visible
+from hloc_reduce.hlm import signs, visible
 from pipelines import localize
 
 PIPELINE = localize
@@ -28,19 +28,19 @@ def with_header(content, header):
     return len(padded).to_bytes(8, "little") + padded + content[end:]
 
 
-@pytest.fixture(params=["uint4 bitmaps", "float16 differences", "uint4 lists"])
+@pytest.fixture(params=["uint4 bitmaps", "float16 differences", "uint4 coarse"])
 def file(request, build_map, tmp_path, monkeypatch):
     """A small map, and the content of its file."""
     built = build_map("--feature", "colmap_sift_sv32")
     storage, kind = request.param.split()
     if kind == "differences":  # which are shorter only in large maps
         monkeypatch.setattr(visible, "is_shorter", lambda *_: True)
-    if kind == "lists":
-        monkeypatch.setattr(lists, "LEAST", 3)
+    if kind == "coarse":
+        monkeypatch.setattr(signs, "FEW", 3)
     path = tmp_path / "place.hlm"
     compact.main(path, built, storage=storage, max_mb=0.015)
     content = path.read_bytes()
-    assert (b"list_ends" in content) == (kind == "lists")
+    assert (b"coarse" in content) == (kind == "coarse")
     assert use(path).names
     return path, content
 

@@ -12,8 +12,8 @@ from hypothesis.extra import numpy as arrays
 from row_of_photos import row
 from small_map import build
 
-from hloc_reduce.hlm import images, lists, names, points, visible
-from hloc_reduce.hlm.signs import Signs, hadamard, pack
+from hloc_reduce.hlm import images, names, points, visible
+from hloc_reduce.hlm.signs import Signs, columns, hadamard, pack
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.parsers import check_names
 
@@ -134,7 +134,7 @@ def signed(number):
     """Return ten descriptors of a number of dimensions, and their signs."""
     descriptors = np.random.default_rng(0).standard_normal((10, number)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    return descriptors, Signs(pack(descriptors)[0], number)
+    return descriptors, Signs(columns(pack(descriptors)[0]), number)
 
 
 @pytest.mark.parametrize("number", [3, 12, 1024, 3000])
@@ -190,21 +190,3 @@ def test_any_rotation_is_kept(quaternion):
     packed, _ = one.pack(np.zeros(3), np.zeros(1))
     [found] = images.rotations(packed.view(images.ROW)[:, 0])
     assert min(np.abs(found - unit).max(), np.abs(found + unit).max()) < 2e-9
-
-
-def test_lists_find_what_a_search_of_all_finds(monkeypatch):
-    """Of images about 40 places, a query finds those of its own."""
-    generator = np.random.default_rng(0)
-    of_place = generator.standard_normal((40, 256)).astype(np.float32)
-    place = generator.integers(40, size=3000)
-    noise = 0.5 * generator.standard_normal((3000, 256)).astype(np.float32)
-    packed, _ = pack(of_place[place] + noise)
-    centers, ends, order = lists.build(packed)
-    assert len(centers) == 54 and sorted(order) == list(range(3000)) and ends[-1] == 3000
-    for i in range(40):
-        parts = lists.visited(Signs(centers, 256).similarity(of_place[i]), ends)
-        rows = np.concatenate([order[part] for part in parts])
-        assert len(rows) < 600
-        whole = Signs(packed, 256).similarity(of_place[i])
-        best = np.argsort(-whole)[:20]
-        assert np.isin(best, rows).mean() > 0.9
