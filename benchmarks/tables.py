@@ -112,7 +112,7 @@ LIGHTGLUE_PLACES = (
     *("herz-jesus", "dark-fountain-P11", "dark-sceaux"),
     *(f"sparse-{place}" for place in ("herz-jesus", "fountain-P11", "sceaux")),
 )
-MANY_IMAGES = 100_000  # from which the table of retrieval has them
+MANY_IMAGES = 1_000_000  # from which the table of retrieval has them
 # from what `benchmarks.changed_photos` changes to what tables say
 CHANGED_PHOTOS = {
     "map 1, queries 1, turned 0": "unchanged",
@@ -445,16 +445,6 @@ def own_maps_table() -> Table:
     return table
 
 
-def extraction_parts_table() -> Table:
-    """Show where the time of extracting the features of a folder goes."""
-    parts = ("import", "start", "copy", "work", "rest")
-    table = [["feature", "photos", *parts, "all"]]
-    for row in sorted(read("extraction_parts"), key=lambda row: int(row["photos"])):
-        cells = [f"{float(row[f'{part}_s']):.1f}" for part in (*parts, "all")]
-        table.append([f"`{row['feature']}`", row["photos"], *cells])
-    return table
-
-
 def retrieval_table() -> Table:
     """Show how long the search for similar images takes, by their number."""
     table = [["images", "search", "a query [ms]", "index [s]", "right of the first 20"]]
@@ -671,7 +661,6 @@ TABLES: dict[str, Callable[[], Table]] = {
     "runs": runs_table,
     "runs_cpu": runs_cpu_table,
     "extraction": extraction_table,
-    "extraction_parts": extraction_parts_table,
     "localizer": localizer_table,
     "own_maps": own_maps_table,
     "tracking": tracking_table,

@@ -45,14 +45,17 @@ class Images:
         if missing := [name for name in listed if name not in numbers]:
             raise InputError(f"The map has no image {some(missing)}.")
         ids = [numbers[name] for name in listed]
-        used = sorted({model.images[i].camera_id for i in ids})
+        used = [model.images[i].camera_id for i in ids]
+        keys = {i: tuple(intrinsics.to_list(model.cameras[i])) for i in used}
+        cameras = {key: model.cameras[i] for i, key in keys.items()}  # equal ones once
+        rows = {key: row for row, key in enumerate(cameras)}
         poses = [model.images[i].cam_from_world() for i in ids]
         return cls(
             listed,
             np.array([pose.rotation.quat for pose in poses]),
             np.array([pose.inverse().translation for pose in poses]),
-            [model.cameras[i] for i in used],
-            np.searchsorted(used, [model.images[i].camera_id for i in ids]),
+            [*cameras.values()],
+            np.array([rows[keys[i]] for i in used]),
         )
 
     def pack(self, least: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, float]:
