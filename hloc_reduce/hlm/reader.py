@@ -197,6 +197,7 @@ class CompactMap:
                 arrays, "coarse", np.uint8, (min(signs.COARSE, width), len(self.names))
             )
             self._coarse = signs.Signs(columns, number)
+            tensors.read_by_pages(self._signs)  # few rows, all over the file
 
     @cached_property
     def _every_sign(self) -> signs.Signs:

@@ -66,6 +66,19 @@ def read(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
     return metadata, arrays
 
 
+def read_by_pages(array: np.ndarray) -> None:
+    """Have the system read only those pages of an array from its file that are used."""
+    content: object = array
+    while isinstance(content, np.ndarray):
+        content = content.base
+    if isinstance(content, memoryview):
+        content = content.obj
+    if isinstance(content, mmap.mmap) and hasattr(mmap, "MADV_RANDOM"):
+        begin = array.ctypes.data - np.frombuffer(content, np.uint8).ctypes.data
+        inside = begin % mmap.PAGESIZE
+        content.madvise(mmap.MADV_RANDOM, begin - inside, array.nbytes + inside)
+
+
 def write(
     file: BinaryIO, metadata: Mapping[str, str], arrays: Mapping[str, np.ndarray | Blocks]
 ) -> int:
