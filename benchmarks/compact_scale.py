@@ -1,13 +1,17 @@
-"""Measure compact maps at fractions of the size of Aachen Day-Night v1.1: size, time, memory.
+"""Measure compact maps of up to 100 times the size of Aachen Day-Night v1.1: size, time, memory.
 
 The names of the map images are the real ones; the rest is synthetic. The images stand in a row, one
 metre apart, in front of a wall with 299 points a metre. Each shows 1,493 of them, so that the whole
 map has 2 million points, each seen in five images, and 10 million observations. A query stands
 between two images and shows the points of one, among clutter.
 
-For each fraction, a process writes the model and the features, another one builds the compact map,
-and a third one opens it and localizes queries, whose features it is given. Adds rows to
-results/compact_scale.csv.
+For each share, a process writes the model and the features, another one builds the compact map, and
+a third one opens it and localizes queries, whose features it is given. For a share above 1, which
+no model in memory can have, names are repeated, and the file is written from blocks of points; the
+global descriptor of an image is then of the points, not of its keypoints. Queries are localized
+twice: first after the system has forgotten the file, to count the bytes of it that are touched, by
+the resident pages of its mapping; then to measure times. CPU seconds are of the process. Adds rows
+to results/compact_scale.csv.
 """
 
 import argparse
@@ -19,13 +23,18 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from safetensors.numpy import save_file
 
 from benchmarks import rows
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.hlm import signs
+from hloc_reduce.localization import intrinsics
 from hloc_reduce.runtime.group_writer import GroupWriter
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
@@ -42,6 +51,7 @@ CAMERA = pycolmap.Camera(
     model="PINHOLE", width=1600, height=1200, params=[1600.0, 1600.0, 800.0, 600.0], camera_id=1
 )
 QUERIES = 20
+BLOCK = 2**16  # points that are drawn at once
 STAGES = ("retrieval", "matching", "pose", "mirror_image")
 
 
@@ -51,13 +61,32 @@ def unit(generator: np.random.Generator, number: int) -> np.ndarray:
     return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
 
 
-def wall(number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coordinates (P, 3) of the points of a number of images, and descriptors (P, D)."""
-    generator = np.random.default_rng(0)
-    ids = np.arange((number - 1) * STEP + SEEN)
-    height, relief = generator.uniform(-3, 3, len(ids)), generator.uniform(-1, 1, len(ids))
-    xyz = np.stack([ids / STEP - SEEN / STEP / 2, height, DEPTH + SPREAD * relief], axis=1)
-    return xyz, unit(generator, len(ids))
+@lru_cache(8)
+def coordinates_of(block: int) -> np.ndarray:
+    """Return the coordinates (BLOCK, 3) of a block of points."""
+    generator = np.random.default_rng([0, block])
+    ids = np.arange(BLOCK) + block * BLOCK
+    height, relief = generator.uniform(-3, 3, BLOCK), generator.uniform(-1, 1, BLOCK)
+    return np.stack([ids / STEP - SEEN / STEP / 2, height, DEPTH + SPREAD * relief], axis=1)
+
+
+@lru_cache(8)
+def descriptors_of(block: int) -> np.ndarray:
+    """Return the descriptors (BLOCK, D) of a block of points."""
+    return unit(np.random.default_rng([1, block]), BLOCK)
+
+
+def wall(first: int, last: int, of_block: Callable[[int], np.ndarray]) -> np.ndarray:
+    """Return the rows of points from first to last, which a function returns by blocks."""
+    parts = []
+    for block in range(first // BLOCK, (last - 1) // BLOCK + 1):
+        parts.append(of_block(block)[max(0, first - block * BLOCK) : last - block * BLOCK])
+    return np.concatenate(parts)
+
+
+def num_points(images: int) -> int:
+    """Return the number of points that a number of images show."""
+    return (images - 1) * STEP + SEEN
 
 
 def view(place: float) -> pycolmap.Rigid3d:
@@ -65,13 +94,14 @@ def view(place: float) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-place, 0.0, 0.0]))
 
 
-def seen(place: float, xyz: np.ndarray, descriptors: np.ndarray) -> tuple[np.ndarray, ...]:
+def seen(place: float) -> tuple[np.ndarray, ...]:
     """Return the points that are seen from a place, their pixels (M, 2) and descriptors (M, D)."""
     generator = np.random.default_rng([1, int(10 * place)])
     ids = np.arange(SEEN) + int(place) * STEP
-    pixels = CAMERA.img_from_cam(view(place) * xyz[ids])
+    shown = int(ids[0]), int(ids[-1]) + 1
+    pixels = CAMERA.img_from_cam(view(place) * wall(*shown, coordinates_of))
     pixels += generator.normal(0, 0.5, pixels.shape)
-    views = descriptors[ids] + NOISE * unit(generator, SEEN)
+    views = wall(*shown, descriptors_of) + NOISE * unit(generator, SEEN)
     return ids, pixels, views / np.linalg.norm(views, axis=1, keepdims=True)
 
 
@@ -79,7 +109,6 @@ def synthesize(names: list[str], folder: Path) -> None:
     """Write a COLMAP model and a feature file."""
     from hloc_reduce import aggregate_features
 
-    xyz, descriptors = wall(len(names))
     features, sfm = folder / "features.h5", folder / "sfm"
     sfm.mkdir()
     cameras = pycolmap.Reconstruction()
@@ -93,7 +122,7 @@ def synthesize(names: list[str], folder: Path) -> None:
     ):
         file.write(struct.pack("<Q", len(names)))
         for place, name in enumerate(progress(names, "Writing", "image")):
-            ids, pixels, views = seen(place, xyz, descriptors)
+            ids, pixels, views = seen(place)
             pose = 1.0, 0.0, 0.0, 0.0, *view(place).translation
             file.write(struct.pack("<I7dI", place + 1, *pose, CAMERA.camera_id))
             file.write(name.encode() + b"\0" + struct.pack("<Q", len(ids)))
@@ -103,13 +132,14 @@ def synthesize(names: list[str], folder: Path) -> None:
             stored = {"keypoints": (pixels - 0.5).astype(np.float32)}
             stored |= {"descriptors": views.T.astype(np.float16)}
             writer.add(name, stored | {"image_size": np.array([CAMERA.width, CAMERA.height])})
-    write_points(xyz, len(names), sfm / "points3D.bin")
+    write_points(len(names), sfm / "points3D.bin")
     vlad = aggregate_features.confs["vlad"]
     aggregate_features.main(vlad, features, names[:: -(-len(names) // 100)])
 
 
-def write_points(xyz: np.ndarray, number: int, path: Path) -> None:
+def write_points(number: int, path: Path) -> None:
     """Write the points of a number of images, with their tracks, as COLMAP does."""
+    xyz = wall(0, num_points(number), coordinates_of)
     ids = np.arange(len(xyz))
     first = np.maximum(0, -(-(ids - SEEN + 1) // STEP))
     lengths = np.minimum(ids // STEP, number - 1) - first + 1
@@ -119,6 +149,87 @@ def write_points(xyz: np.ndarray, number: int, path: Path) -> None:
             file.write(struct.pack("<Q3d3BdQ", i + 1, *at, 0, 0, 0, 0.6, length))
             places = np.arange(start, start + length)
             file.write(np.stack([places + 1, i - places * STEP], 1).astype("<u4").tobytes())
+
+
+class Wall:
+    """The points of a wall, as `hlm.writer.Content`.
+
+    Args:
+        images: number of images.
+    """
+
+    def __init__(self, images: int):
+        self._number = num_points(images)
+
+    def __len__(self) -> int:
+        return self._number
+
+    def xyz(self, part: slice) -> np.ndarray:
+        """Return the coordinates (K, 3) of some points."""
+        return wall(part.start, min(part.stop, self._number), coordinates_of)
+
+    def descriptors(self, part: slice) -> np.ndarray:
+        """Return the descriptors (K, D) of some points."""
+        return wall(part.start, min(part.stop, self._number), descriptors_of)
+
+    def visible(self, image: int) -> np.ndarray:
+        """Return the points that an image shows."""
+        return np.arange(SEEN) + image * STEP
+
+
+def global_signs(images: int, words: np.ndarray) -> np.ndarray:
+    """Return the packed signs (I, B) of the VLAD of the points that images show.
+
+    Args:
+        images: number of images.
+        words: the vocabulary (W, D).
+    """
+    packed, shown = [], -(-SEEN // STEP)  # metres that an image shows
+    for start in progress(range(0, images, 1000), "Global descriptors", "block"):
+        metres = min(1000, images - start) + shown - 1
+        described = wall(start * STEP, (start + metres) * STEP, descriptors_of)
+        nearest = (2 * described @ words.T - (words**2).sum(axis=1)).argmax(axis=1)
+        of_word = np.repeat(np.arange(metres), STEP) * len(words) + nearest
+        order = np.argsort(of_word, kind="stable")
+        used, first = np.unique(of_word[order], return_index=True)
+        sums = np.zeros((metres * len(words), DIM), np.float32)
+        sums[used] = np.add.reduceat((described - words[nearest])[order], first)
+        sums = sums.reshape(metres, len(words), DIM)
+        rows = sum(sums[i : metres - shown + 1 + i] for i in range(shown))
+        rows /= np.maximum(np.linalg.norm(rows, axis=2, keepdims=True), 1e-9)
+        packed.append(signs.pack(rows.reshape(len(rows), -1))[0])
+    return np.concatenate(packed)
+
+
+def stream(names: list[str], folder: Path) -> dict:
+    """Write the compact map block by block, without a model."""
+    from hloc_reduce.hlm import writer
+    from hloc_reduce.hlm.images import Images
+    from hloc_reduce.retrieval.vlad import VLAD
+
+    start, number = time.perf_counter(), len(names)
+    vlad = VLAD({})
+    vlad.fit(wall(0, 100 * STEP, descriptors_of))
+    vocabulary = folder / "vocabulary.safetensors"
+    save_file({"vocabulary": vlad.vocabulary.astype(np.float32)}, vocabulary)
+    camera, unturned = np.zeros(number, int), np.tile([0.0, 0.0, 0.0, 1.0], (number, 1))
+    centers = np.stack([np.arange(number), np.zeros(number), np.zeros(number)], axis=1)
+    images = Images(names, unturned, centers, [CAMERA], camera)
+    source = writer.Source(
+        pycolmap.Reconstruction(),
+        FEATURE,
+        features_confs.get(FEATURE)[1] | {"storage": "uint4"},
+        "NN-ratio90",
+        Path(),
+        vocabulary,
+        intrinsics.of_cameras([CAMERA]),
+    )
+    described = global_signs(number, vlad.vocabulary.astype(np.float32))
+    dim, step = vlad.vocabulary.size, 0.1 * DEPTH / CAMERA.mean_focal_length()
+    with (folder / "place.hlm").open("wb") as file:
+        parts = writer.write(file, Wall(number), images, source, described, dim, step)
+        os.fsync(file.fileno())
+    return built(parts, start)
 
 
 def build(folder: Path) -> dict:
@@ -132,46 +243,81 @@ def build(folder: Path) -> dict:
         features=folder / "features.h5",
         feature=FEATURE,
     )
+    return built(parts, start)
+
+
+def built(parts: dict[str, int], start: float) -> dict:
+    """Return the measures of a compact map of some bytes by part, whose building has begun."""
     return {
         "points": parts["descriptors"] * 2 // DIM,
         "build_s": time.perf_counter() - start,
+        "build_cpu_s": time.process_time(),
         "build_mb": peak(),
-        "mb": (folder / "place.hlm").stat().st_size / 1e6,
+        "mb": sum(parts.values()) / 1e6,
     }
 
 
 def localize(number: int, folder: Path) -> dict:
     """Open the compact map and localize queries, whose features are given."""
+    file = folder / "place.hlm"
+    with file.open("rb") as opened_file:
+        os.posix_fadvise(opened_file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
     start = time.perf_counter()
     from hloc_reduce import Localizer
 
-    imported = time.perf_counter()
-    localizer = Localizer(folder / "place.hlm")
-    opened = time.perf_counter()
-    resident = current()
-    xyz, descriptors = wall(number)
-    queries = [synthetic_query(place, xyz, descriptors) for place in places(number)]
-    del xyz, descriptors
+    imported, cpu = time.perf_counter(), time.process_time()
+    localizer = Localizer(file)
+    opened, open_cpu = time.perf_counter(), time.process_time() - cpu
+    resident, open_mb = current(), touched(file)
+    queries = [synthetic_query(place) for place in places(number)]
+    coordinates_of.cache_clear()
+    descriptors_of.cache_clear()
     before = current()
-    stages: dict[str, list[float]] = {stage: [] for stage in STAGES}
-    right, correspondences = 0, []
-    for place, query in zip(places(number), queries, strict=True):
-        localizer.engine.extract = lambda *_, query=query: dict(query)
-        pose, info = localizer.localize(np.zeros((1200, 1600), np.uint8), CAMERA)
-        for stage, seconds in stages.items():
-            seconds.append(info["seconds"].get(stage, 0.0))
-        correspondences.append(info["num_correspondences"])
-        right += pose is not None and abs(pose.translation[0] + place) < 0.05
+    touching: list[float] = []
+    for again in (False, True):
+        stages: dict[str, list[float]] = {stage: [] for stage in STAGES}
+        right, correspondences, query_cpu = 0, [], []
+        for place, query in zip(places(number), queries, strict=True):
+            localizer.engine.extract = lambda *_, query=query: dict(query)
+            last, cpu = touched(file), time.process_time()
+            pose, info = localizer.localize(np.zeros((1200, 1600), np.uint8), CAMERA)
+            query_cpu.append(time.process_time() - cpu)
+            if not again:
+                touching.append(touched(file) - last)
+            for stage, seconds in stages.items():
+                seconds.append(info["seconds"].get(stage, 0.0))
+            correspondences.append(info["num_correspondences"])
+            right += pose is not None and abs(pose.translation[0] + place) < 0.05
+        if not again:
+            cold = sum(sum(seconds) for seconds in stages.values()) / len(queries)
     return {
         "import_s": imported - start,
         "open_s": opened - imported,
+        "open_cpu_s": open_cpu,
         "resident_mb": resident,
+        "open_file_mb": open_mb,
+        "first_query_file_mb": touching[0],
+        "query_file_mb": float(np.mean(touching[1:])),
+        "cold_query_s": cold,
         "queries_mb": current() - before,
         **{f"{stage}_s": float(np.mean(seconds)) for stage, seconds in stages.items()},
+        "query_cpu_s": float(np.mean(query_cpu)),
         "correspondences": float(np.mean(correspondences)),
         "queries": len(queries),
         "localized": int(right),
     }
+
+
+def touched(path: Path) -> float:
+    """Return the resident size of the mapping of a file in this process, in 1,000,000 bytes."""
+    kilobytes, found = 0, False
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        words = line.split()
+        if "-" in words[0]:
+            found = line.endswith(str(path))
+        elif found and words[0] == "Rss:":
+            kilobytes += int(words[1])
+    return kilobytes * 1024 / 1e6
 
 
 def places(number: int) -> np.ndarray:
@@ -179,10 +325,10 @@ def places(number: int) -> np.ndarray:
     return np.linspace(0, number - 2, QUERIES).astype(int) + 0.3
 
 
-def synthetic_query(place: float, xyz: np.ndarray, descriptors: np.ndarray) -> dict:
+def synthetic_query(place: float) -> dict:
     """Return the features of a query, as an extractor does."""
     generator = np.random.default_rng([2, int(10 * place)])
-    _, pixels, views = seen(place, xyz, descriptors)
+    _, pixels, views = seen(place)
     clutter = generator.uniform(0, [CAMERA.width, CAMERA.height], (CLUTTER, 2))
     return {
         "keypoints": (np.concatenate([pixels, clutter]) - 0.5).astype(np.float32),
@@ -213,14 +359,19 @@ def _main() -> None:
     for hidden in ("--folder", "--stage"):
         parser.add_argument(hidden, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if not all(0 < share <= 1 for share in args.share):
-        raise InputError("--share: numbers above 0 and at most 1.")
-    names = image_names(args.data / "database_images.txt")
+    if not all(0 < share <= 100 for share in args.share):
+        raise InputError("--share: numbers above 0 and at most 100.")
+    names = sorted(image_names(args.data / "database_images.txt"))
     features_confs.get(FEATURE)
     if args.stage:
-        folder, some = Path(args.folder), names[: max(60, round(args.share[0] * len(names)))]
+        folder, number = Path(args.folder), max(60, round(args.share[0] * len(names)))
+        some = names[:number]
+        if number > len(names):
+            some = [f"{i:03}/{name}" for i in range(-(-number // len(names))) for name in names]
+        some = some[:number]
         stages = {
             "synthesize": lambda: synthesize(some, folder),
+            "stream": lambda: stream(some, folder),
             "build": lambda: build(folder),
             "localize": lambda: localize(len(some), folder),
         }
@@ -232,7 +383,7 @@ def _main() -> None:
         if not args.again and rows.select(rows.read(NAME), **cells):
             continue
         with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as folder:
-            for stage in ("synthesize", "build", "localize"):
+            for stage in (*(("stream",) if share > 1 else ("synthesize", "build")), "localize"):
                 given = ["--data", args.data, "--share", str(share), "--folder", folder]
                 done = subprocess.run(
                     [sys.executable, "-m", "benchmarks.compact_scale", "--stage", stage, *given],

@@ -119,7 +119,7 @@ LIGHTGLUE_PLACES = (
     *("herz-jesus", "dark-fountain-P11", "dark-sceaux"),
     *(f"sparse-{place}" for place in ("herz-jesus", "fountain-P11", "sceaux")),
 )
-MANY_IMAGES = 100_000  # from which the table of retrieval has them
+MANY_IMAGES = 1_000_000  # from which the table of retrieval has them
 # from what `benchmarks.changed_photos` changes to what tables say
 CHANGED_PHOTOS = {
     "map 1, queries 1, turned 0": "unchanged",
@@ -452,16 +452,6 @@ def own_maps_table() -> Table:
     return table
 
 
-def extraction_parts_table() -> Table:
-    """Show where the time of extracting the features of a folder goes."""
-    parts = ("import", "start", "copy", "work", "rest")
-    table = [["feature", "photos", *parts, "all"]]
-    for row in sorted(read("extraction_parts"), key=lambda row: int(row["photos"])):
-        cells = [f"{float(row[f'{part}_s']):.1f}" for part in (*parts, "all")]
-        table.append([f"`{row['feature']}`", row["photos"], *cells])
-    return table
-
-
 def retrieval_table() -> Table:
     """Show how long the search for similar images takes, by their number."""
     table = [["images", "search", "a query [ms]", "index [s]", "right of the first 20"]]
@@ -557,13 +547,14 @@ def scale_table() -> Table:
 
 
 def compact_scale_table() -> Table:
-    """Show what compact maps of parts of Aachen's size cost."""
-    columns = {"build_s": "build [s]", "build_mb": "build [MB]", "mb": "file [MB]"}
-    columns |= {"open_s": "open [s]", "resident_mb": "resident [MB]"}
-    columns |= {f"{stage}_s": f"{stage} [s]" for stage in ("retrieval", "matching", "pose")}
+    """Show what compact maps of parts and of multiples of Aachen's size cost."""
+    columns = {"mb": "file [MB]", "build_cpu_s": "build [s]", "build_mb": "build [MB]"}
+    columns |= {"open_cpu_s": "open [s]", "resident_mb": "resident [MB]"}
+    columns |= {"first_query_file_mb": "first query, touched [MB]"}
+    columns |= {"query_file_mb": "a query, touched [MB]", "query_cpu_s": "a query [s]"}
     table = [["images", "points", *columns.values(), "localized"]]
-    for row in read("compact_scale"):
-        cells = [f"{float(row[key]):,.3g}" for key in columns]
+    for row in sorted(read("compact_scale"), key=lambda row: int(row["photos"])):
+        cells = [f"{float(f'{float(row[key]):.3g}'):,}".removesuffix(".0") for key in columns]
         counts = thousands(row["photos"]), thousands(row["points"])
         table.append([*counts, *cells, f"{row['localized']} of {row['queries']}"])
     return table
@@ -727,7 +718,6 @@ TABLES: dict[str, Callable[[], Table]] = {
     "runs": runs_table,
     "runs_cpu": runs_cpu_table,
     "extraction": extraction_table,
-    "extraction_parts": extraction_parts_table,
     "localizer": localizer_table,
     "own_maps": own_maps_table,
     "tracking": tracking_table,

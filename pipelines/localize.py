@@ -7,6 +7,7 @@ is built. A new map has the feature colmap_sift_sv64 and its matcher unless you 
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -360,11 +361,17 @@ class Command(command.Command):
     """The command line of the pipeline.
 
     Args:
+        model_or_map: COLMAP model of `map_images` or `database`, or a folder with one model in it;
+            or a map of an earlier run: its folder or .hlm file, which is unpacked; or several .hlm
+            files of one place, as one map.
         compact: write the map into one small file, too.
         fps: frames per second of a video of queries, at a steady rate; default: its sharp frames,
             whenever the camera has moved.
     """
 
+    model_or_map: (
+        Annotated[Sequence[Path], Option(flags=("--map",), metavar="MODEL|MAP")] | None
+    ) = None
     compact: Annotated[Path, Option(metavar="FILE.hlm")] | None = None
     fps: Annotated[float, ABOVE_0] | None = None
 
@@ -373,11 +380,11 @@ def _parser() -> Parser:
     """Return the parser of the command line."""
     example = "--map sparse --map_images photos --query_images new --outputs outputs/place"
     parser = Parser(__doc__, example)
+    parser.add(Command)
     parser.add(open_map, outputs=None)
     parser.add(main, query_images=None)
     parser.add(changes.main)
     parser.add(metres.main)
-    parser.add(Command)
     return parser
 
 
@@ -422,6 +429,10 @@ def _check(given: dict, is_changed: bool) -> None:
 
 def _main() -> None:
     given = command.read(_parser())
+    paths = given["model_or_map"] or [None]
+    given |= {"model_or_map": paths[0], "joined": paths[1:] and paths}
+    if paths[1:] and not maps.is_compact(paths):
+        raise InputError(f"--map {' '.join(map(str, paths))}: several maps must be .hlm files.")
     change, outputs, folder = taken(changes.main, given), given["outputs"], given["model_or_map"]
     masks = change.pop("masks")
     gps, scale = given["gps"], given["scale"]
@@ -456,6 +467,9 @@ def _run(given: dict) -> None:
     where = given["map_images"], given["model_or_map"], given["query_images"]
     special = map_photos.of_map(*where, given["rigs"], given["panoramas"])
     gps, scale = given["gps"], given["scale"]
+    if given["joined"]:
+        unpacked = maps.unpack(given["joined"], given["outputs"] / "map", given["overwrite"])
+        given["model_or_map"] = unpacked.folder
     options = taken(open_map, given | special._asdict())
     built = open_map(**options, exif_gps=not (gps or scale))
     strict = given["map_images"] is None or given["model_or_map"] is not None

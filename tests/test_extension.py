@@ -131,7 +131,7 @@ def test_a_toy_retrieval_in_a_map(place, tmp_path, run, refused):
     file = tmp_path / "place.hlm"
     compact.main(file, outputs / "map")
     with safe_open(file, "np") as opened:
-        assert '"retrieval": "thumbnail"' in opened.metadata()["map"]
+        assert '"retrieval":"thumbnail"' in opened.metadata()["map"]
         assert "vocabulary" not in {*opened.keys()}
     for path in (outputs / "map", file):
         pose, info = Localizer(path).localize(photos / "a.png")

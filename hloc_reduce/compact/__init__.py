@@ -4,7 +4,7 @@ Keeps one descriptor for each 3D point, which images see it, and what retrieval 
 keypoints. Localize in it with pipelines.localize --map FILE, or with Localizer(FILE).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,8 +17,9 @@ from ..aggregate_features import output_of, vocabulary_if_any
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
-from ..hlm import points, writer
-from ..hlm.reader import SUFFIX, check_feature_keys
+from ..hlm import points, signs, writer
+from ..hlm.images import Images
+from ..hlm.reader import SUFFIX, CompactMap, check_feature_keys
 from ..hlm.writer import Source
 from ..localization import intrinsics
 from ..maps.map import Map
@@ -29,8 +30,10 @@ from ..utils.cli import InputError
 from ..utils.codes import STORAGES, Storage
 from ..utils.files import MEGABYTE, replacing
 from ..utils.options import ABOVE_0, Option
+from ..utils.parsers import image_names
 from ..utils.paths import strings_as_paths
 
+IMAGES_AT_ONCE = 1024  # whose global descriptors are in memory
 MAX_TRIES = 12  # of sizes, to come close to a limit
 AIMED_SHARE = 0.998  # of the limit
 CLOSE_SHARE = 0.995  # of the limit, which is close enough
@@ -51,6 +54,7 @@ def main(
     storage: Storage | None = None,
     max_mb: Annotated[float, ABOVE_0] | None = None,
     retrieval: Annotated[str, Option("retrieval", retrieval_confs.confs)] | None = None,
+    image_list: Path | None = None,
 ) -> dict[str, int]:
     """Write a compact map.
 
@@ -69,6 +73,8 @@ def main(
             levels.
         max_mb: size of the file in 1,000,000 bytes: points that images need least are left out.
         retrieval: what computed `global_descriptors`; default: the map's, or vlad.
+        image_list: text file with the names of the images that the file has, a part of the map that
+            can be joined with others; default: all.
 
     Returns:
         The bytes of each part of the file.
@@ -93,7 +99,8 @@ def main(
     else:
         name = retrieval or retrieval_confs.VLAD
         source = _of_stages(sfm, features, global_descriptors, feature, name)
-    return write(output, source, features, matcher, storage, max_mb)
+    names = None if image_list is None else image_names(image_list)
+    return write(output, source, features, matcher, storage, max_mb, names)
 
 
 def write(
@@ -103,6 +110,7 @@ def write(
     matcher: str | None = None,
     storage: str | None = None,
     max_mb: float | None = None,
+    names: Collection[str] | None = None,
 ) -> dict[str, int]:
     """Write a compact map of what a pipeline has in memory and in files.
 
@@ -113,13 +121,14 @@ def write(
         matcher: matcher of queries; default: the map's, but NN-ratio90 for NN-ratio.
         storage: storage of the points' descriptors; default: as in `main`.
         max_mb: size of the file in 1,000,000 bytes; default: with all points.
+        names: images that the file has; default: all.
 
     Returns:
         The bytes of each part of the file.
 
     Raises:
-        InputError: for a matcher that is unknown or needs what compact maps do not have, or a size
-            that is too small.
+        InputError: for an image that is not in the map, a matcher that is unknown or needs what
+            compact maps do not have, or a size that is too small.
     """
     matcher = matcher or matcher_of(source.matcher)
     check_matcher(matcher)
@@ -128,23 +137,22 @@ def write(
         matchers.load(matchers_confs.for_features(model, made_from))
     conf = {**source.conf, "storage": _storage(source.conf, storage)}
     source = replace(source, matcher=matcher, conf=conf)
-    everything = points.collect(source.model, features)
+    images = Images.of(source.model, names)
+    everything = points.collect(source.model, features, images.names)
     _check_dim(source, features, everything.descriptors.shape[1])
-    rows = read_global(source.global_descriptors, everything.names)
-    encode = partial(_encode, everything, source, rows)
-    if max_mb is None:
-        number = len(everything)
-        content, parts = encode(number)
-    else:
-        number, content, parts = _fit(encode, len(everything), max_mb)
+    described = _global_signs(source.global_descriptors, everything.names)
     with replacing(output) as temporary:
-        temporary.write_bytes(content)
+        encode = partial(_encode, temporary, everything, source, images, described)
+        if max_mb is None:
+            number, parts = len(everything), encode(len(everything))
+        else:
+            number, parts = _fit(encode, len(everything), max_mb)
     logger.info(
         "%s has %s of %s points and %s bytes: %s.",
         output,
         f"{number:,}",
         f"{len(everything):,}",
-        f"{len(content):,}",
+        f"{sum(parts.values()):,}",
         ", ".join(f"{part} {size:,}" for part, size in parts.items()),
     )
     return parts
@@ -183,7 +191,32 @@ def _of_map(built: Map) -> Source:
         built.doubts,
         built.retrieval,
         built.frame,
+        built.id,
     )
+
+
+def check(file: Path, map: Path | None = None, sfm: Path | None = None) -> str | None:
+    """Tell whether a compact map is current.
+
+    Args:
+        file: the compact map.
+        map: folder of the map that it was made from; or else give `sfm`.
+        sfm: COLMAP model that it was made from.
+
+    Returns:
+        Why it is stale, None if it is current.
+
+    Raises:
+        InputError: when something is missing or broken.
+    """
+    if (map is None) == (sfm is None):
+        raise InputError("--check needs --map or --sfm, what the file was made from.")
+    made_from = CompactMap(file).made_from
+    if made_from is None:
+        return f"{file} is of an earlier version, which does not tell what it was made from."
+    if made_from != (Map(map).id if map else colmap.fingerprint(sfm or Path())):
+        return f"{file} is stale: it was made from something else than {map or sfm} as it is now."
+    return None
 
 
 def _of_stages(
@@ -197,7 +230,17 @@ def _of_stages(
     model = colmap.read_model(sfm)
     cameras = intrinsics.of_cameras(image.camera for image in model.images.values())
     matcher = features_confs.matcher_of(conf)
-    return Source(model, name, conf, matcher, descriptors, vocabulary, cameras, retrieval=retrieval)
+    return Source(
+        model,
+        name,
+        conf,
+        matcher,
+        descriptors,
+        vocabulary,
+        cameras,
+        retrieval=retrieval,
+        made_from=colmap.fingerprint(sfm),
+    )
 
 
 def _check_dim(source: Source, features: Path, dim: int) -> None:
@@ -228,29 +271,62 @@ def _storage(conf: dict, storage: str | None) -> str:
 
 
 def _encode(
-    everything: points.Points, source: Source, rows: np.ndarray, number: int
-) -> tuple[bytes, dict[str, int]]:
-    """Encode the points that images need most."""
+    path: Path,
+    everything: points.Points,
+    source: Source,
+    images: Images,
+    described: tuple[np.ndarray, int],
+    number: int,
+) -> dict[str, int]:
+    """Write the points that images need most; return the bytes of each part.
+
+    Args:
+        path: the file.
+        everything: all points.
+        source: what the map is made from.
+        images: of the map.
+        described: from `_global_signs`.
+        number: of points that are written.
+    """
     chosen = everything.only(points.select(everything, number))
-    return writer.encode(chosen, source, rows)
+    step = points.precision(chosen, source.model)
+    with path.open("wb") as file:
+        return writer.write(file, points.Sorted(chosen), images, source, *described, step)
+
+
+def _global_signs(path: Path, names: Sequence[str]) -> tuple[np.ndarray, int]:
+    """Return the packed signs (I, B) of the global descriptors of images, and their dimension."""
+    packed, dims = [], set()
+    for start in range(0, len(names), IMAGES_AT_ONCE):
+        rows = read_global(path, [*names[start : start + IMAGES_AT_ONCE]])
+        packed.append(signs.pack(rows)[0])
+        dims.add(rows.shape[1])
+    if len(dims) > 1:
+        raise InputError(f"The global descriptors in {path} differ in size.")
+    return np.concatenate(packed), dims.pop()
 
 
 def _fit(
-    encode: Callable[[int], tuple[bytes, dict[str, int]]], number: int, max_mb: float
-) -> tuple[int, bytes, dict[str, int]]:
-    """Encode about as many points as fit into a limit.
+    encode: Callable[[int], dict[str, int]], number: int, max_mb: float
+) -> tuple[int, dict[str, int]]:
+    """Write about as many points as fit into a limit.
+
+    Args:
+        encode: writes a number of points, and returns the bytes of each part.
+        number: of all points.
+        max_mb: the limit in 1,000,000 bytes.
 
     Returns:
-        Their number, the content and the bytes of each part.
+        The number of points that were written last, and the bytes of each part.
     """
-    limit, best = max_mb * MEGABYTE, (0, b"", dict[str, int]())
+    limit, best, parts = max_mb * MEGABYTE, 0, dict[str, int]()
     low, high, tried = 0, number + 1, number  # the first number fits, the second one does not
     for _ in range(MAX_TRIES):
-        content, parts = encode(tried)
-        size = len(content)
+        parts = encode(tried)
+        size = sum(parts.values())
         fixed = size - sum(parts[part] for part in ("coordinates", "descriptors", "visible"))
         if size <= limit:
-            low, best = tried, (tried, content, parts)
+            low = best = tried
             if tried == number or size >= CLOSE_SHARE * limit:
                 break
         else:
@@ -260,8 +336,8 @@ def _fit(
         # points that many images show come first, so that fewer take more than their share
         guess = int(AIMED_SHARE * tried * (limit - fixed) / (size - fixed))
         tried = guess if low < guess < high else (low + high) // 2
-    if not low:
+    if not best:
         raise InputError(
             f"--max_mb {max_mb:g} is too small: a point and {fixed:,} bytes are needed."
         )
-    return best
+    return best, parts if tried == best else encode(best)

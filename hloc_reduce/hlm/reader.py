@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property, lru_cache
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -18,6 +19,7 @@ from ..localization.frame import Frame
 from ..localization.projection import reprojection_errors
 from ..projections.layers import Layer
 from ..projections.layers import read as read_layers
+from ..retrieval.ranking import rank
 from ..retrieval.vlad import VOCABULARY, read_vocabulary
 from ..utils.cli import InputError, choose, naming
 from ..utils.codes import CODED, FLOATS, QUANTIZED, STORAGES, check_levels, restore
@@ -25,22 +27,24 @@ from ..utils.feature_files import upright
 from ..utils.files import file_sha256, replacing
 from ..utils.images import TURNS
 from ..utils.parsers import check_names
-from . import points as points_of_map
-from . import signs
+from . import images, older, signs, tensors, visible
+from .broken import reading
+from .names import Names
+from .points import Coordinates, Grid
 
-VERSION = 2
-VERSION_RETRIEVAL = 3  # of files whose global descriptors are not VLAD's
-# that are read; in the first one, all coordinates have the same bits
-VERSIONS = 1, VERSION, VERSION_RETRIEVAL
+VERSION = 4
 SUFFIX = ".hlm"
 FEATURES = "keypoints", "descriptors", "image_size"  # of an image, see `matchers.base.Matcher`
 # what a file may ask for
 MAX_DIM, MAX_GLOBAL, MAX_SIDE, LEAST_OCTAVE = 512, 2**14, 4096, -1
+CACHED = 128  # images whose visible points stay in memory
 PROJECTION = re.compile(r"[\w+-]+(@\d+)?")  # a name, and a prefix of a nested one
 
 
 class CompactMap:
     """A compact map, as a `localization.references.Reference`: its images show points.
+
+    The file is opened, not read: each method reads what it needs, and checks that.
 
     Args:
         path: the file.
@@ -52,8 +56,10 @@ class CompactMap:
         matcher: a key of `confs.matchers`.
         retrieval: a key of `confs.retrieval`.
         cameras: what the map tells about the intrinsics of other photos.
+        doubts: why it may be wrong.
         frame: its unit, and where on Earth it is.
-        camera_number, camera_of: the number of each image's camera, and its intrinsics.
+        made_from: id of the map that it was made from, or a fingerprint of the model; None if it
+            does not tell.
         names: the images, sorted.
         points: the coordinates.
         vocabulary: (W, D) float32, of the global descriptors; None if they have none.
@@ -61,89 +67,64 @@ class CompactMap:
         projection: content of the file of the projection, None without one.
 
     Raises:
-        InputError: when the file is missing, broken or of another version.
+        InputError: when the file is missing, broken or of another version. All methods raise it
+            when the part that they read is broken.
     """
 
     def __init__(self, path: Path):
-        from safetensors import SafetensorError, safe_open
-
         self.path = path
-        try:
-            with safe_open(path, "np") as file:
-                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-                metadata = json.loads((file.metadata() or {})["map"])
-            if metadata["version"] not in VERSIONS:
+        with reading(path):
+            told, arrays = tensors.read(path)
+            metadata = json.loads(told["map"])
+            version = metadata["version"]
+            if version not in (*older.VERSIONS, VERSION):
                 raise InputError(
-                    f"{path} is a compact map of version {metadata['version']}, not "
-                    f"{' or '.join(map(str, VERSIONS[1:]))}."
+                    f"{path} is a compact map of version {version}, not {VERSION} or older."
                 )
-            if metadata["version"] == 1:
-                metadata["bits"] = 3 * [metadata["bits"]]
             with naming(path):
-                self._read(metadata, tensors)
-        except FileNotFoundError:
-            raise InputError(f"There is no map {path}.") from None
-        except InputError:
-            raise
-        except (
-            OSError,
-            SafetensorError,
-            KeyError,
-            ValueError,
-            TypeError,
-            IndexError,
-            RecursionError,
-            OverflowError,
-            AttributeError,
-            RuntimeError,
-        ) as error:
-            said = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-            raise InputError(f"{path} is not a compact map, or broken ({said}).") from None
+                if version != VERSION:
+                    metadata, arrays = older.convert(metadata, arrays, path)
+                self._read(metadata, arrays)
 
-    def _read(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
-        names = _array(tensors, "names", np.uint8, (None,)).tobytes().decode().split("\n")
-        self.names, number = check_names(names, self.path), int(metadata["points"])
-        folders = {str(folder) for name in names for folder in PurePath(name).parents}
-        if len(set(names)) != len(names) or folders & set(names):
-            raise ValueError("images of the same name, or an image in another one")
-        count = len(names)
-        self._rotations = _array(tensors, "rotations", np.float32, (count, 4))
-        self._translations = _array(tensors, "translations", np.float64, (count, 3))
-        cameras = [intrinsics.from_list(values) for values in metadata["cameras"]]
-        used = _array(tensors, "camera_of_image", np.uint32, (count,))
-        self.camera_number = dict(zip(names, used.tolist(), strict=True))
-        self.camera_of = {name: cameras[i] for name, i in self.camera_number.items()}
+    def _read(self, metadata: dict, arrays: Mapping[str, np.ndarray]) -> None:
+        number, shipped = int(metadata["points"]), dict(metadata.get("shipped", {}))
+        table = _array(arrays, "images", np.uint8, (None, images.ROW.itemsize))
+        self._table = np.ascontiguousarray(table).view(images.ROW)[:, 0]
+        packed = _array(arrays, "names", np.uint8, (None,))
+        self._names = Names(packed, len(table), self.path)
+        self.names: Sequence[str] = self._names
+        self._cameras = _array(arrays, "cameras", np.uint8, (None, None))
         bits, step = [int(number) for number in metadata["bits"]], float(metadata["step"])
-        least = np.array(metadata["least"], np.float64)
-        coordinates = _array(tensors, "coordinates", np.uint8, (None,))
-        self.points = points_of_map.Coordinates(coordinates, number, least, step, bits)
-        counts = _array(tensors, "num_visible", np.uint32, (count,)).astype(np.int64)
-        packed = _array(tensors, "visible", np.uint8, (None,))
-        self._visible = points_of_map.Visible(packed, metadata["visible"], counts, number)
-        self._rows = {name: row for row, name in enumerate(names)}
-        self._read_descriptors(metadata, tensors)
-        self._read_feature(metadata)
-        self._read_projection(metadata, tensors)
-        self._read_retrieval(metadata, tensors)
-        norms = np.linalg.norm(self._rotations.astype(np.float64), axis=1)
-        finite = np.isfinite(norms).all() and np.isfinite(self._translations).all()
-        if not (finite and norms.min() > 0):
-            raise ValueError("numbers that are not finite")
-
-    def _read_descriptors(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
+        self._grid = Grid(np.array(metadata["least"], np.float64), step, bits)
+        coordinates = _array(arrays, "coordinates", np.uint8, (None,))
+        self.points = Coordinates(coordinates, number, self._grid)
+        self._center_step = float(metadata["center_step"])
+        if not np.isfinite(self._grid.least + self._center_step * 2.0**31).all():
+            raise ValueError("centers that are not finite")
+        self._packed = _array(arrays, "visible", np.uint8, (None,))
+        self.visible_of = lru_cache(CACHED)(self._visible_of)
         self.storage = choose("storage", metadata["storage"], STORAGES)
+        self._read_feature(metadata)
+        self._read_projection(metadata, arrays, shipped)
+        self._read_descriptors(metadata, arrays)
+        self._read_retrieval(metadata, arrays, shipped)
+
+    def _read_descriptors(self, metadata: dict, arrays: Mapping[str, np.ndarray]) -> None:
         kind = np.dtype(self.storage) if self.storage in FLOATS else np.uint8
-        found = _array(tensors, "descriptors", kind, (None, len(self.points)))
+        self._descriptors = found = _array(arrays, "descriptors", kind, (len(self.points), None))
         self._key = QUANTIZED.get(self.storage, "descriptors")
         self._attrs: dict[str, Any] = {}
-        self._descriptors = found
         if self.storage in CODED:
-            self._attrs["levels"] = check_levels(tensors["levels"], self.storage, len(found))
+            levels = arrays.get("levels")
+            if levels is None:  # they ship with the projection
+                levels = projections.levels(self.conf["model"]["projection"], self.storage)
+                levels = levels.astype(np.float16)
+            self._attrs["levels"] = check_levels(levels, self.storage, found.shape[1])
         elif self.storage not in FLOATS:
             scale, offset = map(float, metadata["scale"])
             self._attrs |= {"scale": scale, "offset": offset}
-        self.dim = len(self._attrs.get("levels", found))
-        numbers = found if self.storage in FLOATS else np.array(metadata["scale"], float)
+        self.dim = len(self._attrs.get("levels", found.T))
+        numbers = [*self._attrs.values()] if "scale" in self._attrs else []
         if not (0 < self.dim <= MAX_DIM and np.isfinite(numbers).all()):
             raise ValueError(f"descriptors of {self.dim} numbers, or not finite")
 
@@ -162,79 +143,102 @@ class CompactMap:
         self.matcher = choose("matcher", metadata["matcher"], matchers_confs.confs)
         self.doubts = [str(doubt) for doubt in metadata.get("doubts", [])]
         self.frame = Frame.from_json(metadata.get("frame"))
-        sizes = {(int(width), int(height)) for width, height in metadata["sizes"]}
-        known = metadata["known"].items()
-        models, focal = {str(m) for m in metadata["models"]}, metadata.get("focal_lengths")
-        typical = intrinsics.from_rows(metadata.get("typical", []))
-        orientations = {int(one) for one in metadata.get("orientations", [])}
-        told = intrinsics.MapCameras(
-            {str(name): intrinsics.from_list(values) for name, values in known},
-            sizes,
-            models,
-            intrinsics.to_range(focal),
-            typical,
-            orientations,
-        )
-        self.cameras = intrinsics.with_lenses(told, self.camera_of.values())
+        self.made_from = metadata.get("made_from")
+        self.cameras = intrinsics.from_dict(metadata)
+        orientations = self.cameras.orientations
         turns = {TURNS.get(one, 0) for one in orientations}
         is_upright = self.conf["preprocessing"].get("upright") and len(turns) == 1
         self._turns = turns.pop() if is_upright else 0
 
-    def _read_projection(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
+    def _read_projection(
+        self, metadata: dict, arrays: Mapping[str, np.ndarray], shipped: dict
+    ) -> None:
         self.projection: bytes | None = None
         projection = self.conf["model"].get("projection")
         if projection is None:
             return
         if not PROJECTION.fullmatch(projection):
             raise ValueError(f"the projection {projection!r}")
-        self._suffix = metadata["projection_suffix"]
+        self._suffix = metadata.get("projection_suffix", ".safetensors")
         if self._suffix not in (".safetensors", ".pth"):
             raise ValueError(f"a projection of type {self._suffix!r}")
-        if "projection" in tensors:
-            self.projection = tensors["projection"].tobytes()
+        if "projection" in arrays:
+            self.projection = arrays["projection"].tobytes()
             return
-        if projections.checksum(projection) != metadata["projection_sha256"]:
+        if projections.checksum(projection) != shipped["projection"]:
             raise InputError(f"{self.path} needs another {projection} than the one that ships.")
         self.projection = projections.find(projection).read_bytes()
 
-    def _read_retrieval(self, metadata: dict, tensors: Mapping[str, np.ndarray]) -> None:
+    def _read_retrieval(
+        self, metadata: dict, arrays: Mapping[str, np.ndarray], shipped: dict
+    ) -> None:
         self.retrieval = str(metadata.get("retrieval", retrieval_confs.VLAD))
         retrieval_confs.get(self.retrieval)
         self.vocabulary: np.ndarray | None = None
-        if "vocabulary" in tensors:
-            found = _array(tensors, "vocabulary", np.float16, (None, self.dim))
+        if "vocabulary" in arrays:
+            found = _array(arrays, "vocabulary", np.float16, (None, self.dim))
             self.vocabulary = found.astype(np.float32)
-        elif self.retrieval == retrieval_confs.VLAD or "vocabulary_sha256" in metadata:
+        elif self.retrieval == retrieval_confs.VLAD or "vocabulary" in shipped:
             self.vocabulary = read_vocabulary()
-            if metadata.get("vocabulary_sha256") not in (None, file_sha256(VOCABULARY)):
+            if shipped.get("vocabulary") not in (None, file_sha256(VOCABULARY)):
                 raise InputError(f"{self.path} needs another vocabulary than the one that ships.")
-        number, size = int(metadata.get("global_dim", 0)), int(metadata["signs"])
+        number = int(metadata.get("global_dim", 0))
         if self.vocabulary is not None:
             if self.vocabulary.shape[1] != self.dim or not np.isfinite(self.vocabulary).all():
                 raise ValueError(f"a vocabulary of shape {self.vocabulary.shape}, or not finite")
             number = number or self.vocabulary.size
-        if not 0 < number <= MAX_GLOBAL or size != signs.count(number):
-            raise ValueError(f"{size} signs of global descriptors of {number} numbers")
-        packed = _array(tensors, "retrieval", np.uint8, (len(self.names), -(-size // 8)))
-        self._retrieval = signs.Signs(packed, number)
+        if not 0 < number <= MAX_GLOBAL:
+            raise ValueError(f"global descriptors of {number} numbers")
+        self._global_dim, width = number, -(-signs.count(number) // 8)
+        self._signs = _array(arrays, "retrieval", np.uint8, (len(self.names), width))
+        self._coarse: signs.Signs | None = None
+        if "coarse" in arrays:
+            columns = _array(
+                arrays, "coarse", np.uint8, (min(signs.COARSE, width), len(self.names))
+            )
+            self._coarse = signs.Signs(columns, number)
+            tensors.read_by_pages(self._signs)  # few rows, all over the file
+
+    @cached_property
+    def _every_sign(self) -> signs.Signs:
+        return signs.Signs(signs.columns(self._signs), self._global_dim)
+
+    def _is_blind(self, rows: np.ndarray) -> np.ndarray:
+        """Return which images (N,) show no point (N,) bool."""
+        ends = self._table["end"]
+        return np.where(rows > 0, ends[rows - 1], 0) == ends[rows]
 
     def global_descriptors(self) -> np.ndarray:
         """Return those of the images (I, G) float32 as their signs tell them.
 
         Norms are 1, or 0 for images without points.
         """
-        found = self._retrieval.descriptors()
-        found[self._visible.counts == 0] = 0
+        found = self._every_sign.descriptors()
+        found[self._is_blind(np.arange(len(found)))] = 0
         return found
 
-    def similarity(self, descriptor: np.ndarray) -> np.ndarray:
-        """Return the similarity (I,) of a global descriptor (G,) to those of the images.
+    def retrieve(self, descriptor: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Find the images that are most similar to a photo.
 
-        It is -inf for images without points.
+        Args:
+            descriptor: (G,) float32, its global descriptor.
+            number: of images, at most.
+
+        Returns:
+            Their rows (N,), best first, and similarity (N,), -inf for images without points.
         """
-        found = self._retrieval.similarity(descriptor)
-        found[self._visible.counts == 0] = -np.inf
-        return found
+        if self._coarse is None:
+            rows = np.arange(len(self.names))
+            similarity = self._every_sign.similarity(descriptor)
+        else:
+            rough = self._coarse.similarity(descriptor)
+            some = min(len(rough), signs.CANDIDATES * number)
+            rows = np.sort(np.argpartition(-rough, some - 1)[:some])
+            packed = signs.columns(self._signs[rows])
+            similarity = signs.Signs(packed, self._global_dim).similarity(descriptor)
+        similarity[self._is_blind(rows)] = -np.inf
+        best = rank(similarity[None], number)[0]
+        return rows[best], similarity[best]
 
     @property
     def is_pickled(self) -> bool:
@@ -271,27 +275,87 @@ class CompactMap:
         return self._stored(self.visible(name))
 
     def _stored(self, points: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
-        return {self._key: self._descriptors[:, points]}, {self._key: self._attrs}
+        found = self._descriptors[points]
+        if self.storage in FLOATS and not np.isfinite(found).all():
+            raise InputError(f"{self.path} is broken: its descriptors are not finite.")
+        return {self._key: found.T}, {self._key: self._attrs}
 
     def descriptors(self, points: np.ndarray, unbiased: bool = False) -> np.ndarray:
         """Return the descriptors (K, D) float32 of points (K,), see `codes.restore`."""
         return restore(*self._stored(points), unbiased)
 
+    def row(self, name: str) -> int:
+        """Return the row of an image."""
+        row = self._names.row(name)
+        if row is None:
+            raise InputError(f"{self.path} has no image {name}, or is broken.")
+        return row
+
+    def check_names(self) -> None:
+        """Refuse images of the same name, or whose name is a folder of another one.
+
+        Raises:
+            InputError: then.
+        """
+        names = list(self.names)
+        folders = {str(folder) for name in names for folder in PurePath(name).parents}
+        if len(set(names)) != len(names) or folders & set(names) or sorted(names) != names:
+            raise InputError(
+                f"{self.path} is broken: it has images of the same name, or one in another one."
+            )
+
     def visible(self, name: str) -> np.ndarray:
         """Return the points (M,) int64 that an image shows, ascending."""
-        return self._visible[self._rows[name]]
+        return self.visible_of(self.row(name))
+
+    def _visible_of(self, row: int) -> np.ndarray:
+        """Return the points (M,) int64 that the image of a row shows, ascending."""
+        with reading(self.path):
+            begin = int(self._table["end"][row - 1]) if row else 0
+            end = int(self._table["end"][row])
+            if not begin <= end <= len(self._packed):
+                raise ValueError(f"visible points from {begin} to {end}")
+            return visible.unpack(self._packed[begin:end], len(self.points))
+
+    @property
+    def num_cameras(self) -> int:
+        """The number of different intrinsics."""
+        return len(self._cameras)
+
+    def camera_number(self, name: str) -> int:
+        """Return the number of the camera of an image."""
+        return int(self._table["camera"][self.row(name)])
+
+    def camera(self, name: str) -> pycolmap.Camera:
+        """Return the intrinsics of an image."""
+        with reading(self.path):
+            return images.read_camera(self._cameras[self.camera_number(name)])
 
     def pose(self, name: str) -> pycolmap.Rigid3d:
         """Return the pose of an image, camera from world."""
-        i = self._rows[name]
-        return pycolmap.Rigid3d(rotation_of(self._rotations[i]), self._translations[i])
+        row = self.row(name)
+        rotations, centers = self._poses(self._table[row : row + 1])
+        rotation = pycolmap.Rotation3d(rotations[0])
+        return pycolmap.Rigid3d(rotation, -(rotation.matrix() @ centers[0]))
+
+    def _poses(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rotations (N, 4), x, y, z, w, and positions (N, 3) in rows of the table."""
+        centers = self._grid.least + self._center_step * table["center"]
+        return images.rotations(table), centers
+
+    def views(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions (I, 3) and the optical axes (I, 3) of all images."""
+        rotations, positions = self._poses(self._table)
+        x, y, z, w = rotations.T
+        axes = [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]
+        return positions, np.stack(axes, axis=1)
 
     def __contains__(self, name: str) -> bool:
-        return name in self._rows
+        return name in self.names
 
     def num_keypoints(self, name: str) -> int:
         """Return the number of points that an image shows: these are its keypoints."""
-        return int(self._visible.counts[self._rows[name]])
+        return len(self.visible(name))
 
     def features(self, name: str, keys: Iterable[str]) -> dict[str, np.ndarray]:
         """Return some features of an image, float32, see `matchers.base.Matcher`.
@@ -307,7 +371,7 @@ class CompactMap:
             if key == "keypoints":
                 found[key] = (self.projections(name) - 0.5).astype(np.float32)
             else:
-                camera = self.camera_of[name]
+                camera = self.camera(name)
                 found[key] = np.array([camera.width, camera.height], np.float32)
         return upright(found, self._turns)
 
@@ -315,7 +379,7 @@ class CompactMap:
         """Return the projections (M, 2) of the points that an image shows, COLMAP's pixels."""
         points = self.points[self.visible(name)]
         given = np.zeros((len(points), 2))
-        _, found = reprojection_errors(given, points, self.pose(name), self.camera_of[name])
+        _, found = reprojection_errors(given, points, self.pose(name), self.camera(name))
         return np.nan_to_num(found, posinf=0.0, neginf=0.0)
 
     def lift(self, name: str, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -330,12 +394,6 @@ class CompactMap:
     def fallback(self, names: list[str]) -> pycolmap.Rigid3d:
         """Return the pose of the first of some images, or without them of the first of all."""
         return self.pose(names[0] if names else self.names[0])
-
-
-def rotation_of(quaternion: np.ndarray) -> pycolmap.Rotation3d:
-    """Return the rotation of a rounded quaternion (4,), x, y, z, w."""
-    exact = quaternion.astype(np.float64)
-    return pycolmap.Rotation3d(exact / np.linalg.norm(exact))
 
 
 def check_model(model: dict, feature: str) -> None:
@@ -356,13 +414,13 @@ def check_model(model: dict, feature: str) -> None:
 
 
 def _array(
-    tensors: Mapping[str, np.ndarray],
+    arrays: Mapping[str, np.ndarray],
     name: str,
     dtype: type | np.dtype,
     shape: tuple[int | None, ...],
 ) -> np.ndarray:
-    """Return a tensor; raise a ValueError if it has another type or shape."""
-    found = tensors[name]
+    """Return an array; raise a ValueError if it has another type or shape."""
+    found = arrays[name]
     fits = len(found.shape) == len(shape) and all(
         size in (None, side) for side, size in zip(found.shape, shape, strict=True)
     )
@@ -385,6 +443,6 @@ def check_feature_keys(matcher: str, feature_keys: Iterable[str]) -> None:
         )
 
 
-def is_compact(path: Path) -> bool:
-    """Tell whether a path is that of a compact map."""
-    return path.suffix == SUFFIX
+def is_compact(path: Path | Sequence[Path]) -> bool:
+    """Tell whether a path is that of a compact map, or all of several are."""
+    return all(one.suffix == SUFFIX for one in ([path] if isinstance(path, Path) else path))

@@ -3,6 +3,9 @@
 import numpy as np
 
 SIGNS = 1024  # bits of a descriptor, at most
+# of more images than this, a query is compared with the first signs of all, `COARSE` bytes of each,
+# and with all signs of the most similar ones, `CANDIDATES` for each image that is wanted
+FEW, COARSE, CANDIDATES = 100_000, 32, 20
 BYTES = np.arange(256, dtype=np.uint8)[:, None]
 
 
@@ -39,21 +42,26 @@ def pack(descriptors: np.ndarray) -> tuple[np.ndarray, int]:
     return np.packbits(positive, axis=1, bitorder="little"), positive.shape[1]
 
 
+def columns(packed: np.ndarray) -> np.ndarray:
+    """Return packed signs (I, B) byte by byte (B, I), as `Signs` takes them."""
+    return np.ascontiguousarray(packed.T)
+
+
 class Signs:
     """Packed signs of global descriptors.
 
     Args:
-        packed: (I, B) uint8 from `pack`.
+        columns: (B, I) uint8 from `columns`, or the first ones of these.
         number: dimensions of the descriptors.
     """
 
-    def __init__(self, packed: np.ndarray, number: int):
-        self._columns = np.ascontiguousarray(packed.T)  # (B, I): `similarity` reads byte by byte
-        self._number, self._count = number, count(number)
+    def __init__(self, columns: np.ndarray, number: int):
+        self._columns = columns
+        self._number, self._count = number, min(count(number), 8 * len(columns))
 
     def descriptors(self) -> np.ndarray:
         """Return the descriptors (I, G) float32 of unit norm that the signs tell."""
-        found = hadamard(_signs(self._columns.T, self._count), self._number)
+        found = hadamard(unpack(self._columns.T, self._count), self._number)
         return found[:, : self._number] * self._scale(found.shape[1])
 
     def similarity(self, descriptor: np.ndarray) -> np.ndarray:
@@ -64,7 +72,7 @@ class Signs:
         transformed = hadamard(descriptor[None], self._number)[0]
         parts = np.zeros(8 * len(self._columns), np.float32)
         parts[: self._count] = transformed[: self._count]
-        tables = parts.reshape(-1, 8) @ _signs(BYTES, 8).T
+        tables = parts.reshape(-1, 8) @ unpack(BYTES, 8).T
         found = np.zeros(self._columns.shape[1], np.float32)
         for table, column in zip(tables, self._columns, strict=True):
             found += table.take(column)
@@ -75,7 +83,7 @@ class Signs:
         return np.float32(1 / np.sqrt(self._count * size))
 
 
-def _signs(packed: np.ndarray, number: int) -> np.ndarray:
-    """Unpack signs (N, B): (N, S) float32, -1 and 1."""
+def unpack(packed: np.ndarray, number: int | None = None) -> np.ndarray:
+    """Unpack signs (N, B): (N, S) float32, -1 and 1; by default, all eight of each byte."""
     bits = np.unpackbits(packed, axis=1, count=number, bitorder="little")
     return 2 * bits.astype(np.float32) - 1

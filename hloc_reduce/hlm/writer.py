@@ -1,9 +1,11 @@
 """Write compact maps. docs/map-format.md describes the file."""
 
 import json
+import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, BinaryIO, Protocol
 
 import numpy as np
 import pycolmap
@@ -15,12 +17,17 @@ from ..localization import intrinsics
 from ..localization.frame import UNKNOWN, Frame
 from ..retrieval.vlad import VOCABULARY, read_vocabulary
 from ..utils.cli import InputError
-from ..utils.codes import QUANTIZED, STORAGES, store
+from ..utils.codes import CODED, FLOATS, STORAGES, encode, pack, quantize
 from ..utils.files import file_sha256
-from . import points as points_of_map
-from . import signs
-from .points import Points
-from .reader import MAX_GLOBAL, VERSION, VERSION_RETRIEVAL, check_model, rotation_of
+from . import names, signs, tensors, visible
+from .images import Images, pack_cameras
+from .points import PADDING, Grid, parts
+from .reader import MAX_GLOBAL, VERSION, check_model
+from .tensors import Blocks
+
+SPOOLED = 2**26  # bytes of visible points that are kept in memory
+# what logs call arrays
+PARTS = {"images": "poses", "cameras": "poses", "coarse": "retrieval", "vocabulary": "retrieval"}
 
 
 @dataclass(frozen=True)
@@ -38,6 +45,7 @@ class Source:
         doubts: why the map may be wrong, see `Map.doubts`.
         retrieval: of the global descriptors, a key of `confs.retrieval`.
         frame: of the map.
+        made_from: id of the map, or a fingerprint of the model.
     """
 
     model: pycolmap.Reconstruction
@@ -50,125 +58,178 @@ class Source:
     doubts: list[str] = field(default_factory=list)
     retrieval: str = retrieval_confs.VLAD
     frame: Frame = UNKNOWN
+    made_from: str | None = None
 
 
-def encode(
-    points: Points, source: Source, global_descriptors: np.ndarray
-) -> tuple[bytes, dict[str, int]]:
-    """Return the content of a compact map, the same for the same arguments.
+class Content(Protocol):
+    """The points of a compact map, in the order in which the file has them."""
+
+    def __len__(self) -> int:
+        """Return their number."""
+
+    def xyz(self, part: slice) -> np.ndarray:
+        """Return the coordinates (K, 3) float64 of some points."""
+
+    def descriptors(self, part: slice) -> np.ndarray:
+        """Return the descriptors (K, D) float32 of some points."""
+
+    def visible(self, image: int) -> np.ndarray:
+        """Return the points (M,) that an image shows, ascending."""
+
+
+def write(
+    file: BinaryIO,
+    points: Content,
+    images: Images,
+    source: Source,
+    global_signs: np.ndarray,
+    global_dim: int,
+    step: float,
+) -> dict[str, int]:
+    """Write a compact map, the same for the same arguments, block by block.
 
     Args:
+        file: where to.
         points: that it has.
-        source: what it is made from.
-        global_descriptors: (I, G) of the images of the points.
+        images: that show them.
+        source: what else it is made from; not its model.
+        global_signs: (I, B) uint8, see `signs.pack`, of the images.
+        global_dim: dimension of the global descriptors.
+        step: about that of the coordinates.
 
     Returns:
-        The content, and the number of bytes of each part.
+        The number of bytes of each part.
     """
-    from safetensors.numpy import save
-
     check_model(source.conf["model"], source.feature)
-    points = points.sorted()
-    tensors: dict[str, np.ndarray] = {}
     metadata: dict[str, Any] = {
         "version": VERSION,
         "feature": source.feature,
         "conf": {key: source.conf[key] for key in ("model", "preprocessing")},
         "matcher": source.matcher,
-        "known": {name: intrinsics.to_list(one) for name, one in source.cameras.known.items()},
-        "sizes": sorted(source.cameras.sizes),
-        "models": sorted(source.cameras.models),
-        "focal_lengths": source.cameras.focal_lengths,
-        "typical": intrinsics.to_rows(source.cameras.typical),
-        "orientations": sorted(source.cameras.orientations),
-        "doubts": source.doubts,
+        "points": len(points),
     }
-    metadata |= {"frame": source.frame.to_json()} if source.frame != UNKNOWN else {}
-    _add_images(tensors, metadata, points, source.model)
-    _add_points(tensors, metadata, points, source.model)
-    _add_descriptors(tensors, metadata, points, source.conf)
-    _add_projection(tensors, metadata, source.conf["model"])
-    _add_retrieval(tensors, metadata, source, global_descriptors)
-    # safetensors writes the memory of an array, whatever its order
-    tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
-    content = save(tensors, {"map": json.dumps(metadata, sort_keys=True)})
-    parts = {name: tensor.nbytes for name, tensor in tensors.items()}
-    return content, parts | {"header": len(content) - sum(parts.values())}
+    told = intrinsics.to_dict(source.cameras) | {"doubts": source.doubts}
+    told |= {"frame": source.frame.to_json() if source.frame != UNKNOWN else None}
+    told |= {"made_from": source.made_from, "shipped": {}}
+    metadata |= told
+    arrays: dict[str, np.ndarray | Blocks] = {}
+    with tempfile.SpooledTemporaryFile(SPOOLED) as spool:
+        ends = _spool_visible(spool, points, len(images.names))
+        grid = _grid(points, step)
+        metadata |= {"least": grid.least.tolist(), "step": grid.step, "bits": grid.bits}
+        arrays["images"], metadata["center_step"] = images.pack(grid.least, ends)
+        _add_retrieval(arrays, metadata, source, global_signs, global_dim)
+        arrays["descriptors"] = _descriptors(arrays, metadata, points, source.conf)
+        arrays["cameras"] = pack_cameras(images.cameras)
+        arrays["names"] = names.pack(images.names)
+        _add_projection(arrays, metadata, source.conf["model"])
+        blocks = (grid.pack(points.xyz(part)) for part in parts(len(points)))
+        arrays["coordinates"] = _blocks(np.uint8, grid.nbytes(len(points)), blocks, PADDING)
+        arrays["visible"] = _blocks(np.uint8, int(ends[-1]), _read(spool))
+        if "levels" in arrays and "projection" in metadata["shipped"]:
+            del arrays["levels"]  # they ship with it
+        kept = {key: value for key, value in metadata.items() if value not in (None, {}, [])}
+        ordered = sorted(arrays, key=lambda name: (-arrays[name].dtype.itemsize, name))
+        text = json.dumps(kept, sort_keys=True, separators=(",", ":"))
+        header = tensors.write(file, {"map": text}, {name: arrays[name] for name in ordered})
+    sizes = dict.fromkeys(PARTS.values(), 0)
+    for name in ordered:
+        part = PARTS.get(name, name)
+        sizes[part] = sizes.get(part, 0) + arrays[name].nbytes
+    return sizes | {"header": header}
 
 
-def _add_images(
-    tensors: dict, metadata: dict, points: Points, model: pycolmap.Reconstruction
-) -> None:
-    images = {image.name: image for image in model.images.values()}
-    shown = [images[name] for name in points.names]
-    ids = sorted({image.camera_id for image in shown})
-    quaternions = [image.cam_from_world().rotation.quat for image in shown]
-    rotations = np.array(quaternions, np.float32)
-    # far from the origin, rounded rotations would move the centres, so these stay as they are
-    centers = [image.projection_center() for image in shown]
-    matrices = [rotation_of(quaternion).matrix() for quaternion in rotations]
-    tensors["names"] = np.frombuffer("\n".join(points.names).encode(), np.uint8)
-    tensors["rotations"] = rotations
-    tensors["translations"] = -np.einsum("nij,nj->ni", matrices, centers)
-    numbers = [ids.index(image.camera_id) for image in shown]
-    tensors["camera_of_image"] = np.array(numbers, np.uint32)
-    metadata["cameras"] = [intrinsics.to_list(model.cameras[i]) for i in ids]
+def _blocks(kind: type, number: int, blocks: Iterator[np.ndarray], padding: int = 0) -> Blocks:
+    """Return numbers that are written block by block, with zeros behind them."""
+
+    def padded() -> Iterator[np.ndarray]:
+        yield from blocks
+        yield np.zeros(padding, kind)
+
+    return Blocks(np.dtype(kind), (number + padding,), padded())
 
 
-def _add_points(
-    tensors: dict, metadata: dict, points: Points, model: pycolmap.Reconstruction
-) -> None:
-    precision = points_of_map.precision(points, model)
-    packed, least, step, bits = points_of_map.quantize(points.xyz, precision)
-    visible, kind = points_of_map.pack_visible(points.visible, len(points))
-    tensors["coordinates"], tensors["visible"] = packed, visible
-    tensors["num_visible"] = np.array([len(part) for part in points.visible], np.uint32)
-    metadata |= {"points": len(points), "least": least.tolist(), "step": step}
-    metadata |= {"bits": bits, "visible": kind}
+def _spool_visible(spool: IO[bytes], points: Content, number: int) -> np.ndarray:
+    """Write which points each image shows; return where its bytes end (I,)."""
+    ends, end = np.zeros(number, np.int64), 0
+    for image in range(number):
+        end += spool.write(visible.pack(points.visible(image)))
+        ends[image] = end
+    if end >= 2**32:
+        raise InputError("The map is too large for one file: split it.")
+    return ends
 
 
-def _add_descriptors(tensors: dict, metadata: dict, points: Points, conf: dict) -> None:
+def _read(spool: IO[bytes]) -> Iterator[np.ndarray]:
+    """Yield the bytes of a file."""
+    spool.seek(0)
+    while block := spool.read(SPOOLED):
+        yield np.frombuffer(block, np.uint8)
+
+
+def _grid(points: Content, step: float) -> Grid:
+    """Return the grid of the coordinates."""
+    limits = [[part.min(axis=0), part.max(axis=0)] for part in map(points.xyz, parts(len(points)))]
+    least, largest = np.array(limits).transpose(1, 0, 2)
+    return Grid.of(least.min(axis=0), largest.max(axis=0), step)
+
+
+def _descriptors(arrays: dict, metadata: dict, points: Content, conf: dict) -> Blocks:
+    """Return the descriptors as they are stored, and add what they need."""
     storage = conf.get("storage", STORAGES[0])
+    metadata["storage"] = storage
     levels = features_confs.levels(conf)
-    stored, attrs = store({"descriptors": points.descriptors.T}, storage, levels)
-    key = QUANTIZED.get(storage, "descriptors")
-    tensors["descriptors"] = stored[key]
+    store: Callable[[np.ndarray], np.ndarray]
     if levels is not None:
-        tensors["levels"] = attrs[key]["levels"]
-    scale = [] if levels is not None else [float(value) for value in attrs.get(key, {}).values()]
-    metadata |= {"storage": storage, "scale": scale}
+        arrays["levels"] = levels.astype(np.float16)
+        store = lambda rows: pack(encode(rows.T, levels), CODED[storage]).T  # noqa: E731
+    elif storage in FLOATS:
+        store = lambda rows: rows.astype(storage)  # noqa: E731
+    else:
+        found = [(part.min(), part.max()) for part in map(points.descriptors, parts(len(points)))]
+        limits = min(least for least, _ in found), max(largest for _, largest in found)
+        _, *metadata["scale"] = quantize(np.zeros((0, 1), np.float32), limits)
+        store = lambda rows: quantize(rows, limits)[0]  # noqa: E731
+    first = store(points.descriptors(slice(0, 1)))
+    blocks = (store(points.descriptors(part)) for part in parts(len(points)))
+    return Blocks(first.dtype, (len(points), first.shape[1]), blocks)
 
 
 def _add_retrieval(
-    tensors: dict, metadata: dict, source: Source, global_descriptors: np.ndarray
+    arrays: dict,
+    metadata: dict,
+    source: Source,
+    global_signs: np.ndarray,
+    global_dim: int,
 ) -> None:
-    """Add global descriptors and their vocabulary, if any, or name the one that ships."""
-    number = global_descriptors.shape[1]
-    if number > MAX_GLOBAL:
-        raise InputError(f"Global descriptors of {number} numbers, of at most {MAX_GLOBAL}.")
-    tensors["retrieval"], metadata["signs"] = signs.pack(global_descriptors)
+    """Add the signs of global descriptors and their vocabulary, if any, or name one that ships."""
+    if global_dim > MAX_GLOBAL:
+        raise InputError(f"Global descriptors of {global_dim} numbers, of at most {MAX_GLOBAL}.")
+    arrays["retrieval"] = global_signs
+    if len(global_signs) > signs.FEW:
+        arrays["coarse"] = signs.columns(global_signs[:, : signs.COARSE])
     if source.retrieval != retrieval_confs.VLAD:
-        metadata["version"] = VERSION_RETRIEVAL
-        metadata |= {"retrieval": source.retrieval, "global_dim": number}
+        metadata |= {"retrieval": source.retrieval, "global_dim": global_dim}
     if source.vocabulary is None:
         return
     words, shipped = read_vocabulary(source.vocabulary), file_sha256(VOCABULARY)
     if file_sha256(source.vocabulary) == shipped:
-        metadata["vocabulary_sha256"] = shipped
+        metadata["shipped"]["vocabulary"] = shipped
     else:
-        tensors["vocabulary"] = words.astype(np.float16)
+        arrays["vocabulary"] = words.astype(np.float16)
 
 
-def _add_projection(tensors: dict, metadata: dict, model: dict) -> None:
+def _add_projection(arrays: dict, metadata: dict, model: dict) -> None:
     """Name the projection, if any, and add it unless it is one that ships."""
     projection = model.get("projection")
     if not projection:
         return
     file, prefix = projections.find(projection), projections.split_prefix(projection)[1]
-    metadata["projection_sha256"] = file_sha256(file)
-    metadata["projection_suffix"] = file.suffix
-    shipped = file.stem in projections.names() and projections.checksum(file.stem)
-    if shipped != metadata["projection_sha256"]:
-        tensors["projection"] = np.frombuffer(file.read_bytes(), np.uint8)
+    checksum = file_sha256(file)
+    if file.stem in projections.names() and projections.checksum(file.stem) == checksum:
+        metadata["shipped"]["projection"] = checksum
+    else:
+        metadata["projection_suffix"] = file.suffix
+        arrays["projection"] = np.frombuffer(file.read_bytes(), np.uint8)
     name = file.stem + (prefix and f"@{prefix}")
     metadata["conf"]["model"] = {**model, "projection": name}

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -311,6 +311,23 @@ def to_dict(cameras: MapCameras) -> dict:
         "orientations": sorted(cameras.orientations),
         "lenses": [to_list(one) for lenses in cameras.lenses.values() for one in lenses],
     }
+
+
+def from_dict(content: Mapping[str, Any]) -> MapCameras:
+    """Return what a map tells, from what `to_dict` returned; what is missing, it does not know.
+
+    Raises:
+        KeyError, TypeError or ValueError: if it is wrong.
+    """
+    return MapCameras(
+        {str(name): from_list(values) for name, values in content.get("cameras", {}).items()},
+        {(int(width), int(height)) for width, height in content.get("sizes", [])},
+        {str(model) for model in content.get("camera_models", [])},
+        to_range(content.get("focal_lengths")),
+        from_rows(content.get("typical", [])),
+        {int(orientation) for orientation in content.get("orientations", [])},
+        to_lenses(content.get("lenses", [])),
+    )
 
 
 def to_lenses(rows: Iterable[Sequence]) -> dict[Size, list[pycolmap.Camera]]:

@@ -1,6 +1,6 @@
 """Where a photo was about taken: the map images that see the same, and the matches that fit."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -62,21 +62,21 @@ class Surroundings:
     Args:
         reference: the map.
         names: its images.
+        views: returns their positions (I, 3) and optical axes (I, 3).
     """
 
-    def __init__(self, reference: Reference, names: Sequence[str]):
-        self._reference, self._names = reference, list(names)
+    def __init__(
+        self,
+        reference: Reference,
+        names: Sequence[str],
+        views: Callable[[], tuple[np.ndarray, np.ndarray]],
+    ):
+        self._reference, self._names, self._read = reference, names, views
         self._some: dict[int, np.ndarray] = {}
 
     @cached_property
     def _views(self) -> tuple[np.ndarray, np.ndarray]:
-        """The positions (I, 3) and the optical axes (I, 3) of the images."""
-        found = (self._reference.fallback([name]) for name in self._names)
-        poses = [pose.inverse() for pose in found if pose is not None]
-        return (
-            np.array([pose.translation for pose in poses]),
-            np.array([pose.rotation.matrix()[:, 2] for pose in poses]),
-        )
+        return self._read()
 
     def guess(
         self,

@@ -105,6 +105,12 @@ class SfmMap:
         """Return the pose of the first of some images, or without them of the first of all."""
         return self.images[names[0] if names else min(self.images)].cam_from_world()
 
+    def views(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions (I, 3) and the optical axes (I, 3) of the images by name."""
+        poses = [self.images[name].cam_from_world().inverse() for name in sorted(self.images)]
+        axes = [pose.rotation.matrix()[:, 2] for pose in poses]
+        return np.array([pose.translation for pose in poses]), np.array(axes)
+
 
 class ScanMap:
     """Cutouts with scans, as a `Reference`.

@@ -1,6 +1,6 @@
 """A map in memory, read from a folder or a compact file."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,12 +11,13 @@ import numpy as np
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
+from ..hlm.joined import opened
 from ..hlm.reader import CompactMap, check_feature_keys, is_compact
 from ..localization import intrinsics, views
 from ..localization.frame import Frame
 from ..localization.references import Reference, SfmMap
 from ..retrieval import load as load_retrieval
-from ..retrieval.ranking import read_global, similarity
+from ..retrieval.ranking import rank, read_global, similarity
 from ..retrieval.vlad import read_vocabulary
 from ..runtime import parallel
 from ..utils import cli, colmap
@@ -74,10 +75,12 @@ class Contents:
         doubts: why it may be wrong, see `Map.doubts`.
         frame: its unit, and where on Earth it is.
         reference: its points.
-        names: its images.
+        names: its images, sorted.
+        views: returns the positions (I, 3) and the optical axes (I, 3) of its images.
         describe: returns the global descriptor (G,) float32 of a photo, rounded as in files, given
             its features, its file or pixels, and by how many quarter turns it is shown.
-        similarity: returns the similarity (I,) of a global descriptor (G,) to those of its images.
+        retrieve: returns the names of the images, at most a number, that are most similar to a
+            global descriptor (G,), best first.
     """
 
     engine: Engine
@@ -89,13 +92,14 @@ class Contents:
     doubts: list[str]
     frame: Frame
     reference: Reference
-    names: list[str]
+    names: Sequence[str]
+    views: Callable[[], tuple[np.ndarray, np.ndarray]]
     describe: Callable[[dict, Path | np.ndarray, int], np.ndarray]
-    similarity: Callable[[np.ndarray], np.ndarray]
+    retrieve: Callable[[np.ndarray, int], list[str]]
 
 
 def read(
-    path: Path,
+    path: Path | Sequence[Path],
     onnx: Path | None = None,
     matcher: str | None = None,
     matcher_onnx: Path | None = None,
@@ -103,7 +107,7 @@ def read(
     """Read a map.
 
     Args:
-        path: folder of a map of `maps.main`, or file of `hloc_reduce.compact`.
+        path: folder of a map of `maps.main`, or file of `hloc_reduce.compact`, or several.
         onnx: file of its feature from `hloc_reduce.export`, in which features are extracted from
             photos; only for a file.
         matcher: one of `confs.matchers.names`; default: the map's.
@@ -119,6 +123,8 @@ def read(
         raise InputError("An ONNX file of LightGlue needs one of the feature, too.")
     if is_compact(path):
         return _of_file(path, onnx, matcher, matcher_onnx)
+    if not isinstance(path, Path):
+        raise InputError(f"Several maps must be compact ones: {', '.join(map(str, path))}.")
     if onnx is not None:
         raise InputError(f"An ONNX file needs a compact map, a file; {path} is none.")
     _check_torch(path, "a map folder")
@@ -165,8 +171,11 @@ def _of_folder(path: Path, matcher: str | None) -> Contents:
         frame=built.frame,
         reference=reference,
         names=names,
+        views=reference.views,
         describe=_describe(built.retrieval, vocabulary, built.conf["preprocessing"]),
-        similarity=lambda descriptor: similarity(descriptor[None], global_descriptors)[0],
+        retrieve=lambda descriptor, number: [
+            names[row] for row in rank(similarity(descriptor[None], global_descriptors), number)[0]
+        ],
     )
 
 
@@ -203,9 +212,10 @@ def _match_images(
 
 
 def _of_file(
-    path: Path, onnx: Path | None, matcher: str | None, matcher_onnx: Path | None
+    paths: Path | Sequence[Path], onnx: Path | None, matcher: str | None, matcher_onnx: Path | None
 ) -> Contents:
-    compact = CompactMap(path)
+    compact = opened(paths)
+    path = compact.path
     if retrieval_confs.get(compact.retrieval)["model"]["name"] == "hloc":
         _check_torch(path, f"a map with the retrieval {compact.retrieval}")
     names = matchers_confs.steps_in(compact.matcher, compact.conf, matcher)
@@ -228,8 +238,11 @@ def _of_file(
         frame=compact.frame,
         reference=compact,
         names=compact.names,
+        views=compact.views,
         describe=_describe(compact.retrieval, compact.vocabulary, compact.conf["preprocessing"]),
-        similarity=compact.similarity,
+        retrieve=lambda descriptor, number: [
+            compact.names[row] for row in compact.retrieve(descriptor, number)[0]
+        ],
     )
 
 

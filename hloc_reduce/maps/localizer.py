@@ -16,7 +16,6 @@ from ..localization.query import merged, ransac_options
 from ..localization.records import nearness
 from ..localization.views import View
 from ..localize_sfm import RANSAC_THRESH
-from ..retrieval.ranking import rank
 from ..runtime import parallel
 from ..runtime.laps import Laps
 from ..utils.cli import InputError
@@ -45,7 +44,7 @@ class Localizer:
 
     Args:
         map_dir: the folder of a map from `maps.main` or `pipelines.localize`, or a file from
-            `hloc_reduce.compact`.
+            `hloc_reduce.compact`, or several files of one place.
         num_loc: the number of most similar map images that a photo is matched with.
         ransac_thresh: RANSAC inlier threshold in pixels; larger in proportion in photos whose
             longer side exceeds 1,600 pixels.
@@ -67,7 +66,7 @@ class Localizer:
 
     def __init__(
         self,
-        map_dir: Path | str,
+        map_dir: Path | str | Sequence[Path | str],
         num_loc: int = 50,
         ransac_thresh: float = RANSAC_THRESH,
         gate: Gate = DEFAULT_GATE,
@@ -81,7 +80,11 @@ class Localizer:
         feature_file, matcher_file = (
             None if path is None else Path(path) for path in (onnx, matcher_onnx)
         )
-        contents = read(Path(map_dir), feature_file, matcher, matcher_file)
+        if isinstance(map_dir, Path | str):
+            path: Path | list[Path] = Path(map_dir)
+        else:
+            path = [Path(file) for file in map_dir]
+        contents = read(path, feature_file, matcher, matcher_file)
         self.num_loc, self.ransac_thresh = num_loc, ransac_thresh
         self.workers = parallel.cores()
         self.preprocessing, self.cameras = contents.preprocessing, contents.cameras
@@ -94,8 +97,8 @@ class Localizer:
         ]
         self.engine, self.reference = contents.engine, contents.reference
         self.names = contents.names
-        self._surroundings = Surroundings(self.reference, self.names)
-        self._describe, self._similarity = contents.describe, contents.similarity
+        self._surroundings = Surroundings(self.reference, self.names, contents.views)
+        self._describe, self._find = contents.describe, contents.retrieve
 
     def localize(
         self,
@@ -425,5 +428,4 @@ class Localizer:
     @parallel.one_thread()
     def _retrieve(self, features: dict, image: Path | np.ndarray, view: View) -> list[str]:
         """Return the names of the map images that are most similar to a photo, best first."""
-        query = self._describe(features, image, view.turns)
-        return [self.names[j] for j in rank(self._similarity(query)[None], self.num_loc)[0]]
+        return self._find(self._describe(features, image, view.turns), self.num_loc)

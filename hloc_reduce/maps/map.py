@@ -113,16 +113,7 @@ class Map:
         self.aligned_to = content.get("aligned_to")
         self.camera_mode = content.get("camera_mode")
         self.has_rigs = bool(content.get("rigs"))
-        known = content.get("cameras", {}).items()
-        self.cameras = intrinsics.MapCameras(
-            {name: intrinsics.from_list(values) for name, values in known},
-            {(int(width), int(height)) for width, height in content.get("sizes", [])},
-            {str(model) for model in content.get("camera_models", [])},
-            intrinsics.to_range(content.get("focal_lengths")),
-            intrinsics.from_rows(content.get("typical", [])),
-            {int(orientation) for orientation in content.get("orientations", [])},
-            intrinsics.to_lenses(content.get("lenses", [])),
-        )
+        self.cameras = intrinsics.from_dict(content)
         self._tells_lenses = "lenses" in content
         conf = dict(content["conf"])
         conf |= {key: dict(conf[key]) for key in ("model", "preprocessing")}

@@ -1,5 +1,6 @@
 """Unpack a compact map into the folder of a map, in which pipelines localize as in any other."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pycolmap
 from ..aggregate_features import output_of, vocabulary_of
 from ..confs import features as features_confs
 from ..confs import retrieval as retrieval_confs
+from ..hlm.joined import opened
 from ..hlm.reader import CompactMap
 from ..runtime import provenance
 from ..runtime.group_writer import GroupWriter
@@ -23,25 +25,26 @@ COMPACT = "compact"  # in the configuration of a folder: the sha256 of the file
 
 
 @strings_as_paths
-def main(path: Path, map_dir: Path, overwrite: bool = False) -> Map:
+def main(path: Path | Sequence[Path], map_dir: Path, overwrite: bool = False) -> Map:
     """Unpack a compact map, unless it is unpacked already.
 
     The keypoints of an image are the projections of the points that it shows.
 
     Args:
-        path: file of `hloc_reduce.compact`.
+        path: file of `hloc_reduce.compact`, or several of one place.
         map_dir: the folder of the map.
         overwrite: replace another map in it.
 
     Raises:
         InputError: when the file is broken, or the folder has another map.
     """
-    compact = CompactMap(path)
+    compact, paths = opened(path), [path] if isinstance(path, Path) else [*path]
+    compact.check_names()
     before = provenance.read(map_dir / CONF)
     if before and before != DELETING and COMPACT not in before:
         raise InputError(f"{map_dir} is a map of photos, not an unpacked one: use other --outputs.")
-    digest = file_sha256(path)
-    with RunFolder(map_dir, {COMPACT: digest}, overwrite, inputs=[path]) as folder:
+    digest = " ".join(map(file_sha256, paths))
+    with RunFolder(map_dir, {COMPACT: digest}, overwrite, inputs=paths) as folder:
         if not (map_dir / FINISHED).exists():
             with folder.stage("unpack"):
                 _write(compact, map_dir, digest)
@@ -60,7 +63,7 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
         for i, name in enumerate(progress(compact.names, "Unpacking", "image")):
             keypoints = _add_image(model, compact, i)
             arrays, attrs = compact.stored(name)
-            camera = compact.camera_of[name]
+            camera = compact.camera(name)
             arrays |= {
                 "keypoints": (keypoints - 0.5).astype(np.float32),  # hloc's pixels
                 "image_size": np.array([camera.width, camera.height]),
@@ -98,8 +101,8 @@ def _write(compact: CompactMap, folder: Path, digest: str) -> None:
 def _add_image(model: pycolmap.Reconstruction, compact: CompactMap, number: int) -> np.ndarray:
     """Add an image; return the projections of its points (M, 2), COLMAP's pixels."""
     name = compact.names[number]
-    camera, pose, projected = compact.camera_of[name], compact.pose(name), compact.projections(name)
-    camera.camera_id = compact.camera_number[name] + 1
+    camera, pose, projected = compact.camera(name), compact.pose(name), compact.projections(name)
+    camera.camera_id = compact.camera_number(name) + 1
     image = pycolmap.Image(
         name=name, keypoints=projected, camera_id=camera.camera_id, image_id=number + 1
     )

@@ -123,16 +123,18 @@ def storage_of(stored: Mapping[str, np.ndarray]) -> str:
     return "float32" if stored["descriptors"].dtype == np.float32 else "float16"
 
 
-def quantize(descriptors: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Round descriptors to 256 steps between their minimum and maximum.
+def quantize(
+    descriptors: np.ndarray, limits: tuple[float, float] | None = None
+) -> tuple[np.ndarray, float, float]:
+    """Round descriptors to 256 steps between limits; default: their minimum and maximum.
 
     Returns:
         Steps (uint8, same shape), scale and offset: descriptors are offset + scale * step.
     """
-    if not descriptors.size:
+    if limits is None and not descriptors.size:
         return descriptors.astype(np.uint8), 1.0, 0.0
-    offset = float(descriptors.min())
-    scale = (float(descriptors.max()) - offset) / STEPS or 1.0
+    offset, largest = map(float, limits or (descriptors.min(), descriptors.max()))
+    scale = (largest - offset) / STEPS or 1.0
     steps = np.round((descriptors.astype(np.float32) - offset) / scale)
     return steps.clip(0, STEPS).astype(np.uint8), scale, offset
 

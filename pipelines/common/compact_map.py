@@ -127,6 +127,7 @@ def _pack(run: DatasetRun, part: Run, place: ModelPlace, sfm: Path, max_mb: floa
                 vocabulary_if_any(retrieval_confs.get(retrieval), run.global_descriptors),
                 intrinsics.of_map(model, place.images),
                 retrieval=retrieval,
+                made_from=colmap.fingerprint(sfm),
             )
             compact.write(file, source, run.features, max_mb=max_mb)
         return maps.unpack(file, part.folder.path / "map")

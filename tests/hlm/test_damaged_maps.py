@@ -6,33 +6,19 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from compact_files import use
 from hostile import HARMFUL, fuzzed, overwrite, refuses_or_reads
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hloc_reduce import compact
-from hloc_reduce.hlm import points, writer
-from hloc_reduce.maps import contents
+from hloc_reduce.hlm import signs, visible
 from pipelines import localize
 
 PIPELINE = localize
 NUMBERS = rb"-?\d[\d.e+-]*"
 NOT_FINITE = np.nan, np.inf, -np.inf
 FLOATS = {"F16": "<f2", "F32": "<f4", "F64": "<f8"}
-
-
-def use(path):
-    """Read a map, and use all that it has."""
-    found = contents.read(path)
-    of_map, names = found.reference, found.names[:3]
-    for name in names:
-        of_map.pose(name)
-        of_map.lift(name, np.arange(min(3, of_map.num_keypoints(name))))
-    of_map.points.all()
-    of_map.global_descriptors()
-    found.similarity(np.ones(of_map.vocabulary.size, np.float32))
-    found.steps[0].match({"descriptors": np.eye(found.dim, 5, dtype=np.float32)}, names)
-    return found
 
 
 def with_header(content, header):
@@ -42,18 +28,19 @@ def with_header(content, header):
     return len(padded).to_bytes(8, "little") + padded + content[end:]
 
 
-@pytest.fixture(params=["uint4 bitmaps", "float16 deltas"])
+@pytest.fixture(params=["uint4 bitmaps", "float16 differences", "uint4 coarse"])
 def file(request, build_map, tmp_path, monkeypatch):
     """A small map, and the content of its file."""
     built = build_map("--feature", "colmap_sift_sv32")
     storage, kind = request.param.split()
-    if kind == "deltas":  # which are shorter only in large maps
-        pack = points.pack_visible
-        monkeypatch.setattr(writer.points_of_map, "pack_visible", lambda of, _: pack(of, 10**9))
+    if kind == "differences":  # which are shorter only in large maps
+        monkeypatch.setattr(visible, "is_shorter", lambda *_: True)
+    if kind == "coarse":
+        monkeypatch.setattr(signs, "FEW", 3)
     path = tmp_path / "place.hlm"
-    compact.main(path, built, storage=storage, max_mb=0.02)
+    compact.main(path, built, storage=storage, max_mb=0.015)
     content = path.read_bytes()
-    assert f'visible\\": \\"{kind}'.encode() in content
+    assert (b"coarse" in content) == (kind == "coarse")
     assert use(path).names
     return path, content
 

@@ -5,75 +5,127 @@ import struct
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
 from hloc_reduce import compact
-from hloc_reduce.hlm import points
+from hloc_reduce.hlm import visible
 from hloc_reduce.hlm.reader import CompactMap
 from hloc_reduce.maps import contents
+from hloc_reduce.projections.files import WEIGHTS
 from pipelines import localize
 
 PIPELINE = localize
 TYPES = {"U8": "u1", "U32": "<u4", "F16": "<f2", "F32": "<f4", "F64": "<f8"}
+MODELS = {0: ("SIMPLE_PINHOLE", 3)}  # COLMAP's number of a camera model, and of its parameters
 
 
 def read(path):
-    """Return the metadata and the tensors."""
+    """Return the metadata and the arrays."""
     content = path.read_bytes()
     end = 8 + struct.unpack("<Q", content[:8])[0]
-    header, tensors = json.loads(content[8:end]), {}
+    header, arrays = json.loads(content[8:end]), {}
     metadata = json.loads(header.pop("__metadata__")["map"])
     for name, entry in header.items():
         first, last = entry["data_offsets"]
         flat = np.frombuffer(content[end + first : end + last], TYPES[entry["dtype"]])
-        tensors[name] = flat.reshape(entry["shape"])
-    return metadata, tensors
+        arrays[name] = flat.reshape(entry["shape"])
+    return metadata, arrays
 
 
 def unpacked(packed, number):
     return np.unpackbits(packed, axis=-1, bitorder="little")[..., :number].astype(np.int64)
 
 
-def read_coordinates(metadata, tensors):
+def read_names(arrays):
+    packed, number = arrays["names"].tobytes(), len(arrays["images"])
+    blocks = -(-number // 16)
+    begins, text = struct.unpack(f"<{blocks}I", packed[: 4 * blocks]), packed[4 * blocks :]
+    names, at, before = [], 0, b""
+    while at < len(text):
+        if len(names) % 16 == 0:
+            assert at == begins[len(names) // 16] and text[at] == 0
+        end = text.index(b"\n", at + 1)
+        before = before[: text[at]] + text[at + 1 : end]
+        names.append(before.decode())
+        at = end + 1
+    assert len(names) == number
+    return names
+
+
+def read_images(metadata, arrays):
+    """Yield the pose, rotation (3, 3) and translation, and the camera of each image."""
+    for row in arrays["images"]:
+        *numbers, camera, _ = struct.unpack("<6i2I", row.tobytes())
+        x, y, z = (number / (2**31 - 1) for number in numbers[:3])
+        square = x * x + y * y + z * z
+        x, y, z, w = (part / (1 + square) for part in (2 * x, 2 * y, 2 * z, 1 - square))
+        rotation = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        center = np.add(metadata["least"], metadata["center_step"] * np.array(numbers[3:]))
+        model, *size = struct.unpack("<3I", arrays["cameras"][camera, :12].tobytes())
+        name, number = MODELS[model]
+        parameters = np.frombuffer(arrays["cameras"][camera, 12:].tobytes(), "<f4")[:number]
+        yield rotation, -rotation @ center, (name, *size, *parameters)
+
+
+def read_coordinates(metadata, arrays):
     sizes, number = metadata["bits"], metadata["points"]
-    rows = unpacked(tensors["coordinates"], number * sum(sizes)).reshape(number, -1)
+    assert len(arrays["coordinates"]) == -(-number * sum(sizes) // 8) + 8
+    rows = unpacked(arrays["coordinates"], number * sum(sizes)).reshape(number, -1)
     axes = np.split(rows, np.cumsum(sizes)[:2], axis=1)
     whole = np.stack([axis @ (1 << np.arange(axis.shape[1])) for axis in axes], axis=1)
     return metadata["least"] + metadata["step"] * whole
 
 
-def read_visible(metadata, tensors):
+def read_numbers(packed):
+    """Yield numbers in base 128, and the bytes behind each one."""
+    value = shift = 0
+    for i, byte in enumerate(packed):
+        value += (byte & 127) << shift
+        shift += 7
+        if byte < 128:
+            yield value, packed[i + 1 :]
+            value = shift = 0
+
+
+def read_visible(arrays):
     """Yield the points of each image."""
-    counts, packed = tensors["num_visible"], tensors["visible"]
-    if metadata["visible"] == "bitmaps":
-        for row in unpacked(packed.reshape(len(counts), -1), metadata["points"]):
-            yield np.flatnonzero(row)
-        return
-    values = iter(packed.tolist())
-    for count in counts:
-        found, point = [], -1
-        for _ in range(count):
-            value, shift = 128, 0
-            while value >= 128:
-                value = next(values)
-                point += (value & 127) << shift
-                shift += 7
-            found.append(point)
-        yield np.array(found, int)
+    begin = 0
+    for row in arrays["images"]:
+        (end,) = struct.unpack("<I", row[28:].tobytes())
+        part, begin = arrays["visible"][begin:end].tolist(), end
+        if not part:
+            yield np.zeros(0, int)
+            continue
+        first, rest = next(read_numbers(part))
+        point = first // 2
+        if first % 2:
+            flags = unpacked(np.array(rest, np.uint8), None)
+            yield np.array([point, *(point + 1 + np.flatnonzero(flags))])
+        else:
+            yield np.cumsum([point, *(number for number, _ in read_numbers(rest))])
 
 
-def read_descriptors(metadata, tensors):
+def read_descriptors(metadata, arrays):
     """Return the descriptors (P, D), and the norms of what codes stand for."""
-    stored, storage = tensors["descriptors"], metadata["storage"]
+    stored, storage = arrays["descriptors"], metadata["storage"]
     if storage.startswith("float"):
-        return stored.T.astype(np.float32), None
+        return stored.astype(np.float32), None
     if storage == "uint8":
         scale, offset = metadata["scale"]
-        found = stored.T * np.float32(scale) + np.float32(offset)
+        found = stored * np.float32(scale) + np.float32(offset)
     else:
-        levels, size = tensors["levels"].astype(np.float32), int(storage.removeprefix("uint"))
+        assert "levels" not in arrays  # they ship with the projection
+        levels = load_file(WEIGHTS / "colmap_sift_sv32.safetensors")[f"levels.{storage}"]
+        levels, size = levels.astype(np.float16).astype(float), int(storage.removeprefix("uint"))
         bit = size * np.arange(len(levels))
-        codes = stored[bit // 8] >> (bit % 8)[:, None] & 2**size - 1
-        found = np.take_along_axis(levels, codes, axis=1).T
+        codes = stored[:, bit // 8] >> bit % 8 & 2**size - 1
+        found = np.take_along_axis(levels, codes.T, axis=1).T.astype(np.float32)
     norms = np.linalg.norm(found, axis=1, keepdims=True)
     return found / norms, None if storage == "uint8" else norms
 
@@ -92,10 +144,11 @@ def vlad(local, words):
     return (sums / np.linalg.norm(sums)).ravel()
 
 
-def similarity(metadata, tensors, descriptor):
-    size, number = 1 << (len(descriptor) - 1).bit_length(), metadata["signs"]
+def similarity(arrays, descriptor):
+    size = 1 << (len(descriptor) - 1).bit_length()
     padded = np.pad(descriptor, (0, size - len(descriptor)))
-    return (2 * unpacked(tensors["retrieval"], number) - 1) @ transform(padded)[:number]
+    number = min(1024, size)
+    return (2 * unpacked(arrays["retrieval"], number) - 1) @ transform(padded)[:number]
 
 
 def match(shown, query, ratio):
@@ -120,45 +173,34 @@ def test_a_reader_of_the_documented_format(built, tmp_path):
     for storage in ("uint4", "uint2", "uint1", "uint8", "float16"):
         path = tmp_path / f"{storage}.hlm"
         compact.main(path, built, storage=storage)
-        metadata, tensors = read(path)
+        metadata, arrays = read(path)
         expected = CompactMap(path)
-        names = tensors["names"].tobytes().decode().split("\n")
-        assert names == expected.names and metadata["points"] > 100
-        xyz = read_coordinates(metadata, tensors)
+        names = read_names(arrays)
+        assert names == list(expected.names) and metadata["points"] > 100
+        xyz = read_coordinates(metadata, arrays)
         np.testing.assert_allclose(xyz, expected.points.all(), atol=1e-12)
         assert np.median(np.abs(xyz[:, 2])) < 0.01  # the photos show the plane z = 0
-        shown = dict(zip(names, read_visible(metadata, tensors), strict=True))
-        for name, number in zip(names, tensors["camera_of_image"], strict=True):
+        shown = dict(zip(names, read_visible(arrays), strict=True))
+        found = read_images(metadata, arrays)
+        for name, (rotation, translation, camera) in zip(names, found, strict=True):
             np.testing.assert_array_equal(shown[name], expected.visible(name))
-            model, width, height, focal_length, x, y = metadata["cameras"][number]
+            pose = expected.pose(name)
+            np.testing.assert_allclose(pose.rotation.matrix(), rotation, atol=1e-9)
+            np.testing.assert_allclose(pose.translation, translation, atol=1e-9)
+            model, width, height, *parameters = camera
             assert (model, width, height) == ("SIMPLE_PINHOLE", 360, 270)
-            np.testing.assert_allclose([focal_length, x, y], expected.camera_of[name].params)
-        check_poses(tensors, expected)
-        described, norms = read_descriptors(metadata, tensors)
+            np.testing.assert_array_equal(parameters, expected.camera(name).params)
+        described, norms = read_descriptors(metadata, arrays)
         every = np.arange(len(described))
         np.testing.assert_allclose(described, expected.descriptors(every), atol=1e-6)
 
         local = described[shown[names[0]]]
-        descriptor = vlad(local, tensors["vocabulary"].astype(float)).astype(np.float16)
-        ranked = similarity(metadata, tensors, descriptor.astype(float))
-        its = expected.similarity(descriptor.astype(np.float32))
-        ranked, its = (part / np.linalg.norm(part) for part in (ranked, its))
-        np.testing.assert_allclose(ranked, its, rtol=1e-4)
+        descriptor = vlad(local, arrays["vocabulary"].astype(float)).astype(np.float16)
+        ranked = similarity(arrays, descriptor.astype(float))
+        rows, its = expected.retrieve(descriptor.astype(np.float32), len(names))
+        ranked, its = (part / np.linalg.norm(part) for part in (ranked[rows], its))
+        np.testing.assert_allclose(ranked, its, atol=1e-6)
         check_matches(path, described, norms, shown)
-
-
-def check_poses(tensors, expected):
-    """The translations belong to the rounded rotations."""
-    for i, name in enumerate(expected.names):
-        x, y, z, w = tensors["rotations"][i] / np.linalg.norm(tensors["rotations"][i].astype(float))
-        rotation = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-        pose = expected.pose(name)
-        np.testing.assert_allclose(pose.rotation.matrix(), rotation, atol=1e-6)
-        np.testing.assert_allclose(pose.translation, tensors["translations"][i])
 
 
 def check_matches(path, described, norms, shown):
@@ -181,10 +223,10 @@ def check_matches(path, described, norms, shown):
     assert number > 20
 
 
-def test_differences_are_read_as_documented():
-    visible = [np.array([0, 5, 70_000]), np.zeros(0, int), np.array([127, 128, 300])]
-    packed, kind = points.pack_visible(visible, 70_001)
-    assert kind == "deltas"
-    tensors = {"num_visible": np.array([3, 0, 3]), "visible": packed}
-    found = read_visible({"visible": kind}, tensors)
-    assert [part.tolist() for part in found] == [part.tolist() for part in visible]
+@pytest.mark.parametrize("points", [[0, 5, 70_000], [], [127, 128, 300], [9], range(50, 90, 2)])
+def test_visible_points_are_read_as_documented(points):
+    packed = np.frombuffer(visible.pack(np.array(points, int)), np.uint8)
+    table = np.zeros((1, 32), np.uint8)
+    table[0, 28:] = np.frombuffer(struct.pack("<I", len(packed)), np.uint8)
+    [found] = read_visible({"images": table, "visible": packed})
+    assert found.tolist() == list(points)

@@ -1,5 +1,7 @@
 """What a compact map keeps of points, images and retrieval: in few bits, and exact enough."""
 
+from pathlib import Path
+
 import h5py
 import numpy as np
 import pycolmap
@@ -10,9 +12,19 @@ from hypothesis.extra import numpy as arrays
 from row_of_photos import row
 from small_map import build
 
-from hloc_reduce.hlm import points, writer
-from hloc_reduce.hlm.reader import rotation_of
-from hloc_reduce.hlm.signs import Signs, hadamard, pack
+from hloc_reduce.hlm import images, names, points, visible
+from hloc_reduce.hlm.signs import Signs, columns, hadamard, pack
+from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.parsers import check_names
+
+
+def on_grid(xyz, step):
+    """Return the grid of coordinates, and these as they are read from a file."""
+    grid = points.Grid.of(xyz.min(axis=0), xyz.max(axis=0), step)
+    packed = np.concatenate([grid.pack(xyz[part]) for part in points.parts(len(xyz))])
+    assert len(packed) == grid.nbytes(len(xyz))
+    padded = np.append(packed, np.zeros(points.PADDING, np.uint8))
+    return grid, points.Coordinates(padded, len(xyz), grid)
 
 
 @given(
@@ -23,14 +35,12 @@ from hloc_reduce.hlm.signs import Signs, hadamard, pack
 )
 @settings(deadline=None)
 def test_coordinates_are_within_half_a_step(xyz, step):
-    packed, least, used, bits = points.quantize(xyz, step)
-    coordinates = points.Coordinates(packed, len(xyz), least, used, bits)
+    grid, coordinates = on_grid(xyz, step)
     restored = coordinates.all()
     rows = np.arange(len(xyz))[::-2]
     assert np.array_equal(coordinates[rows], restored[rows])
-    assert np.abs(restored - xyz).max() <= 0.5001 * used + 1e-9 * np.abs(xyz).max()
-    assert len(packed) == -(-len(xyz) * sum(bits) // 8)
-    assert used == step or np.ptp(xyz, axis=0).max() / step > 2**31
+    assert np.abs(restored - xyz).max() <= 0.5001 * grid.step + 1e-9 * np.abs(xyz).max()
+    assert grid.step == pytest.approx(step, rel=5e-3) or np.ptp(xyz, axis=0).max() / step > 2**30
 
 
 def test_coordinates_move_less_than_is_said(scene):
@@ -43,9 +53,9 @@ def test_coordinates_move_less_than_is_said(scene):
     model, everything = scene.map, points.collect(scene.map, scene.features)
     error = model.compute_mean_reprojection_error()
     assert len(everything) > 200 and 0.3 < error < 1
-    packed, least, step, bits = points.quantize(everything.xyz, points.precision(everything, model))
-    restored = points.Coordinates(packed, len(everything), least, step, bits).all()
-    assert np.abs(restored - everything.xyz).max() <= 0.5001 * step
+    grid, coordinates = on_grid(everything.xyz, points.precision(everything, model))
+    restored = coordinates.all()
+    assert np.abs(restored - everything.xyz).max() <= 0.5001 * grid.step
     moved = []
     for name, rows in zip(everything.names, everything.visible, strict=True):
         image = model.find_image_with_name(name)
@@ -60,36 +70,56 @@ def test_coordinates_move_less_than_is_said(scene):
 
 def test_coordinates_of_many_points_are_packed_in_parts(monkeypatch):
     xyz = np.random.default_rng(0).uniform(-5, 90, (100, 3))
-    whole = points.quantize(xyz, 0.01)
+    whole = on_grid(xyz, 0.01)[1].all()
     monkeypatch.setattr(points, "POINTS_PER_CHUNK", 16)
-    parts = points.quantize(xyz, 0.01)
-    assert np.array_equal(whole[0], parts[0])
-    every = [points.Coordinates(packed, 100, *rest).all() for packed, *rest in (whole, parts)]
-    assert np.array_equal(*every)
+    assert len(points.parts(100)) == 7
+    assert np.array_equal(whole, on_grid(xyz, 0.01)[1].all())
 
 
-@given(st.lists(st.sets(st.integers(0, 40_000), max_size=30), min_size=1, max_size=5))
+@given(st.sets(st.integers(0, 40_000), max_size=30) | st.sets(st.integers(900, 1000)))
 @settings(deadline=None)
 def test_visible_points_survive(chosen):
-    for number in (40_001, max([i for part in chosen for i in part], default=0) + 1):
-        visible = [np.array(sorted(part), np.int64) for part in chosen]
-        packed, kind = points.pack_visible(visible, number)
-        counts = np.array([len(part) for part in visible])
-        found = points.Visible(packed, kind, counts, number)
-        assert len(found) == len(visible)
-        assert [found[i].tolist() for i in range(len(found))] == [part.tolist() for part in visible]
+    shown = np.array(sorted(chosen), np.int64)
+    packed = np.frombuffer(visible.pack(shown), np.uint8)
+    for number in (40_001, max(chosen, default=0) + 1):
+        assert visible.unpack(packed, number).tolist() == shown.tolist()
+    if chosen:
+        with pytest.raises(ValueError, match="do not exist"):
+            visible.unpack(packed, max(chosen))
 
 
 def test_the_shorter_way_is_taken():
-    dense, sparse = [np.arange(0, 800, 2)], [np.array([5, 70_000])]
-    assert points.pack_visible(dense, 800)[1] == "bitmaps"
-    packed, kind = points.pack_visible(sparse, 70_001)
-    assert kind == "deltas" and packed.tolist() == [
-        6,
-        0x80 | (69_995 & 127),
-        0x80 | (69_995 >> 7 & 127),
-        69_995 >> 14,
-    ]
+    assert visible.pack(np.arange(60, 90, 2)) == bytes([121, 0xAA, 0xAA, 0xAA, 0x0A])
+    many = 69_995
+    expected = [10, 0x80 | (many & 127), 0x80 | (many >> 7 & 127), many >> 14]
+    assert visible.pack(np.array([5, 70_000])) == bytes(expected)
+
+
+@given(st.sets(st.text("ab/\n\tä" + chr(700), min_size=1, max_size=9), min_size=1))
+def test_names_survive(chosen):
+    listed = sorted(name for name in chosen if is_name(name))
+    found = names.Names(names.pack(listed), len(listed), Path("a.hlm")) if listed else []
+    assert list(found) == listed == [found[i] for i in range(len(listed))]
+    for i, name in enumerate(listed):
+        assert found.row(name) == i and name in found
+    for name in ("", "a" * 5000, "zz", chr(0xD800)):
+        assert not listed or (name in found) == (name in listed)
+
+
+def is_name(name):
+    try:
+        return bool(check_names([name], "here"))
+    except InputError:
+        return False
+
+
+def test_names_take_few_bytes_and_few_are_read():
+    listed = [f"photos/2024/camera_{i:05d}.jpg" for i in range(5000)]
+    packed = names.pack(listed)
+    assert len(packed) < 9 * len(listed)
+    found = names.Names(packed, len(listed), Path("a.hlm"))
+    assert found.row(listed[4321]) == 4321
+    assert found._names.cache_info().misses == 1
 
 
 def test_hadamard_is_its_own_inverse():
@@ -104,7 +134,7 @@ def signed(number):
     """Return ten descriptors of a number of dimensions, and their signs."""
     descriptors = np.random.default_rng(0).standard_normal((10, number)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    return descriptors, Signs(pack(descriptors)[0], number)
+    return descriptors, Signs(columns(pack(descriptors)[0]), number)
 
 
 @pytest.mark.parametrize("number", [3, 12, 1024, 3000])
@@ -138,12 +168,25 @@ def test_images_far_from_the_origin_stay_where_they_are():
     """As in projected coordinates; rounded rotations moved them by up to 0.6 m."""
     model, *_ = row({1: 20.0, 4: -15.0})
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), [450_000.0, 5_400_000.0, 400.0]))
-    names = sorted(image.name for image in model.images.values())
-    nothing = points.Points(np.zeros((0, 3)), np.zeros((0, 4)), names, [], [])
-    tensors: dict[str, np.ndarray] = {}
-    writer._add_images(tensors, {}, nothing, model)
-    for i, name in enumerate(names):
-        rotation = rotation_of(tensors["rotations"][i])
-        pose = pycolmap.Rigid3d(rotation, tensors["translations"][i])
-        moved = model.find_image_with_name(name).projection_center() - pose.inverse().translation
-        assert np.linalg.norm(moved) < 1e-6
+    of_model = images.Images.of(model)
+    least = of_model.centers.min(axis=0) - [30, 0, 5]
+    packed, step = of_model.pack(least, np.zeros(len(of_model.names)))
+    table = packed.view(images.ROW)[:, 0]
+    assert np.abs(least + step * table["center"] - of_model.centers).max() < 1e-6
+    quaternions = images.rotations(table)
+    cosines = np.abs((quaternions * of_model.rotations).sum(axis=1))
+    np.testing.assert_allclose(cosines, 1, atol=1e-12)
+
+
+@given(
+    arrays.arrays(np.float64, 4, elements=st.floats(-1, 1)).filter(
+        lambda q: np.linalg.norm(q) > 1e-3
+    )
+)
+def test_any_rotation_is_kept(quaternion):
+    """Also half turns."""
+    unit = quaternion / np.linalg.norm(quaternion)
+    one = images.Images(["a"], unit[None], np.zeros((1, 3)), [], np.zeros(1, int))
+    packed, _ = one.pack(np.zeros(3), np.zeros(1))
+    [found] = images.rotations(packed.view(images.ROW)[:, 0])
+    assert min(np.abs(found - unit).max(), np.abs(found + unit).max()) < 2e-9

@@ -55,13 +55,15 @@ class Room:
         local = np.stack([np.linspace(-1, 1, 10), np.zeros(10), np.full(10, 4.0)], axis=1)
         return np.arange(10), self.poses[name].inverse() * local
 
-    def fallback(self, names):
-        return self.poses[names[0]]
+    def views(self):
+        poses = [pose.inverse() for pose in self.poses.values()]
+        axes = [pose.rotation.matrix()[:, 2] for pose in poses]
+        return np.array([pose.translation for pose in poses]), np.array(axes)
 
 
 def test_images_that_see_the_same_come_first():
     room = Room(30)
-    surroundings = Surroundings(room, room.poses)
+    surroundings = Surroundings(room, [*room.poses], room.views)
     guess = surroundings.guess(room.poses["7.png"], None, CAMERA)
     assert guess.images[0] == "7.png" and set(guess.images[1:3]) == {"6.png", "8.png"}
     assert "back.png" not in guess.images
@@ -74,12 +76,13 @@ def test_images_that_see_the_same_come_first():
 
 def test_a_guess_of_another_frame():
     room = Room(5)
-    surroundings = Surroundings(room, room.poses)
+    surroundings = Surroundings(room, [*room.poses], room.views)
     far = moved(room.poses["0.png"], shift=(1e3, 0, 0))
     assert surroundings.is_far(far) and not surroundings.is_far(room.poses["0.png"])
     with pytest.raises(InputError, match="is it of another frame, or world from camera"):
         surroundings.check(far)
-    alone = Surroundings(room, ["0.png"])  # whose positions have no extent
+    first = [part[:1] for part in room.views()]
+    alone = Surroundings(room, ["0.png"], lambda: first)  # whose positions have no extent
     assert not alone.is_far(room.poses["0.png"])
     for radius in (0, -1, np.nan, np.inf):
         with pytest.raises(InputError, match=r"radius is .*: a distance above 0"):

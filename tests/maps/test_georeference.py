@@ -306,7 +306,6 @@ def test_broken_frames(posed, tmp_path, refused):
     write(folder / "map.json", json.dumps(content | {"frame": Frame("m").to_json()}))
     compact.main(tmp_path / "map.hlm", folder)
     data = (tmp_path / "map.hlm").read_bytes()
-    (tmp_path / "map.hlm").write_bytes(
-        data.replace(b'\\"units\\": \\"m\\"', b'\\"units\\": \\"X\\"')
-    )
+    units = b'\\"units\\":\\"%s\\"'
+    (tmp_path / "map.hlm").write_bytes(data.replace(units % b"m", units % b"X"))
     assert "a frame in 'X'" in refused("--map", tmp_path / "map.hlm", "--outputs", tmp_path / "u")

@@ -38,6 +38,7 @@ from .models import (
     add_image,
     cam_from_img,
     find_model,
+    fingerprint,
     infer_camera,
     model_files,
     observed,

@@ -1,5 +1,6 @@
 """COLMAP models: read, check, select images; and the cameras of photos."""
 
+import hashlib
 import shutil
 from collections.abc import Callable, Collection, Iterable
 from functools import lru_cache
@@ -14,7 +15,7 @@ import pycolmap
 
 from ... import logger
 from ..cli import InputError
-from ..files import replacing
+from ..files import file_sha256, replacing
 from ..images import NO_IMAGE, check_format, unreadable
 from . import binary_files, text_files
 from .records import PARTS, UNIT_TOLERANCE
@@ -38,6 +39,12 @@ def find_model(path: Path) -> Path:
         InputError: when there is none, or several.
     """
     return _find(path)[0]
+
+
+def fingerprint(path: Path) -> str:
+    """Return what tells a COLMAP model, a folder as for `find_model`, from others: 32 letters."""
+    files = [file for part in NEEDED for file in sorted(find_model(path).glob(f"{part}.*"))]
+    return hashlib.sha256(" ".join(map(file_sha256, files)).encode()).hexdigest()[:32]
 
 
 def _find(path: Path) -> tuple[Path, ModuleType]:
