@@ -6,18 +6,19 @@ keypoints. Localize in it with pipelines.localize --map FILE, or with Localizer(
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import pycolmap
 
 from .. import extract_features, logger, matchers
 from ..aggregate_features import output_of, vocabulary_if_any
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
-from ..hlm import points, writer
+from ..hlm import points, selection, writer
 from ..hlm.reader import SUFFIX, check_feature_keys
 from ..hlm.writer import Source
 from ..localization import intrinsics
@@ -87,7 +88,7 @@ def main(
         built = Map(map)
         if retrieval not in (None, built.retrieval):
             raise InputError(f"The map {map} was built with --retrieval {built.retrieval}.")
-        features, source = built.features, _of_map(built)
+        features, source = built.features, of_map(built)
     elif sfm is None or features is None or feature is None:
         raise InputError("Give --map, or --sfm, --features and --feature.")
     else:
@@ -103,6 +104,7 @@ def write(
     matcher: str | None = None,
     storage: str | None = None,
     max_mb: float | None = None,
+    rank: Callable[[points.Points, pycolmap.Reconstruction, Path], np.ndarray] = selection.ranked,
 ) -> dict[str, int]:
     """Write a compact map of what a pipeline has in memory and in files.
 
@@ -113,6 +115,7 @@ def write(
         matcher: matcher of queries; default: the map's, but NN-ratio90 for NN-ratio.
         storage: storage of the points' descriptors; default: as in `main`.
         max_mb: size of the file in 1,000,000 bytes; default: with all points.
+        rank: ranks points as `selection.ranked` does: if not all fit, the first ones are kept.
 
     Returns:
         The bytes of each part of the file.
@@ -131,7 +134,13 @@ def write(
     everything = points.collect(source.model, features)
     _check_dim(source, features, everything.descriptors.shape[1])
     rows = read_global(source.global_descriptors, everything.names)
-    encode = partial(_encode, everything, source, rows)
+    ranking = cache(partial(rank, everything, source.model, features))
+
+    def encode(number: int) -> tuple[bytes, dict[str, int]]:
+        """Encode the points that images need most."""
+        chosen = ranking()[:number] if number < len(everything) else np.arange(number)
+        return writer.encode(everything.only(np.sort(chosen)), source, rows)
+
     if max_mb is None:
         number = len(everything)
         content, parts = encode(number)
@@ -170,8 +179,8 @@ def matcher_of(matcher: str) -> str:
     return MATCHERS.get(matcher, matcher)
 
 
-def _of_map(built: Map) -> Source:
-    """Return what a map of `pipelines.localize` gives, with its own matcher."""
+def of_map(built: Map) -> Source:
+    """Return what a compact map of a map of `pipelines.localize` is made from."""
     return Source(
         colmap.read_model(built.sfm),
         built.feature,
@@ -225,14 +234,6 @@ def _storage(conf: dict, storage: str | None) -> str:
         return "uint4" if few and not features_confs.network_of(conf["model"]) else "uint2"
     except InputError:  # a projection without levels
         return STORAGES[0]
-
-
-def _encode(
-    everything: points.Points, source: Source, rows: np.ndarray, number: int
-) -> tuple[bytes, dict[str, int]]:
-    """Encode the points that images need most."""
-    chosen = everything.only(points.select(everything, number))
-    return writer.encode(chosen, source, rows)
 
 
 def _fit(

@@ -15,9 +15,7 @@ from ..utils.progress import progress
 COORDINATE_ERROR_SHARE = 0.1  # of the mean reprojection error
 NEAR_DEPTH_QUANTILE = 0.02  # of the depths, at which it holds
 MAX_BITS = 32
-CELLS_PER_SIDE = 8  # of an image, over which selected points are spread
 POINTS_PER_CHUNK = 2**16  # that are packed at once, a multiple of 8
-SELECTION_ROUNDS = 64  # in which points are selected, some at once
 
 
 @dataclass(frozen=True)
@@ -29,14 +27,16 @@ class Points:
         descriptors: (P, D) float32 of unit norm, the mean of those of a point's keypoints.
         names: the images.
         visible: of each image the points that it shows (M,), ascending.
-        cells: of each image the cell of a grid, from 0 on, that these are seen in (M,).
+        keypoints: of each image the indices of their keypoints (M,).
+        norms: (P,) float32, lengths of the sums of the descriptors of a point's keypoints.
     """
 
     xyz: np.ndarray
     descriptors: np.ndarray
     names: list[str]
     visible: list[np.ndarray]
-    cells: list[np.ndarray]
+    keypoints: list[np.ndarray]
+    norms: np.ndarray
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -45,13 +45,14 @@ class Points:
         """Return chosen points (K,), renumbered in this order."""
         number = np.full(len(self), -1)
         number[chosen] = np.arange(len(chosen))
-        visible, cells = [], []
-        for points, its_cells in zip(self.visible, self.cells, strict=True):
+        visible, keypoints = [], []
+        for points, its_keypoints in zip(self.visible, self.keypoints, strict=True):
             kept = number[points] >= 0
             order = np.argsort(number[points][kept])
             visible.append(number[points][kept][order])
-            cells.append(its_cells[kept][order])
-        return Points(self.xyz[chosen], self.descriptors[chosen], self.names, visible, cells)
+            keypoints.append(its_keypoints[kept][order])
+        each = self.xyz[chosen], self.descriptors[chosen]
+        return Points(*each, self.names, visible, keypoints, self.norms[chosen])
 
     def sorted(self) -> "Points":
         """Return the points in the order of the images that show them, the first ones first."""
@@ -76,7 +77,7 @@ def collect(sfm: pycolmap.Reconstruction, features: Path) -> Points:
     ids = np.array(sorted(sfm.point3D_ids()), np.int64)
     images = {image.name: image for image in sfm.images.values()}
     names = sorted(images)
-    visible, cells, sums = [], [], np.zeros((len(ids), dimension(features)), np.float32)
+    visible, shown, sums = [], [], np.zeros((len(ids), dimension(features)), np.float32)
     for name in progress(names, "Collecting points", "image"):
         image = images[name]
         observed = point3D_ids(image)
@@ -91,51 +92,15 @@ def collect(sfm: pycolmap.Reconstruction, features: Path) -> Points:
                 f"{name}: {image.num_points2D()} of {sums.shape[1]} are expected."
             )
         sums[rows] += described[keypoints]
-        camera = sfm.cameras[image.camera_id]
-        points2D = image.points2D
-        xy = np.array([points2D[i].xy for i in keypoints]).reshape(-1, 2)
-        cell = xy * CELLS_PER_SIDE / [camera.width, camera.height]
-        column, row = cell.clip(0, CELLS_PER_SIDE - 1).astype(int).T
         visible.append(rows)
-        cells.append(row * CELLS_PER_SIDE + column)
+        shown.append(keypoints)
     if not len(ids):
         raise InputError("The map has no points.")
-    norms = np.linalg.norm(sums, axis=1, keepdims=True)
+    norms = np.linalg.norm(sums, axis=1)
     xyz = np.array([sfm.points3D[i].xyz for i in ids])
-    points = Points(xyz, sums / np.maximum(norms, 1e-12), names, visible, cells)
-    return points.only(np.flatnonzero(norms[:, 0] > 0))
-
-
-def select(points: Points, number: int) -> np.ndarray:
-    """Select points that images need most, greedily.
-
-    A point is worth the more, the more images show it, and the fewer selected points lie in its
-    cell of each of them: each image keeps points in all its parts (weighted K-cover).
-
-    Args:
-        points: all points.
-        number: of selected ones.
-
-    Returns:
-        Their indices (number,), ascending.
-    """
-    if number >= len(points):
-        return np.arange(len(points))
-    point = np.concatenate(points.visible)
-    image = np.repeat(np.arange(len(points.names)), [len(part) for part in points.visible])
-    cell = image * CELLS_PER_SIDE**2 + np.concatenate(points.cells)
-    count = np.zeros(len(points.names) * CELLS_PER_SIDE**2)
-    chosen = np.zeros(len(points), bool)
-    for left in range(SELECTION_ROUNDS, 0, -1):
-        gain = np.bincount(point, 1 / (1 + count[cell]), minlength=len(points))
-        gain[chosen] = -1
-        more = -(-(number - int(chosen.sum())) // left)
-        best = np.argsort(-gain, kind="stable")[:more]
-        new = np.zeros(len(points), bool)
-        new[best] = True
-        chosen |= new
-        count += np.bincount(cell[new[point]], minlength=len(count))
-    return np.flatnonzero(chosen)
+    descriptors = sums / np.maximum(norms, 1e-12)[:, None]
+    points = Points(xyz, descriptors, names, visible, shown, norms)
+    return points.only(np.flatnonzero(norms > 0))
 
 
 def precision(points: Points, sfm: pycolmap.Reconstruction) -> float:

@@ -121,25 +121,12 @@ def test_a_descriptor_finds_its_signs(number):
     assert [found.similarity(query).argmax() for query in descriptors] == list(range(10))
 
 
-def test_selected_points_are_spread():
-    """Of 90 points in one cell and 10 in others, the 10 are all taken; and the often seen ones."""
-    xyz, descriptors = np.zeros((100, 3)), np.ones((100, 4), np.float32)
-    cells = np.array([0] * 90 + list(range(1, 11)))
-    everything = points.Points(xyz, descriptors, ["a"], [np.arange(100)], [cells])
-    assert set(range(90, 100)) <= set(points.select(everything, 20).tolist())
-    two = points.Points(
-        xyz, descriptors, ["a", "b"], [np.arange(100), np.arange(5, 9)], [cells, cells[:4]]
-    )
-    assert set(range(5, 9)) <= set(points.select(two, 20).tolist())
-    assert points.select(two, 100).tolist() == list(range(100))
-
-
 def test_images_far_from_the_origin_stay_where_they_are():
     """As in projected coordinates; rounded rotations moved them by up to 0.6 m."""
     model, *_ = row({1: 20.0, 4: -15.0})
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), [450_000.0, 5_400_000.0, 400.0]))
     names = sorted(image.name for image in model.images.values())
-    nothing = points.Points(np.zeros((0, 3)), np.zeros((0, 4)), names, [], [])
+    nothing = points.Points(np.zeros((0, 3)), np.zeros((0, 4)), names, [], [], np.zeros(0))
     tensors: dict[str, np.ndarray] = {}
     writer._add_images(tensors, {}, nothing, model)
     for i, name in enumerate(names):
