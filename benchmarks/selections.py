@@ -136,4 +136,4 @@ def _cells(points: Points, model: pycolmap.Reconstruction) -> np.ndarray:
     return np.concatenate(cells)
 
 
-RANKINGS = {"cover": cover, "longest tracks": longest, "random": drawn, "triplets": triplets}
+RANKINGS = {"cover": cover, "longest": longest, "random": drawn, "triplets": triplets}
