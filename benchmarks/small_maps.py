@@ -12,14 +12,17 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import torch
 
 from benchmarks import rows, selections
 from hloc_reduce import Localizer, compact, maps
+from hloc_reduce.compact import Ranking
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import FAILED, pose_error
 from hloc_reduce.hlm import selection
+from hloc_reduce.hlm.points import Points
 from hloc_reduce.maps.contents import Engine
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.files import MEGABYTE
@@ -74,6 +77,18 @@ def measured(localizer: Localizer, place: Aachen, size: int) -> Iterator[dict[st
         }
 
 
+def _once(rank: Ranking) -> Ranking:
+    """Return a function that ranks points when it is called first, for one map."""
+    known: list[np.ndarray] = []
+
+    def ranked(points: Points, model: pycolmap.Reconstruction, features: Path) -> np.ndarray:
+        if not known:
+            known.append(rank(points, model, features))
+        return known[0]
+
+    return ranked
+
+
 def _main() -> None:
     parser = cli.Parser(__doc__, "--dataset datasets/herz-jesus --feature colmap_sift_sv32")
     add = parser.add_argument
@@ -106,8 +121,10 @@ def _main() -> None:
         if not todo:
             continue
         described: dict[tuple, dict] = {}
+        rankings = {name: _once(RANKINGS[name]) for name in args.selection}
         folder = args.outputs / place.root.name / feature
         built = maps.main(folder / "map", place.images, place.reference_model, feature)
+        source = compact.of_map(built)
         for cells in todo:
             if cells["variant"] == WHOLE:
                 path = built.folder
@@ -116,8 +133,8 @@ def _main() -> None:
             else:
                 path = folder / "compact.hlm"
                 (limit, name), matcher = limits[cells["variant"]], args.matcher or None
-                given = matcher, cells["storage"], limit, RANKINGS[name]
-                compact.write(path, compact.of_map(built), built.features, *given)
+                given = matcher, cells["storage"], limit, rankings[name]
+                compact.write(path, source, built.features, *given)
                 size = path.stat().st_size
             localizer = Localizer(path)
             localizer.engine = Remembering(localizer.engine, described)

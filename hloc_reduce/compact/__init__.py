@@ -37,6 +37,7 @@ AIMED_SHARE = 0.998  # of the limit
 CLOSE_SHARE = 0.995  # of the limit, which is close enough
 # descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
+Ranking = Callable[[points.Points, pycolmap.Reconstruction, Path], np.ndarray]
 MAX_UINT4_DIM = 32  # of DoG's features that are stored as uint4; others as uint2
 
 
@@ -104,7 +105,7 @@ def write(
     matcher: str | None = None,
     storage: str | None = None,
     max_mb: float | None = None,
-    rank: Callable[[points.Points, pycolmap.Reconstruction, Path], np.ndarray] = selection.ranked,
+    rank: Ranking = selection.ranked,
 ) -> dict[str, int]:
     """Write a compact map of what a pipeline has in memory and in files.
 
