@@ -52,50 +52,72 @@ def by_information(
     Returns:
         As `ranked` does.
     """
-    point = np.concatenate(points.visible)
-    by_point = np.argsort(point, kind="stable")
-    weights = reliability[point, None, None] / NOISE
-    derivatives = (_derivatives(points, model) * weights)[by_point].astype(np.float32)
-    sizes = [len(part) for part in points.visible]
-    image = np.repeat(np.arange(len(points.names)), sizes)[by_point]
-    starts = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(points)))])
-
-    def observations(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the observations (O,) of points (K,), and the index of its point of each."""
-        numbers = starts[chosen + 1] - starts[chosen]
-        first = np.repeat(starts[chosen] - np.cumsum(numbers) + numbers, numbers)
-        return first + np.arange(len(first)), np.repeat(np.arange(len(chosen)), numbers)
-
-    def gains_of(chosen: np.ndarray, covariances: np.ndarray) -> np.ndarray:
-        """Return by how much each of points (K,) makes the logarithms grow."""
-        rows, number = observations(chosen)
-        side = derivatives[rows]
-        (a, b), (_, d) = (side @ covariances[image[rows]] @ side.swapaxes(1, 2)).transpose(1, 2, 0)
-        growth = np.log((1 + a) * (1 + d) - b * b)
-        return np.bincount(number, growth, minlength=len(chosen))
-
+    sights = _Sights(points, model, reliability)
     information = np.tile(np.eye(6) / UNKNOWN**2, (len(points.names), 1, 1))
     parts = np.array_split(np.arange(len(points)), 1 + len(points) // POINTS_PER_CHUNK)
-    gains = np.concatenate([gains_of(part, np.linalg.inv(information)) for part in parts])
+    gains = np.concatenate([sights.gains(part, np.linalg.inv(information)) for part in parts])
     ranking = np.zeros(0, np.int64)
-    while len(ranking) < len(points):
+    while left := len(points) - len(ranking):
         covariances = np.linalg.inv(information)
-        left = len(points) - len(ranking)
         more = min(max(1, int(AT_ONCE * len(ranking))), left)
         is_fresh = np.zeros(len(points), bool)
         while True:  # gains only shrink: points whose old gains are too small need no new ones
             candidates = _largest(gains, min(more + SPARE, left))
-            stale = candidates[~is_fresh[candidates]]
-            best = candidates[:more]
+            best, stale = candidates[:more], candidates[~is_fresh[candidates]]
             if is_fresh[best].all():
                 break
-            gains[stale], is_fresh[stale] = gains_of(stale, covariances), True
-        rows, _ = observations(best)
-        side = derivatives[rows]
-        np.add.at(information, image[rows], side.swapaxes(1, 2) @ side)
+            gains[stale], is_fresh[stale] = sights.gains(stale, covariances), True
+        sights.add(best, information)
         gains[best] = -np.inf
         ranking = np.concatenate([ranking, best])
     return ranking
+
+
+class _Sights:
+    """What points tell images about their poses.
+
+    Args:
+        points: all points.
+        model: the map.
+        reliability: of each point (P,).
+    """
+
+    def __init__(self, points: Points, model: pycolmap.Reconstruction, reliability: np.ndarray):
+        point = np.concatenate(points.visible)
+        by_point = np.argsort(point, kind="stable")
+        self._derivatives = _derivatives(points, model)[by_point]
+        weights = (reliability / NOISE).astype(np.float32)
+        self._derivatives *= weights[point[by_point], None, None]
+        sizes = [len(part) for part in points.visible]
+        self._image = np.repeat(np.arange(len(points.names)), sizes)[by_point]
+        self._numbers = np.bincount(point, minlength=len(points))
+        self._starts = np.cumsum(self._numbers) - self._numbers
+
+    def gains(self, chosen: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+        """Return by how much points (K,) make the sum of the logarithms grow, each by itself.
+
+        Args:
+            chosen: the points.
+            covariances: (I, 6, 6) of the poses of the images.
+        """
+        rows = self._rows(chosen)
+        side, covariance = self._derivatives[rows], covariances[self._image[rows]]
+        (a, b), (_, d) = (side @ covariance @ side.swapaxes(1, 2)).transpose(1, 2, 0)
+        growth = np.log((1 + a) * (1 + d) - b * b)
+        number = np.repeat(np.arange(len(chosen)), self._numbers[chosen])
+        return np.bincount(number, growth, minlength=len(chosen))
+
+    def add(self, chosen: np.ndarray, information: np.ndarray) -> None:
+        """Add what points (K,) tell to the inverses of the covariances (I, 6, 6)."""
+        rows = self._rows(chosen)
+        side = self._derivatives[rows]
+        np.add.at(information, self._image[rows], side.swapaxes(1, 2) @ side)
+
+    def _rows(self, chosen: np.ndarray) -> np.ndarray:
+        """Return the rows (O,) of the images that show points (K,), point by point."""
+        numbers = self._numbers[chosen]
+        before = np.cumsum(numbers) - numbers
+        return np.repeat(self._starts[chosen] - before, numbers) + np.arange(numbers.sum())
 
 
 def reliabilities(points: Points, features: Path) -> np.ndarray:
