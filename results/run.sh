@@ -82,8 +82,8 @@ small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.12 0.17 0.25 0.5 1 "$@"
 others="cover triplets longest random" # which points?
 small_maps herz-jesus colmap_sift_sv32 uint4 0.015 0.02 0.03 0.06 0.1 --selection $others "$@"
 small_maps herz-jesus mini32 uint2 0.015 0.02 0.03 0.06 0.1 --selection $others "$@"
-small_maps day-south-building colmap_sift_sv32 uint4 0.0175 0.02 0.025 0.03 --selection ours $others "$@"
-small_maps demo_town-400 colmap_sift_sv32 uint4 0.12 0.17 --selection $others "$@"
+small_maps day-south-building colmap_sift_sv32 uint4 0.0175 0.02 0.025 --selection ours $others "$@"
+small_maps demo_town-400 colmap_sift_sv32 uint4 0.12 0.17 --selection cover triplets "$@"
 
 run metres --map "$(scene fountain-P11)" --map "$(scene entry-P10)" --map $herz_jesus "$@"
 run tracking --feature colmap_sift_sv32:uint4 mini32:uint2 --strangers $data/strangers "$@"
