@@ -82,6 +82,8 @@ def draw_maps() -> list[Callable]:
         for colour, (feature, storage) in zip(plots.COLOURS, MAPS, strict=False):
             sizes: dict[float, list[Row]] = {}
             for row in select(read("maps"), place=place, feature=feature, matcher=""):
+                if "," in row["variant"]:  # points that were selected in another way
+                    continue
                 if row["storage"] == storage or row["variant"] == "whole map":
                     sizes.setdefault(float(row["mb"]), []).append(row)
             values = [measure(sizes[size]) for size in sorted(sizes)]

@@ -2,7 +2,8 @@
 
 The place is in the layout of Aachen. Adds a row for each query list of each map to
 results/maps.csv, leaving out those that have rows unless --again is given. Maps are kept in the
-outputs folder. Seconds are those of matching and pose estimation of a query.
+outputs folder. Seconds are those of matching and pose estimation of a query. With --selection, the
+points of limited maps are those that other rankings put first.
 """
 
 import os
@@ -11,18 +12,47 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import torch
 
-from benchmarks import rows
+from benchmarks import rows, selections
 from hloc_reduce import Localizer, compact, maps
+from hloc_reduce.compact import Ranking
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import FAILED, pose_error
+from hloc_reduce.hlm import selection
+from hloc_reduce.hlm.points import Points
+from hloc_reduce.maps.contents import Engine
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.files import MEGABYTE
 
 NAME = "maps"
 WHOLE, ALL_POINTS = "whole map", "all points"
+OURS = "ours"
+RANKINGS = {OURS: selection.ranked} | selections.RANKINGS
+
+
+class Remembering:
+    """An engine that extracts the features of each photo only once.
+
+    Args:
+        engine: see `Localizer.engine`.
+        known: the features of photos, which this adds to.
+    """
+
+    def __init__(self, engine: Engine, known: dict[tuple, dict]):
+        self._engine, self._known = engine, known
+        self.rotation_invariant, self.matching = engine.rotation_invariant, engine.matching
+
+    def extract(
+        self, image: Path | np.ndarray, preprocessing: dict, mask: np.ndarray | None = None
+    ) -> dict:
+        """Return the features of a photo, see `Engine.extract`."""
+        key = image, repr(sorted(preprocessing.items()))
+        if key not in self._known:
+            self._known[key] = self._engine.extract(image, preprocessing, mask)
+        return dict(self._known[key])
 
 
 def measured(localizer: Localizer, place: Aachen, size: int) -> Iterator[dict[str, object]]:
@@ -47,6 +77,18 @@ def measured(localizer: Localizer, place: Aachen, size: int) -> Iterator[dict[st
         }
 
 
+def _once(rank: Ranking) -> Ranking:
+    """Return a function that ranks points when it is called first, for one map."""
+    known: list[np.ndarray] = []
+
+    def ranked(points: Points, model: pycolmap.Reconstruction, features: Path) -> np.ndarray:
+        if not known:
+            known.append(rank(points, model, features))
+        return known[0]
+
+    return ranked
+
+
 def _main() -> None:
     parser = cli.Parser(__doc__, "--dataset datasets/herz-jesus --feature colmap_sift_sv32")
     add = parser.add_argument
@@ -55,6 +97,7 @@ def _main() -> None:
     add("--storage", nargs="+", default=["uint4"], help="of the points' descriptors")
     add("--matcher", default="", help="of queries and points; default: the feature's")
     add("--max_mb", type=float, nargs="*", default=[0.03, 0.06], help="sizes besides all points")
+    add("--selection", nargs="+", default=[OURS], choices=RANKINGS, help="of points for a size")
     add("--outputs", type=Path, default=Path("outputs/small_maps"))
     rows.add_again_option(parser)
     args = parser.parse_args()
@@ -64,9 +107,12 @@ def _main() -> None:
 
     for feature in args.feature:
         base = {"place": place.root.name, "feature": feature, "matcher": args.matcher}
-        todo = [base | {"storage": "float16", "variant": WHOLE}] if not args.matcher else []
-        limits: dict[str, float | None] = {ALL_POINTS: None}
-        limits |= {f"at most {limit:g} MB": limit for limit in args.max_mb}
+        todo, limits = [], dict[str, tuple[float | None, str]]()
+        if args.selection == [OURS]:
+            todo += [base | {"storage": "float16", "variant": WHOLE}] if not args.matcher else []
+            limits[ALL_POINTS] = None, OURS
+        for limit, name in product(args.max_mb, args.selection):
+            limits[f"at most {limit:g} MB" + f", {name}" * (name != OURS)] = limit, name
         todo += [
             base | {"storage": storage, "variant": variant}
             for storage, variant in product(args.storage, limits)
@@ -74,8 +120,11 @@ def _main() -> None:
         todo = [cells for cells in todo if not rows.select(known, **cells)]
         if not todo:
             continue
+        described: dict[tuple, dict] = {}
+        rankings = {name: _once(RANKINGS[name]) for name in args.selection}
         folder = args.outputs / place.root.name / feature
         built = maps.main(folder / "map", place.images, place.reference_model, feature)
+        source = compact.of_map(built)
         for cells in todo:
             if cells["variant"] == WHOLE:
                 path = built.folder
@@ -83,11 +132,13 @@ def _main() -> None:
                 size = sum(file.stat().st_size for file in files)
             else:
                 path = folder / "compact.hlm"
-                limit, matcher = limits[cells["variant"]], args.matcher or None
-                options = {"storage": cells["storage"], "max_mb": limit, "matcher": matcher}
-                compact.main(path, built.folder, **options)
+                (limit, name), matcher = limits[cells["variant"]], args.matcher or None
+                given = matcher, cells["storage"], limit, rankings[name]
+                compact.write(path, source, built.features, *given)
                 size = path.stat().st_size
-            found = measured(Localizer(path), place, size)
+            localizer = Localizer(path)
+            localizer.engine = Remembering(localizer.engine, described)
+            found = measured(localizer, place, size)
             rows.add(NAME, [cells | each for each in found])
 
 

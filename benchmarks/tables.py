@@ -105,7 +105,7 @@ MAPS: list[Choice] = [
     ("xfeat_sv32", "uint2"),
     ("mini32", "uint2"),
 ]
-MAP_SIZES = (0.06, 0.03)
+MAP_SIZES = (0.06, 0.015)
 # of LightGlue: features, and the numbers of keypoints that are matched
 LIGHTGLUE: list[tuple[str, str, int]] = [
     ("xfeat", "float16", 1024),

@@ -26,7 +26,9 @@ for place in fountain-P11 sceaux; do
     split dusk $place "$(scene $place)" --gain 0.3 0.5
     split sparse $place "$(scene $place)" --map_every 4
 done
-split day fountain-P11 "$(scene fountain-P11)"
+for place in fountain-P11 south-building; do
+    split day $place "$(scene $place)"
+done
 herz_jesus=$data/herz-jesus/images_upright:$data/herz-jesus/3D-models/aachen_v_1_1
 split sparse herz-jesus $herz_jesus --map_every 4
 
@@ -70,13 +72,18 @@ small_maps() { # PLACE, FEATURE, STORAGE and sizes
     shift 3
     run small_maps --dataset $data/$place --feature $feature --storage $storage --max_mb "$@"
 }
-small_maps herz-jesus colmap_sift_sv32 uint4 0.02 0.03 0.06 0.1 "$@"
-small_maps herz-jesus xfeat_sv32 uint2 0.02 0.03 0.06 0.1 "$@"
-small_maps herz-jesus mini32 uint2 0.02 0.03 0.06 0.1 "$@"
+small_maps herz-jesus colmap_sift_sv32 uint4 0.015 0.02 0.03 0.06 0.1 "$@"
+small_maps herz-jesus xfeat_sv32 uint2 0.015 0.02 0.03 0.06 0.1 "$@"
+small_maps herz-jesus mini32 uint2 0.015 0.02 0.03 0.06 0.1 "$@"
 for feature in mini32 xfeat_sv32; do # LightGlue finds fewer points than nearest neighbours of more keypoints
     small_maps herz-jesus $feature uint2 0.1 --matcher lightglue "$@"
 done
-small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.25 0.5 1 "$@"
+small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.12 0.17 0.25 0.5 1 "$@"
+others="cover triplets longest random" # which points?
+small_maps herz-jesus colmap_sift_sv32 uint4 0.015 0.02 0.03 0.06 0.1 --selection $others "$@"
+small_maps herz-jesus mini32 uint2 0.015 0.02 0.03 0.06 0.1 --selection $others "$@"
+small_maps day-south-building colmap_sift_sv32 uint4 0.0175 0.02 0.025 --selection ours $others "$@"
+small_maps demo_town-400 colmap_sift_sv32 uint4 0.12 0.17 --selection cover triplets "$@"
 
 run metres --map "$(scene fountain-P11)" --map "$(scene entry-P10)" --map $herz_jesus "$@"
 run tracking --feature colmap_sift_sv32:uint4 mini32:uint2 --strangers $data/strangers "$@"

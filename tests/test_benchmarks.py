@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import row_of_photos
 import yaml
 
 from benchmarks import (
@@ -23,6 +24,7 @@ from benchmarks import (
     photos_alone,
     render,
     rows,
+    selections,
     split_place,
     tables,
     trial_rows,
@@ -372,3 +374,14 @@ def test_points_of_a_turned_photo_are_where_its_pixels_are(turns):
     found = turned.img_from_cam(changed_photos.about_axis(pose, turns) * points)
     np.testing.assert_allclose(found - 0.5, expected, atol=1e-9)
     assert (turned.width, turned.height) == ((30, 40) if turns % 2 else (40, 30))
+
+
+def test_triplets_with_accurate_poses():
+    """Those with a keypoint that is far off are none; the others are."""
+    model, _ = row_of_photos.row({})
+    image = model.find_image_with_name("2.jpg")
+    image.points2D[7].xy = image.points2D[7].xy + [40, 0]
+    generator, points = np.random.default_rng(0), np.arange(60)
+    rows = selections._accurate(image, row_of_photos.POINTS, points, generator)
+    assert 7 not in rows and len(rows) > 0.8 * selections.TRIPLETS
+    assert all(len(set(triplet)) == 3 for triplet in rows.tolist())

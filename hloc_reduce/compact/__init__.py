@@ -6,18 +6,19 @@ keypoints. Localize in it with pipelines.localize --map FILE, or with Localizer(
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import pycolmap
 
 from .. import extract_features, logger, matchers
 from ..aggregate_features import output_of, vocabulary_if_any
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
-from ..hlm import points, signs, writer
+from ..hlm import points, selection, signs, writer
 from ..hlm.images import Images
 from ..hlm.reader import SUFFIX, CompactMap, check_feature_keys
 from ..hlm.writer import Source
@@ -39,6 +40,7 @@ AIMED_SHARE = 0.998  # of the limit
 CLOSE_SHARE = 0.995  # of the limit, which is close enough
 # descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
+Ranking = Callable[[points.Points, pycolmap.Reconstruction, Path], np.ndarray]
 MAX_UINT4_DIM = 32  # of DoG's features that are stored as uint4; others as uint2
 
 
@@ -93,7 +95,7 @@ def main(
         built = Map(map)
         if retrieval not in (None, built.retrieval):
             raise InputError(f"The map {map} was built with --retrieval {built.retrieval}.")
-        features, source = built.features, _of_map(built)
+        features, source = built.features, of_map(built)
     elif sfm is None or features is None or feature is None:
         raise InputError("Give --map, or --sfm, --features and --feature.")
     else:
@@ -111,6 +113,7 @@ def write(
     storage: str | None = None,
     max_mb: float | None = None,
     names: Collection[str] | None = None,
+    rank: Ranking = selection.ranked,
 ) -> dict[str, int]:
     """Write a compact map of what a pipeline has in memory and in files.
 
@@ -122,6 +125,7 @@ def write(
         storage: storage of the points' descriptors; default: as in `main`.
         max_mb: size of the file in 1,000,000 bytes; default: with all points.
         names: images that the file has; default: all.
+        rank: ranks points as `selection.ranked` does: if not all fit, the first ones are kept.
 
     Returns:
         The bytes of each part of the file.
@@ -141,8 +145,9 @@ def write(
     everything = points.collect(source.model, features, images.names)
     _check_dim(source, features, everything.descriptors.shape[1])
     described = _global_signs(source.global_descriptors, everything.names)
+    ranking = cache(partial(rank, everything, source.model, features))
     with replacing(output) as temporary:
-        encode = partial(_encode, temporary, everything, source, images, described)
+        encode = partial(_encode, temporary, everything, ranking, source, images, described)
         if max_mb is None:
             number, parts = len(everything), encode(len(everything))
         else:
@@ -178,8 +183,8 @@ def matcher_of(matcher: str) -> str:
     return MATCHERS.get(matcher, matcher)
 
 
-def _of_map(built: Map) -> Source:
-    """Return what a map of `pipelines.localize` gives, with its own matcher."""
+def of_map(built: Map) -> Source:
+    """Return what a compact map of a map of `pipelines.localize` is made from."""
     return Source(
         colmap.read_model(built.sfm),
         built.feature,
@@ -273,6 +278,7 @@ def _storage(conf: dict, storage: str | None) -> str:
 def _encode(
     path: Path,
     everything: points.Points,
+    ranking: Callable[[], np.ndarray],
     source: Source,
     images: Images,
     described: tuple[np.ndarray, int],
@@ -283,12 +289,15 @@ def _encode(
     Args:
         path: the file.
         everything: all points.
+        ranking: returns their indices, those that are needed most first.
         source: what the map is made from.
         images: of the map.
         described: from `_global_signs`.
         number: of points that are written.
     """
-    chosen = everything.only(points.select(everything, number))
+    chosen = everything
+    if number < len(everything):
+        chosen = everything.only(np.sort(ranking()[:number]))
     step = points.precision(chosen, source.model)
     with path.open("wb") as file:
         return writer.write(file, points.Sorted(chosen), images, source, *described, step)

@@ -19,9 +19,7 @@ NEAR_DEPTH_QUANTILE = 0.02  # of the depths, at which it holds
 MAX_BITS = 32
 MAX_DIGITS = 15  # of a coordinate, behind the point
 PADDING = 8  # bytes behind packed coordinates, as eight are read at once
-CELLS_PER_SIDE = 8  # of an image, over which selected points are spread
 POINTS_PER_CHUNK = 2**16  # that are packed at once, a multiple of 8
-SELECTION_ROUNDS = 64  # in which points are selected, some at once
 
 
 @dataclass(frozen=True)
@@ -33,14 +31,16 @@ class Points:
         descriptors: (P, D) float32 of unit norm, the mean of those of a point's keypoints.
         names: the images.
         visible: of each image the points that it shows (M,), ascending.
-        cells: of each image the cell of a grid, from 0 on, that these are seen in (M,).
+        keypoints: of each image the indices of their keypoints (M,).
+        norms: (P,) float32, lengths of the sums of the descriptors of a point's keypoints.
     """
 
     xyz: np.ndarray
     descriptors: np.ndarray
     names: Sequence[str]
     visible: list[np.ndarray]
-    cells: list[np.ndarray]
+    keypoints: list[np.ndarray]
+    norms: np.ndarray
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -51,13 +51,14 @@ class Points:
             return self
         number = np.full(len(self), -1, np.int32)
         number[chosen] = np.arange(len(chosen))
-        visible, cells = [], []
-        for points, its_cells in zip(self.visible, self.cells, strict=True):
+        visible, keypoints = [], []
+        for points, its_keypoints in zip(self.visible, self.keypoints, strict=True):
             kept = number[points] >= 0
             order = np.argsort(number[points][kept])
             visible.append(number[points][kept][order])
-            cells.append(its_cells[kept][order])
-        return Points(self.xyz[chosen], self.descriptors[chosen], self.names, visible, cells)
+            keypoints.append(its_keypoints[kept][order])
+        each = self.xyz[chosen], self.descriptors[chosen]
+        return Points(*each, self.names, visible, keypoints, self.norms[chosen])
 
 
 class Sorted:
@@ -110,7 +111,7 @@ def collect(
     ids = np.sort(np.fromiter(sfm.points3D, np.int64))
     images = {image.name: image for image in sfm.images.values()}
     names = sorted(images) if names is None else names
-    visible, cells, sums = [], [], np.zeros((len(ids), dimension(features)), np.float32)
+    visible, shown, sums = [], [], np.zeros((len(ids), dimension(features)), np.float32)
     for name in progress(names, "Collecting points", "image"):
         image = images[name]
         observed = point3D_ids(image)
@@ -125,53 +126,17 @@ def collect(
                 f"{name}: {image.num_points2D()} of {sums.shape[1]} are expected."
             )
         sums[rows] += described[keypoints]
-        camera = sfm.cameras[image.camera_id]
-        points2D = image.points2D
-        xy = np.array([points2D[i].xy for i in keypoints]).reshape(-1, 2)
-        cell = xy * CELLS_PER_SIDE / [camera.width, camera.height]
-        column, row = cell.clip(0, CELLS_PER_SIDE - 1).astype(int).T
         visible.append(rows.astype(np.int32))
-        cells.append((row * CELLS_PER_SIDE + column).astype(np.uint8))
+        shown.append(keypoints.astype(np.int32))
     if not len(ids):
         raise InputError("The map has no points.")
-    norms = np.linalg.norm(sums, axis=1, keepdims=True)
-    sums /= np.maximum(norms, 1e-12)
+    norms = np.linalg.norm(sums, axis=1)
+    sums /= np.maximum(norms, 1e-12)[:, None]
     xyz = np.empty((len(ids), 3))
     for row, i in enumerate(ids.tolist()):
         xyz[row] = sfm.points3D[i].xyz
-    return Points(xyz, sums, names, visible, cells).only(np.flatnonzero(norms[:, 0] > 0))
-
-
-def select(points: Points, number: int) -> np.ndarray:
-    """Select points that images need most, greedily.
-
-    A point is worth the more, the more images show it, and the fewer selected points lie in its
-    cell of each of them: each image keeps points in all its parts (weighted K-cover).
-
-    Args:
-        points: all points.
-        number: of selected ones.
-
-    Returns:
-        Their indices (number,), ascending.
-    """
-    if number >= len(points):
-        return np.arange(len(points))
-    point = np.concatenate(points.visible)
-    image = np.repeat(np.arange(len(points.names)), [len(part) for part in points.visible])
-    cell = image * CELLS_PER_SIDE**2 + np.concatenate(points.cells)
-    count = np.zeros(len(points.names) * CELLS_PER_SIDE**2)
-    chosen = np.zeros(len(points), bool)
-    for left in range(SELECTION_ROUNDS, 0, -1):
-        gain = np.bincount(point, 1 / (1 + count[cell]), minlength=len(points))
-        gain[chosen] = -1
-        more = -(-(number - int(chosen.sum())) // left)
-        best = np.argsort(-gain, kind="stable")[:more]
-        new = np.zeros(len(points), bool)
-        new[best] = True
-        chosen |= new
-        count += np.bincount(cell[new[point]], minlength=len(count))
-    return np.flatnonzero(chosen)
+    points = Points(xyz, sums, names, visible, shown, norms)
+    return points.only(np.flatnonzero(norms > 0))
 
 
 def precision(points: Points, sfm: pycolmap.Reconstruction) -> float:

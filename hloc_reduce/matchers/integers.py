@@ -38,13 +38,28 @@ def nearest(
     Returns:
         Its index (N,) int64, -1 where it does not pass, and its cosine (N,) float32.
     """
-    search = best_two.best_two if best_two.instructions() else best_two_of_blocks
-    index, *products = search(descriptors0, descriptors1)
-    cosine, runner_up = map(_cosine, products)
+    index, cosine, runner_up = two_nearest(descriptors0, descriptors1)
     accepted = _is_near(cosine, distance_threshold)
     if ratio_threshold is not None:
         accepted &= 1 - cosine <= np.float32(ratio_threshold**2) * (1 - runner_up)
     return np.where(accepted, index, -1).astype(np.int64), cosine
+
+
+def two_nearest(
+    descriptors0: np.ndarray, descriptors1: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the nearest descriptor1 of every descriptor0, and how near the second nearest is.
+
+    Args:
+        descriptors0: (N, D) int16 from `utils.codes.to_integers`.
+        descriptors1: (M, D) like these, M > 1.
+
+    Returns:
+        The index of the nearest (N,), its cosine and that of the second nearest, (N,) float32.
+    """
+    search = best_two.best_two if best_two.instructions() else best_two_of_blocks
+    index, best, second = search(descriptors0, descriptors1)
+    return index, _cosine(best), _cosine(second)
 
 
 def _cosine(product: np.ndarray) -> np.ndarray:

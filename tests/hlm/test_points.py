@@ -151,19 +151,6 @@ def test_a_descriptor_finds_its_signs(number):
     assert [found.similarity(query).argmax() for query in descriptors] == list(range(10))
 
 
-def test_selected_points_are_spread():
-    """Of 90 points in one cell and 10 in others, the 10 are all taken; and the often seen ones."""
-    xyz, descriptors = np.zeros((100, 3)), np.ones((100, 4), np.float32)
-    cells = np.array([0] * 90 + list(range(1, 11)))
-    everything = points.Points(xyz, descriptors, ["a"], [np.arange(100)], [cells])
-    assert set(range(90, 100)) <= set(points.select(everything, 20).tolist())
-    two = points.Points(
-        xyz, descriptors, ["a", "b"], [np.arange(100), np.arange(5, 9)], [cells, cells[:4]]
-    )
-    assert set(range(5, 9)) <= set(points.select(two, 20).tolist())
-    assert points.select(two, 100).tolist() == list(range(100))
-
-
 def test_images_far_from_the_origin_stay_where_they_are():
     """As in projected coordinates; rounded rotations moved them by up to 0.6 m."""
     model, *_ = row({1: 20.0, 4: -15.0})
