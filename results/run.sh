@@ -157,7 +157,7 @@ run video --frames 300 "$@" # exhaustive pairs may take more than an hour
 run retrieval_scale --dataset $data/demo_town-400 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 64 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 32 --storage uint4 "$@"
-run compact_scale --data $data/aachen_v1.1 --share 0.1 1 "$@"
+run compact_scale --data $data/aachen_v1.1 --share 0.1 1 10 30 100 "$@" # the last one writes 5 GB
 if "$python" -c "import hloc" 2> /dev/null; then
     for place in herz-jesus day-fountain-P11; do
         run against_hloc --dataset $data/$place --keypoints adaptive hloc fast "$@" \
