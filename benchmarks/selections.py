@@ -11,7 +11,7 @@ import pycolmap
 from hloc_reduce.hlm.points import Points
 
 CELLS_PER_SIDE = 8  # of an image, over which `cover` spreads points
-AT_ONCE = 0.05  # of the points that `cover` ranked already: so many are ranked at once
+AT_ONCE = 0.05  # points that `cover` ranks at once, as a share of those ranked before
 TRIPLETS = 300  # drawn in each image
 ACCURATE = 2.0  # pixels by which the pose of an accurate triplet moves the image's points
 STEPS = 3  # by which the pose of a triplet is refined

@@ -16,7 +16,7 @@ from .points import POINTS_PER_CHUNK, Points
 NOISE = 1e-3  # of a keypoint's direction, in radians
 UNKNOWN = 0.1  # of a pose without points: radians, and shares of the median distance
 MARGIN = 2.0  # how many times as far the next descriptor is if half of the photos are matched
-AT_ONCE = 0.05  # of the points that are ranked already: so many are ranked at once
+AT_ONCE = 0.05  # points that are ranked at once, as a share of those ranked before
 SPARE = 256  # points whose gains are computed besides
 
 

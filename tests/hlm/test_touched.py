@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from benchmarks import compact_scale
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.hlm import signs, writer
 from hloc_reduce.hlm.images import Images
@@ -72,14 +73,7 @@ def written(path, number):
 
 def touched(path):
     """Return the resident size of the mapping of a file in bytes."""
-    kilobytes, found = 0, False
-    for line in Path("/proc/self/smaps").read_text().splitlines():
-        words = line.split()
-        if "-" in words[0]:
-            found = line.endswith(str(path))
-        elif found and words[0] == "Rss:":
-            kilobytes += int(words[1])
-    return 1024 * kilobytes
+    return 1e6 * compact_scale.touched(path)
 
 
 def use(found, image):
