@@ -12,6 +12,7 @@ import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from test_wheel import WITHOUT_SOURCE
 
 from hloc_reduce import __version__
 
@@ -39,6 +40,13 @@ def test_files_have_the_schemas_of_github(schema):
     command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", f"vendor.{schema}"]
     done = subprocess.run([*command, *SCHEMAS[schema]], capture_output=True, text=True)
     assert not done.returncode, done.stdout
+
+
+def test_tests_of_an_installed_wheel_import_nothing_of_the_repository():
+    paths = [path for folder in WITHOUT_SOURCE for path in (ROOT / folder).rglob("*.py")]
+    assert len(paths) > 15
+    found = re.compile(r"^\s*(from|import) (benchmarks|examples)", re.MULTILINE)
+    assert not [path.name for path in paths if found.search(path.read_text())]
 
 
 def test_workflows_call_what_exists():
