@@ -11,16 +11,26 @@ from ..utils import colmap
 from . import gate as gates
 from .gate import ALTERNATIVES, Gate
 from .hypotheses import Alternatives, alternative, rival, with_other_intrinsics
-from .measures import MIN_MATCHES, Measures, agreement, confidence, uncertainty
+from .measures import (
+    FINEST,
+    MIN_MATCHES,
+    Measures,
+    Seen,
+    agreement,
+    confidence,
+    uncertainty,
+    uncertainty_without_one,
+)
 from .pose import Matches, Pose, quality
-from .projection import ALL, FOCAL, POSE, reprojection_errors
+from .projection import ALL, FOCAL, POSE, photo_scale, reprojection_errors
 
 SEED = 0
 SAMPLE = 500  # matches, at most, from which a pose is tried before all, or a rival is estimated
 # confidence of a pose at which no other matches are tried, one and a half times the highest of
 # photos of other places in results/trials
 CERTAIN = 85.0
-STRICT = 1 / 2  # of the inlier threshold, for estimating a pose again
+STRICT = 1 / 2  # of an inlier threshold, the next one with which a pose is estimated again
+LEAST_SCALE = 0.1  # pixels, the least error from which on a match counts less
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
 CLEAR = 0.25  # inlier ratio above which the matches of single images are not tried
 MOST_SIMILAR = 100  # matches of an image that are tried by themselves
@@ -52,7 +62,7 @@ def estimate(
     the pose is not certain, also from all. If few of these agree with a pose, RANSAC may have
     missed the right one. So the most similar matches of each image are tried by themselves, too:
     those of an image that shows the same place agree much more often. The pose with the highest
-    confidence among all matches wins, and is estimated with a stricter threshold, too.
+    confidence among all matches wins, and is estimated with stricter thresholds, too.
     If it is trusted although its intrinsics were guessed, and the lens of the map's photos fits as
     well, it is estimated with that. If its photo seems to be cropped or stretched, and that lens
     fits about as well with another pose, it is not trusted. All poses are estimated and compared
@@ -123,14 +133,19 @@ def _near(matches: Matches, images: list[np.ndarray], likely: np.ndarray) -> Pos
 
 
 def _refined(matches: Matches, pose: Pose, max_error: float) -> Pose:
-    """Refine a pose by the matches that agree within a number of pixels."""
+    """Refine a pose by the matches that agree within a number of pixels.
+
+    A match counts the less, the more its error exceeds the median.
+    """
     if pose.cam_from_world is None:
         return pose
     view = pose.cam_from_world, copy.deepcopy(pose.camera)
     errors, _ = reprojection_errors(matches.points2D, matches.points3D, *view)
-    refinement = matches.config.get("refinement", {})
+    agree = errors <= max_error
+    scale = max(LEAST_SCALE, float(np.median(errors[agree]))) if agree.any() else LEAST_SCALE
+    refinement = matches.config.get("refinement", {}) | {"loss_function_scale": scale}
     found = colmap.refine_pose(
-        view[0], matches.points2D, matches.points3D, errors <= max_error, view[1], refinement
+        view[0], matches.points2D, matches.points3D, agree, view[1], refinement
     )
     if found is None:
         return pose
@@ -180,9 +195,9 @@ def _measures(
     )
     if pose.cam_from_world is None:
         return measures
-    inliers = *matches.inliers(pose), pose.cam_from_world, pose.camera
-    precision = uncertainty(*inliers, pose.degrees_of_freedom)
-    return replace(measures, uncertainty=precision, uncropped=uncertainty(*inliers, ALL))
+    seen = Seen(*matches.inliers(pose), pose.cam_from_world, pose.camera, matches.max_error)
+    precision = uncertainty_without_one(seen, pose.degrees_of_freedom)
+    return replace(measures, uncertainty=precision, uncropped=uncertainty(*seen[:4], ALL))
 
 
 def _off_centre(camera: pycolmap.Camera, x: float, y: float) -> float:
@@ -291,15 +306,16 @@ def _judged(matches: Matches, pose: Pose) -> Pose:
 
 
 def _unbent(matches: Matches, pose: Pose) -> Pose:
-    """Estimate a pose with a stricter threshold, too; return the likelier one.
+    """Refine a pose; unless it is certain, estimate it with stricter thresholds first.
 
-    Wrong matches may have bent it until they agree, above all one of few.
+    Wrong matches may have bent it until they agree, above all one of few. What a threshold finds
+    that few matches meet is refined by all that meet the first. The likeliest pose is returned.
     """
-    strict = matches.with_max_error(STRICT * matches.max_error)
-    found = _found(strict, np.flatnonzero(pose.inliers), LEAST_RATIO, 0)
-    if found.cam_from_world is None:
-        return pose
-    view = found.cam_from_world, found.camera
-    errors, _ = reprojection_errors(matches.points2D, matches.points3D, *view)
-    found = _judged(matches, replace(found, inliers=errors <= matches.max_error))
-    return max(pose, found, key=quality)
+    poses, first = [pose], STRICT * matches.max_error
+    max_error = 0.0 if pose.confidence >= CERTAIN else first
+    while max_error >= FINEST * photo_scale(pose.camera):
+        strict = matches.with_max_error(max_error)
+        found = _found(strict, np.flatnonzero(pose.inliers), LEAST_RATIO, 0)
+        poses.append(_refined(matches, found, first))
+        max_error *= STRICT
+    return _refined(matches, max(poses, key=quality), matches.max_error)

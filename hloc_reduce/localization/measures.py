@@ -293,6 +293,45 @@ def uncertainty(
     )
 
 
+def without_most_telling(
+    photos: Sequence[Seen], cams_from_rig: Sequence[pycolmap.Rigid3d], covariance: np.ndarray
+) -> list[Seen]:
+    """Leave out the keypoint that tells most about a pose, and those within SAME_PLACE of it.
+
+    A wrong match far from all others may fit as well as they do, and what it alone determines looks
+    certain: so a pose is only as certain as the others make it.
+
+    Args:
+        photos: the inliers of each camera.
+        cams_from_rig: the pose of each camera in the rig.
+        covariance: (F, F) of the pose, see `covariance`; only that of its motion (6, 6) counts.
+    """
+    telling = []
+    for seen, cam_from_rig in zip(photos, cams_from_rig, strict=True):
+        pose = seen.cam_from_world
+        local = seen.points3D @ pose.rotation.matrix().T + pose.translation
+        sides = project(local)[1][:, :POSE].transpose(2, 0, 1) @ cam_from_rig.adjoint()
+        lengths = seen.camera.mean_focal_length() ** 2
+        each = np.einsum("mif,fg,mig->m", sides, covariance[:POSE, :POSE], sides) * lengths
+        telling.append(each)
+    most = int(np.argmax([each.max(initial=-np.inf) for each in telling]))
+    left = list(photos)
+    seen, place = photos[most], photos[most].points2D[telling[most].argmax()]
+    apart = np.linalg.norm(seen.points2D - place, axis=1)
+    others = apart > SAME_PLACE * photo_scale(seen.camera)
+    left[most] = seen._replace(points2D=seen.points2D[others], points3D=seen.points3D[others])
+    return left
+
+
+def uncertainty_without_one(seen: Seen, degrees_of_freedom: int = POSE) -> Uncertainty:
+    """Estimate the `uncertainty` of a pose by its inliers, `without_most_telling`."""
+    found = covariance(*seen[:4], degrees_of_freedom)
+    if found is None:
+        return UNDETERMINED
+    (others,) = without_most_telling([seen], [pycolmap.Rigid3d()], found)
+    return uncertainty(*others[:4], degrees_of_freedom)
+
+
 def agreement(inliers: np.ndarray, images: list[np.ndarray]) -> float:
     """Measure how many matches agree with a pose, in the image where most do.
 
@@ -341,8 +380,9 @@ class Measures:
         num_inliers: number of RANSAC's inliers.
         confidence: see `confidence`; minus infinity without a pose.
         agreement: see `agreement`.
-        uncertainty: see `uncertainty`, with the degrees of freedom of the estimation.
-        uncropped: the same with all intrinsics unknown, as those of a photo that was cropped.
+        uncertainty: see `uncertainty_without_one`, with the degrees of freedom of the estimation.
+        uncropped: see `uncertainty`, with all intrinsics unknown, as those of a photo that was
+            cropped.
         degrees_of_freedom: of the estimation, see `projection`.
         may_be_cropped: whether the photo may have been cropped.
         longer_side: of the photo, in pixels.

@@ -22,6 +22,7 @@ from .measures import (
     agreement,
     joint_confidence,
     rig_covariance,
+    without_most_telling,
 )
 from .pose import MAX_ERROR, Pose, motion
 from .projection import reprojection_errors
@@ -268,7 +269,11 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         seen._replace(points2D=seen.points2D[chosen], points3D=seen.points3D[chosen])
         for seen, chosen in zip(photos, best.inliers, strict=True)
     ]
-    covariance = rig_covariance(agreeing, [one.cam_from_rig for one in sights])
+    cams_from_rig = [one.cam_from_rig for one in sights]
+    covariance = others_covariance = rig_covariance(agreeing, cams_from_rig)
+    if covariance is not None:
+        most = without_most_telling(agreeing, cams_from_rig, covariance)
+        others_covariance = rig_covariance(most, cams_from_rig)
     depth = _median_depth(agreeing)
     start, images = 0, []
     for one in sights:
@@ -280,7 +285,7 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         best.measures,
         num_matches=start,
         agreement=agreement(np.concatenate(best.inliers), images),
-        uncertainty=_uncertainty(covariance, depth, best.measures.num_inliers),
+        uncertainty=_uncertainty(others_covariance, depth, best.measures.num_inliers),
         is_camera_given=True,
         focal_range=(0.0, np.inf),
         alternatives={"rival": max(rivals)} if rivals else {},

@@ -13,13 +13,18 @@ from hloc_reduce.localization import absolute_pose, measures
 from hloc_reduce.localization.gate import DEFAULT_GATE, MATCH_KINDS, Gate, probability, refusal
 from hloc_reduce.localization.measures import (
     Measures,
+    Seen,
     Uncertainty,
     _log10_tail,
     agreement,
     confidence,
     covariance,
+    rig_covariance,
     uncertainty,
+    uncertainty_without_one,
+    without_most_telling,
 )
+from hloc_reduce.localization.pose import motion
 from hloc_reduce.localization.projection import reprojection_errors
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
@@ -217,6 +222,58 @@ def test_the_covariance_of_a_pose_is_that_of_the_estimator():
     expected, measured = found["covariance"], motion @ found_here @ motion.T
     scale = np.trace(measured) / np.trace(expected)
     np.testing.assert_allclose(measured, scale * expected, atol=0.05 * measured.max())
+
+
+@pytest.mark.parametrize("wrong", [1, 2])
+def test_wrong_matches_far_from_a_facade_do_not_bend_the_pose(wrong):
+    """They agree with another pose, which fits the small, distant facade nearly as well."""
+    true = pose_of(35, (0, 0, 8))
+    trusted = []
+    for seed in range(20):
+        generator = np.random.default_rng(seed)
+        bent = pose_of(35 + generator.choice([-1, 1]) * generator.uniform(4, 9), (0, 0, 8))
+        facade = generator.uniform([-1, -0.7, 0], [1, 0.7, 0.02], (12, 3))
+        nearer = generator.uniform([-3, -2, -4], [3, 2, -1.5], (wrong, 3))
+        chance = generator.uniform(-3, 3, (10, 3))
+        points = np.concatenate([facade, nearer, chance])
+        _, keypoints = reprojection_errors(np.zeros((12, 2)), facade, true, CAMERA)
+        _, wrong_ones = reprojection_errors(np.zeros((wrong, 2)), nearer, bent, CAMERA)
+        keypoints = np.concatenate([keypoints, wrong_ones])
+        keypoints += 0.6 * generator.standard_normal(keypoints.shape)
+        keypoints = np.concatenate([keypoints, generator.uniform(0, [1600, 1200], (10, 2))])
+        images = np.split(np.arange(len(points)), [12 + wrong])
+        found = solve(keypoints, points, images)
+        if not found.refusal:
+            trusted.append(motion(found.cam_from_world, true)[0])
+    # one never does; where two do, neither is the only one that tells much
+    assert len(trusted) > 15 and sum(np.array(trusted) > 0.04 * 8) < wrong
+
+
+def test_a_pose_is_as_certain_as_it_is_without_the_keypoint_that_tells_most():
+    """One of them is much nearer than the others, and has another scale at the same place."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform([-1, -1, 0], [1, 1, 0.02], (20, 3))
+    points[-2:] = [[0.5, 0.3, -4], [0.5005, 0.3, -4]]
+    pose = pose_of(0, (0, 0, 8))
+    _, keypoints = reprojection_errors(np.zeros((20, 2)), points, pose, CAMERA)
+    keypoints += generator.standard_normal(keypoints.shape)
+    keypoints[-1] = keypoints[-2] + 0.5
+    seen = Seen(keypoints, points, pose, CAMERA, 12.0)
+    found = uncertainty_without_one(seen)
+    assert found == uncertainty(keypoints[:-2], points[:-2], pose, CAMERA)
+    assert found.position > 2 * uncertainty(keypoints, points, pose, CAMERA).position
+    alone = Seen(*(values[-2:] for values in (keypoints, points)), pose, CAMERA, 12.0)
+    assert uncertainty_without_one(alone) == measures.UNDETERMINED
+    # so it is with a rig, whose second camera sees only that point
+    cams_from_rig = [pycolmap.Rigid3d(), pose_of(20, (0.1, 0, 0))]
+    own = cams_from_rig[1] * pose
+    _, others = reprojection_errors(keypoints[-1:], points[-1:], own, CAMERA)
+    photos = [
+        Seen(keypoints[:-2], points[:-2], pose, CAMERA, 12.0),
+        Seen(others, points[-1:], own, CAMERA, 12.0),
+    ]
+    left = without_most_telling(photos, cams_from_rig, rig_covariance(photos, cams_from_rig))
+    assert [len(photo.points2D) for photo in left] == [18, 0]
 
 
 def test_inliers_that_do_not_fix_the_pose_are_refused():
