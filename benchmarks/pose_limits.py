@@ -23,7 +23,7 @@ from pipelines.batch import jobs
 NAME = "pose_limits"
 # values that are tried of each limit, the others being as they are
 LIMITS = {
-    "STRICT": (1, 1 / 3, 2 / 3),
+    "STRICT": (1 / 3, 2 / 3),
     "WIDER": (1, 2, 10, 20),
     "RIVAL_SHARE": (1 / 2, 1),
 }
