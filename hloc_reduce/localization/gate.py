@@ -431,8 +431,8 @@ RULES = (
     ),
     Rule(
         _imprecise,
-        f"be fixed by its inliers, of which at most {INDEPENDENT} count, because neighbours err "
-        "alike",
+        "be fixed by its inliers even without the one that tells most; at most "
+        f"{INDEPENDENT} count, because neighbours err alike",
         f"standard deviations of at most {_words(PRECISE)}",
         (
             (
