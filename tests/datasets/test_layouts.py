@@ -9,8 +9,8 @@ import pycolmap
 import pytest
 from command import table
 
-from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets import nvm
+from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.aachen_v1 import NVM, AachenV1
 from hloc_reduce.datasets.cambridge import Cambridge
 from hloc_reduce.datasets.cambridge_nvm import CambridgeNvm
