@@ -33,6 +33,7 @@ CAMBRIDGE = {
     "ShopFacade": ((2,), 231, (1, 3), 103),
     "StMarysChurch": ((1, 2, 4, 6, 7, 8, 9, 10, 11, 12, 14), 1487, (3, 5, 13), 530),
 }
+HEADER = "Visual Landmark Dataset V1", "ImageFile, Camera Position [X Y Z W P Q R]", ""
 SEVENSCENES = {
     "chess": ((1, 2, 4, 6), 4000, (3, 5), 2000),
     "fire": ((1, 2), 2000, (3, 4), 2000),
@@ -151,10 +152,8 @@ def along(map_names: list[str], queries: list[str], share: float) -> list[Photo]
 
 def spread(names: list[str], share: float) -> list[str]:
     """Return a share of names, but at least three, from all parts of the list."""
-    return [
-        names[i]
-        for i in np.linspace(0, len(names) - 1, max(3, round(share * len(names)))).astype(int)
-    ]
+    rows = np.linspace(0, len(names) - 1, max(3, round(share * len(names))))
+    return [names[int(row)] for row in rows]
 
 
 def in_sequences(form: str, sequences: Sequence[int], number: int, first: int) -> list[str]:
@@ -245,13 +244,12 @@ def write_cambridge(root: Path, share: float) -> None:
     wall, of_map = Wall(photos), [photo for photo in photos if not photo.is_query]
     write_photos(wall, photos, root)
     for name, is_query in ((cambridge_nvm.MAP_LIST, False), (cambridge_nvm.QUERY_LIST, True)):
-        lines = ["Visual Landmark Dataset V1", "ImageFile, Camera Position [X Y Z W P Q R]", ""]
-        lines += [
+        lines = [
             to_line(photo.name, *photo.pose.inverse().translation, *pose_words(photo))
             for photo in photos
             if photo.is_query == is_query
         ]
-        write_lines(root / name, lines)
+        write_lines(root / name, [*HEADER, *lines])
     jpeg = [replace(photo, name=photo.name.replace(".png", ".jpg")) for photo in photos]
     write_nvm(wall.model(jpeg), root / cambridge_nvm.NVM)
     folder = Cambridge.folder(root)
@@ -316,8 +314,10 @@ def main(output: Path, place: str, share: float = 1) -> Path:
         share: of the photos.
 
     Raises:
-        InputError: for an unknown place, or one that is there.
+        InputError: for an unknown place, one that is there, or a share of nothing or too much.
     """
+    if not 0 < share <= 1:
+        raise InputError(f"--share {share}: above 0, at most 1.")
     write = PLACES[choose("place", place, PLACES)]
     if (root := output / place).exists():
         raise InputError(f"{root} exists: delete it, or choose another folder.")

@@ -13,6 +13,7 @@ from hloc_reduce.datasets.cambridge import Cambridge
 from hloc_reduce.datasets.cambridge_nvm import CambridgeNvm
 from hloc_reduce.datasets.layouts import open_model_place
 from hloc_reduce.datasets.sevenscenes import SevenScenes
+from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.parsers import parse_pairs
 from pipelines import aachen
 from pipelines.common.retrieval import check_retrieval
@@ -67,6 +68,18 @@ def test_a_part_of_a_place(name, share, run, tmp_path):
         shutil.rmtree(Cambridge.folder(root))
         assert type(open_model_place(root)) is CambridgeNvm
         localize(run, root, tmp_path / "without")
+
+
+def test_what_exists_is_kept(tmp_path):
+    (tmp_path / "aachen").mkdir()
+    for name, share, message in (
+        ("aachen", 1, "aachen exists: delete it"),
+        ("cambridge/Street", 1, "Unknown place"),
+        ("7scenes/chess", 1.5, "--share 1.5: above 0, at most 1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            dry_runs.main(tmp_path, name, share)
+    assert not [*(tmp_path / "aachen").iterdir()]
 
 
 @pytest.mark.check

@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from command import table
 
+from benchmarks import dry_runs
 from hloc_reduce.datasets import nvm
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.datasets.aachen_v1 import NVM, AachenV1
@@ -24,37 +25,19 @@ from hloc_reduce.utils.parsers import parse_query_list, to_line, write_poses
 from pipelines import aachen, compare
 
 QUERY = "4.png"  # of the plane
-# of a list of Cambridge Landmarks
-HEADER = "Visual Landmark Dataset V1", "ImageFile, Camera Position [X Y Z W P Q R]", ""
 
 
 def write_nvm(model: pycolmap.Reconstruction, path: Path) -> Path:
-    """Write an NVM file and the list of its intrinsics, which is returned; of Windows, both."""
-    ids = sorted(model.reg_image_ids())
-    lines, intrinsics = ["NVM_V3", "", str(len(ids))], []
-    for image in map(model.image, ids):
-        pose, camera = image.cam_from_world(), image.camera
-        x, y, z, w = pose.rotation.quat
-        numbers = (w, x, y, z, *pose.inverse().translation)
-        distortion = -camera.params[3] if camera.model.name == "SIMPLE_RADIAL" else 0
-        lines.append(to_line(image.name, camera.focal_length, *numbers, distortion, 0).strip())
+    """Write an NVM file and the list of its intrinsics, which is returned."""
+    dry_runs.write_nvm(model, path)
+    lines = []
+    for image in map(model.image, sorted(model.reg_image_ids())):
+        camera = image.camera
         size = camera.model.name, camera.width, camera.height
-        intrinsics.append(to_line(image.name, *size, *camera.params).strip())
-    lines += ["", str(model.num_points3D())]
-    for point in model.points3D.values():
-        seen = []
-        for element in point.track.elements:
-            xy = model.image(element.image_id).points2D[element.point2D_idx].xy
-            seen += [ids.index(element.image_id), element.point2D_idx, *xy]
-        number = len(point.track.elements)
-        lines.append(" ".join(map(str, [*point.xyz, *point.color, number, *seen])))
-    write_windows(path, [*lines, "", "0"])
-    return write_windows(path.with_name("database_intrinsics.txt"), intrinsics)
-
-
-def write_windows(path: Path, lines: list[str]) -> Path:
-    path.write_bytes("".join(f"{line}\r\n" for line in lines).encode())
-    return path
+        lines.append(to_line(image.name, *size, *camera.params))
+    listed = path.with_name("database_intrinsics.txt")
+    dry_runs.write_lines(listed, lines)
+    return listed
 
 
 def read_nvm(path: Path, intrinsics: Path) -> pycolmap.Reconstruction:
@@ -165,15 +148,15 @@ def cambridge_nvm_layout(plane) -> Path:
     """The plane as a scene that is downloaded without models, with names of JPEG photos."""
     root = plane / "downloaded/Plane"
     model = write_scene(plane, root, "seq1")
-    lists = {"train": [*HEADER], "test": [*HEADER]}
+    lists = {"train": [*dry_runs.HEADER], "test": [*dry_runs.HEADER]}
     for image in model.images.values():
         x, y, z, w = image.cam_from_world().rotation.quat
         numbers = *image.projection_center(), w, x, y, z
         listed = lists["test" if image.name == f"seq1/{QUERY}" else "train"]
-        listed.append(to_line(image.name, *numbers).strip())
+        listed.append(to_line(image.name, *numbers))
         image.name = image.name.replace(".png", ".jpg")
     for name, lines in lists.items():
-        write_windows(root / f"dataset_{name}.txt", lines)
+        dry_runs.write_lines(root / f"dataset_{name}.txt", lines)
     write_nvm(model, root / "reconstruction.nvm").unlink()
     return root
 
@@ -333,8 +316,8 @@ def test_a_lens_of_an_nvm_file_is_that_of_its_model(tmp_path):
         image.name = f"seq1/{image.image_id}.jpg"
     write_nvm(model, root / "reconstruction.nvm")
     names = [f"seq1/{i}.png 0 0 0 1 0 0 0" for i in model.images]
-    write_windows(root / "dataset_train.txt", [*HEADER, *names[1:]])
-    write_windows(root / "dataset_test.txt", [*HEADER, names[0]])
+    dry_runs.write_lines(root / "dataset_train.txt", [*dry_runs.HEADER, *names[1:]])
+    dry_runs.write_lines(root / "dataset_test.txt", [*dry_runs.HEADER, names[0]])
     ((name, camera),) = CambridgeNvm(root).queries  # its photo is missing
     assert (camera.width, camera.height) == (1920, 1080)
     expected = model.find_image_with_name(name.replace("png", "jpg")).camera
