@@ -54,12 +54,8 @@ class CambridgeNvm(Cambridge):
         names = (*self.map_names(), *self.query_names())
         return {name: (self._intrinsics(name), self._view(name).cam_from_world) for name in names}
 
-    def map_names(self) -> list[str]:
-        """Read the names of the map images. Those that are not in the model are left out.
-
-        Raises:
-            InputError: when all are.
-        """
+    @cached_property
+    def _map_names(self) -> list[str]:
         path = self.root / MAP_LIST
         names, absent = self._listed(path)
         if not names:
@@ -67,6 +63,14 @@ class CambridgeNvm(Cambridge):
         if absent:
             logger.warning("%s are not in %s: they are left out.", some(absent), self.root / NVM)
         return sorted(names)
+
+    def map_names(self) -> list[str]:
+        """Read the names of the map images. Those that are not in the model are left out.
+
+        Raises:
+            InputError: when all are.
+        """
+        return [*self._map_names]
 
     def query_names(self) -> list[str]:
         """Read the names of the queries.
