@@ -18,6 +18,7 @@ from hloc_reduce import projections
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.confs.features import matcher_of
 from hloc_reduce.detectors.dog import FAST, KEYPOINT_SETTINGS
+from hloc_reduce.evaluation import published
 from hloc_reduce.localization.exif import WELL_KNOWN
 from hloc_reduce.localization.gate import DEFAULT_GATE, FOCAL_LENGTHS, REFINED, RULES
 from hloc_reduce.mapping.adjustment import GAIN_OF_FREE, MAX_ADJUSTED_IMAGES
@@ -100,12 +101,8 @@ FAMILIES: dict[str, list[Choice]] = {
     },
 }
 SIZES = (256, 128, 64, 32, 16, 8)
-MAPS: list[Choice] = [
-    ("colmap_sift_sv32", "uint4"),
-    ("xfeat_sv32", "uint2"),
-    ("mini32", "uint2"),
-]
-MAP_SIZES = (0.06, 0.015)
+MAPS: list[Choice] = [("colmap_sift_sv32", "uint4"), ("mini32", "uint2")]
+MAP_SIZES = (0.015,)
 # of LightGlue: features, and the numbers of keypoints that are matched
 LIGHTGLUE: list[tuple[str, str, int]] = [
     ("xfeat", "float16", 1024),
@@ -279,6 +276,25 @@ def maps_table() -> Table:
                 cells.append(f"{float(row['median_cm']):.2f} / {float(row['largest_cm']):.1f}")
                 cells.append(thousands(row["inliers"]))
             table.append(cells)
+    return table
+
+
+def small_maps_table() -> Table:
+    """Compare maps of Aachen by others with this project's, and say what is counted."""
+    table = [["map", "counted", "photos", "MB", "within 25 cm, 2°"]]
+    for one in published.small_maps():
+        recall = one["night_0.25m_2deg"]
+        name = one["method"] + (f" ({one['published']})" if one["published"] else "")
+        photos, size = (thousands(one[key]) for key in ("photos", "mb"))
+        table.append([name, one["counted"], photos, size, f"{recall} %" if recall else ""])
+    feature, storage = MAPS[0]
+    [row] = select(read("compact_scale"), feature=feature, list="share 1")
+    cells = ["the file", thousands(row["photos"]), thousands(row["mb"]), "unknown"]
+    table.append(["ours, synthetic descriptors", *cells])
+    rows = select(read("maps"), place="herz-jesus", list="night", feature=feature, matcher="")
+    [row] = select(rows, storage=storage, variant="all points")
+    cells = ["the file", row["photos"], f"{float(row['mb']):.2f}"]
+    table.append(["ours, Herz-Jesus", *cells, f"{row['within_25cm']} of {row['queries']}"])
     return table
 
 
@@ -706,6 +722,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "bytes": bytes_table,
     "schemes": schemes_table,
     "maps": maps_table,
+    "small_maps": small_maps_table,
     "false_accepts": false_accepts_table,
     "limits": limits_table,
     "map_limits": map_limits_table,

@@ -96,7 +96,8 @@ def _check(
         verified, cameras = opened.verified(), opened.cameras()
         known = _registration(opened, reference, verified, cameras)
         localize = None if images is None else _by_others(opened, reference, images, Path(folder))
-        return _run(Inputs(reference, verified, None, images, cameras, known, None, localize))
+        given = reference, verified, None, images, cameras, known, None, localize
+        return _run(Inputs(*given, matched=opened.matched() or None))
 
 
 def _run(inputs: Inputs) -> tuple[list[Finding], dict[str, set[str]]]:

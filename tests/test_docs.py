@@ -10,7 +10,10 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+import pycolmap
 import pytest
+
+from hloc_reduce.hlm.images import MODELS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("results/*.md")])
@@ -101,6 +104,14 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     reference = (tmp_path / "site/docs/api.html").read_text()
     assert 'id="hloc_reduce.maps.localizer.Localizer.localize"' in reference
     assert 'id="hloc_reduce.extract_features.main"' in reference
+
+
+def test_camera_models_of_the_format():
+    text = (ROOT / "docs/map-format.md").read_text()
+    listed = re.findall(r"`([A-Z_]+)`\s\((\d+)\)", text)
+    for number, name in MODELS.items():
+        parameters = len(pycolmap.Camera(model=name).params_info.split(","))
+        assert name == "EQUIRECTANGULAR" or listed[number] == (name, str(parameters))
 
 
 @pytest.mark.parametrize("name", ["CONTRIBUTING.md", "docs/architecture.md", "docs/map-format.md"])

@@ -7,13 +7,18 @@ from . import ModelPlace, Place
 from .aachen import Aachen
 from .aachen_v1 import AachenV1
 from .cambridge import Cambridge
+from .cambridge_nvm import CambridgeNvm
 from .cmu import CMU
 from .inloc import InLoc
 from .scenes import Scene
 from .sevenscenes import SevenScenes
 
 # the first one that recognizes a folder reads it
-MODEL_LAYOUTS: tuple[type[ModelPlace], ...] = (AachenV1, Aachen, Cambridge, SevenScenes, CMU)
+MODEL_LAYOUTS: tuple[type[ModelPlace], ...] = (
+    *(AachenV1, Aachen),
+    *(Cambridge, CambridgeNvm, SevenScenes),
+    CMU,
+)
 LAYOUTS: tuple[type[Place], ...] = (*MODEL_LAYOUTS, InLoc)
 
 
@@ -28,7 +33,8 @@ def layout_of(root: Path) -> type[Place]:
     for layout in LAYOUTS:
         if layout.recognizes(root):
             return layout
-    models = [layout.models for layout in MODEL_LAYOUTS if issubclass(layout, Scene)]
+    scenes = [layout for layout in MODEL_LAYOUTS if issubclass(layout, Scene)]
+    models = dict.fromkeys(layout.models for layout in scenes)
     raise InputError(
         f"{root} has neither of the folders 3D-models and database, of Aachen and InLoc, and is no "
         f"scene beside the folder of its COLMAP model, {' or '.join(models)}: see docs/aachen.md."

@@ -9,16 +9,19 @@ import pycolmap
 import pytest
 from command import table
 
+from benchmarks import dry_runs
+from hloc_reduce.datasets import nvm
 from hloc_reduce.datasets.aachen import Aachen
-from hloc_reduce.datasets.aachen_v1 import NVM, AachenV1, read_nvm
+from hloc_reduce.datasets.aachen_v1 import NVM, AachenV1
 from hloc_reduce.datasets.cambridge import Cambridge
+from hloc_reduce.datasets.cambridge_nvm import CambridgeNvm
 from hloc_reduce.datasets.cmu import CMU
 from hloc_reduce.datasets.inloc import InLoc
 from hloc_reduce.datasets.layouts import LAYOUTS, layout_of, open_model_place
 from hloc_reduce.datasets.sevenscenes import SevenScenes
 from hloc_reduce.utils import colmap
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.parsers import to_line, write_poses
+from hloc_reduce.utils.parsers import parse_query_list, to_line, write_poses
 from pipelines import aachen, compare
 
 QUERY = "4.png"  # of the plane
@@ -26,28 +29,20 @@ QUERY = "4.png"  # of the plane
 
 def write_nvm(model: pycolmap.Reconstruction, path: Path) -> Path:
     """Write an NVM file and the list of its intrinsics, which is returned."""
-    ids = sorted(model.reg_image_ids())
-    lines, intrinsics = ["NVM_V3", "", str(len(ids))], ""
-    for image in map(model.image, ids):
-        pose, camera = image.cam_from_world(), image.camera
-        x, y, z, w = pose.rotation.quat
-        centre = pose.inverse().translation
-        numbers = (w, x, y, z, *centre)
-        lines.append(to_line(image.name, camera.focal_length, *numbers, 0, 0).strip())
+    dry_runs.write_nvm(model, path)
+    lines = []
+    for image in map(model.image, sorted(model.reg_image_ids())):
+        camera = image.camera
         size = camera.model.name, camera.width, camera.height
-        intrinsics += to_line(image.name, *size, *camera.params)
-    lines += ["", str(model.num_points3D())]
-    for point in model.points3D.values():
-        seen = []
-        for element in point.track.elements:
-            xy = model.image(element.image_id).points2D[element.point2D_idx].xy
-            seen += [ids.index(element.image_id), element.point2D_idx, *xy]
-        number = len(point.track.elements)
-        lines.append(" ".join(map(str, [*point.xyz, *point.color, number, *seen])))
-    path.write_text("\n".join([*lines, "", "0"]))
+        lines.append(to_line(image.name, *size, *camera.params))
     listed = path.with_name("database_intrinsics.txt")
-    listed.write_text(intrinsics)
+    dry_runs.write_lines(listed, lines)
     return listed
+
+
+def read_nvm(path: Path, intrinsics: Path) -> pycolmap.Reconstruction:
+    cameras = dict(parse_query_list(intrinsics))
+    return nvm.read(path, lambda view: (view.name, cameras[view.name]))
 
 
 def synthetic() -> pycolmap.Reconstruction:
@@ -88,21 +83,14 @@ def test_a_broken_nvm_file_is_refused(tmp_path):
     for broken, message in (
         (lines[:5], "ends early: 4 lines"),
         ([*lines[:3], lines[3].rsplit(maxsplit=4)[0], *lines[4:]], "m.nvm:4: not an image"),
-        ([*lines[:3], lines[3].replace(" ", " x", 1), *lines[4:]], None),
+        ([*lines[:3], lines[3].replace(" ", " x", 1), *lines[4:]], "m.nvm:4: not an image"),
         ([*lines[:12], lines[12].rsplit(maxsplit=1)[0], *lines[13:]], "m.nvm:13: not a point"),
         (["NVM_V3", "x"], "m.nvm:2: not a number of lines"),
         ([], "not a number of lines"),
     ):
         path.write_text("\n".join(broken))
-        if message is None:  # the focal length is not used
-            assert read_nvm(path, listed).num_reg_images() == 6
-            continue
         with pytest.raises(InputError, match=message):
             read_nvm(path, listed)
-    write_nvm(synthetic(), path)
-    listed.write_text("".join(listed.read_text().splitlines(keepends=True)[1:]))
-    with pytest.raises(InputError, match="database_intrinsics.txt lacks .*, which is in m.nvm"):
-        read_nvm(path, listed)
 
 
 @pytest.fixture
@@ -112,6 +100,13 @@ def nvm_layout(aachen_layout) -> Path:
     write_nvm(colmap.read_model(folder), aachen_layout / NVM)
     shutil.rmtree(folder)
     return aachen_layout
+
+
+def test_images_without_intrinsics_are_named(nvm_layout, tmp_path):
+    path = AachenV1(nvm_layout).intrinsics
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[1:]))
+    with pytest.raises(InputError, match="database_intrinsics.txt lacks db/.*, which is in aachen"):
+        AachenV1(nvm_layout).reference(tmp_path / "reference")
 
 
 def write_scene(plane: Path, root: Path, sequence: str) -> pycolmap.Reconstruction:
@@ -145,6 +140,24 @@ def cambridge_layout(plane) -> Path:
     model.deregister_frame(query.frame_id)
     model.write_binary(models / "model_train")
     (models / "list_query.txt").write_text(f"seq1/{QUERY}\n")
+    return root
+
+
+@pytest.fixture
+def cambridge_nvm_layout(plane) -> Path:
+    """The plane as a scene that is downloaded without models, with names of JPEG photos."""
+    root = plane / "downloaded/Plane"
+    model = write_scene(plane, root, "seq1")
+    lists = {"train": [*dry_runs.HEADER], "test": [*dry_runs.HEADER]}
+    for image in model.images.values():
+        x, y, z, w = image.cam_from_world().rotation.quat
+        numbers = *image.projection_center(), w, x, y, z
+        listed = lists["test" if image.name == f"seq1/{QUERY}" else "train"]
+        listed.append(to_line(image.name, *numbers))
+        image.name = image.name.replace(".png", ".jpg")
+    for name, lines in lists.items():
+        dry_runs.write_lines(root / f"dataset_{name}.txt", lines)
+    write_nvm(model, root / "reconstruction.nvm").unlink()
     return root
 
 
@@ -186,6 +199,7 @@ KINDS = {
     "aachen_layout": Aachen,
     "nvm_layout": AachenV1,
     "cambridge_layout": Cambridge,
+    "cambridge_nvm_layout": CambridgeNvm,
     "sevenscenes_layout": SevenScenes,
     "cmu_layout": CMU,
     "inloc_layout": InLoc,
@@ -206,7 +220,10 @@ def test_layouts_are_recognized(kind, request, monkeypatch):
     assert layout_of(Path(".")) is KINDS[kind]
 
 
-@pytest.mark.parametrize("kind", ["nvm_layout", "cambridge_layout", "sevenscenes_layout"])
+LOCALIZED = ["nvm_layout", "cambridge_layout", "cambridge_nvm_layout", "sevenscenes_layout"]
+
+
+@pytest.mark.parametrize("kind", LOCALIZED)
 def test_the_queries_of_a_layout_are_localized(kind, request, tmp_path):
     root = request.getfixturevalue(kind)
     summary = aachen.main(root, tmp_path / "outputs", "sift_sv16")
@@ -256,6 +273,7 @@ def test_intrinsics_of_queries_are_those_of_their_photos(cambridge_layout):
         ("nvm_layout", "queries", "visuallocalization.net"),
         ("cambridge_layout", f"../{Cambridge.models}/Plane/list_query.txt", "Cambridge/README.md"),
         ("cambridge_layout", f"../{Cambridge.models}/Plane/empty_all", "Cambridge/README.md"),
+        ("cambridge_nvm_layout", "dataset_test.txt", "projects/relocalisation"),
         ("sevenscenes_layout", "../" + SevenScenes.models + "/plane/triangulated", "7Scenes/READ"),
         ("cmu_layout", "../intrinsics.txt", "visuallocalization.net"),
         ("cmu_layout", "test-images-slice2.txt", "visuallocalization.net"),
@@ -271,6 +289,41 @@ def test_what_is_missing_is_named(kind, part, said, request):
     with pytest.raises(InputError) as error:
         layout_of(root)(root)
     assert path.name in str(error.value) and said in str(error.value)
+
+
+def test_a_list_of_other_images_is_refused(cambridge_nvm_layout, caplog):
+    root, path = cambridge_nvm_layout, cambridge_nvm_layout / "dataset_train.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines, f"seq9/0.png {lines[-1].partition(' ')[2]}"]))
+    place = CambridgeNvm(root)
+    assert len(place.map_names()) == 4 and len(place.posed) == 5
+    assert caplog.text.count("seq9/0.png are not in") == 1
+    path.write_text("\n".join([*lines, "seq9/3.png 1 2"]))
+    with pytest.raises(InputError, match="'seq9/3.png 1 2' is not a line `name x y z qw qx"):
+        CambridgeNvm(root).map_names()
+    path.write_text("\n".join(lines[:3]))
+    with pytest.raises(InputError, match="dataset_train.txt has no image of reconstruction.nvm"):
+        CambridgeNvm(root).map_names()
+    path = root / "dataset_test.txt"
+    path.write_text(path.read_text().replace("seq1", "seq9"))
+    with pytest.raises(InputError, match="dataset_test.txt: seq9/4.png are not in recon"):
+        CambridgeNvm(root).query_names()
+
+
+def test_a_lens_of_an_nvm_file_is_that_of_its_model(tmp_path):
+    model = synthetic()  # of SIMPLE_RADIAL
+    root = tmp_path / "scene"
+    (root / "seq1").mkdir(parents=True)
+    for image in model.images.values():
+        image.name = f"seq1/{image.image_id}.jpg"
+    write_nvm(model, root / "reconstruction.nvm")
+    names = [f"seq1/{i}.png 0 0 0 1 0 0 0" for i in model.images]
+    dry_runs.write_lines(root / "dataset_train.txt", [*dry_runs.HEADER, *names[1:]])
+    dry_runs.write_lines(root / "dataset_test.txt", [*dry_runs.HEADER, names[0]])
+    ((name, camera),) = CambridgeNvm(root).queries  # its photo is missing
+    assert (camera.width, camera.height) == (1920, 1080)
+    expected = model.find_image_with_name(name.replace("png", "jpg")).camera
+    np.testing.assert_allclose(camera.params[[0, 3]], expected.params[[0, 3]])
 
 
 def test_queries_without_a_pose_are_named(sevenscenes_layout):

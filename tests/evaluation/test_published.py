@@ -10,6 +10,13 @@ def test_published_numbers():
     assert published.localization()["sift"]["aachen_day_0.25m_2deg"] == 88.1
 
 
+def test_small_maps():
+    found = {row["method"]: row for row in published.small_maps()}
+    assert found["R-SCoRe"]["night_0.25m_2deg"] == "64.3" and found["R-SCoRe"]["mb"] == "47"
+    assert all(row["counted"] and row["source"] for row in found.values())
+    assert found["D-PQED"]["counted"] == "descriptors alone"
+
+
 def numbered(folder, number):
     return [f"{folder}/{i}.jpg" for i in range(number)]
 

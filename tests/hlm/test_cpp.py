@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from compact_files import change
+from compact_files import LIES, change
 from hostile import HARMFUL
 from safetensors.numpy import load_file, save_file
 
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.hlm import signs, writer
-from hloc_reduce.hlm.images import ROW, Images
+from hloc_reduce.hlm.images import Images
 from hloc_reduce.hlm.reader import CompactMap
 from hloc_reduce.localization.intrinsics import MapCameras
 from hloc_reduce.localization.query import correspondences
@@ -288,77 +288,33 @@ def test_damaged_anywhere(sanitized, small):
     assert None in outcomes and any(outcomes)
 
 
-def field(name, value):
-    """Return what changes a field of the table of images."""
-
-    def changed(table):
-        table.view(ROW)[name] = value
-        return table
-
-    return changed
-
-
-LIES = [
-    ("images", lambda a: a[:-1], {}),
-    ("images", lambda a: a[:0], {}),
-    ("images", lambda a: a[:, :-1], {}),
-    ("images", field("camera", 99), {}),
-    ("images", field("end", 2**32 - 1), {}),
-    ("images", field("end", np.arange(18, 0, -1)[:, None]), {}),
-    ("cameras", lambda a: a[:0], {}),
-    ("cameras", lambda a: a[:, :5], {}),
-    ("cameras", lambda a: np.full_like(a, 255), {}),
-    ("coordinates", lambda a: a[:-5], {}),
+MORE_LIES = [
+    *LIES,
     ("coordinates", lambda a: a.reshape(1, -1), {}),
-    ("descriptors", lambda a: a[:, :-1], {}),
-    ("descriptors", lambda a: a[:-1], {}),
     ("descriptors", lambda a: a.astype(np.uint16), {}),
-    ("descriptors", lambda a: a.astype(np.int64), {}),
     ("levels", lambda a: a[:-1], {}),
     ("levels", lambda a: a * np.float16(np.nan), {}),
     ("levels", lambda a: a[:, :-1], {}),
-    ("visible", lambda a: a[:-1], {}),
-    ("visible", lambda a: np.full_like(a, 255), {}),
-    ("visible", lambda a: np.full_like(a, 127), {}),
-    ("visible", np.zeros_like, {}),
-    ("retrieval", lambda a: a[:, :1], {}),
-    ("retrieval", lambda a: a[1:], {}),
-    ("names", lambda a: a[:3], {}),
-    ("names", lambda a: a[:-1], {}),
-    ("names", lambda a: np.full_like(a, 255), {}),
-    (None, None, {"points": 10**12}),
-    (None, None, {"points": -1}),
     (None, None, {"points": 2**53}),
     (None, None, {"points": 0}),
-    (None, None, {"points": "many"}),
     (None, None, {"points": 16.5}),
-    (None, None, {"bits": [10**6] * 3}),
-    (None, None, {"bits": [0, 8, 8]}),
-    (None, None, {"bits": [8, 8]}),
-    (None, None, {"bits": 8}),
-    (None, None, {"step": "wide"}),
     (None, None, {"step": 1e308}),
-    (None, None, {"least": [0, 0]}),
-    (None, None, {"center_step": float("nan")}),
-    (None, None, {"center_step": [1]}),
-    (None, None, {"storage": "uint3"}),
     (None, None, {"storage": "uint8"}),
     (None, None, {"storage": "uint8", "scale": [1e308, 0]}),
     (None, None, {"storage": "float32"}),
     (None, None, {"matcher": "none\n"}),
-    (None, None, {"version": 99}),
 ]
 
 
 def test_lies(sanitized, small):
     """Each is refused."""
     content, lying = small.read_bytes(), []
-    for name, value, metadata in LIES:
+    for name, value, metadata in MORE_LIES:
         small.write_bytes(content)
         change(small, name, value, **metadata)
         lying.append(small.read_bytes())
     found = refusals(sanitized, small.parent, lying)
-    assert [lie for lie, line in zip(LIES, found, strict=True) if line is None] == []
+    assert [lie for lie, line in zip(MORE_LIES, found, strict=True) if line is None] == []
 
 
 def test_lies_of_floats_and_of_large_maps(sanitized, tmp_path, monkeypatch):

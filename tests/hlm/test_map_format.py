@@ -1,10 +1,10 @@
 """A reader of compact maps, written from docs/map-format.md; its numbers are CompactMap's."""
 
-import json
 import struct
 
 import numpy as np
 import pytest
+from compact_files import read, read_coordinates, unpacked
 from safetensors.numpy import load_file
 
 from hloc_reduce import compact
@@ -15,25 +15,7 @@ from hloc_reduce.projections.files import WEIGHTS
 from pipelines import localize
 
 PIPELINE = localize
-TYPES = {"U8": "u1", "U32": "<u4", "F16": "<f2", "F32": "<f4", "F64": "<f8"}
 MODELS = {0: ("SIMPLE_PINHOLE", 3)}  # COLMAP's number of a camera model, and of its parameters
-
-
-def read(path):
-    """Return the metadata and the arrays."""
-    content = path.read_bytes()
-    end = 8 + struct.unpack("<Q", content[:8])[0]
-    header, arrays = json.loads(content[8:end]), {}
-    metadata = json.loads(header.pop("__metadata__")["map"])
-    for name, entry in header.items():
-        first, last = entry["data_offsets"]
-        flat = np.frombuffer(content[end + first : end + last], TYPES[entry["dtype"]])
-        arrays[name] = flat.reshape(entry["shape"])
-    return metadata, arrays
-
-
-def unpacked(packed, number):
-    return np.unpackbits(packed, axis=-1, bitorder="little")[..., :number].astype(np.int64)
 
 
 def read_names(arrays):
@@ -71,15 +53,6 @@ def read_images(metadata, arrays):
         name, number = MODELS[model]
         parameters = np.frombuffer(arrays["cameras"][camera, 12:].tobytes(), "<f4")[:number]
         yield rotation, -rotation @ center, (name, *size, *parameters)
-
-
-def read_coordinates(metadata, arrays):
-    sizes, number = metadata["bits"], metadata["points"]
-    assert len(arrays["coordinates"]) == -(-number * sum(sizes) // 8) + 8
-    rows = unpacked(arrays["coordinates"], number * sum(sizes)).reshape(number, -1)
-    axes = np.split(rows, np.cumsum(sizes)[:2], axis=1)
-    whole = np.stack([axis @ (1 << np.arange(axis.shape[1])) for axis in axes], axis=1)
-    return metadata["least"] + metadata["step"] * whole
 
 
 def read_numbers(packed):
@@ -153,8 +126,8 @@ def similarity(arrays, descriptor):
 
 def match(shown, query, ratio):
     """Return the rows of mutual nearest descriptors, (M, 2)."""
-    integers = [np.rint(part * 3000).astype(np.int64) for part in (query, shown)]
-    distances = 2 - 2 * (integers[0] @ integers[1].T / 3000**2)
+    integers = [np.rint(part * 20_000).astype(np.int64) for part in (query, shown)]
+    distances = 2 - 2 * (integers[0] @ integers[1].T / 20_000**2)
     nearest, second = distances.argmin(axis=1), np.sort(distances, axis=1)[:, 1]
     backward, other = distances.argmin(axis=0), np.sort(distances, axis=0)[1]
     rows = np.arange(len(query))
@@ -177,6 +150,8 @@ def test_a_reader_of_the_documented_format(built, tmp_path):
         expected = CompactMap(path)
         names = read_names(arrays)
         assert names == list(expected.names) and metadata["points"] > 100
+        size = -(-metadata["points"] * sum(metadata["bits"]) // 8)
+        assert len(arrays["coordinates"]) == size + 8
         xyz = read_coordinates(metadata, arrays)
         np.testing.assert_allclose(xyz, expected.points.all(), atol=1e-12)
         assert np.median(np.abs(xyz[:, 2])) < 0.01  # the photos show the plane z = 0

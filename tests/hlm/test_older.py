@@ -3,17 +3,12 @@
 The files were written by the version before, of the map of the plane.
 """
 
-import json
 import shutil
-import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from compact_files import change, use
-from hostile import fuzzed, overwrite, refuses_or_reads
-from hypothesis import given
-from hypothesis import strategies as st
+from compact_files import change, check_flipped_bits, read, read_coordinates, unpacked, use
 
 from hloc_reduce import Localizer, maps
 from hloc_reduce.evaluation.poses import pose_error
@@ -23,32 +18,6 @@ from pipelines import localize
 
 PIPELINE = localize
 FILES = [Path(__file__).parent / f"version2_{kind}.hlm" for kind in ("bitmaps", "deltas")]
-TYPES = {"U8": "u1", "U32": "<u4", "F16": "<f2", "F32": "<f4", "F64": "<f8"}
-
-
-def read(path):
-    """Return the metadata and the tensors."""
-    content = path.read_bytes()
-    end = 8 + struct.unpack("<Q", content[:8])[0]
-    header, tensors = json.loads(content[8:end]), {}
-    metadata = json.loads(header.pop("__metadata__")["map"])
-    for name, entry in header.items():
-        first, last = entry["data_offsets"]
-        flat = np.frombuffer(content[end + first : end + last], TYPES[entry["dtype"]])
-        tensors[name] = flat.reshape(entry["shape"])
-    return metadata, tensors
-
-
-def unpacked(packed, number):
-    return np.unpackbits(packed, axis=-1, bitorder="little")[..., :number].astype(np.int64)
-
-
-def read_coordinates(metadata, tensors):
-    sizes, number = metadata["bits"], metadata["points"]
-    rows = unpacked(tensors["coordinates"], number * sum(sizes)).reshape(number, -1)
-    axes = np.split(rows, np.cumsum(sizes)[:2], axis=1)
-    whole = np.stack([axis @ (1 << np.arange(axis.shape[1])) for axis in axes], axis=1)
-    return metadata["least"] + metadata["step"] * whole
 
 
 def read_visible(metadata, tensors):
@@ -187,17 +156,4 @@ def test_hostile_files(file, name, value, metadata):
 
 
 def test_damaged_bytes(file):
-    """They are refused by an InputError, or can be used."""
-    content, outcomes = file.read_bytes(), set()
-
-    @fuzzed
-    @given(st.lists(st.integers(0, 8 * len(content) - 1), min_size=1, max_size=8))
-    def flipped(bits):
-        damaged = bytearray(content)
-        for bit in bits:
-            damaged[bit // 8] ^= 1 << bit % 8
-        overwrite(file, damaged)
-        outcomes.add(refuses_or_reads(use, file) is None)
-
-    flipped()
-    assert outcomes == {True, False}
+    check_flipped_bits(file)

@@ -5,7 +5,9 @@ import itertools
 import numpy as np
 import pycolmap
 import pytest
+from colmap_database import write_with_pycolmap
 
+from hloc_reduce import check
 from hloc_reduce.mapping.checks import Inputs, copies, groups
 from hloc_reduce.mapping.findings import names_in
 from hloc_reduce.mapping.plausibility import keep_plausible
@@ -69,6 +71,40 @@ def test_photos_that_were_not_matched_tell_nothing():
         assert names_in(found) in SIDES if is_found else found == []
         listed = [pair for pair in every if "9.jpg" not in pair]  # 9.jpg was added later
         assert bool(copies.find(Inputs(sides, matched=listed))) == is_found
+
+
+@pytest.mark.parametrize("are_matched", [True, False])
+def test_a_database_tells_which_photos_were_matched(are_matched, tmp_path):
+    """Those of a pair without matches were, if the pair is listed."""
+    sides = two_sides(12)
+    sides.write(tmp_path)
+    keypoints, shown = {}, {}
+    for image in sides.images.values():
+        keypoints[image.name] = np.array([point.xy for point in image.points2D])
+        shown[image.name] = np.array([point.has_point3D() for point in image.points2D])
+    matches = {}
+    for pair in itertools.combinations(sorted(shown), 2):
+        is_inside = any({*pair} <= side for side in SIDES)
+        if is_inside or are_matched:
+            rows = np.flatnonzero(shown[pair[0]] & shown[pair[1]] & is_inside)
+            matches[pair] = (np.stack([rows, rows], axis=1),) * 2
+    colmap.write_reference(tmp_path / "database.db", sides)
+    colmap.write_matches(tmp_path / "database.db", keypoints, matches)
+    found, _ = check.main(tmp_path, tmp_path / "database.db")
+    assert bool(names_in(found, "copies")) == are_matched
+
+
+def test_colmap_lists_pairs_that_have_few_matches(tmp_path):
+    descriptors = np.random.default_rng(0).integers(0, 99, (3, 100, 128))
+    descriptors[1] = descriptors[0]
+    descriptors[2, :8] = descriptors[0, :8]
+    keypoints = np.random.default_rng(1).uniform(0, 200, (100, 4))
+    features = {f"{i}.jpg": (keypoints, of_image) for i, of_image in enumerate(descriptors)}
+    path = write_with_pycolmap(tmp_path / "database.db", features)
+    pycolmap.match_exhaustive(path)
+    with colmap.open_stored(path) as database:
+        assert [*database.verified()] == [("0.jpg", "1.jpg")]
+        assert sorted(database.matched()) == [*itertools.combinations(sorted(features), 2)]
 
 
 def test_what_is_before_a_point_hides_it():

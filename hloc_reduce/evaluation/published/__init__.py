@@ -1,4 +1,4 @@
-"""The paper's own numbers: its localization tables and the means of its HPatches figures."""
+"""Published numbers: the paper's localization tables and HPatches means, and maps of others."""
 
 import csv
 from collections.abc import Collection, Mapping
@@ -25,6 +25,18 @@ def hpatches() -> dict[str, dict[str, float]]:
 def localization() -> dict[str, dict[str, float]]:
     """Return the recall [%] of each feature, by columns: one for each query list and threshold."""
     return _read("localization_recall.csv")
+
+
+def small_maps() -> list[dict[str, str]]:
+    """Return maps of Aachen Day-Night v1.0 by others.
+
+    Returns:
+        For each, the `method`, where it was `published`, the `source` of the numbers, the number of
+        `photos`, the megabytes `mb`, what is `counted` in these, and the recall [%] by night within
+        0.25 m and 2 degrees, `night_0.25m_2deg`, empty if that is of maps of several sizes.
+    """
+    with (TABLE_FOLDER / "small_maps.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def dataset(lists: Mapping[str, Collection[str]]) -> str | None:

@@ -138,6 +138,19 @@ class StoredDatabase:
             found[first, second] = np.frombuffer(data, np.uint32).reshape(-1, 2).astype(np.int64)
         return found
 
+    def matched(self) -> list[tuple[str, str]]:
+        """Return the pairs of images that were matched, whether they have matches or not.
+
+        COLMAP keeps a row without matches of a pair that has fewer than 15. None are in databases
+        whose matches were deleted.
+        """
+        if not self._rows("SELECT 1 FROM sqlite_master WHERE name = 'matches'"):
+            return []
+        names = {image_id: name for name, image_id in self.images.items()}
+        ids = self._rows("SELECT pair_id FROM matches")
+        pairs = [pycolmap.pair_id_to_image_pair(i) for (i,) in ids]
+        return [(names[a], names[b]) for a, b in pairs if a in names and b in names]
+
     def _array(self, table: str, name: str, dtype: type) -> np.ndarray:
         """Return the array of an image in a table; an empty one if there is none."""
         asked = f"SELECT rows, cols, data FROM {table} WHERE image_id = ?"
