@@ -7,6 +7,7 @@ import re
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ import yaml
 
 from benchmarks import (
     accuracy,
+    adding,
     against_hloc,
     changed_photos,
     fit_gate,
@@ -37,7 +39,7 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.demo import town
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import absolute_pose, gate
-from hloc_reduce.utils import images, videos
+from hloc_reduce.utils import colmap, images, videos
 from hloc_reduce.utils.cli import InputError
 from pipelines.batch import jobs
 from pipelines.batch.jobs import Job
@@ -97,6 +99,32 @@ def test_models_are_aligned_in_spite_of_a_wrong_pose():
         few.deregister_frame(image.frame_id)
     with pytest.raises(InputError, match="share 2 images"):
         photos_alone.align(few, reference)
+
+
+def test_photos_are_added_to_a_map_of_the_others(tmp_path, monkeypatch):
+    reference, _ = row_of_photos.row({})
+    known = colmap.write_model(reference, tmp_path / "reference")
+    names = sorted(image.name for image in reference.images.values())
+
+    def built(folder, photos, **_):
+        if folder.name == adding.ALONE:
+            raise InputError("They do not overlap.")
+        colmap.write_part(known, [path.name for path in photos.iterdir()], folder)
+        return SimpleNamespace(sfm=folder)
+
+    def added(folder, photos):
+        inside = {image.name for image in colmap.read_model(folder).images.values()}
+        new = {path.name for path in photos.iterdir()}
+        assert not inside & new and inside | new == {*names}
+        return SimpleNamespace(sfm=known)
+
+    monkeypatch.setattr(adding, "NEW", 2)
+    monkeypatch.setattr(adding, "Map", lambda folder: folder)
+    monkeypatch.setattr(adding, "maps", SimpleNamespace(main=built, add=added))
+    found = [*adding.compared(tmp_path, names, reference, tmp_path / "maps", "sift")]
+    counted = {row["variant"]: (row["photos"], row["registered"]) for row in found}
+    assert counted == {"at once": (6, 6), "others": (4, 4), "alone": (2, 0), "added": (6, 6)}
+    assert found[-1]["median_percent"] == pytest.approx(0, abs=1e-6)
 
 
 def test_errors_in_metres():
