@@ -1,5 +1,6 @@
 """Rows that benchmarks write, and the documentation that is made from them."""
 
+import copy
 import csv
 import itertools
 import json
@@ -24,6 +25,7 @@ from benchmarks import (
     fit_gate,
     metres,
     photos_alone,
+    ransacs,
     render,
     rows,
     selections,
@@ -125,6 +127,36 @@ def test_photos_are_added_to_a_map_of_the_others(tmp_path, monkeypatch):
     counted = {row["variant"]: (row["photos"], row["registered"]) for row in found}
     assert counted == {"at once": (6, 6), "others": (4, 4), "alone": (2, 0), "added": (6, 6)}
     assert found[-1]["median_percent"] == pytest.approx(0, abs=1e-6)
+
+
+@pytest.fixture
+def query():
+    """60 matches of a photo of points in a row of photos, the first 20 of which are wrong."""
+    model, _ = row_of_photos.row({})
+    camera, pose = copy.deepcopy(model.cameras[1]), model.images[1].cam_from_world()
+    points2D = camera.img_from_cam(pose * row_of_photos.POINTS)
+    points2D[:20] = np.random.default_rng(1).uniform((0, 0), (640, 480), (20, 2))
+    images = [np.arange(60)[::-1], np.arange(40, 60)]
+    return ransacs.Query(points2D, row_of_photos.POINTS, images, camera, pose)
+
+
+@pytest.mark.parametrize("estimate", ransacs.estimators().values(), ids=ransacs.estimators())
+def test_all_ransacs_find_the_pose_of_a_query(estimate, query):
+    found = ransacs.measured([query], estimate)
+    assert (found["matches"], found["queries"], found["within_1cm"]) == (60, 1, 1)
+    assert 40 <= found["inliers"] < 50
+    assert 60 <= query.right < 80
+
+
+def test_matches_of_queries_are_kept(query, tmp_path):
+    ransacs.save(tmp_path / "matches.npz", [query, query])
+    (_, read) = ransacs.load(tmp_path / "matches.npz")
+    np.testing.assert_array_equal(read.points2D, query.points2D)
+    np.testing.assert_array_equal(read.points3D, query.points3D)
+    assert [chosen.tolist() for chosen in read.images] == [one.tolist() for one in query.images]
+    assert read.camera.model == query.camera.model
+    np.testing.assert_array_equal(read.camera.params, query.camera.params)
+    assert pose_error(read.cam_from_world, query.cam_from_world) == pytest.approx((0, 0), abs=1e-9)
 
 
 def test_errors_in_metres():
