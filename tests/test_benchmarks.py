@@ -32,6 +32,7 @@ from benchmarks import (
     split_place,
     tables,
     trial_rows,
+    triangulation_scale,
     video,
 )
 from benchmarks import trials as benchmark_trials
@@ -157,6 +158,15 @@ def test_matches_of_queries_are_kept(query, tmp_path):
     assert read.camera.model == query.camera.model
     np.testing.assert_array_equal(read.camera.params, query.camera.params)
     assert pose_error(read.cam_from_world, query.cam_from_world) == pytest.approx((0, 0), abs=1e-9)
+
+
+def test_landmarks_of_synthetic_maps_are_triangulated(tmp_path):
+    triangulation_scale.synthesize([f"{i}.jpg" for i in range(15)], tmp_path)
+    found = triangulation_scale.triangulate(tmp_path)
+    assert found["pairs"] == 15 * 14 / 2
+    landmarks = 1200 + 10 * 48  # that at least three images show
+    assert 0.98 * landmarks < found["points"] < 1.02 * landmarks
+    assert found["near"] > 50  # most images that show one are within two metres
 
 
 def test_errors_in_metres():
