@@ -5,9 +5,9 @@ feature, by its own matcher and without a ratio test; the matches are kept in th
 match is right if its point is within the inlier threshold by the true pose. All RANSACs get the
 same matches, threshold, confidence and limits of trials, and refine the pose that they find. They
 take all matches, or, as `Localizer`, the likeliest ones first and then those near the pose; or, by
-PROSAC, those first that are more likely. The time of a query is the CPU time of one thread, the
-best of two rounds. Adds rows to results/ransacs.csv. Those of another version of pycolmap are added
-where PYTHONPATH has that, and those of PoseLib where it is installed.
+PROSAC, those first that are more likely. Times are CPU milliseconds of one thread, `ms` their
+median. Adds rows to results/ransacs.csv. Those of another version of pycolmap are added where
+PYTHONPATH has that, and those of PoseLib where it is installed.
 """
 
 import copy
@@ -47,7 +47,6 @@ from hloc_reduce.utils.progress import progress
 NAME = "ransacs"
 WITHOUT_RATIO = "NN-mutual"
 SHARES = 0, 5, 20, 50  # percent of right matches from which on queries are compared
-ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -246,12 +245,9 @@ def measured(queries: list[Query], estimate: Callable[[Query], Found]) -> dict[s
     """Return the measures of poses of some queries."""
     errors, inliers, seconds = [], [], []
     for query in queries:
-        rounds = []
-        for _ in range(ROUNDS):
-            start = time.process_time()
-            pose = estimate(query)
-            rounds.append(time.process_time() - start)
-        seconds.append(min(rounds))
+        start = time.process_time()
+        pose = estimate(query)
+        seconds.append(time.process_time() - start)
         errors.append(FAILED if pose is None else pose_error(pose, query.cam_from_world))
         agreeing = 0 if pose is None else int((query.errors(pose) <= query.max_error).sum())
         inliers.append(agreeing)
