@@ -50,7 +50,8 @@ STEP = 0.04  # share of these that the next image in the row does not show
 NOISE = 0.2  # length of the noise vector that is added to the descriptor of a landmark
 CHECKED = 200  # pairs whose matches are checked
 MIN_KEYPOINTS = 10  # so that at least one shows a landmark
-WHOLE = {"photos": 6697 + 1015, "pairs": 20 * 6697 + 50 * 1015}
+WHOLE_MAP = 6697  # images
+WHOLE = {"photos": WHOLE_MAP + 1015, "pairs": 20 * WHOLE_MAP + 50 * 1015}
 # columns that are proportional to the number of images, or of pairs
 GROWING = {
     "photos": ("feature_mb",),

@@ -349,6 +349,16 @@ def peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
+def in_new_process(name: str, stage: str, data: Path, share: float, folder: str) -> dict:
+    """Return the measures that a stage of a benchmark prints, of a share of the images."""
+    given = ["--data", str(data), "--share", str(share), "--folder", folder, "--stage", stage]
+    command = [sys.executable, "-m", f"benchmarks.{name}", *given]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    if done.returncode:
+        raise InputError(f"The share {share} failed.")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def _main() -> None:
     parser = cli.Parser(__doc__, "--data aachen_v1.1 --share 0.1 1")
     parser.add_argument(
@@ -384,15 +394,7 @@ def _main() -> None:
             continue
         with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as folder:
             for stage in (*(("stream",) if share > 1 else ("synthesize", "build")), "localize"):
-                given = ["--data", args.data, "--share", str(share), "--folder", folder]
-                done = subprocess.run(
-                    [sys.executable, "-m", "benchmarks.compact_scale", "--stage", stage, *given],
-                    stdout=subprocess.PIPE,
-                    text=True,
-                )
-                if done.returncode:
-                    raise InputError(f"The share {share} failed.")
-                cells |= json.loads(done.stdout.splitlines()[-1])
+                cells |= in_new_process(NAME, stage, args.data, share, folder)
         rows.add(NAME, [cells | rows.how(cells["build_s"])])
 
 

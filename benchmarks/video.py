@@ -95,7 +95,7 @@ def town(number: int, folder: Path) -> pycolmap.Reconstruction:
         image *= 0.3 / image.mean()
         levels = (np.clip(image, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
         cv2.imwrite(str(folder / name), levels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
-    return _model(poses, CAMERA)
+    return model_of_poses(poses, CAMERA)
 
 
 def sequence(frames: Path, number: int, folder: Path) -> pycolmap.Reconstruction:
@@ -118,10 +118,12 @@ def sequence(frames: Path, number: int, folder: Path) -> pycolmap.Reconstruction
     camera = pycolmap.Camera(
         camera_id=1, model="PINHOLE", width=width, height=height, params=params
     )
-    return _model(poses, camera)
+    return model_of_poses(poses, camera)
 
 
-def _model(poses: dict[str, pycolmap.Rigid3d], camera: pycolmap.Camera) -> pycolmap.Reconstruction:
+def model_of_poses(
+    poses: dict[str, pycolmap.Rigid3d], camera: pycolmap.Camera
+) -> pycolmap.Reconstruction:
     """Return a model of poses without points."""
     model = pycolmap.Reconstruction()
     for i, (name, pose) in enumerate(poses.items(), 1):

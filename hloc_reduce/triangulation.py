@@ -112,15 +112,7 @@ def main(
 
     with replacing_map(sfm_dir, made_from, reference_model) as building:
         database = building / "database.db"
-        colmap.write_reference(database, reference)
-        names = [image.name for image in reference.images.values()]
-        keypoints, uncertainty, found = read_matches(
-            names, pairs, features, matches, min_match_score
-        )
-        verified = _verify(verification, reference, keypoints, uncertainty, found)
-        colmap.write_matches(database, keypoints, verified)
-        if any(part is None for _, part in verified.values()):
-            colmap.verify_matches(database, found, verbose)
+        _write_database(database, reference, pairs, features, matches, verification, verbose)
         logger.info("Triangulating...")
         reconstruction = colmap.triangulate_points(
             reference, database, image_dir, building, mapper, verbose
@@ -183,6 +175,29 @@ def replacing_map(
         sfm_dir.replace(replaced)
     building.replace(sfm_dir)
     shutil.rmtree(replaced, ignore_errors=True)
+
+
+def _write_database(
+    database: Path,
+    reference: pycolmap.Reconstruction,
+    pairs: Path,
+    features: Path,
+    matches: Path,
+    verification: dict,
+    verbose: bool,
+) -> None:
+    """Write a database of the images of a model and of their verified matches.
+
+    What was read of these is no longer in memory when COLMAP reads the database.
+    """
+    colmap.write_reference(database, reference)
+    names = [image.name for image in reference.images.values()]
+    least = verification["min_match_score"]
+    keypoints, uncertainty, found = read_matches(names, pairs, features, matches, least)
+    verified = _verify(verification, reference, keypoints, uncertainty, found)
+    colmap.write_matches(database, keypoints, verified)
+    if any(part is None for _, part in verified.values()):
+        colmap.verify_matches(database, found, verbose)
 
 
 def read_matches(

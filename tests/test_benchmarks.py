@@ -1,5 +1,6 @@
 """Rows that benchmarks write, and the documentation that is made from them."""
 
+import copy
 import csv
 import itertools
 import json
@@ -7,6 +8,7 @@ import re
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,17 +19,20 @@ import yaml
 
 from benchmarks import (
     accuracy,
+    adding,
     against_hloc,
     changed_photos,
     fit_gate,
     metres,
     photos_alone,
+    ransacs,
     render,
     rows,
     selections,
     split_place,
     tables,
     trial_rows,
+    triangulation_scale,
     video,
 )
 from benchmarks import trials as benchmark_trials
@@ -37,7 +42,7 @@ from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.demo import town
 from hloc_reduce.evaluation.poses import pose_error
 from hloc_reduce.localization import absolute_pose, gate
-from hloc_reduce.utils import images, videos
+from hloc_reduce.utils import colmap, images, videos
 from hloc_reduce.utils.cli import InputError
 from pipelines.batch import jobs
 from pipelines.batch.jobs import Job
@@ -97,6 +102,71 @@ def test_models_are_aligned_in_spite_of_a_wrong_pose():
         few.deregister_frame(image.frame_id)
     with pytest.raises(InputError, match="share 2 images"):
         photos_alone.align(few, reference)
+
+
+def test_photos_are_added_to_a_map_of_the_others(tmp_path, monkeypatch):
+    reference, _ = row_of_photos.row({})
+    known = colmap.write_model(reference, tmp_path / "reference")
+    names = sorted(image.name for image in reference.images.values())
+
+    def built(folder, photos, **_):
+        if folder.name == adding.ALONE:
+            raise InputError("They do not overlap.")
+        colmap.write_part(known, [path.name for path in photos.iterdir()], folder)
+        return SimpleNamespace(sfm=folder)
+
+    def added(folder, photos):
+        inside = {image.name for image in colmap.read_model(folder).images.values()}
+        new = {path.name for path in photos.iterdir()}
+        assert not inside & new and inside | new == {*names}
+        return SimpleNamespace(sfm=known)
+
+    monkeypatch.setattr(adding, "NEW", 2)
+    monkeypatch.setattr(adding, "Map", lambda folder: folder)
+    monkeypatch.setattr(adding, "maps", SimpleNamespace(main=built, add=added))
+    found = [*adding.compared(tmp_path, names, reference, tmp_path / "maps", "sift")]
+    counted = {row["variant"]: (row["photos"], row["registered"]) for row in found}
+    assert counted == {"at once": (6, 6), "others": (4, 4), "alone": (2, 0), "added": (6, 6)}
+    assert found[-1]["median_percent"] == pytest.approx(0, abs=1e-6)
+
+
+@pytest.fixture
+def query():
+    """60 matches of a photo of points in a row of photos, the first 20 of which are wrong."""
+    model, _ = row_of_photos.row({})
+    camera, pose = copy.deepcopy(model.cameras[1]), model.images[1].cam_from_world()
+    points2D = camera.img_from_cam(pose * row_of_photos.POINTS)
+    points2D[:20] = np.random.default_rng(1).uniform((0, 0), (640, 480), (20, 2))
+    images = [np.arange(60)[::-1], np.arange(40, 60)]
+    return ransacs.Query(points2D, row_of_photos.POINTS, images, camera, pose)
+
+
+@pytest.mark.parametrize("estimate", ransacs.estimators().values(), ids=ransacs.estimators())
+def test_all_ransacs_find_the_pose_of_a_query(estimate, query):
+    found = ransacs.measured([query], estimate)
+    assert (found["matches"], found["queries"], found["within_1cm"]) == (60, 1, 1)
+    assert 40 <= found["inliers"] < 50
+    assert 60 <= query.right < 80
+
+
+def test_matches_of_queries_are_kept(query, tmp_path):
+    ransacs.save(tmp_path / "matches.npz", [query, query])
+    (_, read) = ransacs.load(tmp_path / "matches.npz")
+    np.testing.assert_array_equal(read.points2D, query.points2D)
+    np.testing.assert_array_equal(read.points3D, query.points3D)
+    assert [chosen.tolist() for chosen in read.images] == [one.tolist() for one in query.images]
+    assert read.camera.model == query.camera.model
+    np.testing.assert_array_equal(read.camera.params, query.camera.params)
+    assert pose_error(read.cam_from_world, query.cam_from_world) == pytest.approx((0, 0), abs=1e-9)
+
+
+def test_landmarks_of_synthetic_maps_are_triangulated(tmp_path):
+    triangulation_scale.synthesize([f"{i}.jpg" for i in range(15)], tmp_path)
+    found = triangulation_scale.triangulate(tmp_path)
+    assert found["pairs"] == 15 * 14 / 2
+    landmarks = 1200 + 10 * 48  # that at least three images show
+    assert 0.98 * landmarks < found["points"] < 1.02 * landmarks
+    assert found["near"] > 50  # most images that show one are within two metres
 
 
 def test_errors_in_metres():

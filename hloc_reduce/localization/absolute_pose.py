@@ -154,20 +154,30 @@ def _refined(matches: Matches, pose: Pose, max_error: float) -> Pose:
 
 
 def likeliest(images: list[np.ndarray], number: int, most: int = SAMPLE) -> np.ndarray:
-    """Return the indices, ascending, of those of a number of matches that are right most often.
-
-    These are matches of several images, and then the most similar ones of each image.
+    """Return the indices, ascending, of the first of `ranked` matches.
 
     Args:
         images: of each map image the indices of its matches, the most similar first.
         number: of all matches.
         most: how many are returned, at most.
     """
+    return np.sort(ranked(images, number)[:most])
+
+
+def ranked(images: list[np.ndarray], number: int) -> np.ndarray:
+    """Return the indices of a number of matches, those first that are right most often.
+
+    These are matches of several images, and then the most similar ones of each image.
+
+    Args:
+        images: of each map image the indices of its matches, the most similar first.
+        number: of all matches.
+    """
     times, rank = np.zeros(number, np.int64), np.full(number, number)
     for chosen in images:
         times[chosen] += 1
         rank[chosen] = np.minimum(rank[chosen], np.arange(len(chosen)))
-    return np.sort(np.lexsort((rank, -times))[:most])
+    return np.lexsort((rank, -times))
 
 
 def _measures(
