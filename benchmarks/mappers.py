@@ -1,7 +1,8 @@
 """Compare COLMAP's incremental mapper with its global one on the same verified matches.
 
-Builds a map of the photos of each place without their poses, whose database both mappers then read,
-in one thread and with default options. A similarity aligns the positions of the largest model with
+Builds a map of the photos of each place without their poses, whose database all mappers then read,
+in one thread: the incremental one with the options of such maps and with COLMAP's own, and the
+global one, which needs COLMAP 4. A similarity aligns the positions of the largest model with
 the given ones. Adds rows to results/mappers.csv, leaving out what has rows unless --again is given;
 position errors are in percent of the largest distance between two given positions, and `seconds`
 those of the mapper.
@@ -18,21 +19,35 @@ from benchmarks import rows
 from benchmarks.photos_alone import link, measured
 from hloc_reduce import maps
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.mapping.mapper import attempts_for
 from hloc_reduce.reconstruction import MAPPER_OPTIONS
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.images import list_images
 
 NAME = "mappers"
 
 
-def incremental(database: Path, photos: Path, output: Path) -> dict[int, pycolmap.Reconstruction]:
+Models = dict[int, pycolmap.Reconstruction]
+
+
+def incremental(database: Path, photos: Path, output: Path) -> Models:
     """Reconstruct photos as maps of photos alone are, in one attempt."""
-    options = colmap.mapper_options(MAPPER_OPTIONS)
+    return _incremental(database, photos, output, attempts_for(len(list_images(photos)))[0])
+
+
+def plain(database: Path, photos: Path, output: Path) -> Models:
+    """Reconstruct photos with COLMAP's options of adjustments, in one attempt."""
+    return _incremental(database, photos, output, {})
+
+
+def _incremental(database: Path, photos: Path, output: Path, changed: dict) -> Models:
+    options = colmap.mapper_options(MAPPER_OPTIONS | changed)
     return pycolmap.incremental_mapping(database, photos, output, options=options)
 
 
-def global_(database: Path, photos: Path, output: Path) -> dict[int, pycolmap.Reconstruction]:
+def global_(database: Path, photos: Path, output: Path) -> Models:
     """Reconstruct photos by GLOMAP, as COLMAP has it since version 4."""
     options = pycolmap.GlobalPipelineOptions()
     for part in (options, options.mapper):
@@ -40,7 +55,7 @@ def global_(database: Path, photos: Path, output: Path) -> dict[int, pycolmap.Re
     return pycolmap.global_mapping(database, photos, output, options)
 
 
-MAPPERS = {"incremental": incremental, "global": global_}
+MAPPERS = {"incremental": incremental, "incremental, COLMAP's options": plain, "global": global_}
 
 
 def _main() -> None:
@@ -55,8 +70,8 @@ def _main() -> None:
     args = parser.parse_args()
     if args.database and len(args.map) > 1:
         raise InputError("--database is of one --map.")
-    if not hasattr(pycolmap, "global_mapping"):
-        raise InputError("pycolmap has no global mapper: install version 4.2 or later.")
+    if "global" in args.mapper and not hasattr(pycolmap, "global_mapping"):
+        raise InputError("pycolmap has no global mapper: choose --mapper, or install version 4.2.")
     known = [] if args.again else rows.read(NAME)
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     for place, (images, model) in parse_maps(args.map).items():

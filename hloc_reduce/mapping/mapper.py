@@ -36,6 +36,11 @@ RELAXED = {
 # adds any that the first attempt does not have; so later attempts do without.
 FALLBACK = "structure_less_registration_fallback"
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
+# Of more images, adjusting all poses takes most of the time: it is done when a fifth of the images
+# or points are new, instead of COLMAP's tenth, and by the points that the images need. The others
+# are adjusted with these poses. `benchmarks.mappers` compares both.
+RARE_ADJUSTMENTS = {"ba_global_frames_ratio": 1.2, "ba_global_points_ratio": 1.2}
+FEWER_POINTS = {"ba_global_ignore_redundant_points3D": True}
 SEEDS = (1, 2, 3)
 MAPPER_PATIENCE = (
     300.0  # seconds of further attempts, after which none begins: most maps take far less
@@ -72,8 +77,11 @@ def attempts_for(number: int) -> list[dict]:
     """Return the changed mapper options of each attempt to reconstruct a number of images."""
     known = hasattr(pycolmap.IncrementalPipelineOptions(), FALLBACK)  # since COLMAP 4
     later: dict = {FALLBACK: False} if known else {}
+    if number > VERY_FEW:
+        first: dict = RARE_ADJUSTMENTS | {"mapper": FEWER_POINTS}
+        return [first, first | {"mapper": FEWER_POINTS | RELAXED} | later]
     attempts: list[dict] = [{}, {"mapper": RELAXED} | later]
-    for seed in SEEDS if number <= VERY_FEW else ():
+    for seed in SEEDS:
         seeded = {"random_seed": seed} | later
         attempts += [seeded, seeded | {"mapper": RELAXED}]
     return attempts
