@@ -19,7 +19,7 @@ from benchmarks import rows
 from benchmarks.photos_alone import link, measured
 from hloc_reduce import maps
 from hloc_reduce.confs import features as features_confs
-from hloc_reduce.mapping.mapper import attempts_for
+from hloc_reduce.mapping.mapper import with_adjustments
 from hloc_reduce.reconstruction import MAPPER_OPTIONS
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
@@ -34,7 +34,8 @@ Models = dict[int, pycolmap.Reconstruction]
 
 def incremental(database: Path, photos: Path, output: Path) -> Models:
     """Reconstruct photos as maps of photos alone are, in one attempt."""
-    return _incremental(database, photos, output, attempts_for(len(list_images(photos)))[0])
+    number, cameras = len(list_images(photos)), len(colmap.read_cameras(database))
+    return _incremental(database, photos, output, with_adjustments({}, number, cameras))
 
 
 def plain(database: Path, photos: Path, output: Path) -> Models:

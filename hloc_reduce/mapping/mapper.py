@@ -36,11 +36,15 @@ RELAXED = {
 # adds any that the first attempt does not have; so later attempts do without.
 FALLBACK = "structure_less_registration_fallback"
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
-# Of more images, adjusting all poses takes most of the time: it is done when a fifth of the images
-# or points are new, instead of COLMAP's tenth, and by the points that the images need. The others
-# are adjusted with these poses. `benchmarks.mappers` compares both.
-RARE_ADJUSTMENTS = {"ba_global_frames_ratio": 1.2, "ba_global_points_ratio": 1.2}
-FEWER_POINTS = {"ba_global_ignore_redundant_points3D": True}
+# Of more images, adjusting all poses takes most of the time. If one camera took them, so that its
+# focal length is certain, this is done when a fifth of the images or points are new, instead of
+# COLMAP's tenth, and by fewer points, with whose poses the others are adjusted. Photos of cameras
+# of their own may end far from where all points put them (`benchmarks.mappers`, liberty-statue).
+RARE_ADJUSTMENTS: dict = {
+    "ba_global_frames_ratio": 1.2,
+    "ba_global_points_ratio": 1.2,
+    "mapper": {"ba_global_ignore_redundant_points3D": True},
+}
 SEEDS = (1, 2, 3)
 MAPPER_PATIENCE = (
     300.0  # seconds of further attempts, after which none begins: most maps take far less
@@ -70,6 +74,7 @@ MODEL_CHOICE = {
     "copies": f"sharing less than {copies.JOINED_SHARE} of the points expected in "
     f"{copies.MIN_TELLING_POINTS}, any less than {copies.APART_SHARE}",
     "dropped": "findings",
+    "adjustments": f"{RARE_ADJUSTMENTS} of one camera and more than {VERY_FEW} images",
 }
 
 
@@ -77,14 +82,27 @@ def attempts_for(number: int) -> list[dict]:
     """Return the changed mapper options of each attempt to reconstruct a number of images."""
     known = hasattr(pycolmap.IncrementalPipelineOptions(), FALLBACK)  # since COLMAP 4
     later: dict = {FALLBACK: False} if known else {}
-    if number > VERY_FEW:
-        first: dict = RARE_ADJUSTMENTS | {"mapper": FEWER_POINTS}
-        return [first, first | {"mapper": FEWER_POINTS | RELAXED} | later]
     attempts: list[dict] = [{}, {"mapper": RELAXED} | later]
-    for seed in SEEDS:
+    for seed in SEEDS if number <= VERY_FEW else ():
         seeded = {"random_seed": seed} | later
         attempts += [seeded, seeded | {"mapper": RELAXED}]
     return attempts
+
+
+def with_adjustments(changed: dict, number: int, cameras: int) -> dict:
+    """Return changed mapper options with those of how often all poses are adjusted, if not given.
+
+    Args:
+        changed: options of pycolmap's IncrementalPipelineOptions.
+        number: of images.
+        cameras: number of cameras that took them.
+    """
+    if number <= VERY_FEW or cameras > 1:
+        return changed
+    both = {**RARE_ADJUSTMENTS, **changed}
+    if isinstance(given := changed.get("mapper", {}), dict):
+        both["mapper"] = {**RARE_ADJUSTMENTS["mapper"], **given}
+    return both
 
 
 @dataclass
@@ -188,9 +206,10 @@ class Mapper:
         if _largest_group(database) < MIN_VIEWPOINTS:
             logger.info("No %d images have verified matches that connect them.", MIN_VIEWPOINTS)
             return [], []
+        took = colmap.read_cameras(database)
         known = partial(
             Inputs,
-            cameras=colmap.read_cameras(database),
+            cameras=took,
             verified=colmap.read_verified(database),
             matched=self.matches.keys(),
         )
@@ -201,7 +220,8 @@ class Mapper:
         enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
 
         def attempted(changed: dict, alone: bool = True) -> Models:
-            options = colmap.mapper_options(changed | exact)
+            adjusted = with_adjustments(changed, number, len(took))
+            options = colmap.mapper_options(adjusted | exact)
             options.constant_cameras = fixed
             with TemporaryDirectory(dir=self.folder) as folder:
                 # the mapper opens it for writing

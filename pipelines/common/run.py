@@ -217,7 +217,7 @@ class Run:
         outputs = self.folder.path
         rows = query_table(lists, records, truth, frame)
         localized = [row for row in rows if row["status"] == "localized"]
-        known = failures(features) | unreadable
+        known = {**failures(features), **unreadable}
         failed = {name: reason for name, reason in known.items() if name in records}
         if failed:
             logger.warning(
