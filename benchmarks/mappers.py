@@ -65,6 +65,7 @@ def _main() -> None:
     add("--map", action="append", required=True, metavar="IMAGES:MODEL", help="may be repeated")
     add("--feature", default=features_confs.RECOMMENDED, help="name or YAML file")
     add("--database", type=Path, help="of a map of these photos; default: build one")
+    add("--single", action="store_true", help="one camera took all photos of each place")
     add("--mapper", nargs="+", default=[*MAPPERS], choices=[*MAPPERS])
     add("--outputs", type=Path, default=Path("outputs/mappers"))
     rows.add_again_option(parser)
@@ -76,17 +77,20 @@ def _main() -> None:
     known = [] if args.again else rows.read(NAME)
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     for place, (images, model) in parse_maps(args.map).items():
-        cells = {"place": place, "feature": args.feature}
+        listed = "one camera" if args.single else ""
+        cells = {"place": place, "list": listed, "feature": args.feature}
         todo = [one for one in args.mapper if not rows.select(known, **cells, variant=one)]
         if not todo:
             continue
         reference = colmap.read_model(model)
         names = sorted(image.name for image in reference.images.values())
-        folder = args.outputs / f"{place}-{Path(args.feature).stem}"
+        folder = args.outputs / f"{place}-{Path(args.feature).stem}{'-single' * args.single}"
         photos = link(images, names, folder / "photos")
         verified = args.database
         if verified is None:
-            built = maps.main(folder / "map", photos, feature=args.feature, accept_partial=True)
+            mode = pycolmap.CameraMode.SINGLE if args.single else pycolmap.CameraMode.AUTO
+            options = {"feature": args.feature, "accept_partial": True, "camera_mode": mode}
+            built = maps.main(folder / "map", photos, **options)
             verified = built.sfm / "database.db"
         for mapper in todo:
             output = folder / mapper
