@@ -1,16 +1,17 @@
 """Compare COLMAP's incremental mapper with its global one on the same verified matches.
 
 Builds a map of the photos of each place without their poses, whose database all mappers then read,
-in one thread: the incremental one with the options of such maps and with COLMAP's own, and the
-global one, which needs COLMAP 4. A similarity aligns the positions of the largest model with
-the given ones. Adds rows to results/mappers.csv, leaving out what has rows unless --again is given;
-position errors are in percent of the largest distance between two given positions, and `seconds`
-those of the mapper.
+in one thread: the incremental one as few photos are mapped, and with the rare adjustments of many
+photos of one camera; and the global one, which needs COLMAP 4. A similarity aligns the positions of
+the largest model with the given ones. Adds rows to results/mappers.csv, leaving out what has rows
+unless --again is given; position errors are in percent of the largest distance between two given
+positions, and `seconds` and `cpu_s` those of the mapper.
 """
 
 import os
 import shutil
 import time
+from functools import partial
 from pathlib import Path
 
 import pycolmap
@@ -19,31 +20,19 @@ from benchmarks import rows
 from benchmarks.photos_alone import link, measured
 from hloc_reduce import maps
 from hloc_reduce.confs import features as features_confs
-from hloc_reduce.mapping.mapper import with_adjustments
+from hloc_reduce.mapping.mapper import RARE_ADJUSTMENTS
 from hloc_reduce.reconstruction import MAPPER_OPTIONS
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
 from hloc_reduce.utils.cli import InputError
-from hloc_reduce.utils.images import list_images
 
 NAME = "mappers"
-
 
 Models = dict[int, pycolmap.Reconstruction]
 
 
-def incremental(database: Path, photos: Path, output: Path) -> Models:
-    """Reconstruct photos as maps of photos alone are, in one attempt."""
-    number, cameras = len(list_images(photos)), len(colmap.read_cameras(database))
-    return _incremental(database, photos, output, with_adjustments({}, number, cameras))
-
-
-def plain(database: Path, photos: Path, output: Path) -> Models:
-    """Reconstruct photos with COLMAP's options of adjustments, in one attempt."""
-    return _incremental(database, photos, output, {})
-
-
-def _incremental(database: Path, photos: Path, output: Path, changed: dict) -> Models:
+def incremental(changed: dict, database: Path, photos: Path, output: Path) -> Models:
+    """Reconstruct photos as maps of photos alone are, in one attempt, with changed options."""
     options = colmap.mapper_options(MAPPER_OPTIONS | changed)
     return pycolmap.incremental_mapping(database, photos, output, options=options)
 
@@ -56,7 +45,11 @@ def global_(database: Path, photos: Path, output: Path) -> Models:
     return pycolmap.global_mapping(database, photos, output, options)
 
 
-MAPPERS = {"incremental": incremental, "incremental, COLMAP's options": plain, "global": global_}
+MAPPERS = {
+    "incremental": partial(incremental, {}),
+    "incremental, rare adjustments": partial(incremental, RARE_ADJUSTMENTS),
+    "global": global_,
+}
 
 
 def _main() -> None:

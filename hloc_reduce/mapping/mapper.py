@@ -39,7 +39,7 @@ VERY_FEW = 30  # images: several more attempts take little time, and the outcome
 # Of more images, adjusting all poses takes most of the time. If one camera took them, so that its
 # focal length is certain, this is done when a fifth of the images or points are new, instead of
 # COLMAP's tenth, and by fewer points, with whose poses the others are adjusted. Photos of cameras
-# of their own may end far from where all points put them (`benchmarks.mappers`, liberty-statue).
+# of their own may end far from their places (`benchmarks.mappers`, liberty-statue).
 RARE_ADJUSTMENTS: dict = {
     "ba_global_frames_ratio": 1.2,
     "ba_global_points_ratio": 1.2,
