@@ -20,6 +20,7 @@ from benchmarks import rows
 from benchmarks.photos_alone import link, measured
 from hloc_reduce import maps
 from hloc_reduce.confs import features as features_confs
+from hloc_reduce.mapping.adjustment import adjust
 from hloc_reduce.mapping.mapper import RARE_ADJUSTMENTS
 from hloc_reduce.reconstruction import MAPPER_OPTIONS
 from hloc_reduce.training.tracks import parse_maps
@@ -34,7 +35,10 @@ Models = dict[int, pycolmap.Reconstruction]
 def incremental(changed: dict, database: Path, photos: Path, output: Path) -> Models:
     """Reconstruct photos as maps of photos alone are, in one attempt, with changed options."""
     options = colmap.mapper_options(MAPPER_OPTIONS | changed)
-    return pycolmap.incremental_mapping(database, photos, output, options=options)
+    models = pycolmap.incremental_mapping(database, photos, output, options=options)
+    for model in models.values() if changed else ():
+        adjust(model, options)
+    return models
 
 
 def global_(database: Path, photos: Path, output: Path) -> Models:

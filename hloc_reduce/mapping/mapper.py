@@ -17,7 +17,7 @@ from ..runtime import parallel
 from ..utils import cli, colmap
 from ..utils.interrupts import interruptible
 from . import database as databases
-from .adjustment import adjusted_error, scale_by_rigs, with_one_camera
+from .adjustment import adjust, adjusted_error, scale_by_rigs, with_one_camera
 from .checks import Inputs, copies, lenses
 from .checks.focal_lengths import FEW_IMAGES, SPREAD, SPREAD_OF_FEW, are_alike, of_spread
 from .checks.partial import ENOUGH_REGISTERED
@@ -38,8 +38,8 @@ FALLBACK = "structure_less_registration_fallback"
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
 # Of more images, adjusting all poses takes most of the time. If one camera took them, so that its
 # focal length is certain, this is done when a fifth of the images or points are new, instead of
-# COLMAP's tenth, and by fewer points, with whose poses the others are adjusted. Photos of cameras
-# of their own may end far from their places (`benchmarks.mappers`, liberty-statue).
+# COLMAP's tenth, and by fewer points, and in the end once by all. Photos of cameras of their own
+# may end far from their places (`benchmarks.mappers`, liberty-statue).
 RARE_ADJUSTMENTS: dict = {
     "ba_global_frames_ratio": 1.2,
     "ba_global_points_ratio": 1.2,
@@ -89,16 +89,8 @@ def attempts_for(number: int) -> list[dict]:
     return attempts
 
 
-def with_adjustments(changed: dict, number: int, cameras: int) -> dict:
-    """Return changed mapper options with those of how often all poses are adjusted, if not given.
-
-    Args:
-        changed: options of pycolmap's IncrementalPipelineOptions.
-        number: of images.
-        cameras: number of cameras that took them.
-    """
-    if number <= VERY_FEW or cameras > 1:
-        return changed
+def with_rare_adjustments(changed: dict) -> dict:
+    """Return changed mapper options with `RARE_ADJUSTMENTS`, as far as they do not change these."""
     both = {**RARE_ADJUSTMENTS, **changed}
     if isinstance(given := changed.get("mapper", {}), dict):
         both["mapper"] = {**RARE_ADJUSTMENTS["mapper"], **given}
@@ -216,11 +208,12 @@ class Mapper:
         exact = {"ba_refine_sensor_from_rig": False} if self.rigs else {}
         fixed = databases.fixed_cameras(database, self.rigs)
         number = len(self.names)
+        are_rare = number > VERY_FEW and len(took) == 1
         enough = number if number <= FEW_IMAGES else ENOUGH_REGISTERED * number
         enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
 
         def attempted(changed: dict, alone: bool = True) -> Models:
-            adjusted = with_adjustments(changed, number, len(took))
+            adjusted = with_rare_adjustments(changed) if are_rare else changed
             options = colmap.mapper_options(adjusted | exact)
             options.constant_cameras = fixed
             with TemporaryDirectory(dir=self.folder) as folder:
@@ -229,6 +222,8 @@ class Mapper:
                 found = colmap.incremental_mapping(
                     own, self.image_dir, Path(folder) / "models", options, self.verbose
                 )
+            for model in found if are_rare else ():
+                adjust(model, options)
             for model in found if self.rigs else ():
                 scale_by_rigs(model, fixed.intersection(model.cameras))
             cameras = [camera for model in found for camera in _cameras(model)]

@@ -91,10 +91,13 @@ def test_many_images_of_one_camera_are_adjusted_less_often(
         is_second = len(tried) == 2
         return mapping(database, image_dir, output, options, verbose) if is_second else []
 
+    adjusted, adjust = [], mapper.adjust
     monkeypatch.setattr(colmap, "incremental_mapping", second)
+    monkeypatch.setattr(mapper, "adjust", lambda *given: adjusted.append(adjust(*given)))
     arguments = (scene.images, pairs, scene.features, matches, mode)
     model = reconstruction.main(tmp_path / "sfm", *arguments, image_list=names)
     assert tried == [(*expected, 30), (*expected, 15)]
+    assert len(adjusted) == expected[2]  # in the end once by all points
     assert model.num_reg_images() == 6 and model.num_points3D() == 300
     centres = [image.projection_center() for image in model.images.values()]
     true = [scene.poses[image.name].inverse().translation for image in model.images.values()]
@@ -105,11 +108,10 @@ def test_many_images_of_one_camera_are_adjusted_less_often(
 def test_options_that_are_given_count():
     """Beside those of rare adjustments."""
     given = {"ba_global_frames_ratio": 1.3, "mapper": mapper.RELAXED}
-    found = colmap.mapper_options(mapper.with_adjustments(given, 31, 1))
+    found = colmap.mapper_options(mapper.with_rare_adjustments(given))
     assert (found.ba_global_frames_ratio, found.ba_global_points_ratio) == (1.3, 1.2)
     assert found.mapper.ba_global_ignore_redundant_points3D
     assert found.mapper.abs_pose_min_num_inliers == 15
-    assert mapper.with_adjustments(given, 31, 2) == mapper.with_adjustments(given, 30, 1) == given
 
 
 @pytest.mark.fault(6)
