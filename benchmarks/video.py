@@ -183,6 +183,8 @@ def _main() -> None:
         reference = sequence(args.sequence, args.frames, photos)
     else:
         reference = town(args.frames, photos)
+    (folder / "reference").mkdir(exist_ok=True)  # for benchmarks.mappers
+    reference.write(folder / "reference")
     listed = f"{len(reference.images)} frames"
     if args.encode:
         video = encode(photos, folder / "video.mp4")

@@ -96,8 +96,8 @@ def open_map(
         camera_mode: which photos share a camera; default: auto.
         camera_model: the model of the cameras, of fisheyes for example OPENCV_FISHEYE; default:
             SIMPLE_RADIAL.
-        camera_params: about their parameters, as COLMAP has them, such as fx,fy,cx,cy,k1,k2,k3,k4;
-            default: from EXIF data or guessed.
+        camera_params: approximate parameters of `camera_model`, in COLMAP's order, such as
+            fx,fy,cx,cy,k1,k2,k3,k4, which the map refines; default: from EXIF data or guessed.
         database: COLMAP database that `map` was made from: its keypoints and descriptors make the
             map, without photos. Photos, if given, only tell more about the cameras.
         retrieval: a name (those of networks need an installed hloc); or, for the queries only,
@@ -106,13 +106,11 @@ def open_map(
         masks: folder of masks of photos, as COLMAP's: keypoints of a/photo.jpg in black pixels of
             `masks`/a/photo.jpg.png are dropped, in photos of the map, queries, and photos that are
             added; or one mask for all photos of its size; default: none.
-        pairs: which photos are matched with each other in a map of photos alone: all, each with
-            the `num_covis` most similar ones, or each with those around it by name and similar
-            ones; default: sequential for a video, else exhaustive for up to 100 photos and
-            retrieval for more.
-        rigs: COLMAP's file of cameras that are fixed to each other: a map of photos alone that they
-            took is in the units of the file; queries with the same name in the folders of their
-            cameras get their poses together.
+        pairs: which photos are matched with each other in a map of photos alone; default:
+            sequential for a video, else exhaustive for up to 100 photos and retrieval for more.
+        rigs: COLMAP's file of cameras that are fixed to each other. Photos of one moment have the
+            same name in the folders of their cameras. A map of photos alone is in the units of the
+            file; queries of one moment get one pose of the rig.
         panoramas: photos that are twice as wide as high are panoramas of all directions; default:
             those whose XMP data say so.
 
@@ -163,6 +161,8 @@ def open_map(
             if camera_model:
                 raise InputError("The lens of panoramas is known: leave out --camera_model.")
             map_images, rigs = views
+        elif rigs:
+            map_photos.check_camera_mode(map_images, rigs, camera_mode)
         new |= {"num_covis": num_covis, "accept_partial": accept_partial, "camera_mode": mode}
         new |= {"exif_gps": exif_gps}
         new["masks"] = masks
@@ -229,8 +229,8 @@ def main(
         gate: what a pose must have for the query to be called localized.
         retrieval: hloc's text file of pairs or h5 file of global descriptors; default: the map's.
         matcher: matcher of queries; default: the map's.
-        rigs: COLMAP's file of cameras that are fixed to each other, in the units of the map: photos
-            with the same name in the folders of their cameras get their poses together.
+        rigs: COLMAP's file of cameras that are fixed to each other, in the units of the map. Photos
+            of one moment, which have the same name in the folders of their cameras, get one pose.
         masks: of the queries, see `open_map`; default: none.
         panoramas: photos that are twice as wide as high are panoramas of all directions; default:
             those whose XMP data say so.
@@ -275,10 +275,12 @@ def main(
         listed = queries or wanted.write(outputs / LISTED)
         wanted.log()
         seen = query_images  # where the queries are
+        unreadable: dict[str, str] = {}
         if wanted.panoramas:
             with run.stage("panoramas"):
-                given = query_images, wanted.panoramas, outputs / panorama_files.SHOWN
-                seen = panorama_files.write_views(*given)
+                seen = outputs / panorama_files.SHOWN
+                given = query_images, wanted.panoramas, seen
+                unreadable = panorama_files.write_views(*given, strict)
         with run.stage("extract_features"):
             features = extract_features.main(
                 built.conf,
@@ -289,7 +291,7 @@ def main(
                 queries=names,
                 masks=masks,
             )
-        photos.forget(failures(features))
+        photos.forget(failures(features) | unreadable)
         with run.stage("retrieval"):
             wanted_pairs = loc_pairs, num_loc, readable(features, names), map_names, seen
             if retrieval == built.retrieval:
@@ -329,7 +331,7 @@ def main(
                 rigs=wanted.frames,
             )
             if wanted.panoramas:
-                records = panorama_files.write_records(wanted.frames, records, poses)
+                records = panorama_files.write_records(wanted.frames, records, poses, unreadable)
         if not trajectory.write(records, outputs):
             folder.delete((trajectory.TUM, trajectory.CSV))
         limits = dict.fromkeys(wanted.lists, DAY_THRESHOLDS)
@@ -353,7 +355,7 @@ def main(
             "map": built.sfm,
         }
         told = summary, wanted.photo_lists, records, truth, limits, features, poses, files
-        return run.finish(*told, built.frame)
+        return run.finish(*told, built.frame, unreadable)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -365,7 +367,7 @@ class Command(command.Command):
             or a map of an earlier run: its folder or .hlm file, which is unpacked; or several .hlm
             files of one place, as one map.
         compact: write the map into one small file, too.
-        fps: frames per second of a video of queries, at a steady rate; default: its sharp frames,
+        fps: frames per second that are taken from a video of queries; default: a sharp frame
             whenever the camera has moved.
     """
 

@@ -97,6 +97,9 @@ for place in bronze-statue cyprus entry-P10 fountain-P11 fox kitchen liberty-sta
 done
 run mappers $mappers --map $data/demo_town-400/images_upright:$data/demo_town-400/3D-models/aachen_v_1_1 "$@"
 
+run mappers --single --mapper incremental "incremental, rare adjustments" \
+    --map "$(scene fox)" --map "$(scene south-building)" "$@"
+
 # how often wrong?
 [ -e $data/strangers ] || run strangers --output $data/strangers || true # from GitHub
 web="$data/strangers/naver+mast3r $data/strangers/cvg+Hierarchical-Localization"
@@ -154,6 +157,10 @@ run video --frames 100 "$@"
 run video --sequence $data/7-scenes-redkitchen "$@"
 run video --frames 100 --encode "$@"
 run video --frames 300 "$@" # exhaustive pairs may take more than an hour
+for video in outputs/video/demo_town-100 outputs/video/demo_town-300; do
+    run mappers --map $video/frames:$video/reference --database $video/map-sequential/sfm/database.db "$@" \
+        --single --mapper incremental "incremental, rare adjustments"
+done
 run retrieval_scale --dataset $data/demo_town-400 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 64 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 32 --storage uint4 "$@"

@@ -128,7 +128,8 @@ def get(
             of a YAML file.
 
     Raises:
-        InputError: for an unknown name or a file that is not a feature's configuration.
+        InputError: for an unknown name, a file that is not a feature's configuration, or settings
+            of DoG for a feature without it.
     """
     choose("storage", storage, STORAGES)
     choose("keypoints", keypoints, KEYPOINT_SETTINGS)
@@ -138,8 +139,12 @@ def get(
         conf = confs[choose("feature", name, confs)]
     if storage != STORAGES[0]:
         conf = {**conf, "storage": storage}
-    if keypoints != KEYPOINT_SETTINGS[0]:
-        conf = {**conf, "model": with_keypoints(conf["model"], keypoints)}
+    if keypoints != KEYPOINT_SETTINGS[0] and descriptor_of(conf["model"]) is None:
+        raise InputError(
+            f"--keypoints {keypoints} is for DoG keypoints, and {name} finds its own: leave out "
+            "--keypoints."
+        )
+    conf = with_settings(conf, keypoints)
     if projection is None:
         return name, conf
     base = base_of(conf["model"])
@@ -147,6 +152,13 @@ def get(
     file, prefix = projections.split_prefix(projection)
     name = Path(file).stem + (prefix and f"@{prefix}")
     return name, {**conf, "output": feature(name, model)["output"], "model": model}
+
+
+def with_settings(conf: dict, keypoints: str) -> dict:
+    """Return the configuration of a feature with settings of DoG, if it uses DoG; see `get`."""
+    if keypoints == KEYPOINT_SETTINGS[0]:
+        return conf
+    return {**conf, "model": with_keypoints(conf["model"], keypoints)}
 
 
 def with_keypoints(model: dict, keypoints: str) -> dict:

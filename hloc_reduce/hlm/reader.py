@@ -391,6 +391,10 @@ class CompactMap:
         """Return the images in one cluster."""
         return [names]
 
+    def floors(self, names: list[str]) -> list[list[str]]:
+        """Return all images together: a map has one frame."""
+        return [names]
+
     def fallback(self, names: list[str]) -> pycolmap.Rigid3d:
         """Return the pose of the first of some images, or without them of the first of all."""
         return self.pose(names[0] if names else self.names[0])

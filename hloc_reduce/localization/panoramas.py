@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import cv2
@@ -19,7 +20,7 @@ from ..runtime import provenance
 from ..utils import cli
 from ..utils.cli import InputError
 from ..utils.files import replacing
-from ..utils.images import ORIENTATION, read_image, stored_size
+from ..utils.images import ORIENTATION, UnreadableImage, read_image, stored_size
 from ..utils.parsers import write_poses
 from ..utils.progress import progress
 from .gps import GPS, gps_tags
@@ -45,6 +46,7 @@ SHOWN = "views"  # folder of the views of queries, in that of the results
 NO_RIGS = "Panoramas are rigs of their own views: leave out --rigs {}."
 
 Size = tuple[int, int]  # width and height in pixels
+SMALLEST: Size = MIN_WIDTH, MIN_WIDTH // 2
 
 
 class View(NamedTuple):
@@ -64,6 +66,8 @@ class View(NamedTuple):
 def find(image_dir: Path, names: list[str], given: bool = False) -> dict[str, Size]:
     """Return the sizes of the photos of a folder if they are panoramas, else nothing.
 
+    Photos whose size cannot be read are left out.
+
     Args:
         image_dir: the folder.
         names: the photos.
@@ -81,14 +85,14 @@ def find(image_dir: Path, names: list[str], given: bool = False) -> dict[str, Si
     found = whole if given else {name for name in whole if TOLD.search(heads[name])}
     if not found:
         return {}
-    if others := [name for name in names if name not in found]:
-        why = "not twice as wide as high, or not readable" if given else "without such XMP data"
+    if others := [name for name in sizes if name not in found]:
+        why = "not twice as wide as high" if given else "without such XMP data"
         why = "parts of panoramas" if {*others} <= heads.keys() - whole else why
         raise InputError(
             f"{image_dir} has panoramas of all directions, {cli.some(sorted(found))}, and other "
             f"photos, {why}: {cli.some(others)}. Put panoramas into a folder of their own."
         )
-    if small := [name for name in names if sizes[name][0] < MIN_WIDTH]:
+    if small := [name for name in sizes if sizes[name][0] < MIN_WIDTH]:
         raise InputError(
             f"Panoramas in {image_dir} are too small, less than {MIN_WIDTH} pixels wide: "
             f"{cli.some(small)}."
@@ -182,31 +186,45 @@ def of_views(names: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def write_views(image_dir: Path, sizes: Mapping[str, Size], folder: Path) -> Path:
-    """Write the views of panoramas that are not there yet, with their GPS, and return their folder.
+def write_views(
+    image_dir: Path, sizes: Mapping[str, Size], folder: Path, strict: bool = True
+) -> dict[str, str]:
+    """Write the views of panoramas that are not there yet, with their GPS.
 
     Args:
         image_dir: folder of the panoramas.
         sizes: of the panoramas, by name.
         folder: for the views, upright photos.
+        strict: stop at a panorama that cannot be read.
+
+    Returns:
+        Why panoramas cannot be read, by name; they have no views.
 
     Raises:
-        UnreadableImage: if a panorama cannot be read.
+        UnreadableImage: if `strict`.
     """
+    unreadable = {}
     for name, size in progress([*sizes.items()], "Rendering views of panoramas", "panorama"):
         views = views_of(size)
         paths = [folder / one for one in view_names(name, views)]
         if all(path.exists() for path in paths):
             continue
+        try:
+            panorama = read_image(image_dir / name)
+        except UnreadableImage as error:
+            if strict:
+                raise
+            unreadable[name] = str(error)
+            continue
         exif = Image.Exif()
         exif[ORIENTATION] = 1
         exif.get_ifd(GPS).update(gps_tags(image_dir / name))
-        for path, pixels in zip(paths, render(read_image(image_dir / name), views), strict=True):
+        for path, pixels in zip(paths, render(panorama, views), strict=True):
             with replacing(path) as temporary:
                 Image.fromarray(pixels).save(
                     temporary, format="JPEG", quality=QUALITY, subsampling=0, exif=exif
                 )
-    return folder
+    return unreadable
 
 
 def write_rigs(image_dir: Path, sizes: Mapping[str, Size], folder: Path) -> tuple[Path, Path]:
@@ -268,7 +286,10 @@ def results_of_views(results: Path) -> Path:
 
 
 def write_records(
-    frames: Mapping[str, Mapping[str, pycolmap.Rigid3d]], records: Mapping[str, dict], results: Path
+    frames: Mapping[str, Mapping[str, pycolmap.Rigid3d]],
+    records: Mapping[str, dict],
+    results: Path,
+    unreadable: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, dict]:
     """Write the records of panoramas from those of their views, and return them.
 
@@ -276,6 +297,7 @@ def write_records(
         frames: of each panorama the views, with their poses in it.
         records: of the views, see `localization.stage.main`.
         results: text file of poses, next to which the records go.
+        unreadable: why panoramas cannot be read.
 
     Returns:
         A record for each panorama, with its pose, the numbers of all its views and no camera; the
@@ -283,6 +305,8 @@ def write_records(
         rig is.
     """
     found = {name: _record(views, records) for name, views in frames.items()}
+    for name, reason in unreadable.items():  # instead of that its views are missing
+        found[name]["reason"] = reason
     with Log(log_file(results), {"records": RECORDS, "panoramas": VIEWS}, overwrite=True) as log:
         for name, record in found.items():
             log.add(name, record)

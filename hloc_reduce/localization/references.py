@@ -37,6 +37,9 @@ class Reference(Protocol):
     def clusters(self, names: list[str]) -> list[list[str]]:
         """Split images, at least one, into clusters that queries are localized in separately."""
 
+    def floors(self, names: list[str]) -> list[list[str]]:
+        """Split images, at least one, into those whose points have a common frame."""
+
     def fallback(self, names: list[str]) -> pycolmap.Rigid3d | None:
         """Return the pose for a query that was not localized, from its images, best first."""
 
@@ -101,6 +104,10 @@ class SfmMap:
             clusters.setdefault(cluster, []).append(name)
         return sorted(clusters.values(), key=len, reverse=True)
 
+    def floors(self, names: list[str]) -> list[list[str]]:
+        """Return all images together: a model has one frame."""
+        return [names]
+
     def fallback(self, names: list[str]) -> pycolmap.Rigid3d:
         """Return the pose of the first of some images, or without them of the first of all."""
         return self.images[names[0] if names else min(self.images)].cam_from_world()
@@ -157,6 +164,10 @@ class ScanMap:
         return np.where(np.isfinite(points[:, 0]), ids, -1), points
 
     def clusters(self, names: list[str]) -> list[list[str]]:
+        """Split cutouts as `floors` does."""
+        return self.floors(names)
+
+    def floors(self, names: list[str]) -> list[list[str]]:
         """Split cutouts by floor, the floor of the first one first."""
         floors: dict[str, list[str]] = {}
         for name in names:

@@ -160,6 +160,28 @@ def estimate(sights: Sequence[Sight], gate: Gate) -> RigPose:
     )
 
 
+def best_of(found: Sequence[RigPose], gate: Gate) -> tuple[int, RigPose]:
+    """Return the index and the best of the poses on all floors, each by its own images.
+
+    It is not trusted if another would be, too, and has nearly as many inliers.
+
+    Args:
+        found: a pose for each floor, at least one.
+        gate: what a pose must have to be trusted.
+    """
+    number = max(range(len(found)), key=lambda i: (not found[i].refusal, *_quality(found[i])))
+    best = found[number]
+    others = [one.measures.num_inliers for one in found if one is not best and not one.refusal]
+    if best.refusal or not others:
+        return number, best
+    ratio = max(others) / best.measures.num_inliers
+    other = Alternative(ratio, position=np.inf, rotation=180.0, detail=max(others))
+    measures = replace(
+        best.measures, alternatives={**best.measures.alternatives, "other_images": other}
+    )
+    return number, replace(best, measures=measures, refusal=gates.refusal(measures, gate))
+
+
 def _moved(one: Sight, near_from_world: pycolmap.Sim3d) -> Sight:
     """Return what a camera sees in a frame near the points, which has another unit."""
     pose = pycolmap.Rigid3d(

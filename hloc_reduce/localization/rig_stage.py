@@ -110,18 +110,27 @@ def _localize_chunk(
 
     def solve(task: tuple) -> tuple[str, str | None, dict[str, dict]]:
         frame, seen = task
+        names = dict.fromkeys(name for *_, found in seen for name in found)
+        floors = reference.floors([*names]) if names else [[]]
+        solved = [on_floor(seen, floor) for floor in floors]
+        number, pose = rig_pose.best_of([pose for pose, _ in solved], gate)
+        verdict = gates.verdict(pose.measures, gate) | {"reason": pose.refusal}
+        told = solved[number][1]
+        records = {one[0].name: _record(reference, pose, verdict, *one) for one in told}
+        return frame, pose.refusal, records
+
+    def on_floor(seen: list, floor: list[str]) -> tuple[rig_pose.RigPose, list[tuple]]:
         sights, infos = [], []
         for photo, keypoints, found in seen:
             options = settings.config(photo.name, photo.camera)
-            given = keypoints, found, options, gate, *photo[:3]
+            there = {name: found[name] for name in found if name in floor}
+            given = keypoints, there, options, gate, *photo[:3]
             sight, info = rig_pose.sight(reference, *given)
             sights.append(sight)
-            infos.append(info | {"db": next(iter(found), None)})
+            infos.append(info | {"db": next(iter(there), None)})
         pose = rig_pose.estimate(sights, gate)
-        verdict = gates.verdict(pose.measures, gate) | {"reason": pose.refusal}
-        told = zip((photo for photo, *_ in seen), sights, infos, pose.inliers, strict=True)
-        records = {one[0].name: _record(reference, pose, verdict, *one) for one in told}
-        return frame, pose.refusal, records
+        photos = [photo for photo, *_ in seen]
+        return pose, list(zip(photos, sights, infos, pose.inliers, strict=True))
 
     with open_h5(features) as feature_file, open_h5(matches) as match_file:
         tasks = ((frame, [(one, *read(one)) for one in photos]) for frame, photos in frames)

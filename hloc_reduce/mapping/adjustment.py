@@ -67,6 +67,13 @@ def with_one_camera(sfm: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return colmap.with_cameras(sfm, lambda _: shared)
 
 
+def adjust(sfm: pycolmap.Reconstruction, options: pycolmap.IncrementalPipelineOptions) -> None:
+    """Adjust a model, in place, by all of its points, with the mapper's options."""
+    with colmap.near_origin(sfm):
+        _adjuster(sfm, known=options.constant_cameras, mapper=options).solve()
+    sfm.update_point_3d_errors()
+
+
 def adjusted_error(sfm: pycolmap.Reconstruction, refine_principal_point: bool = False) -> float:
     """Adjust a model, in place, and return its mean reprojection error in pixels."""
     with colmap.near_origin(sfm):
@@ -140,12 +147,13 @@ def _adjuster(
     refine_principal_point: bool = False,
     known: Iterable[int] = (),
     is_scale_fixed: bool = True,
+    mapper: pycolmap.IncrementalPipelineOptions = OPTIONS,
 ) -> Any:
     """Prepare the adjustment of a whole model, but for the intrinsics of known cameras.
 
     One frame stays where it is, and, if its scale is fixed, a coordinate of another.
     """
-    options = colmap.exact(OPTIONS.get_global_bundle_adjustment())
+    options = colmap.exact(mapper.get_global_bundle_adjustment())
     options.refine_principal_point = refine_principal_point
     options.print_summary = False
     config = pycolmap.BundleAdjustmentConfig()

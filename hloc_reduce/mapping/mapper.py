@@ -17,7 +17,7 @@ from ..runtime import parallel
 from ..utils import cli, colmap
 from ..utils.interrupts import interruptible
 from . import database as databases
-from .adjustment import adjusted_error, scale_by_rigs, with_one_camera
+from .adjustment import adjust, adjusted_error, scale_by_rigs, with_one_camera
 from .checks import Inputs, copies, lenses
 from .checks.focal_lengths import FEW_IMAGES, SPREAD, SPREAD_OF_FEW, are_alike, of_spread
 from .checks.partial import ENOUGH_REGISTERED
@@ -36,6 +36,15 @@ RELAXED = {
 # adds any that the first attempt does not have; so later attempts do without.
 FALLBACK = "structure_less_registration_fallback"
 VERY_FEW = 30  # images: several more attempts take little time, and the outcome depends on luck
+# Of more images, adjusting all poses takes most of the time. If one camera took them, so that its
+# focal length is certain, this is done when a fifth of the images or points are new, instead of
+# COLMAP's tenth, and by fewer points, and in the end once by all. Photos of cameras of their own
+# may end far from their places (`benchmarks.mappers`, liberty-statue).
+RARE_ADJUSTMENTS: dict = {
+    "ba_global_frames_ratio": 1.2,
+    "ba_global_points_ratio": 1.2,
+    "mapper": {"ba_global_ignore_redundant_points3D": True},
+}
 SEEDS = (1, 2, 3)
 MAPPER_PATIENCE = (
     300.0  # seconds of further attempts, after which none begins: most maps take far less
@@ -65,6 +74,7 @@ MODEL_CHOICE = {
     "copies": f"sharing less than {copies.JOINED_SHARE} of the points expected in "
     f"{copies.MIN_TELLING_POINTS}, any less than {copies.APART_SHARE}",
     "dropped": "findings",
+    "adjustments": f"{RARE_ADJUSTMENTS} of one camera and more than {VERY_FEW} images",
 }
 
 
@@ -77,6 +87,14 @@ def attempts_for(number: int) -> list[dict]:
         seeded = {"random_seed": seed} | later
         attempts += [seeded, seeded | {"mapper": RELAXED}]
     return attempts
+
+
+def with_rare_adjustments(changed: dict) -> dict:
+    """Return changed mapper options with `RARE_ADJUSTMENTS`, as far as they do not change these."""
+    both = {**RARE_ADJUSTMENTS, **changed}
+    if isinstance(given := changed.get("mapper", {}), dict):
+        both["mapper"] = {**RARE_ADJUSTMENTS["mapper"], **given}
+    return both
 
 
 @dataclass
@@ -180,20 +198,23 @@ class Mapper:
         if _largest_group(database) < MIN_VIEWPOINTS:
             logger.info("No %d images have verified matches that connect them.", MIN_VIEWPOINTS)
             return [], []
+        took = colmap.read_cameras(database)
         known = partial(
             Inputs,
-            cameras=colmap.read_cameras(database),
+            cameras=took,
             verified=colmap.read_verified(database),
             matched=self.matches.keys(),
         )
         exact = {"ba_refine_sensor_from_rig": False} if self.rigs else {}
         fixed = databases.fixed_cameras(database, self.rigs)
         number = len(self.names)
+        are_rare = number > VERY_FEW and len(took) == 1
         enough = number if number <= FEW_IMAGES else ENOUGH_REGISTERED * number
         enough = min(enough, len(_matched(database)))  # no attempt registers an unmatched image
 
         def attempted(changed: dict, alone: bool = True) -> Models:
-            options = colmap.mapper_options(changed | exact)
+            adjusted = with_rare_adjustments(changed) if are_rare else changed
+            options = colmap.mapper_options(adjusted | exact)
             options.constant_cameras = fixed
             with TemporaryDirectory(dir=self.folder) as folder:
                 # the mapper opens it for writing
@@ -201,6 +222,8 @@ class Mapper:
                 found = colmap.incremental_mapping(
                     own, self.image_dir, Path(folder) / "models", options, self.verbose
                 )
+            for model in found if are_rare else ():
+                adjust(model, options)
             for model in found if self.rigs else ():
                 scale_by_rigs(model, fixed.intersection(model.cameras))
             cameras = [camera for model in found for camera in _cameras(model)]

@@ -312,6 +312,8 @@ def _reconstruct(
                 image_options=photos.lens,
             )
         _match(photos, pairs, features, matches)
+        if _pairs(pairs) == _pairs(before):  # so the next round would find none, too
+            break
     kept = photos.kept
     if len(kept) < len(photos.names):
         listed = [pair for pair in parse_pairs(pairs) if {*pair} <= {*kept}]
@@ -332,6 +334,11 @@ def _reconstruct(
             image_options=photos.lens,
         )
     return Attempt(photos, conf, matches, folder.path / name, sfm)
+
+
+def _pairs(path: Path) -> set[frozenset[str]]:
+    """Return the pairs of a file in any order."""
+    return {frozenset(pair) for pair in parse_pairs(path)}
 
 
 def _describe(photos: Photos, conf: dict) -> Described:

@@ -187,7 +187,8 @@ class Map:
         Raises:
             InputError: if it is another one, or has the same name but another projection.
         """
-        name, conf = features_confs.get(feature, projection, self.storage, self.keypoints)
+        name, conf = features_confs.get(feature, projection, self.storage)
+        conf = features_confs.with_settings(conf, self.keypoints)
         made_from = provenance.read(self.folder / CONF).get("feature")
         known = (
             name == self.feature

@@ -53,7 +53,16 @@ PAIRS = {
     "retrieval": Pairs(_retrieval, widens=True),
     "sequential": Pairs(_sequential),
 }
-PairsOption = Annotated[str, Option("kind of pairs", PAIRS)]
+PairsOption = Annotated[
+    str,
+    Option(
+        "kind of pairs",
+        PAIRS,
+        "exhaustive pairs each photo with all others; retrieval with the --num_covis most similar "
+        "ones; sequential with those before and after it by name or time stamp, and with similar "
+        "ones of other times",
+    ),
+]
 
 
 def default(number: int) -> str:

@@ -37,7 +37,7 @@ def serve(
         host: address to listen on; 0.0.0.0 for all networks.
         port: port to listen on.
         num_loc: retrieved map images per photo.
-        max_mb: largest request in 1,000,000 bytes; photos of a rig take a third more.
+        max_mb: largest request in 1,000,000 bytes; photos of a rig, in base64, take a third more.
         queue: requests that may wait; others get status 503.
     """
     if port > MAX_PORT:

@@ -149,7 +149,8 @@ def _described(
     _check_source(images, model, output / "source.json")
     patches = conf is None and descriptor in DESCRIPTORS
     found_by = MATCHED if patches else descriptor
-    conf = conf or features_confs.get(found_by, keypoints=DOG_SETTINGS)[1]
+    if conf is None:
+        conf = features_confs.with_settings(features_confs.get(found_by)[1], DOG_SETTINGS)
     names = sorted(image.name for image in colmap.read_model(model).images.values())
     sfm = output / f"sfm_{found_by}"
     features, reconstruction = _triangulate(images, model, names, conf, sfm)

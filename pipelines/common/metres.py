@@ -58,7 +58,8 @@ def main(
         gps: CSV file with the columns name, latitude, longitude (degrees, WGS84) and altitude
             (metres, may be empty) of map photos, to put the map into metres east, north and up;
             default: a new map of photos alone has the GPS of their EXIF data.
-        scale: two map photos and the distance of their cameras in metres, to scale the map by.
+        scale: two map photos and the distance between their cameras in metres, to put the map into
+            metres.
         strict: raise an error, rather than warn, if the positions do not tell the frame.
 
     Raises:

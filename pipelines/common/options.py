@@ -33,8 +33,9 @@ class Method(Checked):
             or h5 file of global descriptors.
         ground_truth: true poses of the queries; default: those of the data set.
         num_loc: retrieved map images per query.
-        rigs: COLMAP's file of cameras that are fixed to each other, in the units of the map:
-            queries with the same name in the folders of their cameras get their poses together.
+        rigs: COLMAP's file of cameras that are fixed to each other, in the units of the map.
+            Queries of one moment, which have the same name in the folders of their cameras, get one
+            pose of the rig.
         gate: what a pose must have for the query to be called localized.
     """
 

@@ -20,7 +20,7 @@ from hloc_reduce.utils import cli
 from hloc_reduce.utils import masks as masks_of
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.files import is_readable
-from hloc_reduce.utils.images import list_images
+from hloc_reduce.utils.images import check_readable, list_images
 from hloc_reduce.utils.match_files import check_distinct
 from hloc_reduce.utils.parsers import parse_query_lists
 
@@ -170,16 +170,21 @@ def find_queries(
 
     Raises:
         InputError: as `Queries.find` and `panoramas.find`; or if there is no panorama, or there are
-            some and rigs.
+            some and rigs; or, if `strict`, one cannot be read.
     """
     if queries is not None:
         if are_panoramas:
             raise InputError("--panoramas have no intrinsics: leave out --queries.")
         return Queries.find(query_images, queries, built, strict, rigs)
-    sizes = panorama_files.find(query_images, list_images(query_images), are_panoramas)
+    names = list_images(query_images)
+    sizes = panorama_files.find(query_images, names, are_panoramas)
     if sizes:
         if rigs is not None:
             raise InputError(panorama_files.NO_RIGS.format(rigs))
+        if strict:
+            check_readable(query_images, [name for name in names if name not in sizes])
+        # the views of unreadable ones are never written, so that their size does not matter
+        sizes = {name: sizes.get(name, panorama_files.SMALLEST) for name in names}
         return Queries.of_panoramas(query_images, sizes)
     if are_panoramas:
         raise InputError(panorama_files.NONE.format(query_images))

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Self
 
 import pycolmap
@@ -192,6 +193,7 @@ class Run:
         poses: Path,
         files: Mapping[str, Path | None],
         frame: Frame = UNKNOWN,
+        unreadable: Mapping[str, str] = MappingProxyType({}),
     ) -> dict:
         """Write queries.csv and summary.json.
 
@@ -207,6 +209,7 @@ class Run:
                 `matches` of the queries; `map_features`; `map`, a COLMAP model or the h5 file of
                 `localize_inloc.lift_keypoints`; and `ground_truth`.
             frame: of the map.
+            unreadable: why panoramas, which have no features of their own, cannot be read.
 
         Returns:
             The summary.
@@ -214,7 +217,8 @@ class Run:
         outputs = self.folder.path
         rows = query_table(lists, records, truth, frame)
         localized = [row for row in rows if row["status"] == "localized"]
-        failed = {name: reason for name, reason in failures(features).items() if name in records}
+        known = {**failures(features), **unreadable}
+        failed = {name: reason for name, reason in known.items() if name in records}
         if failed:
             logger.warning(
                 "%d of %d queries are unreadable and not localized: %s. Run the same command again "

@@ -3,6 +3,7 @@
 import re
 import shutil
 from functools import partial
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -188,6 +189,15 @@ def test_more_keypoints_that_do_not_help_are_dropped(plane, tmp_path, monkeypatc
     assert [path.name for path in built.folder.glob("sfm*")] == ["sfm"]
 
 
+def sizes_of(pairs):
+    """Return the numbers of pairs, first and after each round of more; none follows one without."""
+    rounds = sorted(pairs.parent.glob(f"{pairs.stem}-*.txt"))
+    sizes = [len({*parsers.parse_pairs(path)}) for path in (pairs, *rounds)]
+    assert len(rounds) == 3 or sizes[-1] == sizes[-2]
+    assert all(one < another for one, another in pairwise(sizes[:-1]))
+    return sizes
+
+
 def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch, run):
     """One retrieved photo each leaves two parts; all are in the map in the end."""
     monkeypatch.setattr(maps.pairing, "MAX_EXHAUSTIVE", 4)
@@ -202,8 +212,7 @@ def test_more_pairs_where_the_graph_falls_apart(plane, tmp_path, monkeypatch, ru
     run(*build)
     built = maps.Map(outputs / "map")
     assert len(built.names()) == 5
-    lists = [outputs / f"map/pairs-db-1{end}.txt" for end in ("", "-1", "-2", "-3")]
-    sizes = [len(set(parsers.parse_pairs(path))) for path in lists]
+    sizes = sizes_of(outputs / "map/pairs-db-1.txt")
     assert sizes[0] == 3 < sizes[1] and sizes == sorted(sizes)
     written = state(outputs / "map")
     (outputs / "map/map.json").unlink()
@@ -240,7 +249,8 @@ def test_sequential_pairs(plane, tmp_path, monkeypatch, run, refused):
     assert len(built.names()) == 5
     pairs = {*parsers.parse_pairs(outputs / "map/pairs-db-sequential.txt")}
     assert pairs == {(f"{i}.png", f"{i + 1}.png") for i in range(4)}
-    assert {*parsers.parse_pairs(outputs / "map/pairs-db-sequential-3.txt")} > pairs
+    assert {*parsers.parse_pairs(outputs / "map/pairs-db-sequential-1.txt")} > pairs
+    assert sizes_of(outputs / "map/pairs-db-sequential.txt") == [4, 10, 10]
     written = state(outputs / "map")
     run(*build, *PAIRS)
     assert state(outputs / "map") == written

@@ -113,6 +113,15 @@ def test_settings_of_dog_reach_the_base_of_a_projection():
     assert features.confs["sift_sv64"]["model"]["base"]["keypoints"] == "adaptive"
 
 
+@pytest.mark.parametrize("feature", ["mini32", "xfeat_sv32", "edgepoint2_t32"])
+def test_features_of_networks_have_no_settings_of_dog(feature):
+    for keypoints in ("fast", "hloc"):
+        message = f"--keypoints {keypoints} is for DoG keypoints, and {feature} finds its own"
+        with pytest.raises(InputError, match=message):
+            features.get(feature, keypoints=keypoints)
+    assert features.get(feature, keypoints="adaptive") == features.get(feature)
+
+
 OF_PATCHES = [
     name
     for name in confs

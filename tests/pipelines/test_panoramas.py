@@ -79,7 +79,8 @@ def test_views_are_where_their_panorama_is(tmp_path):
     geotag(tmp_path / "untold.jpg", tmp_path / "a.jpg", place)
     cv2.imwrite(str(tmp_path / "b.png"), np.zeros((512, 1024, 3), np.uint8))
     sizes = dict.fromkeys(("a.jpg", "b.png"), (1024, 512))
-    views = panoramas.write_views(tmp_path, sizes, tmp_path / "views")
+    views = tmp_path / "views"
+    assert panoramas.write_views(tmp_path, sizes, views) == {}
     names = sorted(path.relative_to(views).as_posix() for path in views.rglob("*.jpg"))
     of_views = panoramas.of_views([*names, "photo.jpg"])
     assert of_views["a.jpg"] == "view000-326/a.jpg"
@@ -148,6 +149,54 @@ def test_panoramas_are_queries(panorama, run):
     assert distance < 0.02 and degrees < 0.3
 
 
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [("empty", "it is empty"), ("part", "it is not an image, or it is truncated")],
+)
+def test_a_panorama_that_cannot_be_read_does_not_stop_the_others(
+    kind, why, panorama, run, refused, caplog
+):
+    """It is a query that is not localized, also if its head, with its size, can be read."""
+    folder, _, outputs = panorama
+    path, whole = folder / "lobby/2.png", (folder / "lobby/1.png").read_bytes()
+    path.write_bytes(whole[:1000] if kind == "part" else b"")
+    given = "--map", outputs / "map", "--query_images", folder, "--outputs", outputs, "--panoramas"
+    assert f"Cannot read image {path}: " in refused(*given, "--strict")
+    caplog.clear()
+    results = outputs / "queries-panoramas"
+    for _ in range(2):  # the second time, only it is read again
+        run(*given)
+        summary, rows = outcome(results)
+        assert (summary["queries"], summary["queries_localized"]) == (2, 1)
+        assert summary["queries_unreadable"] == 1 and rows["lobby/1.png"]["status"] == "localized"
+        assert rows["lobby/2.png"]["status"] == "fallback"
+        assert rows["lobby/2.png"]["reason"] == f"Cannot read image {path}: {why}."
+        assert (
+            f"1 of 2 queries are unreadable and not localized: lobby/2.png ({why})" in caplog.text
+        )
+        caplog.clear()
+    of_views = read_records(results / f"views_{summary['poses']}_logs.jsonl")
+    assert pictures.matched(runs.Run(results), "lobby/2.png") is None
+    path.write_bytes(whole)
+    run(*given)
+    summary, rows = outcome(results)
+    assert summary["queries_localized"] == 2 and summary["queries_unreadable"] == 0
+    again = read_records(results / f"views_{summary['poses']}_logs.jsonl")
+    ours = [name for name in again if "lobby/1.png" in name]
+    assert ours and all(again[name] == of_views[name] for name in ours)
+
+
+def test_maps_are_not_built_without_panoramas_that_cannot_be_read(tmp_path, refused):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name in ("1.png", "2.png", "3.png"):
+        cv2.imwrite(str(folder / name), np.zeros((512, 1024), np.uint8))
+    (folder / "2.png").write_bytes(b"")
+    given = "--map_images", folder, "--panoramas", "--outputs", tmp_path / "new"
+    assert f"Cannot read image {folder / '2.png'}" in refused(*given)
+    assert not (tmp_path / "new/map-views").exists()
+
+
 def test_a_panorama_in_memory(panorama):
     folder, true, outputs = panorama
     localizer = Localizer(outputs / "map")
@@ -177,7 +226,7 @@ def test_what_is_no_panorama(panorama, place, tmp_path, refused):
     )
     cv2.imwrite(str(folder / "small.png"), np.zeros((480, 640), np.uint8))
     message = refused(*given, folder, "--panoramas")
-    assert "not twice as wide as high, or not readable: small.png" in message
+    assert "not twice as wide as high: small.png" in message
     assert not (outputs / "queries-panoramas").exists()
 
 

@@ -211,3 +211,32 @@ def test_rigs_of_the_map_or_the_queries(rig, plane, tmp_path, monkeypatch, refus
     for images, expected in ((plane / "images", None), (folder, path)):
         assert "stopped" in refused("--map_images", images, *given, "--rigs", path)
         assert options["rigs"] == expected
+
+
+def test_rigs_of_no_query_are_refused_before_the_map_is_built(rig, place, tmp_path, refused):
+    folder, rigs, _, _ = rig
+    _, images, _ = place
+    path, outputs = write(rigs, tmp_path), tmp_path / "new"
+    given = "--map_images", folder, "--rigs", path, "--outputs", outputs
+    message = refused(*given, "--query_images", images / "query")
+    assert f"no photo is of a camera of a rig in {images / 'query'}" in message
+    assert "without --query_images" in message and not outputs.exists()
+
+
+def test_the_camera_mode_of_photos_of_rigs(rig, tmp_path, monkeypatch, refused):
+    """Is that of other photos; without any, it is refused."""
+    folder, rigs, _, _ = rig
+    path, outputs = write(rigs, tmp_path), tmp_path / "new"
+    given = "--map_images", folder, "--rigs", path, "--outputs", outputs
+    message = refused(*given, "--camera_mode", "per_image")
+    assert "Leave out --camera_mode" in message and not outputs.exists()
+    shutil.copy(folder / "left/1.png", folder / "alone.png")
+    modes = []
+
+    def stop(*_, camera_mode, **given):
+        modes.append(camera_mode)
+        raise InputError("stopped")
+
+    monkeypatch.setattr(localize.maps, "main", stop)
+    assert "stopped" in refused(*given, "--camera_mode", "per_image")
+    assert modes == [pycolmap.CameraMode.PER_IMAGE]

@@ -68,6 +68,52 @@ def test_reconstruction_from_matches_alone(scene, matched, tmp_path):
         reconstruction.main(tmp_path / "no", *arguments, **shared)
 
 
+@pytest.mark.parametrize(
+    ("very_few", "mode", "expected"),
+    [
+        (5, pycolmap.CameraMode.SINGLE, (1.2, 1.2, True)),
+        (5, pycolmap.CameraMode.PER_IMAGE, (1.1, 1.1, False)),
+        (6, pycolmap.CameraMode.SINGLE, (1.1, 1.1, False)),
+    ],
+)
+def test_many_images_of_one_camera_are_adjusted_less_often(
+    very_few, mode, expected, scene, matched, tmp_path, monkeypatch
+):
+    """And by fewer points; of others, COLMAP's options stay. The poses are right."""
+    monkeypatch.setattr(mapper, "VERY_FEW", very_few)
+    names, pairs, matches = matched
+    mapping, tried = colmap.incremental_mapping, []
+
+    def second(database, image_dir, output, options, verbose):
+        rare = options.ba_global_frames_ratio, options.ba_global_points_ratio
+        fewer = options.mapper.ba_global_ignore_redundant_points3D
+        tried.append((*rare, fewer, options.mapper.abs_pose_min_num_inliers))
+        is_second = len(tried) == 2
+        return mapping(database, image_dir, output, options, verbose) if is_second else []
+
+    adjusted, adjust = [], mapper.adjust
+    monkeypatch.setattr(colmap, "incremental_mapping", second)
+    monkeypatch.setattr(mapper, "adjust", lambda *given: adjusted.append(adjust(*given)))
+    arguments = (scene.images, pairs, scene.features, matches, mode)
+    model = reconstruction.main(tmp_path / "sfm", *arguments, image_list=names)
+    assert tried == [(*expected, 30), (*expected, 15)]
+    assert len(adjusted) == expected[2]  # in the end once by all points
+    assert model.num_reg_images() == 6 and model.num_points3D() == 300
+    centres = [image.projection_center() for image in model.images.values()]
+    true = [scene.poses[image.name].inverse().translation for image in model.images.values()]
+    errors = np.linalg.norm(similarity(np.array(centres), np.array(true)), axis=1)
+    assert errors.max() < 0.01
+
+
+def test_options_that_are_given_count():
+    """Beside those of rare adjustments."""
+    given = {"ba_global_frames_ratio": 1.3, "mapper": mapper.RELAXED}
+    found = colmap.mapper_options(mapper.with_rare_adjustments(given))
+    assert (found.ba_global_frames_ratio, found.ba_global_points_ratio) == (1.3, 1.2)
+    assert found.mapper.ba_global_ignore_redundant_points3D
+    assert found.mapper.abs_pose_min_num_inliers == 15
+
+
 @pytest.mark.fault(6)
 @pytest.mark.parametrize(("narrow", "number"), [(True, 6), (False, 0)])
 def test_photos_of_a_narrow_view_are_tried_without_distortion(
