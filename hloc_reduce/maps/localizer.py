@@ -277,7 +277,8 @@ class Localizer:
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Localize photos that cameras which are fixed to each other took at one moment.
 
-        Photos are matched one by one, and the matches of all give one pose.
+        Photos are matched one by one, and the matches of all give one pose. If it is not trusted,
+        they are matched with the map images about it, too.
 
         Args:
             images: of each camera the file, or the pixels (H, W) or (H, W, 3) RGB, uint8; upright.
@@ -364,6 +365,9 @@ class Localizer:
     ) -> tuple[rig_pose.RigPose, list[dict]]:
         """Localize a rig by one matcher, and return the pose and the info of each camera.
 
+        A camera in the dark may retrieve other places. So if the pose is not trusted, each photo is
+        matched with the map images about it, too, and the pose by all these matches is judged.
+
         Args:
             photos: of each camera the features, and the map images that are most similar.
             rig: of each camera its name, intrinsics and pose in the rig.
@@ -371,18 +375,42 @@ class Localizer:
             laps: times the stages.
         """
         match, gate = step
+        matches = [match(features, retrieved) for features, retrieved in photos]
+        laps.end("matching")
+        found = self._estimate_rig(photos, matches, rig, gate)
+        laps.end("pose")
+        likely = found[0].rig_from_world
+        if found[0].refusal is None or likely is None or self.is_far(likely):
+            return found
+        more: list[dict[str, np.ndarray]] = []
+        for photo, known, (_, camera, cam_from_rig) in zip(photos, matches, rig, strict=True):
+            near = self._surroundings.guess(cam_from_rig * likely, None, camera).images
+            others = [name for name in near if name not in known]
+            more.append({**known, **match(photo[0], others)} if others else known)
+        laps.end("matching")
+        if list(map(len, more)) == list(map(len, matches)):
+            return found
+        again = self._estimate_rig(photos, more, rig, gate)
+        laps.end("pose")
+        return again if again[0].refusal is None else found
+
+    def _estimate_rig(
+        self,
+        photos: list[tuple[dict, list[str]]],
+        matches: list[dict[str, np.ndarray]],
+        rig: list[tuple],
+        gate: Gate,
+    ) -> tuple[rig_pose.RigPose, list[dict]]:
+        """Estimate the pose of a rig from the matches of each camera, see `_try_rig`."""
         sights, infos = [], []
-        for (features, retrieved), (name, camera, pose) in zip(photos, rig, strict=True):
-            matches, keypoints = match(features, retrieved), to_colmap(features["keypoints"])
-            config = ransac_options(self.ransac_thresh, camera)
-            given = matches, config, gate, name, camera, pose
+        for (features, _), found, (name, camera, pose) in zip(photos, matches, rig, strict=True):
+            keypoints = to_colmap(features["keypoints"])
+            given = found, ransac_options(self.ransac_thresh, camera), gate, name, camera, pose
             sight, info = rig_pose.sight(self.reference, keypoints, *given)
             sights.append(sight)
             del info["keypoints"]
-            infos.append(info | {"points2D": sight.points2D, "retrieved": retrieved})
-        laps.end("matching")
+            infos.append(info | {"points2D": sight.points2D, "retrieved": list(found)})
         pose = rig_pose.estimate(sights, gate)
-        laps.end("pose")
         for info, inliers in zip(infos, pose.inliers, strict=True):
             info |= {"inliers": inliers, "num_inliers": int(inliers.sum())}
         return pose, infos
