@@ -10,6 +10,7 @@ import pycolmap
 
 from ..localization import gate as gates
 from ..localization import intrinsics, mirrored, panoramas, query, rig_pose, stage, views
+from ..localization.absolute_pose import CERTAIN
 from ..localization.gate import DEFAULT_GATE, Gate
 from ..localization.near import Guess, Surroundings
 from ..localization.query import merged, ransac_options
@@ -277,7 +278,7 @@ class Localizer:
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Localize photos that cameras which are fixed to each other took at one moment.
 
-        Photos are matched one by one, and the matches of all give one pose. If it is not trusted,
+        Photos are matched one by one, and the matches of all give one pose. Unless it is certain,
         they are matched with the map images about it, too.
 
         Args:
@@ -365,7 +366,7 @@ class Localizer:
     ) -> tuple[rig_pose.RigPose, list[dict]]:
         """Localize a rig by one matcher, and return the pose and the info of each camera.
 
-        A camera in the dark may retrieve other places. So if the pose is not trusted, each photo is
+        A camera in the dark may retrieve other places. So unless the pose is certain, each photo is
         matched with the map images about it, too, and the pose by all these matches is judged.
 
         Args:
@@ -379,8 +380,9 @@ class Localizer:
         laps.end("matching")
         found = self._estimate_rig(photos, matches, rig, gate)
         laps.end("pose")
-        likely = found[0].rig_from_world
-        if found[0].refusal is None or likely is None or self.is_far(likely):
+        pose, likely = found[0], found[0].rig_from_world
+        is_certain = pose.refusal is None and pose.measures.confidence >= CERTAIN
+        if is_certain or likely is None or self.is_far(likely):
             return found
         more: list[dict[str, np.ndarray]] = []
         for photo, known, (_, camera, cam_from_rig) in zip(photos, matches, rig, strict=True):
@@ -390,9 +392,9 @@ class Localizer:
         laps.end("matching")
         if list(map(len, more)) == list(map(len, matches)):
             return found
-        again = self._estimate_rig(photos, more, rig, gate)
+        found = self._estimate_rig(photos, more, rig, gate)
         laps.end("pose")
-        return again if again[0].refusal is None else found
+        return found
 
     def _estimate_rig(
         self,
