@@ -1,9 +1,13 @@
 """Localize rigs: one to four cameras in the demo town at night, or the halves of dark photos.
 
-A rig stands where a query by night was taken; its cameras look ahead, to the left, back and to the
-right, and are 20 cm apart. Adds rows to results/rigs.csv, leaving out what has rows unless --again
-is given: the first one to four cameras, and the one of these that is localized with the most
-inliers by itself. Position errors are those of the rig.
+A rig stands where a query by night was taken, or would be in a larger town of the same seed; its
+cameras look ahead, to the left, back and to the right, and are 20 cm apart. Adds rows to
+results/rigs.csv, leaving out what has rows unless --again is given: the first one to four cameras,
+and the one of these that is localized with the most inliers by itself; each camera by itself; rigs
+whose last camera took its photo elsewhere in the town. Position errors are those of the rig;
+`wrong` counts those above 1 m.
+
+With --strangers, rigs are of successive photos of other places, and none may be localized.
 
 With --halves, each night photo of data sets in the layout of Aachen is cut into a left and a right
 half, as if two cameras had taken them. `apart_cm` is the largest distance between the pose of the
@@ -12,8 +16,13 @@ halves and that of the whole photo.
 
 import copy
 import os
+from collections import defaultdict
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
+from unittest import mock
 
 import numpy as np
 import pycolmap
@@ -23,17 +32,19 @@ from benchmarks import rows
 from hloc_reduce import Localizer, demo, maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets.aachen import Aachen
-from hloc_reduce.demo.cameras import NIGHT, WALK, Photo, list_photos
+from hloc_reduce.demo.cameras import NIGHT, Photo, list_photos
 from hloc_reduce.demo.photo import take
 from hloc_reduce.demo.town import build_town
 from hloc_reduce.evaluation.poses import FAILED, pose_error
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.files import replacing
-from hloc_reduce.utils.images import read_image
+from hloc_reduce.utils.images import list_images, read_image
 from hloc_reduce.utils.progress import progress
 
 NAME = "rigs"
-NUM_LOC, SEED = 10, 0
+NUM_LOC, SEED, FRAMES = 10, 0, 40
+WRONG = 1.0  # metres
+NOWHERE = float("inf"), 180.0  # the error of a rig that is not in the town
 OFFSET = 0.1  # metres from the centre of the rig to each camera
 
 
@@ -112,12 +123,109 @@ def measure_halves(root: Path, feature: str, storage: str, folder: Path) -> dict
     return measures
 
 
+class Found(NamedTuple):
+    """The pose of a rig, None if it is not localized, its inliers, and poses that are right."""
+
+    rig_from_world: pycolmap.Rigid3d | None
+    inliers: int
+    right: Sequence[pycolmap.Rigid3d]
+
+
+def measures_of(found: Sequence[Found]) -> dict[str, object]:
+    """Return the measures of poses, with errors to the nearest one that is right."""
+    errors = [
+        FAILED
+        if one.rig_from_world is None
+        else min(
+            (pose_error(one.rig_from_world, pose) for pose in one.right), default=(np.inf, 180.0)
+        )
+        for one in found
+    ]
+    localized = sum(error != FAILED for error in errors)
+    wrong = sum(error != FAILED and error[0] > WRONG for error in errors)
+    measures = rows.localization(errors, [one.inliers for one in found], localized)
+    return {**measures, "wrong": wrong}
+
+
+def localize_town(
+    localizer: Localizer, frames: Sequence[tuple[Photo, Sequence[Path]]], most: int
+) -> dict[str, list[Found]]:
+    """Return the poses of rigs of the town by variant.
+
+    Args:
+        localizer: a map of the town.
+        frames: the photo by which each rig stands, and those of its cameras.
+        most: number of cameras.
+    """
+    rig, found = cams_from_rig(most), defaultdict(list)
+    for i, (photo, paths) in enumerate(progress(frames, "Localizing", "frame")):
+        right, elsewhere = photo.cam_from_world, frames[(i + len(frames) // 2) % len(frames)]
+        alone = []
+        for path, cam_from_rig in zip(paths, rig, strict=True):
+            pose, info = localizer.localize(path, photo.camera)
+            inliers = 0 if pose is None else info["num_inliers"]
+            alone.append(Found(pose and cam_from_rig.inverse() * pose, inliers, [right]))
+        found["alone"] += alone
+        for number in range(1, most + 1):
+            cameras = [photo.camera] * number
+            pose, info = localizer.localize_rig(paths[:number], cameras, rig[:number])
+            inliers = info["num_inliers"] if pose else 0
+            found[f"{number} cameras"].append(Found(pose, inliers, [right]))
+            best = max(alone[:number], key=lambda one: one.inliers)
+            found[f"best of {number}"].append(best)
+            if number == 1:
+                continue
+            mixed = [*paths[: number - 1], elsewhere[1][number - 1]]
+            cameras[-1] = elsewhere[0].camera
+            pose, info = localizer.localize_rig(mixed, cameras, rig[:number])
+            inliers = info["num_inliers"] if pose else 0
+            both = [right, elsewhere[0].cam_from_world]
+            found[f"{number} cameras, one elsewhere"].append(Found(pose, inliers, both))
+    return found
+
+
+def localize_strangers(
+    localizer: Localizer, folders: Sequence[Path], most: int
+) -> dict[str, list[Found]]:
+    """Return the poses of rigs of two and of the most cameras whose photos are of other places."""
+    rig, found = cams_from_rig(most), defaultdict(list)
+    for folder in folders:
+        paths = [folder / name for name in list_images(folder)]
+        cameras = []
+        for path in paths:
+            height, width = read_image(path).shape[:2]
+            params = [max(width, height), width / 2, height / 2]
+            size = {"width": width, "height": height}
+            cameras.append(pycolmap.Camera(model="SIMPLE_PINHOLE", params=params, **size))
+        for number in sorted({2, most}):
+            for i in progress(range(len(paths) - number + 1), f"Localizing {folder}", "rig"):
+                part = slice(i, i + number)
+                pose, info = localizer.localize_rig(paths[part], cameras[part], rig[:number])
+                inliers = info["num_inliers"] if pose else 0
+                found[f"{number} cameras, strangers"].append(Found(pose, inliers, []))
+    return found
+
+
+def remember(localizer: Localizer) -> AbstractContextManager:
+    """In a block, let a localizer extract the features of a file once."""
+    extract, known = localizer.engine.extract, {}
+
+    def once(image: Path, shown: dict, mask: None = None) -> dict:
+        key = image, str(shown)
+        if key not in known:
+            known[key] = extract(image, shown, mask)
+        return known[key]
+
+    return mock.patch.object(localizer.engine, "extract", once)
+
+
 def _main() -> None:
     parser = cli.Parser(__doc__, "--feature colmap_sift_sv64 mini32:uint2")
     add = parser.add_argument
     add("--feature", nargs="+", default=["colmap_sift_sv64"], help="with the map's storage")
     add("--dataset", type=Path, default=Path("datasets/demo_town"), help="the demo town")
     add("--cameras", type=int, default=4, choices=(2, 3, 4), help="most of a rig")
+    add("--strangers", nargs="+", type=Path, help="instead photos of other places, in folders")
     add("--halves", nargs="+", type=Path, help="cut dark photos of these data sets instead")
     add("--outputs", type=Path, default=Path("outputs/rigs"))
     rows.add_again_option(parser)
@@ -136,46 +244,29 @@ def _main() -> None:
     if args.halves:
         return
     place = Aachen(demo.main(args.dataset, SEED))
-    photos = [photo for photo in list_photos(SEED, len(WALK)) if photo.kind == NIGHT]
-    seen = [photos_of(one, args.cameras, args.outputs / "photos") for one in progress(photos)]
-    rig = cams_from_rig(args.cameras)
+    # a town of eight times as many photos has as many queries by night
+    photos = [photo for photo in list_photos(SEED, 8 * FRAMES) if photo.kind == NIGHT]
+    folder = args.outputs / "photos"
+    frames = [(one, photos_of(one, args.cameras, folder)) for one in progress(photos)]
     for given in args.feature:
         feature, _, storage = given.partition(":")
         storage = storage or "float16"
         cells = {"place": place.root.name, "list": "night", "feature": feature, "storage": storage}
         cells["matcher"] = features_confs.matcher_of(features_confs.get(feature)[1])
-        if rows.select(known, **cells):
+        last = f"{args.cameras} cameras, strangers" if args.strangers else "alone"
+        if rows.select(known, variant=last, **cells):
             continue
         folder = args.outputs / f"{feature}-{storage}"
         options = {"feature": feature, "storage": storage}
         built = maps.main(folder, place.images, place.reference_model, **options)
         localizer = Localizer(built.folder, num_loc=NUM_LOC)
-        found: dict[str, list] = {}
-        for photo, paths in zip(photos, seen, strict=True):
-            alone = [localizer.localize(path, photo.camera) for path in paths]
-            for number in range(1, args.cameras + 1):
-                cameras = [photo.camera] * number
-                pose, info = localizer.localize_rig(paths[:number], cameras, rig[:number])
-                result = pose, info["num_inliers"]
-                found.setdefault(f"{number} cameras", []).append((photo, *result))
-                best = max(range(number), key=lambda i: _inliers(alone[i]))
-                pose = alone[best][0] and rig[best].inverse() * alone[best][0]
-                result = pose, _inliers(alone[best])
-                found.setdefault(f"best of {number}", []).append((photo, *result))
-        for variant, results in found.items():
-            errors = [
-                FAILED if pose is None else pose_error(pose, photo.cam_from_world)
-                for photo, pose, _ in results
-            ]
-            localized = sum(error != FAILED for error in errors)
-            inliers = [number for _, _, number in results]
-            measures = rows.localization(errors, inliers, localized) | rows.how(cores=1)
-            rows.add(NAME, [cells | {"variant": variant} | measures])
-
-
-def _inliers(found: tuple[pycolmap.Rigid3d | None, dict]) -> int:
-    """Return the number of inliers of a photo, 0 if it is not localized."""
-    return 0 if found[0] is None else found[1]["num_inliers"]
+        with remember(localizer):
+            if args.strangers:
+                found = localize_strangers(localizer, args.strangers, args.cameras)
+            else:
+                found = localize_town(localizer, frames, args.cameras)
+        for variant, poses in found.items():
+            rows.add(NAME, [cells | {"variant": variant} | measures_of(poses) | rows.how(cores=1)])
 
 
 if __name__ == "__main__":

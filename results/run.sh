@@ -89,6 +89,8 @@ run metres --map "$(scene fountain-P11)" --map "$(scene entry-P10)" --map $herz_
 run tracking --feature colmap_sift_sv32:uint4 mini32:uint2 --strangers $data/strangers "$@"
 run rigs --feature colmap_sift_sv64 mini32:uint2 "$@"
 run rigs --feature colmap_sift_sv64 mini32:uint2 "$@" \
+    --strangers $data/scenes/fountain-P11/images $data/scenes/sceaux/images
+run rigs --feature colmap_sift_sv64 mini32:uint2 "$@" \
     --halves $data/herz-jesus $data/dark-fountain-P11 $data/dark-sceaux
 run panoramas --feature colmap_sift_sv64 "$@"
 mappers= # of photos alone

@@ -235,17 +235,29 @@ def _sampled(sights: Sequence[Sight], chosen: Sequence[np.ndarray]) -> list[pyco
     return [] if found is None else [found]
 
 
-def _inliers(sights: Sequence[Sight], rig_from_world: pycolmap.Rigid3d) -> list[np.ndarray]:
+def _inliers(
+    sights: Sequence[Sight], rig_from_world: pycolmap.Rigid3d, share: float = 1.0
+) -> list[np.ndarray]:
     found = []
     for one in sights:
         errors, _ = reprojection_errors(*one.seen(rig_from_world)[:4])
-        found.append(errors <= one.max_error)
+        found.append(errors <= share * one.max_error)
     return found
 
 
-def _refined(sights: Sequence[Sight], start: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
-    """Refine a pose by the matches of all cameras that agree with it, as long as more do."""
-    pose, inliers = start, _inliers(sights, start)
+def _refined(
+    sights: Sequence[Sight], start: pycolmap.Rigid3d, share: float = 1.0
+) -> pycolmap.Rigid3d:
+    """Refine a pose by the matches of all cameras that agree with it, as long as more do.
+
+    It is refined once even if fewer do then: that of a sample has not the least errors.
+
+    Args:
+        sights: what each camera sees.
+        start: the pose.
+        share: of the inlier thresholds, within which matches agree.
+    """
+    pose, inliers = start, _inliers(sights, start, share)
     everything = [np.ones(len(one.points2D), bool) for one in sights]
     points2D, points3D, cameras = _together(sights, everything)
     for _ in range(absolute_pose.REESTIMATIONS):
@@ -255,9 +267,9 @@ def _refined(sights: Sequence[Sight], start: pycolmap.Rigid3d) -> pycolmap.Rigid
         refined = colmap.refine_rig_pose(pose, points2D, points3D, mask, *cameras)
         if refined is None:
             break
-        agreeing = _inliers(sights, refined)
+        agreeing = _inliers(sights, refined, share)
         more = sum(map(np.sum, agreeing)) - mask.sum()
-        if more < 0:
+        if more < 0 and pose is not start:
             break
         pose, inliers = refined, agreeing
         if more == 0:

@@ -10,6 +10,7 @@ import pycolmap
 
 from ..localization import gate as gates
 from ..localization import intrinsics, mirrored, panoramas, query, rig_pose, stage, views
+from ..localization.absolute_pose import CERTAIN
 from ..localization.gate import DEFAULT_GATE, Gate
 from ..localization.near import Guess, Surroundings
 from ..localization.query import merged, ransac_options
@@ -277,7 +278,8 @@ class Localizer:
     ) -> tuple[pycolmap.Rigid3d | None, dict]:
         """Localize photos that cameras which are fixed to each other took at one moment.
 
-        Photos are matched one by one, and the matches of all give one pose.
+        Photos are matched one by one, and the matches of all give one pose. Unless it is certain,
+        they are matched with the map images about it, too.
 
         Args:
             images: of each camera the file, or the pixels (H, W) or (H, W, 3) RGB, uint8; upright.
@@ -364,6 +366,9 @@ class Localizer:
     ) -> tuple[rig_pose.RigPose, list[dict]]:
         """Localize a rig by one matcher, and return the pose and the info of each camera.
 
+        A camera in the dark may retrieve other places. So unless the pose is certain, each photo is
+        matched with the map images about it, too, and the pose by all these matches is judged.
+
         Args:
             photos: of each camera the features, and the map images that are most similar.
             rig: of each camera its name, intrinsics and pose in the rig.
@@ -371,18 +376,43 @@ class Localizer:
             laps: times the stages.
         """
         match, gate = step
+        matches = [match(features, retrieved) for features, retrieved in photos]
+        laps.end("matching")
+        found = self._estimate_rig(photos, matches, rig, gate)
+        laps.end("pose")
+        pose, likely = found[0], found[0].rig_from_world
+        is_certain = pose.refusal is None and pose.measures.confidence >= CERTAIN
+        if is_certain or likely is None or self.is_far(likely):
+            return found
+        more: list[dict[str, np.ndarray]] = []
+        for photo, known, (_, camera, cam_from_rig) in zip(photos, matches, rig, strict=True):
+            near = self._surroundings.guess(cam_from_rig * likely, None, camera).images
+            others = [name for name in near if name not in known]
+            more.append({**known, **match(photo[0], others)} if others else known)
+        laps.end("matching")
+        if list(map(len, more)) == list(map(len, matches)):
+            return found
+        found = self._estimate_rig(photos, more, rig, gate)
+        laps.end("pose")
+        return found
+
+    def _estimate_rig(
+        self,
+        photos: list[tuple[dict, list[str]]],
+        matches: list[dict[str, np.ndarray]],
+        rig: list[tuple],
+        gate: Gate,
+    ) -> tuple[rig_pose.RigPose, list[dict]]:
+        """Estimate the pose of a rig from the matches of each camera, see `_try_rig`."""
         sights, infos = [], []
-        for (features, retrieved), (name, camera, pose) in zip(photos, rig, strict=True):
-            matches, keypoints = match(features, retrieved), to_colmap(features["keypoints"])
-            config = ransac_options(self.ransac_thresh, camera)
-            given = matches, config, gate, name, camera, pose
+        for (features, _), found, (name, camera, pose) in zip(photos, matches, rig, strict=True):
+            keypoints = to_colmap(features["keypoints"])
+            given = found, ransac_options(self.ransac_thresh, camera), gate, name, camera, pose
             sight, info = rig_pose.sight(self.reference, keypoints, *given)
             sights.append(sight)
             del info["keypoints"]
-            infos.append(info | {"points2D": sight.points2D, "retrieved": retrieved})
-        laps.end("matching")
+            infos.append(info | {"points2D": sight.points2D, "retrieved": list(found)})
         pose = rig_pose.estimate(sights, gate)
-        laps.end("pose")
         for info, inliers in zip(infos, pose.inliers, strict=True):
             info |= {"inliers": inliers, "num_inliers": int(inliers.sum())}
         return pose, infos

@@ -9,6 +9,8 @@ import pytest
 
 from hloc_reduce import Localizer, compact
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.localization.gate import Gate
+from hloc_reduce.maps import localizer
 from hloc_reduce.utils.cli import InputError
 
 
@@ -51,6 +53,26 @@ def test_a_rig_is_localized_by_all_its_cameras(is_compact, rig, tmp_path):
         projected = camera.img_from_cam(local + (cam_from_rig * pose).translation)
         errors = np.linalg.norm(projected - one["points2D"], axis=1)
         assert errors[one["inliers"]].max() <= 12
+
+
+@pytest.mark.parametrize("is_trusted", [False, True])
+def test_an_uncertain_rig_is_matched_with_the_images_about_it(is_trusted, rig, monkeypatch):
+    """Each camera retrieves one image."""
+    path, photos, cameras, cams_from_rig, true = rig
+    _, info = Localizer(path, num_loc=1).localize_rig(photos, cameras, cams_from_rig)
+    assert [len(one["retrieved"]) for one in info["cameras"]] == [1, 1]  # it is certain
+    number = info["num_inliers"]
+    gate = Gate(min_inliers=8 if is_trusted else number + 1)
+    monkeypatch.setattr(localizer, "CERTAIN", np.inf if is_trusted else 0.0)
+    given = photos, cameras, cams_from_rig
+    pose, more = Localizer(path, num_loc=1, gate=gate).localize_rig(*given)
+    assert more["reason"] is None and more["num_inliers"] > number
+    assert pose_error(pose, true)[0] < 0.02
+    for one, before in zip(more["cameras"], info["cameras"], strict=True):
+        assert one["retrieved"][0] == before["retrieved"][0] and len(one["retrieved"]) > 1
+        assert len(set(one["retrieved"])) == len(one["retrieved"])
+    pose, info = Localizer(path, num_loc=1, gate=Gate(min_inliers=10**6)).localize_rig(*given)
+    assert pose is None and info["reason"].startswith("too few inliers")
 
 
 def test_a_camera_that_was_moved_is_named(rig):
