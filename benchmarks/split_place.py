@@ -3,8 +3,8 @@
 Every third photo becomes a query, and the others stay in the map; with --map_every, only every
 N-th photo stays, for a map with long baselines. With --gain, each query is multiplied by a gain,
 blurred, made noisy and rounded to 8 bits again, with parameters that are drawn from a seed, and is
-listed by night. `pipelines.aachen --dataset` runs on it. With --sequence, the photos are the frames of
-an RGB-D sequence, and the model has their poses only.
+listed by night. `pipelines.aachen --dataset` runs on it. With --sequence, the photos are the frames
+of an RGB-D sequence, and the model has their poses only.
 """
 
 import shutil
