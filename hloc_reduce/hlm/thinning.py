@@ -34,11 +34,13 @@ def thinned(points: Points, number: int) -> Points:
             largest[others] = np.maximum(share, largest[others])
             chosen.append(best)
             gains[best] = -1
-    names, visible, keypoints = (
-        [part[i] for i in sorted(chosen)]
-        for part in (points.names, points.visible, points.keypoints)
+    kept = sorted(chosen)
+    return replace(
+        points,
+        names=[points.names[i] for i in kept],
+        visible=[points.visible[i] for i in kept],
+        keypoints=[points.keypoints[i] for i in kept],
     )
-    return replace(points, names=names, visible=visible, keypoints=keypoints)
 
 
 def _shares(points: Points):  # type: ignore[no-untyped-def]
