@@ -105,7 +105,12 @@ MAPS: list[Choice] = [
     ("xfeat_sv32", "uint2"),
     ("mini32", "uint2"),
 ]
-MAP_SIZES = (0.06, 0.015)
+MAP_SIZES = (0.015, 0.0075)
+# whose bytes are listed by part: place, and size in MB
+MAP_PARTS = [("herz-jesus", "0.0075"), ("herz-jesus", "0.015"), ("herz-jesus", "0.03")]
+MAP_PARTS += [("demo_town-400", size) for size in ("0.083", "0.125", "0.25", "0.5")]
+PARTS = {part: (part,) for part in ("descriptors", "coordinates", "visible", "retrieval", "header")}
+PARTS |= {"images": ("poses", "names")}
 # of LightGlue: features, and the numbers of keypoints that are matched
 LIGHTGLUE: list[tuple[str, str, int]] = [
     ("xfeat", "float16", 1024),
@@ -279,6 +284,22 @@ def maps_table() -> Table:
                 cells.append(f"{float(row['median_cm']):.2f} / {float(row['largest_cm']):.1f}")
                 cells.append(thousands(row["inliers"]))
             table.append(cells)
+    return table
+
+
+def map_parts_table() -> Table:
+    """List the bytes of the parts of small maps, and what they localize."""
+    table = [["place", "KB", "images", "points", *PARTS, "day", "night"]]
+    for place, size in MAP_PARTS:
+        rows = select(read("maps"), place=place, feature=MAPS[0][0], variant=f"at most {size} MB")
+        if not rows:
+            continue
+        day, night = (select(rows, list=part)[0] for part in ("day", "night"))
+        parts = [sum(int(day[f"{one}_bytes"] or 0) for one in names) for names in PARTS.values()]
+        found = [f"{row['within_25cm']} of {row['queries']}" for row in (day, night)]
+        sizes = f"{1000 * float(day['mb']):.1f}", f"{day['images']} of {day['photos']}"
+        cells = [place, *sizes, thousands(day["points"]), *map(thousands, map(str, parts)), *found]
+        table.append(cells)
     return table
 
 
@@ -706,6 +727,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "bytes": bytes_table,
     "schemes": schemes_table,
     "maps": maps_table,
+    "map_parts": map_parts_table,
     "false_accepts": false_accepts_table,
     "limits": limits_table,
     "map_limits": map_limits_table,
