@@ -145,8 +145,8 @@ def _main() -> None:
             else:
                 path = folder / "compact.hlm"
                 (limit, name), matcher = limits[cells["variant"]], args.matcher or None
-                given = matcher, cells["storage"], limit, rankings[name]
-                parts = compact.write(path, source, built.features, *given)
+                given = source, built.features, matcher, cells["storage"], limit
+                parts = compact.write(path, *given, rank=rankings[name])
                 size = path.stat().st_size
             localizer = Localizer(path)
             localizer.engine = Remembering(localizer.engine, described)
