@@ -105,7 +105,7 @@ def along(points: Points) -> np.ndarray:
     points have half the bytes that they have in the order of the images.
     """
     from scipy.sparse import csr_array
-    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+    from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 
     point = np.concatenate(points.visible)
     ends = np.cumsum([0, *map(len, points.visible)])
@@ -126,7 +126,7 @@ def along(points: Points) -> np.ndarray:
     begin = np.linspace(-1, 1, len(of_image))
     try:
         places = eigsh(matrix, 1, which="LA", v0=begin, tol=TOLERANCE, maxiter=MAX_ROUNDS)[1][:, 0]
-    except ArpackNoConvergence:
+    except ArpackError:  # no convergence, or images that all show the same
         return np.zeros(len(points))
     return (scale * places * np.sign(places @ begin)) @ shows / of_point
 

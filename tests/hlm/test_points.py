@@ -111,7 +111,7 @@ def test_points_of_an_image_are_close_together():
 
 
 def test_points_of_places_without_common_images_and_of_few_images():
-    for shown in ([[0, 2], [0, 2], [1, 3], [1, 3], []], [[0, 1, 2, 3]]):
+    for shown in ([[0, 2], [0, 2], [1, 3], [1, 3], []], [[0, 1, 2, 3]], 4 * [[0, 1, 2, 3]]):
         names = [f"{i}.jpg" for i in range(len(shown))]
         shown = [np.array(part, np.int64) for part in shown]
         xyz = np.arange(12.0).reshape(-1, 3)
