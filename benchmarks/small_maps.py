@@ -55,8 +55,17 @@ class Remembering:
         return dict(self._known[key])
 
 
-def measured(localizer: Localizer, place: Aachen, size: int) -> Iterator[dict[str, object]]:
-    """Yield the cells of each query list, localized in a map of `size` bytes."""
+def measured(
+    localizer: Localizer, place: Aachen, size: int, parts: dict[str, int]
+) -> Iterator[dict[str, object]]:
+    """Yield the cells of each query list, localized in a map of `size` bytes.
+
+    Args:
+        localizer: in the map.
+        place: whose queries these are.
+        size: bytes of the map.
+        parts: of a compact map, the bytes of each part.
+    """
     lists = place.query_lists()
     names = [name for part in lists.values() for name, _ in part]
     truth = true_poses(names, place.ground_truth, True)
@@ -72,6 +81,8 @@ def measured(localizer: Localizer, place: Aachen, size: int) -> Iterator[dict[st
             "photos": len(place.map_names()),
             "points": len(localizer.reference.points),
             "mb": size / MEGABYTE,
+            "images": len(localizer.names),
+            **{f"{part}_bytes": size for part, size in parts.items()},
             **rows.localization(errors, inliers, sum(error != FAILED for error in errors)),
             **rows.how(float(np.mean(seconds)), cores=1),
         }
@@ -126,6 +137,7 @@ def _main() -> None:
         built = maps.main(folder / "map", place.images, place.reference_model, feature)
         source = compact.of_map(built)
         for cells in todo:
+            parts: dict[str, int] = {}
             if cells["variant"] == WHOLE:
                 path = built.folder
                 files = [built.features, built.descriptors, *built.sfm.glob("*.bin")]
@@ -133,12 +145,12 @@ def _main() -> None:
             else:
                 path = folder / "compact.hlm"
                 (limit, name), matcher = limits[cells["variant"]], args.matcher or None
-                given = matcher, cells["storage"], limit, rankings[name]
-                compact.write(path, source, built.features, *given)
+                given = source, built.features, matcher, cells["storage"], limit
+                parts = compact.write(path, *given, rank=rankings[name])
                 size = path.stat().st_size
             localizer = Localizer(path)
             localizer.engine = Remembering(localizer.engine, described)
-            found = measured(localizer, place, size)
+            found = measured(localizer, place, size, parts)
             rows.add(NAME, [cells | each for each in found])
 
 

@@ -3,15 +3,18 @@
 Every third photo becomes a query, and the others stay in the map; with --map_every, only every
 N-th photo stays, for a map with long baselines. With --gain, each query is multiplied by a gain,
 blurred, made noisy and rounded to 8 bits again, with parameters that are drawn from a seed, and is
-listed by night. `pipelines.aachen --dataset` runs on it.
+listed by night. `pipelines.aachen --dataset` runs on it. With --sequence, the photos are the frames
+of an RGB-D sequence, and the model has their poses only.
 """
 
 import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 
+from benchmarks import video
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.training.tracks import parse_maps
 from hloc_reduce.utils import cli, colmap
@@ -95,7 +98,8 @@ def main(
 def _main() -> None:
     parser = cli.Parser(__doc__, "--map sceaux/images:sceaux/sparse --output datasets/sparse")
     add = parser.add_argument
-    add("--map", required=True, metavar="IMAGES:MODEL")
+    add("--map", metavar="IMAGES:MODEL")
+    add("--sequence", type=Path, help="folder of an RGB-D sequence, instead of --map")
     add("--gain", type=float, nargs=2, metavar=("LEAST", "MOST"), help="darken the queries by this")
     add("--map_every", type=int, metavar="N", help="keep every N-th photo in the map, at least 2")
     add("--output", type=Path, required=True, help="new folder of the data set")
@@ -104,8 +108,18 @@ def _main() -> None:
         raise InputError("--gain: give two numbers above 0, the smaller first.")
     if args.map_every is not None and args.map_every < 2:
         raise InputError("--map_every: at least 2.")
-    [(images, model)] = parse_maps([args.map]).values()
-    main(images, model, args.output, args.gain and tuple(args.gain), args.map_every)
+    if (args.map is None) == (args.sequence is None):
+        raise InputError("Give --map or --sequence.")
+    rest = args.output, args.gain and tuple(args.gain), args.map_every
+    if args.map:
+        [(images, model)] = parse_maps([args.map]).values()
+        main(images, model, *rest)
+        return
+    with TemporaryDirectory() as folder:
+        images, model = Path(folder) / "images", Path(folder) / "model"
+        model.mkdir()
+        video.sequence(args.sequence, 0, images).write(model)
+        main(images, model, *rest)
 
 
 if __name__ == "__main__":

@@ -101,8 +101,17 @@ FAMILIES: dict[str, list[Choice]] = {
     },
 }
 SIZES = (256, 128, 64, 32, 16, 8)
-MAPS: list[Choice] = [("colmap_sift_sv32", "uint4"), ("mini32", "uint2")]
-MAP_SIZES = (0.015,)
+MAPS: list[Choice] = [
+    ("colmap_sift_sv32", "uint4"),
+    ("xfeat_sv32", "uint2"),
+    ("mini32", "uint2"),
+]
+MAP_SIZES = (0.015, 0.0075)
+# whose bytes are listed by part: place, and size in MB
+MAP_PARTS = [("herz-jesus", "0.0075"), ("herz-jesus", "0.03")]
+MAP_PARTS += [("demo_town-400", "0.083"), ("demo_town-400", "0.25")]
+PARTS = {part: (part,) for part in ("descriptors", "coordinates", "visible", "retrieval", "header")}
+PARTS |= {"images": ("poses", "names")}
 # of LightGlue: features, and the numbers of keypoints that are matched
 LIGHTGLUE: list[tuple[str, str, int]] = [
     ("xfeat", "float16", 1024),
@@ -261,7 +270,7 @@ def schemes_table() -> Table:
 def maps_table() -> Table:
     """Compare compact maps with the whole map of each feature."""
     table = [["feature", "map", "KB", "points", "day", "cm", "inliers", "night", "cm", "inliers"]]
-    for feature, storage in MAPS:
+    for feature, storage in (MAPS[0], MAPS[-1]):
         rows = select(read("maps"), place="herz-jesus", feature=feature, matcher="")
         for variant in ("whole map", "all points", *(f"at most {size} MB" for size in MAP_SIZES)):
             found = select(rows, variant=variant)
@@ -295,6 +304,20 @@ def small_maps_table() -> Table:
     [row] = select(rows, storage=storage, variant="all points")
     cells = ["the file", row["photos"], f"{float(row['mb']):.2f}"]
     table.append(["ours, Herz-Jesus", *cells, f"{row['within_25cm']} of {row['queries']}"])
+    return table
+
+
+def map_parts_table() -> Table:
+    """List the bytes of the parts of small maps, and what they localize."""
+    table = [["place", "KB", "images", "points", *PARTS, "day", "night"]]
+    for place, size in MAP_PARTS:
+        rows = select(read("maps"), place=place, feature=MAPS[0][0], variant=f"at most {size} MB")
+        day, night = (select(rows, list=part)[0] for part in ("day", "night"))
+        parts = [sum(int(day[f"{one}_bytes"] or 0) for one in names) for names in PARTS.values()]
+        found = [f"{row['within_25cm']} of {row['queries']}" for row in (day, night)]
+        sizes = f"{1000 * float(day['mb']):.1f}", f"{day['images']} of {day['photos']}"
+        cells = [place, *sizes, thousands(day["points"]), *map(thousands, map(str, parts)), *found]
+        table.append(cells)
     return table
 
 
@@ -723,6 +746,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "schemes": schemes_table,
     "maps": maps_table,
     "small_maps": small_maps_table,
+    "map_parts": map_parts_table,
     "false_accepts": false_accepts_table,
     "limits": limits_table,
     "map_limits": map_limits_table,

@@ -146,7 +146,7 @@ def _run_sizes(
         finished.append(compact_map.folder(outputs, bool(options), options.get("max_mb")))
         whole = whole or summary
         if options and summary["map_points3D"] == whole["map_points3D"]:
-            logger.info("%s: all points fit, so that larger files would be the same.", label)
+            logger.info("%s: all points fit.", label)
             break
     return finished
 

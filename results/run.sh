@@ -31,6 +31,8 @@ for place in fountain-P11 south-building; do
 done
 herz_jesus=$data/herz-jesus/images_upright:$data/herz-jesus/3D-models/aachen_v_1_1
 split sparse herz-jesus $herz_jesus --map_every 4
+[ -e $data/sparse-redkitchen ] || run split_place --sequence $data/7-scenes-redkitchen --map_every 3 \
+    --output $data/sparse-redkitchen
 
 # which feature? how many bytes?
 run accuracy results/accuracy.yaml "$@"
@@ -72,18 +74,21 @@ small_maps() { # PLACE, FEATURE, STORAGE and sizes
     shift 3
     run small_maps --dataset $data/$place --feature $feature --storage $storage --max_mb "$@"
 }
-small_maps herz-jesus colmap_sift_sv32 uint4 0.015 0.02 0.03 0.06 0.1 "$@"
-small_maps herz-jesus xfeat_sv32 uint2 0.015 0.02 0.03 0.06 0.1 "$@"
-small_maps herz-jesus mini32 uint2 0.015 0.02 0.03 0.06 0.1 "$@"
+small_maps herz-jesus colmap_sift_sv32 uint4 0.006 0.0075 0.01 0.015 0.02 0.03 0.06 0.1 "$@"
+small_maps herz-jesus xfeat_sv32 uint2 0.006 0.0075 0.01 0.015 0.02 0.03 0.06 0.1 "$@"
+small_maps herz-jesus mini32 uint2 0.006 0.0075 0.01 0.015 0.02 0.03 0.06 0.1 "$@"
 for feature in mini32 xfeat_sv32; do # LightGlue finds fewer points than nearest neighbours of more keypoints
-    small_maps herz-jesus $feature uint2 0.1 --matcher lightglue "$@"
+    small_maps herz-jesus $feature uint2 0.0075 0.03 0.1 --matcher lightglue "$@"
 done
-small_maps demo_town-400 colmap_sift_sv32 uint4 0.1 0.12 0.17 0.25 0.5 1 "$@"
+small_maps demo_town-400 colmap_sift_sv32 uint4 0.083 0.1 0.125 0.17 0.25 0.5 1 "$@"
+small_maps day-south-building colmap_sift_sv32 uint4 0.006 0.0075 0.01 0.0175 0.02 0.025 "$@"
+small_maps sparse-redkitchen colmap_sift_sv32 uint4 0.006 0.0075 0.01 0.015 0.03 "$@"
 others="cover triplets longest random" # which points?
-small_maps herz-jesus colmap_sift_sv32 uint4 0.015 0.02 0.03 0.06 0.1 --selection $others "$@"
-small_maps herz-jesus mini32 uint2 0.015 0.02 0.03 0.06 0.1 --selection $others "$@"
-small_maps day-south-building colmap_sift_sv32 uint4 0.0175 0.02 0.025 --selection ours $others "$@"
-small_maps demo_town-400 colmap_sift_sv32 uint4 0.12 0.17 --selection cover triplets "$@"
+small_maps herz-jesus colmap_sift_sv32 uint4 0.0075 0.015 0.02 0.03 0.06 0.1 --selection $others "$@"
+small_maps herz-jesus mini32 uint2 0.0075 0.015 0.02 0.03 0.06 0.1 --selection $others "$@"
+small_maps day-south-building colmap_sift_sv32 uint4 0.0075 0.0175 0.02 0.025 --selection $others "$@"
+small_maps sparse-redkitchen colmap_sift_sv32 uint4 0.0075 0.015 0.03 --selection $others "$@"
+small_maps demo_town-400 colmap_sift_sv32 uint4 0.083 0.12 0.17 --selection cover triplets "$@"
 
 run metres --map "$(scene fountain-P11)" --map "$(scene entry-P10)" --map $herz_jesus "$@"
 run tracking --feature colmap_sift_sv32:uint4 mini32:uint2 --strangers $data/strangers "$@"

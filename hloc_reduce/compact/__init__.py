@@ -6,26 +6,29 @@ keypoints. Localize in it with pipelines.localize --map FILE, or with Localizer(
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import numpy as np
 import pycolmap
 
-from .. import extract_features, logger, matchers
-from ..aggregate_features import output_of, vocabulary_if_any
+from .. import aggregate_features, extract_features, logger, matchers
+from ..aggregate_features import output_of, vocabulary_if_any, vocabulary_of
 from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..hlm import points, selection, signs, writer
-from ..hlm.images import Images
+from ..hlm.images import ROW, Images
 from ..hlm.reader import SUFFIX, CompactMap, check_feature_keys
+from ..hlm.thinning import thinned
 from ..hlm.writer import Source
 from ..localization import intrinsics
 from ..maps.map import Map
 from ..maps.matching import is_integer_matcher
 from ..retrieval.ranking import read_global
+from ..retrieval.vlad import read_vocabulary
 from ..utils import cli, colmap
 from ..utils.cli import InputError
 from ..utils.codes import STORAGES, Storage
@@ -38,6 +41,7 @@ IMAGES_AT_ONCE = 1024  # whose global descriptors are in memory
 MAX_TRIES = 12  # of sizes, to come close to a limit
 AIMED_SHARE = 0.998  # of the limit
 CLOSE_SHARE = 0.995  # of the limit, which is close enough
+VOCABULARY_SHARE = 1 / 256  # of the limit, at most, but for two words
 # descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
 Ranking = Callable[[points.Points, pycolmap.Reconstruction, Path], np.ndarray]
@@ -73,7 +77,8 @@ def main(
         storage: storage of the points' descriptors; default: the map's if it stores codes, else
             uint4 for DoG features of up to 32 dimensions, uint2 for others, and float16 without
             levels.
-        max_mb: size of the file in 1,000,000 bytes: points that images need least are left out.
+        max_mb: size of the file in 1,000,000 bytes: points that images need least are left out, and
+            of many images those that show the same as others.
         retrieval: what computed `global_descriptors`; default: the map's, or vlad.
         image_list: text file with the names of the images that the file has, a part of the map that
             can be joined with others; default: all.
@@ -141,22 +146,26 @@ def write(
         matchers.load(matchers_confs.for_features(model, made_from))
     conf = {**source.conf, "storage": _storage(source.conf, storage)}
     source = replace(source, matcher=matcher, conf=conf)
-    images = Images.of(source.model, names)
-    everything = points.collect(source.model, features, images.names)
+    everything = points.collect(source.model, features, Images.of(source.model, names).names)
     _check_dim(source, features, everything.descriptors.shape[1])
-    described = _global_signs(source.global_descriptors, everything.names)
-    ranking = cache(partial(rank, everything, source.model, features))
-    with replacing(output) as temporary:
-        encode = partial(_encode, temporary, everything, ranking, source, images, described)
-        if max_mb is None:
-            number, parts = len(everything), encode(len(everything))
-        else:
-            number, parts = _fit(encode, len(everything), max_mb)
+    limit = None if max_mb is None else max_mb * MEGABYTE
+    with TemporaryDirectory() as folder, replacing(output) as temporary:
+        kept, encode = everything, partial(_encode, temporary, source, everything)
+        number, parts = len(everything), encode(np.arange(len(everything)))
+        if limit is not None and sum(parts.values()) > limit:
+            source = _with_few_words(source, features, everything, limit, Path(folder))
+            kept = thinned(everything, _num_images(limit))
+            ranking = rank(everything, source.model, features)
+            ranking = ranking[np.isin(ranking, np.concatenate(kept.visible))]
+            encode = partial(_encode, temporary, source, kept)
+            number, parts = _fit(lambda number: encode(ranking[:number]), len(ranking), limit)
     logger.info(
-        "%s has %s of %s points and %s bytes: %s.",
+        "%s has %s of %s points, %s of %s images and %s bytes: %s.",
         output,
         f"{number:,}",
         f"{len(everything):,}",
+        f"{len(kept.names):,}",
+        f"{len(everything.names):,}",
         f"{sum(parts.values()):,}",
         ", ".join(f"{part} {size:,}" for part, size in parts.items()),
     )
@@ -275,32 +284,56 @@ def _storage(conf: dict, storage: str | None) -> str:
         return STORAGES[0]
 
 
+def _num_images(limit: float) -> int:
+    """Return how many images a map that is limited to a number of bytes has at most.
+
+    One of N has an N-th of it for its row of the table.
+    """
+    return max(1, int(np.sqrt(limit / ROW.itemsize)))
+
+
+def _with_few_words(
+    source: Source, features: Path, everything: points.Points, limit: float, folder: Path
+) -> Source:
+    """Describe images by a vocabulary that takes a small share of a limit, if the map's does not.
+
+    Args:
+        source: what the map is made from.
+        features: feature file of its images.
+        everything: all points.
+        limit: bytes of the map.
+        folder: for global descriptors.
+    """
+    fitting = VOCABULARY_SHARE * limit / (2 * everything.descriptors.shape[1])  # float16
+    number = 2 ** max(1, int(np.log2(max(1, fitting))))
+    if source.vocabulary is None or number >= len(read_vocabulary(source.vocabulary)):
+        return source
+    conf = retrieval_confs.get(source.retrieval)
+    conf = {**conf, "model": {**conf["model"], "num_words": number}}
+    # parts of a map have the same vocabulary
+    learned_from = sorted(image.name for image in source.model.images.values())
+    given = conf, features, learned_from, folder
+    described = aggregate_features.main(*given, image_list=[*everything.names])
+    return replace(source, global_descriptors=described, vocabulary=vocabulary_of(described))
+
+
 def _encode(
-    path: Path,
-    everything: points.Points,
-    ranking: Callable[[], np.ndarray],
-    source: Source,
-    images: Images,
-    described: tuple[np.ndarray, int],
-    number: int,
+    path: Path, source: Source, everything: points.Points, chosen: np.ndarray
 ) -> dict[str, int]:
-    """Write the points that images need most; return the bytes of each part.
+    """Write some points; return the bytes of each part.
 
     Args:
         path: the file.
-        everything: all points.
-        ranking: returns their indices, those that are needed most first.
         source: what the map is made from.
-        images: of the map.
-        described: from `_global_signs`.
-        number: of points that are written.
+        everything: all points, and the images of the file.
+        chosen: the points.
     """
-    chosen = everything
-    if number < len(everything):
-        chosen = everything.only(np.sort(ranking()[:number]))
-    step = points.precision(chosen, source.model)
+    kept = everything.only(np.sort(chosen))
+    step = points.precision(kept, source.model)
+    images = Images.of(source.model, kept.names)
+    described = _global_signs(source.global_descriptors, kept.names)
     with path.open("wb") as file:
-        return writer.write(file, points.Sorted(chosen), images, source, *described, step)
+        return writer.write(file, points.Sorted(kept), images, source, *described, step)
 
 
 def _global_signs(path: Path, names: Sequence[str]) -> tuple[np.ndarray, int]:
@@ -316,19 +349,19 @@ def _global_signs(path: Path, names: Sequence[str]) -> tuple[np.ndarray, int]:
 
 
 def _fit(
-    encode: Callable[[int], dict[str, int]], number: int, max_mb: float
+    encode: Callable[[int], dict[str, int]], number: int, limit: float
 ) -> tuple[int, dict[str, int]]:
     """Write about as many points as fit into a limit.
 
     Args:
         encode: writes a number of points, and returns the bytes of each part.
         number: of all points.
-        max_mb: the limit in 1,000,000 bytes.
+        limit: of the bytes of all parts.
 
     Returns:
         The number of points that were written last, and the bytes of each part.
     """
-    limit, best, parts = max_mb * MEGABYTE, 0, dict[str, int]()
+    best, parts = 0, dict[str, int]()
     low, high, tried = 0, number + 1, number  # the first number fits, the second one does not
     for _ in range(MAX_TRIES):
         parts = encode(tried)
@@ -347,6 +380,6 @@ def _fit(
         tried = guess if low < guess < high else (low + high) // 2
     if not best:
         raise InputError(
-            f"--max_mb {max_mb:g} is too small: a point and {fixed:,} bytes are needed."
+            f"--max_mb {limit / MEGABYTE:g} is too small: a point and {fixed:,} bytes are needed."
         )
     return best, parts if tried == best else encode(best)

@@ -202,7 +202,7 @@ def _check(first: CompactMap, other: CompactMap) -> None:
     if not np.array_equal(_words(first), _words(other)):
         raise InputError(
             f"{both} have different vocabularies of global descriptors: write parts of one map, "
-            "with --image_list."
+            "with --image_list and the same --max_mb."
         )
     told = first.made_from is not None and first.made_from == other.made_from
     if first.frame.origin is None and not told:

@@ -114,11 +114,11 @@ def test_a_limit_is_met_although_the_first_points_take_most(monkeypatch):
         return parts | {"header": 200_000}
 
     for limit in (0.21, 0.3, 1.0, 5.0):
-        number, parts = compact._fit(encode, 1_000_000, limit)
+        number, parts = compact._fit(encode, 1_000_000, 1e6 * limit)
         assert 0.9 * limit < sum(parts.values()) / 1e6 <= limit
         assert number == written[-1] and parts == encode(number)
     with pytest.raises(InputError, match="too small"):
-        compact._fit(encode, 1_000_000, 0.2)
+        compact._fit(encode, 1_000_000, 0.2e6)
 
 
 def test_codes_of_a_projection_of_ones_own(built, tmp_path):
@@ -147,6 +147,12 @@ def test_a_limit_of_the_size(built, tmp_path):
     pose, _ = Localizer(half).localize(images / "query/day/a.png")
     expected, _ = Localizer(whole).localize(images / "query/day/a.png")
     assert max(pose_error(pose, expected)) < 0.2
+    found, everything = CompactMap(half), CompactMap(whole)
+    assert [*found.names] == [*everything.names]  # so few are all needed
+    assert found.vocabulary.shape == (2, 32) and everything.vocabulary.shape == (64, 32)
+    assert found.global_descriptors().shape == (4, 64)
+    compact.main(half, folder, max_mb=whole.stat().st_size / 1e6)
+    assert half.read_bytes() == whole.read_bytes()
     with pytest.raises(InputError, match="too small"):
         compact.main(tmp_path / "none.hlm", folder, max_mb=1e-4)
     assert not (tmp_path / "none.hlm").exists()

@@ -95,6 +95,33 @@ def test_the_shorter_way_is_taken():
     assert visible.pack(np.array([5, 70_000])) == bytes(expected)
 
 
+def test_points_of_an_image_are_close_together():
+    """Along a walk, each image shows some points in a row, but images and points are shuffled."""
+    generator = np.random.default_rng(0)
+    number, shuffled = 300, generator.permutation(300)
+    shown = [np.sort(shuffled[start : start + 20]) for start in generator.permutation(280)]
+    names = [f"{i}.jpg" for i in range(len(shown))]
+    xyz = np.arange(number * 3.0).reshape(-1, 3)
+    walk = points.Points(xyz, xyz, names, shown, shown, np.ones(number))
+    ordered = points.Sorted(walk)
+    for i, own in enumerate(shown):
+        found = ordered.visible(i)
+        assert found[-1] - found[0] < 25
+        np.testing.assert_array_equal(ordered.xyz(slice(None))[found].sum(0), xyz[own].sum(0))
+
+
+def test_points_of_places_without_common_images_and_of_few_images():
+    for shown in ([[0, 2], [0, 2], [1, 3], [1, 3], []], [[0, 1, 2, 3]], 4 * [[0, 1, 2, 3]]):
+        names = [f"{i}.jpg" for i in range(len(shown))]
+        shown = [np.array(part, np.int64) for part in shown]
+        xyz = np.arange(12.0).reshape(-1, 3)
+        ordered = points.Sorted(points.Points(xyz, xyz, names, shown, shown, np.ones(4)))
+        assert sorted(ordered.xyz(slice(None))[:, 0]) == [0, 3, 6, 9]
+        for i, own in enumerate(shown):
+            found = ordered.visible(i)
+            assert not len(own) or found[-1] - found[0] == len(own) - 1
+
+
 @given(st.sets(st.text("ab/\n\tä" + chr(700), min_size=1, max_size=9), min_size=1))
 def test_names_survive(chosen):
     listed = sorted(name for name in chosen if is_name(name))

@@ -72,14 +72,14 @@ def test_sizes_of_maps(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
     outputs, shown = tmp_path / "outputs", []
     monkeypatch.setattr(compare.report, "main", lambda folders, page: shown.append(folders))
     given = ("--dataset", aachen_layout, "--outputs", outputs, "--features", "colmap_sift_sv32")
-    sizes = ("--max_mb", 0.03, 0.001, 0.02, 0.012)
+    sizes = ("--max_mb", 0.03, 0.001, 0.02, 0.008)
     with pytest.raises(SystemExit) as exit:
         command.run(monkeypatch, compare, *given, *sizes)
     assert exit.value.code == 2
     assert "colmap_sift_sv32, at most 0.001 MB failed: --max_mb 0.001 is too small" in caplog.text
     assert "at most 0.02 MB: all points fit" in caplog.text
     whole = outputs / "colmap_sift_sv32"
-    folders = [whole, whole / "compact-0.012MB", whole / "compact-0.02MB"]
+    folders = [whole, whole / "compact-0.008MB", whole / "compact-0.02MB"]
     assert shown == [folders]
     assert {path.parent for path in outputs.rglob("map.hlm")} == {*folders[1:]}
 
@@ -104,7 +104,7 @@ def test_sizes_of_maps(aachen_layout, tmp_path, monkeypatch, capsys, caplog):
     assert "megabytes of the map" in drawn and "colmap_sift_sv32, night" in drawn
 
     times = command.state(whole)
-    command.run(monkeypatch, compare, *given, "--max_mb", 0.012)
+    command.run(monkeypatch, compare, *given, "--max_mb", 0.008)
     assert command.state(whole) == times and len(times) > 30
 
 
