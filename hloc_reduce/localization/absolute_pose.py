@@ -133,17 +133,13 @@ def _near(matches: Matches, images: list[np.ndarray], likely: np.ndarray) -> Pos
 
 
 def _refined(matches: Matches, pose: Pose, max_error: float) -> Pose:
-    """Refine a pose by the matches that agree within a number of pixels.
-
-    A match counts the less, the more its error exceeds the median.
-    """
+    """Refine a pose by the matches that agree within a number of pixels."""
     if pose.cam_from_world is None:
         return pose
     view = pose.cam_from_world, copy.deepcopy(pose.camera)
     errors, _ = reprojection_errors(matches.points2D, matches.points3D, *view)
     agree = errors <= max_error
-    scale = max(LEAST_SCALE, float(np.median(errors[agree]))) if agree.any() else LEAST_SCALE
-    refinement = matches.config.get("refinement", {}) | {"loss_function_scale": scale}
+    refinement = matches.config.get("refinement", {}) | loss_options(errors[agree])
     found = colmap.refine_pose(
         view[0], matches.points2D, matches.points3D, agree, view[1], refinement
     )
@@ -151,6 +147,19 @@ def _refined(matches: Matches, pose: Pose, max_error: float) -> Pose:
         return pose
     errors, _ = reprojection_errors(matches.points2D, matches.points3D, found, view[1])
     return _judged(matches, Pose(found, view[1], errors <= matches.max_error))
+
+
+def loss_options(errors: np.ndarray) -> dict[str, float]:
+    """Return options of a refinement in which a match counts the less, the larger its error is.
+
+    With pycolmap's own scale of one pixel, small errors are squared, and those of the night are all
+    taken for large.
+
+    Args:
+        errors: (N,) of the matches that agree, in pixels; their median is the scale.
+    """
+    scale = float(np.median(errors)) if len(errors) else LEAST_SCALE
+    return {"loss_function_scale": max(LEAST_SCALE, scale)}
 
 
 def likeliest(images: list[np.ndarray], number: int, most: int = SAMPLE) -> np.ndarray:

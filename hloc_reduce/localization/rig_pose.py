@@ -235,51 +235,42 @@ def _sampled(sights: Sequence[Sight], chosen: Sequence[np.ndarray]) -> list[pyco
     return [] if found is None else [found]
 
 
-def _inliers(
-    sights: Sequence[Sight], rig_from_world: pycolmap.Rigid3d, share: float = 1.0
-) -> list[np.ndarray]:
-    found = []
-    for one in sights:
-        errors, _ = reprojection_errors(*one.seen(rig_from_world)[:4])
-        found.append(errors <= share * one.max_error)
-    return found
+def _errors(sights: Sequence[Sight], rig_from_world: pycolmap.Rigid3d) -> list[np.ndarray]:
+    """Return the reprojection errors (M,) of the matches of each camera in pixels."""
+    return [reprojection_errors(*one.seen(rig_from_world)[:4])[0] for one in sights]
 
 
-def _refined(
-    sights: Sequence[Sight], start: pycolmap.Rigid3d, share: float = 1.0
-) -> pycolmap.Rigid3d:
+def _refined(sights: Sequence[Sight], start: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
     """Refine a pose by the matches of all cameras that agree with it, as long as more do.
 
     It is refined once even if fewer do then: that of a sample has not the least errors.
-
-    Args:
-        sights: what each camera sees.
-        start: the pose.
-        share: of the inlier thresholds, within which matches agree.
     """
-    pose, inliers = start, _inliers(sights, start, share)
     everything = [np.ones(len(one.points2D), bool) for one in sights]
     points2D, points3D, cameras = _together(sights, everything)
-    for _ in range(absolute_pose.REESTIMATIONS):
-        mask = np.concatenate(inliers)
+    most = np.array([one.max_error for one in sights])[cameras.camera_of]
+    pose, errors = start, np.concatenate(_errors(sights, start))
+    for number in range(absolute_pose.REESTIMATIONS):
+        mask = errors <= most
         if mask.sum() < colmap.MIN_OF_POSE:
             break
-        refined = colmap.refine_rig_pose(pose, points2D, points3D, mask, *cameras)
+        options = absolute_pose.loss_options(errors[mask])
+        refined = colmap.refine_rig_pose(pose, points2D, points3D, mask, *cameras, options)
         if refined is None:
             break
-        agreeing = _inliers(sights, refined, share)
-        more = sum(map(np.sum, agreeing)) - mask.sum()
-        if more < 0 and pose is not start:
+        its_errors = np.concatenate(_errors(sights, refined))
+        more = (its_errors <= most).sum() - mask.sum()
+        if more < 0 and number:
             break
-        pose, inliers = refined, agreeing
-        if more == 0:
+        pose, errors = refined, its_errors
+        if more == 0 and number:
             break
     return pose
 
 
 def _judged(sights: Sequence[Sight], pose: pycolmap.Rigid3d) -> RigPose:
     """Return a pose with its inliers and confidence."""
-    inliers = _inliers(sights, pose)
+    errors = _errors(sights, pose)
+    inliers = [its <= one.max_error for its, one in zip(errors, sights, strict=True)]
     value = joint_confidence([one.seen(pose) for one in sights])
     number = int(sum(map(np.sum, inliers)))
     return RigPose(pose, inliers, Measures(num_inliers=number, confidence=value))

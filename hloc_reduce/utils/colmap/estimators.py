@@ -261,9 +261,10 @@ def refine_rig_pose(
     camera_of: np.ndarray,
     cams_from_rig: Sequence[pycolmap.Rigid3d],
     cameras: Sequence[pycolmap.Camera],
+    refinement: dict,
 ) -> pycolmap.Rigid3d | None:
-    """Refine the pose of a rig by its inliers (M,) bool, see `estimate_rig_pose`."""
+    """Refine the pose of a rig by its inliers (M,) bool, see `estimate_rig_pose`, `refine_pose`."""
     refine: Callable[..., dict | None] = pycolmap.refine_generalized_absolute_pose
     given = points2D, points3D, inliers, camera_of, cams_from_rig, cameras
-    found = refine(rig_from_world, *given)
+    found = refine(rig_from_world, *given, refinement)
     return None if found is None else found["rig_from_world"]
