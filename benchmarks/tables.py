@@ -10,13 +10,13 @@ from statistics import mean, median
 
 from safetensors import safe_open
 
-from benchmarks import changed_photos, lightglue_seconds
+from benchmarks import changed_photos
 from benchmarks.rows import Row, read, select, with_keypoints
 from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
 from hloc_reduce import projections
 from hloc_reduce.confs import features as features_confs
-from hloc_reduce.confs.features import matcher_of
+from hloc_reduce.confs.features import RECOMMENDED, matcher_of
 from hloc_reduce.detectors.dog import FAST, KEYPOINT_SETTINGS
 from hloc_reduce.evaluation import published
 from hloc_reduce.localization.exif import WELL_KNOWN
@@ -62,7 +62,6 @@ FEATURES: list[Choice] = [
     ("mini64", "float16"),
     ("aliked_sv64", "uint4"),
     ("colmap_sift_sv32", "uint4"),
-    ("xfeat_sv32", "uint4"),
     ("mini64", "uint2"),
     ("xfeat_sv32", "uint2"),
     ("mini32", "uint2"),
@@ -137,12 +136,15 @@ CHANGED_PHOTOS = {
     "map 1, queries 1, turned 90": "turned by 90°",
 }
 SECONDS_OF_PAIRS = {
-    "all layers, 1 thread": "all layers, one core",
-    "early exit, 1 thread": "early exit",
+    "early exit, 1 thread": "one core",
     "early exit, 2 pairs at a time": "a pair on each of two cores",
 }
 ONE_CORE = "1 core"
+OLDEST = "pycolmap 3.13"
 RUN_PLACES = "herz-jesus", "day-fountain-P11"
+# of the rows of runs, in the table
+SHOWN_RUNS = "", with_keypoints(KEYPOINT_SETTINGS[0])
+FAST_RUN = f"`{RECOMMENDED}`, `{FAST}` keypoints"
 STAGES = ("extraction", "matching", "triangulation", "localization")
 PAPER = ("sift", "mkd", "tfeat")
 PAPER_DIMS = (64, 32, 24, 16)
@@ -388,16 +390,13 @@ def inliers_and_median(row: Row) -> str:
 def lightglue_seconds_table() -> Table:
     """Show the time and the matches of a pair with LightGlue, by keypoints."""
     table = [["feature", "keypoints", *(f"{head} [ms]" for head in SECONDS_OF_PAIRS.values())]]
-    table[0] += [f"matches, {layers}" for layers in lightglue_seconds.LAYERS]
     rows = read("lightglue_seconds")
     for feature in dict.fromkeys(row["feature"] for row in rows):
         of_feature = select(rows, feature=feature)
         by_number = {int(row["list"].split()[0]): row["list"] for row in of_feature}
-        for number, name in sorted(by_number.items()):
+        for number, name in sorted(by_number.items())[1:]:
             found = {row["variant"]: row for row in select(of_feature, list=name)}
             cells = [f"{float(found[variant]['ms']):,.0f}" for variant in SECONDS_OF_PAIRS]
-            one_core = (found[f"{layers}, 1 thread"] for layers in lightglue_seconds.LAYERS)
-            cells += [thousands(row["matches"]) for row in one_core]
             table.append([f"`{feature}`", f"{number:,}", *cells])
     return table
 
@@ -520,6 +519,8 @@ def runs_table() -> Table:
     table[0] += ["matches [MB]"]
     runs, others = (select(read("runs"), place=place) for place in RUN_PLACES)
     for row in sorted(runs, key=lambda row: -float(row["seconds"])):
+        if row["variant"] not in SHOWN_RUNS and run_name(row) != FAST_RUN:
+            continue
         [other] = select(others, **{key: row[key] for key in ("feature", "storage", "variant")})
         cells = [f"{float(row[f'{stage}_s']):.1f}" for stage in STAGES]
         cells += [f"{float(row['seconds']):.1f}"]
@@ -577,12 +578,47 @@ def scale_table() -> Table:
     rows = select(read("scale"), list="whole", variant="8000 keypoints")
     rows.sort(key=lambda row: -float(row["feature_mb"]))
     heads = [f"{row['feature']}, `{row['storage']}`" for row in rows]
+    [triangulated] = select(read("scale"), list="whole", variant="triangulation")
+    minutes = float(triangulated["triangulation_cpu_s"]) / 60
+    gigabytes = float(triangulated["peak_mib"]) * 2**20 / 1e9
     return [
         ["", *heads],
         ["feature file [MB]", *(thousands(row["feature_mb"]) for row in rows)],
         ["match file [MB]", *(thousands(row["match_mb"]) for row in rows)],
         ["matching [minutes]", *(f"{float(row['matching_s']) / 60:.0f}" for row in rows)],
+        ["triangulation, one core [minutes]", *(f"{minutes:.0f}" for _ in rows)],
+        ["memory of the triangulation [GB]", *(f"{gigabytes:.1f}" for _ in rows)],
     ]
+
+
+def ransacs_table() -> Table:
+    """Show how long RANSACs take and what they localize, by the share of right matches."""
+    rows = [row for row in read("ransacs") if not row["variant"].startswith(OLDEST)]
+    parts = sorted({row["list"] for row in rows}, key=lambda part: int(part.split()[0]))
+    table = [["CPU [ms], queries within 5 cm"]]
+    for part in parts:
+        queries = select(rows, list=part)[0]["queries"]
+        table[0].append(f"{part} ({queries})")
+    for variant in dict.fromkeys(row["variant"] for row in rows):
+        of_variant = [select(rows, list=part, variant=variant) for part in parts]
+        cells = [f"{float(row['ms']):.3g}, {row['within_5cm']}" for [row] in of_variant]
+        table.append([variant, *cells])
+    return table
+
+
+def adding_table() -> Table:
+    """Show what adding photos to a map costs, and building maps of the same photos."""
+    variants = {"at once": "all at once", "others": "the others", "alone": "the 20 alone"}
+    variants |= {"added": "the 20 added"}
+    errors = ["median error, all at once [%]", "20 added [%]"]
+    table = [["photos", *(f"{text} [s]" for text in variants.values()), *errors]]
+    rows = read("adding")
+    for place, part in dict.fromkeys((row["place"], row["list"]) for row in rows):
+        found = {row["variant"]: row for row in select(rows, place=place, list=part)}
+        cells = [f"{float(found[key]['cpu_s']):.0f}" for key in variants]
+        cells += [f"{float(found[key]['median_percent']):.2g}" for key in ("at once", "added")]
+        table.append([f"`{place}`, {part.split()[0]}", *cells])
+    return table
 
 
 def compact_scale_table() -> Table:
@@ -601,7 +637,7 @@ def compact_scale_table() -> Table:
 
 def matching_table() -> Table:
     """Show how long a pair of images takes to match, by dimensions and storage."""
-    rows, storages = read("matching"), ("float32", "uint8", "uint4")
+    rows, storages = read("matching"), ("float32", "uint4")
     table = [["numbers", "hloc", "torch, floats", *(f"`{storage}`" for storage in storages)]]
     for dim in (128, 64, 32, 24, 16):
         found = select(rows, feature=f"{dim} numbers")
@@ -762,6 +798,8 @@ TABLES: dict[str, Callable[[], Table]] = {
     "localizer": localizer_table,
     "own_maps": own_maps_table,
     "tracking": tracking_table,
+    "adding": adding_table,
+    "ransacs": ransacs_table,
     "scale": scale_table,
     "compact_scale": compact_scale_table,
     "matching": matching_table,

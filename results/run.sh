@@ -103,6 +103,8 @@ for place in bronze-statue cyprus entry-P10 fountain-P11 fox kitchen liberty-sta
     mappers="$mappers --map $(scene "$place")"
 done
 run mappers $mappers --map $data/demo_town-400/images_upright:$data/demo_town-400/3D-models/aachen_v_1_1 "$@"
+run adding --map "$(scene south-building)" "$@"
+run adding --map $data/demo_town-400/images_upright:$data/demo_town-400/3D-models/aachen_v_1_1 --photos 100 "$@"
 
 run mappers --single --mapper incremental "incremental, rare adjustments" \
     --map "$(scene fox)" --map "$(scene south-building)" "$@"
@@ -158,6 +160,13 @@ run extraction_parts --images $data/demo_town-400/images_upright --photos 30 300
 run keypoint_steps --scenes $data/scenes "$@"
 run keypoint_steps --scenes $data/scenes --place cyprus fountain-P11 kitchen sceaux --fast "$@"
 run matching "$@"
+ransacs() {
+    run ransacs --dataset $data/herz-jesus $data/demo_town "$@" \
+        --feature colmap_sift_sv32:uint4 mini32:uint2
+}
+ransacs "$@"
+oldest=.venv/pycolmap-3.13.0 # from make check
+[ ! -d $oldest ] || (export PYTHONPATH=$PWD/$oldest && ransacs "$@")
 run lightglue_seconds --dataset $data/herz-jesus --feature mini32 --rounds 2 "$@"
 run lightglue_seconds --dataset $data/herz-jesus --feature aliked --keypoints 512 1024 2048 --pairs 2 --rounds 1 "$@"
 run video --frames 100 "$@"
@@ -171,6 +180,7 @@ done
 run retrieval_scale --dataset $data/demo_town-400 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 64 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 32 --storage uint4 "$@"
+run triangulation_scale --data $data/aachen_v1.1 --share 0.05 0.1 "$@"
 run compact_scale --data $data/aachen_v1.1 --share 0.1 1 10 30 100 "$@" # the last one writes 5 GB
 if "$python" -c "import hloc" 2> /dev/null; then
     for place in herz-jesus day-fountain-P11; do
