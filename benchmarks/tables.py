@@ -107,10 +107,8 @@ MAPS: list[Choice] = [
 ]
 MAP_SIZES = (0.015, 0.0075)
 # whose bytes are listed by part: place, and size in MB
-MAP_PARTS = [("herz-jesus", "0.0075"), ("herz-jesus", "0.03")]
-MAP_PARTS += [("demo_town-400", "0.083"), ("demo_town-400", "0.25")]
-PARTS = {part: (part,) for part in ("descriptors", "coordinates", "visible", "retrieval", "header")}
-PARTS |= {"images": ("poses", "names")}
+MAP_PARTS = [("herz-jesus", "0.0075"), ("demo_town-400", "0.083")]
+PARTS = ("descriptors", "coordinates", "visible", "retrieval", "poses", "names", "header")
 # of LightGlue: features, and the numbers of keypoints that are matched
 LIGHTGLUE: list[tuple[str, str, int]] = [
     ("xfeat", "float16", 1024),
@@ -310,16 +308,15 @@ def small_maps_table() -> Table:
 
 
 def map_parts_table() -> Table:
-    """List the bytes of the parts of small maps, and what they localize."""
-    table = [["place", "KB", "images", "points", *PARTS, "day", "night"]]
+    """List the bytes of the parts of small maps."""
+    table = [["bytes"], ["images"], ["points"], *([part] for part in PARTS)]
     for place, size in MAP_PARTS:
-        rows = select(read("maps"), place=place, feature=MAPS[0][0], variant=f"at most {size} MB")
-        day, night = (select(rows, list=part)[0] for part in ("day", "night"))
-        parts = [sum(int(day[f"{one}_bytes"] or 0) for one in names) for names in PARTS.values()]
-        found = [f"{row['within_25cm']} of {row['queries']}" for row in (day, night)]
-        sizes = f"{1000 * float(day['mb']):.1f}", f"{day['images']} of {day['photos']}"
-        cells = [place, *sizes, thousands(day["points"]), *map(thousands, map(str, parts)), *found]
-        table.append(cells)
+        found = select(read("maps"), place=place, feature=MAPS[0][0], variant=f"at most {size} MB")
+        row = select(found, matcher="")[0]
+        numbers = [row["images"], row["points"], *(row[f"{part}_bytes"] for part in PARTS)]
+        cells = [f"{place}, {size} MB", *map(thousands, numbers)]
+        for line, cell in zip(table, cells, strict=True):
+            line.append(cell)
     return table
 
 
