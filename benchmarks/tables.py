@@ -105,7 +105,7 @@ MAPS: list[Choice] = [
     ("xfeat_sv32", "uint2"),
     ("mini32", "uint2"),
 ]
-MAP_SIZES = (0.015, 0.0075)
+MAP_SIZES = (0.0075,)
 # whose bytes are listed by part: place, and size in MB
 MAP_PARTS = [("herz-jesus", "0.0075"), ("demo_town-400", "0.083")]
 PARTS = ("descriptors", "coordinates", "visible", "retrieval", "poses", "names", "header")
