@@ -152,8 +152,12 @@ def write(
     with TemporaryDirectory() as folder, replacing(output) as temporary:
         kept, encode = everything, partial(_encode, temporary, source, everything)
         number, parts = len(everything), encode(np.arange(len(everything)))
-        if limit is not None and sum(parts.values()) > limit:
+        # parts of a map have the same vocabulary, whether all of their points fit or not
+        if limit is not None and (names is not None or sum(parts.values()) > limit):
             source = _with_few_words(source, features, everything, limit, Path(folder))
+            encode = partial(_encode, temporary, source, everything)
+            parts = encode(np.arange(len(everything)))
+        if limit is not None and sum(parts.values()) > limit:
             kept = thinned(everything, _num_images(limit))
             ranking = rank(everything, source.model, features)
             ranking = ranking[np.isin(ranking, np.concatenate(kept.visible))]

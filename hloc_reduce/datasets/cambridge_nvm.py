@@ -117,6 +117,8 @@ def _names(path: Path) -> list[str]:
     """Read the names of a list. What comes before the first line of an image is the header."""
     lines = map(str.split, path.read_text(encoding="utf-8", errors="replace").splitlines())
     found = [words for words in dropwhile(lambda words: len(words) != WORDS, lines) if words]
+    if not found:
+        raise InputError(f"{path} has no line `{LINE}`.")
     if wrong := [words for words in found if len(words) != WORDS]:
         raise InputError(f"{path}: '{' '.join(wrong[0])}' is not a line `{LINE}`.")
-    return check_names([words[0] for words in found], path)
+    return check_names([*dict.fromkeys(words[0] for words in found)], path)

@@ -7,7 +7,7 @@ from . import ModelPlace, Place
 from .aachen import Aachen
 from .aachen_v1 import AachenV1
 from .cambridge import Cambridge
-from .cambridge_nvm import CambridgeNvm
+from .cambridge_nvm import NVM, CambridgeNvm
 from .cmu import CMU
 from .inloc import InLoc
 from .scenes import Scene
@@ -37,7 +37,8 @@ def layout_of(root: Path) -> type[Place]:
     models = dict.fromkeys(layout.models for layout in scenes)
     raise InputError(
         f"{root} has neither of the folders 3D-models and database, of Aachen and InLoc, and is no "
-        f"scene beside the folder of its COLMAP model, {' or '.join(models)}: see docs/aachen.md."
+        f"scene with {NVM} or beside the folder of its COLMAP model, {' or '.join(models)}: see "
+        "docs/aachen.md."
     )
 
 

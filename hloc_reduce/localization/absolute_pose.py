@@ -139,7 +139,7 @@ def _refined(matches: Matches, pose: Pose, max_error: float) -> Pose:
     view = pose.cam_from_world, copy.deepcopy(pose.camera)
     errors, _ = reprojection_errors(matches.points2D, matches.points3D, *view)
     agree = errors <= max_error
-    refinement = matches.config.get("refinement", {}) | loss_options(errors[agree])
+    refinement = loss_options(errors[agree]) | matches.config.get("refinement", {})
     found = colmap.refine_pose(
         view[0], matches.points2D, matches.points3D, agree, view[1], refinement
     )
@@ -337,4 +337,7 @@ def _unbent(matches: Matches, pose: Pose) -> Pose:
         found = _found(strict, np.flatnonzero(pose.inliers), LEAST_RATIO, 0)
         poses.append(_refined(matches, found, first))
         max_error *= STRICT
-    return _refined(matches, max(poses, key=quality), matches.max_error)
+    best = max(poses, key=quality)
+    refined = _refined(matches, best, matches.max_error)
+    # intrinsics that few matches determine may leave them all behind
+    return refined if 2 * refined.num_inliers > best.num_inliers else best

@@ -313,7 +313,7 @@ def without_most_telling(
         sides = project(local)[1][:, :POSE].transpose(2, 0, 1) @ cam_from_rig.adjoint()
         lengths = seen.camera.mean_focal_length() ** 2
         each = np.einsum("mif,fg,mig->m", sides, covariance[:POSE, :POSE], sides) * lengths
-        telling.append(each)
+        telling.append(_sums_of_places(seen, each))
     most = int(np.argmax([each.max(initial=-np.inf) for each in telling]))
     left = list(photos)
     seen, place = photos[most], photos[most].points2D[telling[most].argmax()]
@@ -321,6 +321,18 @@ def without_most_telling(
     others = apart > SAME_PLACE * photo_scale(seen.camera)
     left[most] = seen._replace(points2D=seen.points2D[others], points3D=seen.points3D[others])
     return left
+
+
+def _sums_of_places(seen: Seen, values: np.ndarray) -> np.ndarray:
+    """Return for each match (M,) the sum of its value and of those within SAME_PLACE of it."""
+    from scipy.spatial import cKDTree
+
+    near = SAME_PLACE * photo_scale(seen.camera)
+    pairs = cKDTree(seen.points2D).query_pairs(near, output_type="ndarray")
+    sums = values.copy()
+    for one, other in (pairs.T, pairs.T[::-1]):
+        sums += np.bincount(one, values[other], minlength=len(values))
+    return sums
 
 
 def uncertainty_without_one(seen: Seen, degrees_of_freedom: int = POSE) -> Uncertainty:

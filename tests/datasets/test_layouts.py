@@ -302,8 +302,13 @@ def test_a_list_of_other_images_is_refused(cambridge_nvm_layout, caplog):
     with pytest.raises(InputError, match="'seq9/3.png 1 2' is not a line `name x y z qw qx"):
         CambridgeNvm(root).map_names()
     path.write_text("\n".join(lines[:3]))
+    with pytest.raises(InputError, match="dataset_train.txt has no line `name x y z qw"):
+        CambridgeNvm(root).map_names()
+    path.write_text("\n".join([*lines[:3], "seq9/0.png 0 0 0 1 0 0 0"]))
     with pytest.raises(InputError, match="dataset_train.txt has no image of reconstruction.nvm"):
         CambridgeNvm(root).map_names()
+    path.write_text("\n".join([*lines, lines[-1]]))
+    assert len(CambridgeNvm(root).map_names()) == 4
     path = root / "dataset_test.txt"
     path.write_text(path.read_text().replace("seq1", "seq9"))
     with pytest.raises(InputError, match="dataset_test.txt: seq9/4.png are not in recon"):

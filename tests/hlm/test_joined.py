@@ -38,6 +38,21 @@ def parts(built, tmp_path):
     return paths
 
 
+def test_parts_of_one_limit_are_joined_whether_it_limits_them_or_not(built, tmp_path):
+    names, paths = maps.Map(built[0]).names(), []
+    for i, some in enumerate((names[:1], names[1:])):
+        (tmp_path / f"{i}.txt").write_text("\n".join(some))
+        paths.append(tmp_path / f"part{i}.hlm")
+    given = [(path, tmp_path / f"{i}.txt") for i, path in enumerate(paths)]
+    sizes = [
+        sum(compact.main(path, built[0], image_list=listed).values()) for path, listed in given
+    ]
+    assert sizes[0] < sizes[1]
+    for path, listed in given:
+        compact.main(path, built[0], image_list=listed, max_mb=sum(sizes) / 2e6)
+    assert len(JoinedMap(paths).names) == len(names)
+
+
 def test_parts_localize_as_the_whole_map(built, parts, tmp_path, run):
     folder, images = built
     compact.main(tmp_path / "whole.hlm", folder)

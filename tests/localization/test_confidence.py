@@ -262,6 +262,11 @@ def test_a_pose_is_as_certain_as_it_is_without_the_keypoint_that_tells_most():
     found = uncertainty_without_one(seen)
     assert found == uncertainty(keypoints[:-2], points[:-2], pose, CAMERA)
     assert found.position > 2 * uncertainty(keypoints, points, pose, CAMERA).position
+    # also where it is matched with many points, each of which tells less than another keypoint
+    rows = [*range(20), *[18] * 7]
+    repeated = Seen(keypoints[rows], points[rows], pose, CAMERA, 12.0)
+    (left,) = without_most_telling([repeated], [pycolmap.Rigid3d()], covariance(*repeated[:4]))
+    assert len(left.points2D) == 18
     alone = Seen(*(values[-2:] for values in (keypoints, points)), pose, CAMERA, 12.0)
     assert uncertainty_without_one(alone) == measures.UNDETERMINED
     # so it is with a rig, whose second camera sees only that point
