@@ -110,7 +110,7 @@ def searches(packed: np.ndarray, number: int) -> Iterator[tuple[str, Callable[[]
         return search
 
     yield "products with signs, all images", by_signs
-    yield "products with 256 signs, then all", by_some_signs
+    yield f"products with {8 * COARSE} signs, then all", by_some_signs
     yield "faiss, Hamming, all images", lambda: by_faiss(faiss.IndexBinaryFlat(bits))
     yield "faiss, Hamming, HNSW", hnsw
     yield "faiss, Hamming, IVF", ivf
