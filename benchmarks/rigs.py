@@ -1,7 +1,7 @@
 """Localize rigs: one to four cameras in the demo town at night, or the halves of dark photos.
 
-A rig stands where a query by night was taken, or would be in a larger town of the same seed; its
-cameras look ahead, to the left, back and to the right, and are 20 cm apart. Adds rows to
+A rig stands where a query by night is taken in towns of seed 0 with 320 photos or more; its cameras
+look ahead, to the left, back and to the right, and are 20 cm apart. Adds rows to
 results/rigs.csv, leaving out what has rows unless --again is given: the first one to four cameras,
 and the one of these that is localized with the most inliers by itself; each camera by itself; rigs
 whose last camera took its photo elsewhere in the town. Position errors are those of the rig;
@@ -29,7 +29,7 @@ import pycolmap
 import torch
 
 from benchmarks import rows
-from hloc_reduce import Localizer, demo, maps
+from hloc_reduce import Localizer, maps
 from hloc_reduce.confs import features as features_confs
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.demo.cameras import NIGHT, Photo, list_photos
@@ -223,7 +223,7 @@ def _main() -> None:
     parser = cli.Parser(__doc__, "--feature colmap_sift_sv64 mini32:uint2")
     add = parser.add_argument
     add("--feature", nargs="+", default=["colmap_sift_sv64"], help="with the map's storage")
-    add("--dataset", type=Path, default=Path("datasets/demo_town"), help="the demo town")
+    add("--dataset", type=Path, default=Path("datasets/demo_town"), help="a demo town")
     add("--cameras", type=int, default=4, choices=(2, 3, 4), help="most of a rig")
     add("--strangers", nargs="+", type=Path, help="instead photos of other places, in folders")
     add("--halves", nargs="+", type=Path, help="cut dark photos of these data sets instead")
@@ -243,7 +243,7 @@ def _main() -> None:
                 rows.add(NAME, [cells | {"variant": variant} | measures | rows.how(cores=1)])
     if args.halves:
         return
-    place = Aachen(demo.main(args.dataset, SEED))
+    place = Aachen(args.dataset)
     # a town of eight times as many photos has as many queries by night
     photos = [photo for photo in list_photos(SEED, 8 * FRAMES) if photo.kind == NIGHT]
     folder = args.outputs / "photos"
@@ -256,7 +256,7 @@ def _main() -> None:
         last = f"{args.cameras} cameras, strangers" if args.strangers else "alone"
         if rows.select(known, variant=last, **cells):
             continue
-        folder = args.outputs / f"{feature}-{storage}"
+        folder = args.outputs / f"{place.root.name}-{feature}-{storage}"
         options = {"feature": feature, "storage": storage}
         built = maps.main(folder, place.images, place.reference_model, **options)
         localizer = Localizer(built.folder, num_loc=NUM_LOC)

@@ -93,6 +93,7 @@ small_maps demo_town-400 colmap_sift_sv32 uint4 0.083 0.12 0.17 --selection cove
 run metres --map "$(scene fountain-P11)" --map "$(scene entry-P10)" --map $herz_jesus "$@"
 run tracking --feature colmap_sift_sv32:uint4 mini32:uint2 --strangers $data/strangers "$@"
 run rigs --feature colmap_sift_sv64 mini32:uint2 "$@"
+run rigs --dataset $data/demo_town-400 --feature colmap_sift_sv64 "$@"
 run rigs --feature colmap_sift_sv64 mini32:uint2 "$@" \
     --strangers $data/scenes/fountain-P11/images $data/scenes/sceaux/images
 run rigs --feature colmap_sift_sv64 mini32:uint2 "$@" \
