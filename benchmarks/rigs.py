@@ -265,6 +265,7 @@ def _main() -> None:
                 found = localize_strangers(localizer, args.strangers, args.cameras)
             else:
                 found = localize_town(localizer, frames, args.cameras)
+        cells["photos"] = len(place.map_names())
         for variant, poses in found.items():
             rows.add(NAME, [cells | {"variant": variant} | measures_of(poses) | rows.how(cores=1)])
 

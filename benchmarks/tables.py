@@ -418,18 +418,19 @@ def changed_photos_table() -> Table:
 
 def rigs_table() -> Table:
     """Compare rigs of cameras with the best of their photos alone."""
-    table = [["feature", "cameras", "localized", "within 5 cm", "median [cm]"]]
+    table = [["feature", "map photos", "cameras", "localized", "within 5 cm", "median [cm]"]]
     table[0] += ["best alone: localized", "within 5 cm", "median [cm]"]
-    rows = read("rigs")
-    for name in dict.fromkeys(map(name_of, rows)):
-        of_name = {row["variant"]: row for row in rows if name_of(row) == name}
+    rows = [row for row in read("rigs") if row["photos"]]  # of the demo town
+    for name, photos in dict.fromkeys((name_of(row), row["photos"]) for row in rows):
+        of_map = [row for row in rows if (name_of(row), row["photos"]) == (name, photos)]
+        of_name = {row["variant"]: row for row in of_map}
         for number in (2, 4):
             cells = []
             for variant in (f"{number} cameras", f"best of {number}"):
                 row = of_name[variant]
                 localized = f"{row['localized']} of {row['queries']}"
                 cells += [localized, row["within_5cm"], f"{float(row['median_cm']):.2f}"]
-            table.append([name, str(number), *cells])
+            table.append([name, photos, str(number), *cells])
     return table
 
 
