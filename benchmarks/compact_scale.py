@@ -232,8 +232,8 @@ def stream(names: list[str], folder: Path) -> dict:
     return built(parts, start)
 
 
-def build(folder: Path) -> dict:
-    """Build the compact map."""
+def build(folder: Path, max_mb: float | None) -> dict:
+    """Build the compact map, of a size at most."""
     from hloc_reduce import compact
 
     start = time.perf_counter()
@@ -242,6 +242,7 @@ def build(folder: Path) -> dict:
         sfm=folder / "sfm",
         features=folder / "features.h5",
         feature=FEATURE,
+        max_mb=max_mb,
     )
     return built(parts, start)
 
@@ -349,10 +350,12 @@ def peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def in_new_process(name: str, stage: str, data: Path, share: float, folder: str) -> dict:
+def in_new_process(
+    name: str, stage: str, data: Path, share: float, folder: str, *options: str
+) -> dict:
     """Return the measures that a stage of a benchmark prints, of a share of the images."""
     given = ["--data", str(data), "--share", str(share), "--folder", folder, "--stage", stage]
-    command = [sys.executable, "-m", f"benchmarks.{name}", *given]
+    command = [sys.executable, "-m", f"benchmarks.{name}", *given, *options]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     if done.returncode:
         raise InputError(f"The share {share} failed.")
@@ -365,12 +368,15 @@ def _main() -> None:
         "--data", type=Path, required=True, help="folder of database_images.txt, a list of images"
     )
     parser.add_argument("--share", type=float, nargs="+", default=[0.01, 0.1], help="of its images")
+    parser.add_argument("--max_mb", type=float, help="size of the maps, of shares up to 1")
     rows.add_again_option(parser)
     for hidden in ("--folder", "--stage"):
         parser.add_argument(hidden, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if not all(0 < share <= 100 for share in args.share):
         raise InputError("--share: numbers above 0 and at most 100.")
+    if args.max_mb and max(args.share) > 1:
+        raise InputError("--max_mb limits maps of shares up to 1.")
     names = sorted(image_names(args.data / "database_images.txt"))
     features_confs.get(FEATURE)
     if args.stage:
@@ -382,7 +388,7 @@ def _main() -> None:
         stages = {
             "synthesize": lambda: synthesize(some, folder),
             "stream": lambda: stream(some, folder),
-            "build": lambda: build(folder),
+            "build": lambda: build(folder, args.max_mb),
             "localize": lambda: localize(len(some), folder),
         }
         print(json.dumps({"photos": len(some)} | (stages[args.stage]() or {})))
@@ -390,11 +396,13 @@ def _main() -> None:
     for share in args.share:
         cells: dict = {"place": args.data.name, "list": f"share {share:g}", "feature": FEATURE}
         cells |= {"storage": "uint4"}
+        cells |= {"variant": f"at most {args.max_mb:g} MB"} if args.max_mb else {}
+        limited = ["--max_mb", str(args.max_mb)] if args.max_mb else []
         if not args.again and rows.select(rows.read(NAME), **cells):
             continue
         with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as folder:
             for stage in (*(("stream",) if share > 1 else ("synthesize", "build")), "localize"):
-                cells |= in_new_process(NAME, stage, args.data, share, folder)
+                cells |= in_new_process(NAME, stage, args.data, share, folder, *limited)
         rows.add(NAME, [cells | rows.how(cells["build_s"])])
 
 
