@@ -65,8 +65,8 @@ def test_the_others_are_tried_when_one_is_mirrored(plane, symmetric, tmp_path, m
     """Also one that seemed to be sound; a run that was stopped after it leaves nothing behind."""
     for name in ("1.png", "3.png"):
         mirror(plane / "images" / name)
-    sound = {"0.png", "1.png", "2.png", "4.png"}
-    monkeypatch.setattr(mirrored, "largest_group", lambda _: sound)
+    sound = ["0.png", "1.png", "2.png", "4.png"]
+    monkeypatch.setattr(mirrored, "groups", lambda _: [sound, ["3.png"]])
     folder = tmp_path / "outputs/map"
     arguments = "--map_images", plane / "images", "--outputs", folder.parent
     arguments += "--camera_mode", "single"
@@ -116,23 +116,45 @@ def test_only_what_is_beyond_doubt_is_named(as_it_is, of_mirror_image, agreement
     assert mirrored.mirrored(lambda *_: {}, {"0.png"}, {*OTHERS}) == set()
 
 
-def test_photos_that_share_little_are_not_judged(tmp_path):
-    """Five photos, each pair of which sees other points: no group tells anything."""
+def sharing(tracks):
+    """Return a model of points that some photos each see."""
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
         model="SIMPLE_PINHOLE", width=100, height=100, params=[100, 50, 50], camera_id=1
     )
-    pairs = [pair for pair in itertools.combinations(range(1, 6), 2) for _ in range(60)]
-    seen = {i: [row for row, pair in enumerate(pairs) if i in pair] for i in range(1, 6)}
+    numbers = sorted({i for track in tracks for i in track})
+    seen = {i: [row for row, track in enumerate(tracks) if i in track] for i in numbers}
     for i, rows in seen.items():
         image = pycolmap.Image(
             name=f"{i}.png", keypoints=np.full((len(rows), 2), 50.0), camera_id=1, image_id=i
         )
         colmap.add_image(model, camera, image, pycolmap.Rigid3d())
-    for row, pair in enumerate(pairs):
-        elements = [pycolmap.TrackElement(i, seen[i].index(row)) for i in pair]
+    for row, track in enumerate(tracks):
+        elements = [pycolmap.TrackElement(i, seen[i].index(row)) for i in track]
         model.add_point3D(np.array([0, 0, 1.0 + row]), pycolmap.Track(elements))
-    for i in seen:
+    return model
+
+
+def test_a_few_photos_of_each_group_are_tried():
+    """Three groups; only the last photo of the second one, which has the fewest points, is not."""
+    tracks = [*[(1, 2, 3, 4, 5)] * 20, *[(6, 7, 8, 9)] * 20, (6, 7, 8), *[(1, 6, 10)] * 4]
+    model = sharing(tracks)
+    tried = []
+
+    def localize(names, by, is_mirrored):
+        tried.append((sorted(names), sorted(by), is_mirrored))
+        return {name: {"confidence": 300.0, "agreement": 1.0} for name in names}
+
+    assert mirrored.find(Inputs(model, localize=localize)) == []
+    some, largest = ["10.png", "6.png", "7.png", "8.png"], [f"{i}.png" for i in range(1, 6)]
+    assert tried == [(some, largest, True), (some, largest, False)]
+
+
+def test_photos_that_share_little_are_not_judged(tmp_path):
+    """Five photos, each pair of which sees other points: no group tells anything."""
+    pairs = [pair for pair in itertools.combinations(range(1, 6), 2) for _ in range(60)]
+    model = sharing(pairs)
+    for i in range(1, 6):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((100, 100), np.uint8))
     by_others = ByOthers(model, {}, "", tmp_path, *3 * [tmp_path / "none"], {})
     assert mirrored.find(Inputs(model, localize=by_others)) == []
@@ -149,7 +171,7 @@ def test_no_photo_is_mirrored(plane, symmetric, tmp_path, caplog, run):
     sfm = colmap.read_model(built.sfm)
     names = built.names()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mirrored, "largest_group", lambda _: {*names[1:]})
+        patch.setattr(mirrored, "groups", lambda _: [names[1:], names[:1]])
         by_others = ByOthers(
             sfm,
             conf=built.conf,

@@ -1,5 +1,6 @@
 """Mirrored photos."""
 
+from collections import defaultdict
 from collections.abc import Iterable
 
 import numpy as np
@@ -11,25 +12,29 @@ from ..registration import MIN_VIEWPOINTS
 from .inputs import Inputs, Localize
 
 CERTAIN = 0.9, 250.0  # least agreement and confidence of the mirror image of a mirrored photo
+TRIED = 3  # photos of a group, which are all mirrored or not
 
 
 def find(inputs: Inputs) -> list[Finding]:
     """Find the mirrored photos among those of a map, with a pose or without.
 
     Mirrored photos match others only where the place is symmetric, so a mapper places them anywhere
-    or not at all. They share few points with the others, though many among themselves. So photos
-    that share few points with most others, and those without a pose, are localized by the others,
-    as they are and mirrored. If the mirror image fits beyond doubt, with a higher confidence, they
-    were mirrored before, or all others were. If there are any, all other photos are tried, too.
-    This takes up to as long as the extraction of the photos that are tried, and their matching.
+    or not at all. They share few points with the others, though many among themselves. So a few
+    photos of each group that shares few points with the largest one, and all without a pose, are
+    localized by that one, as they are and mirrored. If the mirror image fits beyond doubt, with a
+    higher confidence, they were mirrored before, or all others were. If there are any, all other
+    photos are tried, too. This takes up to as long as the extraction of the photos that are tried,
+    and their matching.
     """
     if inputs.localize is None:
         return []
-    placed, sound = {*inputs.names}, largest_group(inputs.images)
-    names = placed | {*(inputs.registration.missing if inputs.registration else ())}
-    found = mirrored(inputs.localize, names - sound, sound)
+    largest, *others = groups(inputs.images)
+    missing = {*(inputs.registration.missing if inputs.registration else ())}
+    some = {name for group in others for name in group[:TRIED]}
+    found = mirrored(inputs.localize, some | missing, {*largest})
     if found:
-        found |= mirrored(inputs.localize, names - found, placed - found)
+        placed = {*inputs.names}
+        found |= mirrored(inputs.localize, (placed | missing) - found, placed - found)
     return [finding(sorted(found))] if found else []
 
 
@@ -60,19 +65,22 @@ def mirrored(localize: Localize, names: set[str], by: set[str]) -> set[str]:
     }
 
 
-def largest_group(images: list[pycolmap.Image]) -> set[str]:
-    """Return the names of the largest group of photos that share many points.
+def groups(images: list[pycolmap.Image]) -> list[list[str]]:
+    """Return the names of photos in groups that share many points, the largest one first.
 
     Photos show the same part of a place if they share half as many points as the median number
-    that a photo of the map has.
+    that a photo of the map has. In a group, those with the most points come first.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     shows = visibility(map(point3D_ids, images)).sign()
     shared = (shows @ shows.T).tocoo()
-    many = 2 * shared.data >= np.median(shared.diagonal())
+    numbers = shared.diagonal()
+    many = 2 * shared.data >= np.median(numbers)
     pairs = shared.row[many], shared.col[many]
     _, group = connected_components(coo_array((shared.data[many], pairs), shared.shape))
-    largest = np.bincount(group).argmax()
-    return {image.name for image, its in zip(images, group, strict=True) if its == largest}
+    found = defaultdict[int, list[str]](list)
+    for i in np.argsort(-numbers, kind="stable"):
+        found[group[i]].append(images[i].name)
+    return sorted(found.values(), key=len, reverse=True)
