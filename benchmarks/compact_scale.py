@@ -393,11 +393,11 @@ def _main() -> None:
         }
         print(json.dumps({"photos": len(some)} | (stages[args.stage]() or {})))
         return
+    variant = f"at most {args.max_mb:g} MB" if args.max_mb else ""
+    limited = ["--max_mb", str(args.max_mb)] if args.max_mb else []
     for share in args.share:
         cells: dict = {"place": args.data.name, "list": f"share {share:g}", "feature": FEATURE}
-        cells |= {"storage": "uint4"}
-        cells |= {"variant": f"at most {args.max_mb:g} MB"} if args.max_mb else {}
-        limited = ["--max_mb", str(args.max_mb)] if args.max_mb else []
+        cells |= {"storage": "uint4", "variant": variant}
         if not args.again and rows.select(rows.read(NAME), **cells):
             continue
         with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as folder:

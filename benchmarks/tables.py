@@ -297,9 +297,9 @@ def small_maps_table() -> Table:
         photos, size = (thousands(one[key]) for key in ("photos", "mb"))
         table.append([name, one["counted"], photos, size, f"{recall} %" if recall else ""])
     feature, storage = MAPS[0]
-    [row] = select(read("compact_scale"), feature=feature, list="share 1")
-    cells = ["the file", thousands(row["photos"]), thousands(row["mb"]), "unknown"]
-    table.append(["ours, synthetic descriptors", *cells])
+    for row in select(read("compact_scale"), feature=feature, list="share 1"):
+        cells = ["the file", thousands(row["photos"]), thousands(row["mb"]), "unknown"]
+        table.append(["ours, synthetic descriptors", *cells])
     rows = select(read("maps"), place="herz-jesus", list="night", feature=feature, matcher="")
     [row] = select(rows, storage=storage, variant="all points")
     cells = ["the file", row["photos"], f"{float(row['mb']):.2f}"]
@@ -626,7 +626,7 @@ def compact_scale_table() -> Table:
     columns |= {"first_query_file_mb": "first query, touched [MB]"}
     columns |= {"query_file_mb": "a query, touched [MB]", "query_cpu_s": "a query [s]"}
     table = [["images", "points", *columns.values(), "localized"]]
-    for row in sorted(read("compact_scale"), key=lambda row: int(row["photos"])):
+    for row in sorted(read("compact_scale"), key=lambda row: float(row["mb"])):
         cells = [f"{float(f'{float(row[key]):.3g}'):,}".removesuffix(".0") for key in columns]
         counts = thousands(row["photos"]), thousands(row["points"])
         table.append([*counts, *cells, f"{row['localized']} of {row['queries']}"])
