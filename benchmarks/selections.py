@@ -1,9 +1,7 @@
-"""Other ways to rank the points of a map, to compare `hlm.selection.ranked` with.
+"""Other ways to rank the points of a map, to compare `hlm.selection.Sights.ranked` with.
 
 Each ranks points (P,), those that are kept first, as that function does.
 """
-
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -19,7 +17,7 @@ NEAREST = 1e-9  # depth
 REGULAR = 1e-6  # of the largest singular value: smaller ones do not fix a pose
 
 
-def cover(points: Points, model: pycolmap.Reconstruction, _: Path) -> np.ndarray:
+def cover(points: Points, model: pycolmap.Reconstruction) -> np.ndarray:
     """Rank points by how many images show them, and how few ranked ones are in their cells."""
     point, cell = np.concatenate(points.visible), _cells(points, model)
     count = np.zeros(len(points.names) * CELLS_PER_SIDE**2)
@@ -37,17 +35,17 @@ def cover(points: Points, model: pycolmap.Reconstruction, _: Path) -> np.ndarray
     return ranking
 
 
-def longest(points: Points, _: pycolmap.Reconstruction, __: Path) -> np.ndarray:
+def longest(points: Points, _: pycolmap.Reconstruction) -> np.ndarray:
     """Rank points by how many images show them."""
     return np.argsort(-_tracks(points), kind="stable")
 
 
-def drawn(points: Points, _: pycolmap.Reconstruction, __: Path) -> np.ndarray:
+def drawn(points: Points, _: pycolmap.Reconstruction) -> np.ndarray:
     """Rank points at random."""
     return np.random.default_rng(0).permutation(len(points))
 
 
-def triplets(points: Points, model: pycolmap.Reconstruction, _: Path) -> np.ndarray:
+def triplets(points: Points, model: pycolmap.Reconstruction) -> np.ndarray:
     """Rank points of triplets that fix the pose of an image, after Sattler and Kukelova, CVPR 2026.
 
     Of triplets drawn in each image, those with accurate poses are kept. Each image in turn gets

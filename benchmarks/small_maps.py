@@ -21,7 +21,6 @@ from hloc_reduce.compact import Ranking
 from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.evaluation.poses import FAILED, pose_error
-from hloc_reduce.hlm import selection
 from hloc_reduce.hlm.points import Points
 from hloc_reduce.maps.contents import Engine
 from hloc_reduce.utils import cli
@@ -30,7 +29,7 @@ from hloc_reduce.utils.files import MEGABYTE
 NAME = "maps"
 WHOLE, ALL_POINTS = "whole map", "all points"
 OURS = "ours"
-RANKINGS = {OURS: selection.ranked} | selections.RANKINGS
+RANKINGS = {OURS: None} | selections.RANKINGS
 
 
 class Remembering:
@@ -92,9 +91,9 @@ def _once(rank: Ranking) -> Ranking:
     """Return a function that ranks points when it is called first, for one map."""
     known: list[np.ndarray] = []
 
-    def ranked(points: Points, model: pycolmap.Reconstruction, features: Path) -> np.ndarray:
+    def ranked(points: Points, model: pycolmap.Reconstruction) -> np.ndarray:
         if not known:
-            known.append(rank(points, model, features))
+            known.append(rank(points, model))
         return known[0]
 
     return ranked
@@ -132,7 +131,7 @@ def _main() -> None:
         if not todo:
             continue
         described: dict[tuple, dict] = {}
-        rankings = {name: _once(RANKINGS[name]) for name in args.selection}
+        rankings = {name: rank and _once(rank) for name, rank in RANKINGS.items()}
         folder = args.outputs / place.root.name / feature
         built = maps.main(folder / "map", place.images, place.reference_model, feature)
         source = compact.of_map(built)

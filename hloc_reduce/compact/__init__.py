@@ -20,7 +20,7 @@ from ..confs import features as features_confs
 from ..confs import matchers as matchers_confs
 from ..confs import retrieval as retrieval_confs
 from ..hlm import points, selection, signs, writer
-from ..hlm.images import ROW, Images
+from ..hlm.images import Images
 from ..hlm.reader import SUFFIX, CompactMap, check_feature_keys
 from ..hlm.thinning import thinned
 from ..hlm.writer import Source
@@ -44,7 +44,7 @@ CLOSE_SHARE = 0.995  # of the limit, which is close enough
 VOCABULARY_SHARE = 1 / 256  # of the limit, at most, but for two words
 # descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
-Ranking = Callable[[points.Points, pycolmap.Reconstruction, Path], np.ndarray]
+Ranking = Callable[[points.Points, pycolmap.Reconstruction], np.ndarray]
 MAX_UINT4_DIM = 32  # of DoG's features that are stored as uint4; others as uint2
 
 
@@ -118,7 +118,7 @@ def write(
     storage: str | None = None,
     max_mb: float | None = None,
     names: Collection[str] | None = None,
-    rank: Ranking = selection.ranked,
+    rank: Ranking | None = None,
 ) -> dict[str, int]:
     """Write a compact map of what a pipeline has in memory and in files.
 
@@ -130,7 +130,7 @@ def write(
         storage: storage of the points' descriptors; default: as in `main`.
         max_mb: size of the file in 1,000,000 bytes; default: with all points.
         names: images that the file has; default: all.
-        rank: ranks points as `selection.ranked` does: if not all fit, the first ones are kept.
+        rank: ranks points instead of `selection.Sights`: if not all fit, the first ones are kept.
 
     Returns:
         The bytes of each part of the file.
@@ -158,8 +158,10 @@ def write(
             encode = partial(_encode, temporary, source, everything)
             parts = encode(np.arange(len(everything)))
         if limit is not None and sum(parts.values()) > limit:
-            kept = thinned(everything, _num_images(limit))
-            ranking = rank(everything, source.model, features)
+            reliability = selection.reliabilities(everything, features)
+            sights = selection.Sights(everything, source.model, reliability)
+            ranking = rank(everything, source.model) if rank else sights.ranked()
+            kept = thinned(sights, ranking, parts, limit)
             ranking = ranking[np.isin(ranking, np.concatenate(kept.visible))]
             encode = partial(_encode, temporary, source, kept)
             number, parts = _fit(lambda number: encode(ranking[:number]), len(ranking), limit)
@@ -286,14 +288,6 @@ def _storage(conf: dict, storage: str | None) -> str:
         return "uint4" if few and not features_confs.network_of(conf["model"]) else "uint2"
     except InputError:  # a projection without levels
         return STORAGES[0]
-
-
-def _num_images(limit: float) -> int:
-    """Return how many images a map that is limited to a number of bytes has at most.
-
-    One of N has an N-th of it for its row of the table.
-    """
-    return max(1, int(np.sqrt(limit / ROW.itemsize)))
 
 
 def _with_few_words(

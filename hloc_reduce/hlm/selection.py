@@ -20,69 +20,23 @@ AT_ONCE = 0.05  # points that are ranked at once, as a share of those ranked bef
 SPARE = 256  # points whose gains are computed besides
 
 
-def ranked(points: Points, model: pycolmap.Reconstruction, features: Path) -> np.ndarray:
-    """Rank points by what photos like the map's images learn from them about their poses.
+class Sights:
+    """What points tell photos like a map's images about their poses.
 
-    Args:
-        points: all points.
-        model: the map.
-        features: feature file of its images.
-
-    Returns:
-        Their indices (P,) int64, those that are needed most first; the same for the same arguments.
-    """
-    return by_information(points, model, reliabilities(points, features))
-
-
-def by_information(
-    points: Points, model: pycolmap.Reconstruction, reliability: np.ndarray
-) -> np.ndarray:
-    """Rank points by what they add to the poses of images, greedily (D-optimal design).
-
-    Each image has a matrix, the inverse of the covariance of its pose by the points that it shows
-    and that are ranked already. The next point is the one that makes the sum of the logarithms of
-    the determinants grow most. So all images get points, spread over their parts and depths, and
-    points that many images share come first.
+    Each image has a matrix, the inverse of the covariance of its pose by points that it shows. How
+    much it learns from them is the logarithm of the determinant (D-optimal design).
 
     Args:
         points: all points.
         model: the map.
         reliability: of each point (P,), a factor of its derivatives.
 
-    Returns:
-        As `ranked` does.
-    """
-    sights = _Sights(points, model, reliability)
-    information = np.tile(np.eye(6) / UNKNOWN**2, (len(points.names), 1, 1))
-    parts = np.array_split(np.arange(len(points)), 1 + len(points) // POINTS_PER_CHUNK)
-    gains = np.concatenate([sights.gains(part, np.linalg.inv(information)) for part in parts])
-    ranking = np.zeros(0, np.int64)
-    while left := len(points) - len(ranking):
-        covariances = np.linalg.inv(information)
-        more = min(max(1, int(AT_ONCE * len(ranking))), left)
-        is_fresh = np.zeros(len(points), bool)
-        while True:  # gains only shrink: points whose old gains are too small need no new ones
-            candidates = _largest(gains, min(more + SPARE, left))
-            best, stale = candidates[:more], candidates[~is_fresh[candidates]]
-            if is_fresh[best].all():
-                break
-            gains[stale], is_fresh[stale] = sights.gains(stale, covariances), True
-        sights.add(best, information)
-        gains[best] = -np.inf
-        ranking = np.concatenate([ranking, best])
-    return ranking
-
-
-class _Sights:
-    """What points tell images about their poses.
-
-    Args:
+    Attributes:
         points: all points.
-        model: the map.
-        reliability: of each point (P,).
     """
 
     def __init__(self, points: Points, model: pycolmap.Reconstruction, reliability: np.ndarray):
+        self.points = points
         point = np.concatenate(points.visible)
         by_point = np.argsort(point, kind="stable")
         self._derivatives = _derivatives(points, model)[by_point]
@@ -93,8 +47,57 @@ class _Sights:
         self._numbers = np.bincount(point, minlength=len(points))
         self._starts = np.cumsum(self._numbers) - self._numbers
 
-    def gains(self, chosen: np.ndarray, covariances: np.ndarray) -> np.ndarray:
-        """Return by how much points (K,) make the sum of the logarithms grow, each by itself.
+    def ranked(self) -> np.ndarray:
+        """Rank points by how much more images learn with them, greedily.
+
+        All images get points, spread over their parts and depths, and points that many images share
+        come first.
+
+        Returns:
+            Their indices (P,) int64, those that are needed most first; the same for the same
+            arguments.
+        """
+        information = self._unknown()
+        number = len(self.points)
+        parts = np.array_split(np.arange(number), 1 + number // POINTS_PER_CHUNK)
+        gains = np.concatenate([self._gains(part, np.linalg.inv(information)) for part in parts])
+        ranking = np.zeros(0, np.int64)
+        while left := number - len(ranking):
+            covariances = np.linalg.inv(information)
+            more = min(max(1, int(AT_ONCE * len(ranking))), left)
+            is_fresh = np.zeros(number, bool)
+            while True:  # gains only shrink: points whose old gains are too small need no new ones
+                candidates = _largest(gains, min(more + SPARE, left))
+                best, stale = candidates[:more], candidates[~is_fresh[candidates]]
+                if is_fresh[best].all():
+                    break
+                gains[stale], is_fresh[stale] = self._gains(stale, covariances), True
+            self._add(self._rows(best), information)
+            gains[best] = -np.inf
+            ranking = np.concatenate([ranking, best])
+        return ranking
+
+    def learned(self, chosen: np.ndarray, nearest: np.ndarray) -> float:
+        """Return how much images learn, on average, if each is matched with another one alone.
+
+        Args:
+            chosen: the points (K,) that are kept.
+            nearest: of each image the one (I,) that it is matched with, maybe itself.
+        """
+        rows = self._rows(chosen)
+        point = np.repeat(chosen, self._numbers[chosen])
+        shown = self._image[rows] * len(self.points) + point
+        is_matched = np.isin(nearest[self._image[rows]] * len(self.points) + point, shown)
+        information = self._unknown()
+        self._add(rows[is_matched], information)
+        return float(np.linalg.slogdet(information)[1].mean())
+
+    def _unknown(self) -> np.ndarray:
+        """Return the matrices (I, 6, 6) of images without points."""
+        return np.tile(np.eye(6) / UNKNOWN**2, (len(self.points.names), 1, 1))
+
+    def _gains(self, chosen: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+        """Return how much more images learn, in sum, with each of points (K,) by itself.
 
         Args:
             chosen: the points.
@@ -107,9 +110,8 @@ class _Sights:
         number = np.repeat(np.arange(len(chosen)), self._numbers[chosen])
         return np.bincount(number, growth, minlength=len(chosen))
 
-    def add(self, chosen: np.ndarray, information: np.ndarray) -> None:
-        """Add what points (K,) tell to the inverses of the covariances (I, 6, 6)."""
-        rows = self._rows(chosen)
+    def _add(self, rows: np.ndarray, information: np.ndarray) -> None:
+        """Add what points tell images, in rows (O,), to the matrices (I, 6, 6)."""
         side = self._derivatives[rows]
         np.add.at(information, self._image[rows], side.swapaxes(1, 2) @ side)
 

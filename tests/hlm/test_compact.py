@@ -148,9 +148,9 @@ def test_a_limit_of_the_size(built, tmp_path):
     expected, _ = Localizer(whole).localize(images / "query/day/a.png")
     assert max(pose_error(pose, expected)) < 0.2
     found, everything = CompactMap(half), CompactMap(whole)
-    assert [*found.names] == [*everything.names]  # so few are all needed
+    assert len(found.names) == 1 and {*found.names} < {*everything.names}  # all show the plane
     assert found.vocabulary.shape == (2, 32) and everything.vocabulary.shape == (64, 32)
-    assert found.global_descriptors().shape == (4, 64)
+    assert found.global_descriptors().shape == (1, 64)
     compact.main(half, folder, max_mb=whole.stat().st_size / 1e6)
     assert half.read_bytes() == whole.read_bytes()
     with pytest.raises(InputError, match="too small"):

@@ -24,7 +24,7 @@ def points_of(xyz, shown):
 def rank(xyz, shown, reliability=None):
     points = points_of(xyz, shown)
     reliability = np.ones(len(xyz)) if reliability is None else reliability
-    return selection.by_information(points, row({})[0], reliability)
+    return selection.Sights(points, row({})[0], reliability).ranked()
 
 
 @pytest.fixture
@@ -63,6 +63,19 @@ def test_all_points_are_ranked_once_and_always_the_same(cloud, monkeypatch):
     monkeypatch.setattr(selection, "SPARE", 0)
     monkeypatch.setattr(selection, "POINTS_PER_CHUNK", 7)
     assert np.array_equal(rank(cloud, shown), ranking)
+
+
+def test_images_learn_from_the_points_that_they_share_with_the_one_they_are_matched_with(cloud):
+    """The first three show other points than the last three."""
+    points = points_of(cloud, [range(30)] * 3 + [range(30, 60)] * 3)
+    sights = selection.Sights(points, row({})[0], np.ones(60))
+    everything, itself = np.arange(60), np.arange(IMAGES)
+    learned = sights.learned(everything, itself)
+    assert learned == sights.learned(everything, np.array([1, 2, 0, 5, 3, 4]))
+    nothing = sights.learned(everything[:0], itself)
+    assert nothing == pytest.approx(12 * np.log(1 / selection.UNKNOWN))
+    assert sights.learned(everything, np.zeros(IMAGES, int)) < (learned + nothing) / 2 + 1
+    assert nothing < sights.learned(everything[::2], itself) < learned
 
 
 def test_points_like_other_keypoints_are_unreliable(tmp_path):
