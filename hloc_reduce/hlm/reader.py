@@ -197,7 +197,8 @@ class CompactMap:
                 arrays, "coarse", np.uint8, (min(signs.COARSE, width), len(self.names))
             )
             self._coarse = signs.Signs(columns, number)
-            tensors.read_by_pages(self._signs)  # few rows, all over the file
+            for part in ("retrieval", "images", "names"):  # little of each, all over the file
+                tensors.read_by_pages(arrays[part])
 
     @cached_property
     def _every_sign(self) -> signs.Signs:
