@@ -45,6 +45,7 @@ VOCABULARY_SHARE = 1 / 256  # of the limit, at most, but for two words
 # descriptors of points are means, so that a less strict ratio test is enough
 MATCHERS = {"NN-ratio": "NN-ratio90"}
 Ranking = Callable[[points.Points, pycolmap.Reconstruction], np.ndarray]
+PACKED = 2  # version of the choice of points and images of a limited map
 MAX_UINT4_DIM = 32  # of DoG's features that are stored as uint4; others as uint2
 
 

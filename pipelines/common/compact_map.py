@@ -55,7 +55,7 @@ def main(
     """Pack the map of a run into a file, localize the queries in it and return the summary.
 
     The file and the results are in a folder of the run's outputs folder, whose features they share.
-    They are stale if the map has changed.
+    They are stale if the map or its packing has changed.
 
     Args:
         run: the run, with features, map and global descriptors.
@@ -69,10 +69,10 @@ def main(
         InputError: when `max_mb` is too small.
     """
     outputs = folder(run.folder.path, True, max_mb)
-    made_from = provenance.of_inputs({}, [sfm / "points3D.bin"])
+    made_from = provenance.of_inputs({"packed": compact.PACKED}, [sfm / "points3D.bin"])
     is_old = (outputs / provenance.MADE_FROM).exists()
     if stale := is_old and not provenance.is_current(outputs / provenance.MADE_FROM, made_from):
-        logger.info("Results in %s are stale, as the map has changed.", outputs)
+        logger.info("Results in %s are stale, as the map or its packing has changed.", outputs)
     results = RunFolder(outputs, {"max_mb": max_mb}, overwrite=False, stale=stale)
     steps = compact.matcher_of(run.steps[0]), *run.steps[1:]
     matcher = run.matcher if run.steps[1:] else steps[0]
