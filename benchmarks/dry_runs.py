@@ -181,14 +181,15 @@ def write_photos(wall: Wall, photos: list[Photo], root: Path) -> None:
         cv2.imwrite(str(root / photo.name), pixels)
 
 
-def write_nvm(model: pycolmap.Reconstruction, path: Path) -> None:
-    """Write a COLMAP model as an NVM file."""
+def write_nvm(model: pycolmap.Reconstruction, path: Path, width: int | None = None) -> None:
+    """Write a COLMAP model as an NVM file, with focal lengths of photos of a width."""
     ids = sorted(model.reg_image_ids())
     lines = ["NVM_V3", "", str(len(ids))]
     for image in map(model.image, ids):
         camera, pose = image.camera, image.cam_from_world()
         x, y, z, w = pose.rotation.quat
-        numbers = camera.focal_length, w, x, y, z, *image.projection_center()
+        focal_length = camera.focal_length * (width or camera.width) / camera.width
+        numbers = focal_length, w, x, y, z, *image.projection_center()
         distortion = -camera.params[3] if camera.model.name == "SIMPLE_RADIAL" else 0
         lines.append(to_line(image.name, *numbers, distortion, 0))
     lines += ["", str(model.num_points3D())]
@@ -251,7 +252,7 @@ def write_cambridge(root: Path, share: float) -> None:
         ]
         write_lines(root / name, [*HEADER, *lines])
     jpeg = [replace(photo, name=photo.name.replace(".png", ".jpg")) for photo in photos]
-    write_nvm(wall.model(jpeg), root / cambridge_nvm.NVM)
+    write_nvm(wall.model(jpeg), root / cambridge_nvm.NVM, cambridge_nvm.SIZE[0])
     folder = Cambridge.folder(root)
     write_lines(folder / Cambridge.query_list, [photo.name for photo in photos if photo.is_query])
     for name in (Cambridge.all_images, "model_train"):

@@ -19,7 +19,7 @@ NVM = "reconstruction.nvm"
 MAP_LIST, QUERY_LIST = "dataset_train.txt", "dataset_test.txt"
 LINE = "name x y z qw qx qy qz"
 WORDS = len(LINE.split())
-SIZE = 1920, 1080  # of all photos
+SIZE = 1920, 1080  # of all photos, unless they were resized
 
 
 class CambridgeNvm(Cambridge):
@@ -108,8 +108,9 @@ class CambridgeNvm(Cambridge):
     def _intrinsics(self, name: str) -> pycolmap.Camera:
         view = self._view(name)
         width, height = stored_size(self.images / name) or SIZE
+        focal_length = view.focal_length * width / SIZE[0]
         # COLMAP's distortion is that of undistorted positions
-        params = view.focal_length, width / 2, height / 2, -view.distortion
+        params = focal_length, width / 2, height / 2, -view.distortion
         return pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
 
 

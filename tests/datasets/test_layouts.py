@@ -27,9 +27,9 @@ from pipelines import aachen, compare
 QUERY = "4.png"  # of the plane
 
 
-def write_nvm(model: pycolmap.Reconstruction, path: Path) -> Path:
+def write_nvm(model: pycolmap.Reconstruction, path: Path, width: int | None = None) -> Path:
     """Write an NVM file and the list of its intrinsics, which is returned."""
-    dry_runs.write_nvm(model, path)
+    dry_runs.write_nvm(model, path, width)
     lines = []
     for image in map(model.image, sorted(model.reg_image_ids())):
         camera = image.camera
@@ -157,7 +157,7 @@ def cambridge_nvm_layout(plane) -> Path:
         image.name = image.name.replace(".png", ".jpg")
     for name, lines in lists.items():
         dry_runs.write_lines(root / f"dataset_{name}.txt", lines)
-    write_nvm(model, root / "reconstruction.nvm").unlink()
+    write_nvm(model, root / "reconstruction.nvm", 1920).unlink()  # the photos are smaller
     return root
 
 
