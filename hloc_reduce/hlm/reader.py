@@ -193,9 +193,9 @@ class CompactMap:
         self._signs = _array(arrays, "retrieval", np.uint8, (len(self.names), width))
         self._coarse: signs.Signs | None = None
         if "coarse" in arrays:
-            columns = _array(
-                arrays, "coarse", np.uint8, (min(signs.COARSE, width), len(self.names))
-            )
+            columns = _array(arrays, "coarse", np.uint8, (None, len(self.names)))
+            if not 0 < len(columns) <= width:
+                raise ValueError(f"coarse of {len(columns)} bytes an image")
             self._coarse = signs.Signs(columns, number)
             for part in ("retrieval", "images", "names"):  # little of each, all over the file
                 tensors.read_by_pages(arrays[part])
