@@ -45,6 +45,7 @@ def main(
     mirror_images: MirrorImages | None = None,
     again: Sequence[stage.Try] = (),
     rigs: Annotated[Frames, HIDDEN] = MappingProxyType({}),
+    match_rigs: stage.MatchRigs | None = None,
 ) -> dict[str, dict]:
     """Localize queries in a COLMAP model.
 
@@ -73,6 +74,7 @@ def main(
         again: how queries that are not localized are matched once more, see
             `localization.stage.main`.
         rigs: queries of which one pose is estimated together, see `localization.stage.main`.
+        match_rigs: matches photos of rigs once more, see `localization.stage.main`.
 
     Returns:
         A record for each query, as `localization.stage.main` returns it and keeps it in
@@ -122,6 +124,7 @@ def main(
             mirror_images=mirror_images,
             again=again,
             rigs=rigs,
+            match_rigs=match_rigs,
         )
     finally:
         _load.cache_clear()  # a map may be large

@@ -91,6 +91,7 @@ def main(
                 gate=given.gate,
                 again=run.again(loc_pairs, features),
                 rigs=run.rigs,
+                match_rigs=run.match_rigs(loc_pairs, features),
             )
         sizes = {"map_points3D": reconstruction.num_points3D(), "map_bytes": run.map_bytes(sfm)}
         return run.finish_dataset(lists, limits, records, poses, loc_matches, sfm, **sizes)

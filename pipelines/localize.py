@@ -329,6 +329,7 @@ def main(
                 mirror_images=mirror_images(steps[0]),
                 again=run.again(loc_pairs, features, built.features, mirror_images, others),
                 rigs=wanted.frames,
+                match_rigs=run.match_rigs(loc_pairs, features, built.features),
             )
             if wanted.panoramas:
                 records = panorama_files.write_records(wanted.frames, records, poses, unreadable)

@@ -10,6 +10,7 @@ import pycolmap
 from ..utils import colmap
 from . import absolute_pose
 from . import gate as gates
+from .absolute_pose import CERTAIN
 from .gate import Gate
 from .measures import (
     INDEPENDENT,
@@ -115,6 +116,12 @@ class RigPose:
     measures: Measures = Measures()
     refusal: str | None = None
     covariance: np.ndarray | None = None
+
+    @property
+    def may_gain(self) -> bool:
+        """Whether matches with the map images about it may make the pose certain, or another."""
+        is_certain = self.refusal is None and self.measures.confidence >= CERTAIN
+        return self.rig_from_world is not None and not is_certain
 
 
 def estimate(sights: Sequence[Sight], gate: Gate) -> RigPose:

@@ -17,8 +17,9 @@ from ..utils.progress import progress
 from . import gate as gates
 from . import rig_pose
 from .inputs import Settings, read_matches
+from .near import Surroundings
 from .records import to_record
-from .references import Reference
+from .references import Reference, SfmMap
 from .rigs import Frames
 
 CHUNK = 4  # frames
@@ -39,6 +40,10 @@ class RigPhoto(NamedTuple):
     camera: pycolmap.Camera
     cam_from_rig: pycolmap.Rigid3d
     retrieved: list[str]
+
+
+# the name of a frame, its pose, and the records of its photos
+SolvedFrame = tuple[str, rig_pose.RigPose, dict[str, dict]]
 
 
 def open_frames(
@@ -70,13 +75,43 @@ def open_frames(
     return frames
 
 
+def with_images_about(
+    reference: SfmMap,
+    frames: Sequence[tuple[str, list[RigPhoto]]],
+    poses: Mapping[str, rig_pose.RigPose],
+) -> list[tuple[str, list[RigPhoto]]]:
+    """Return the frames whose poses may gain by map images about them, with these.
+
+    A camera in the dark may retrieve other places.
+
+    Args:
+        reference: the map.
+        frames: names of frames and their photos.
+        poses: of some frames.
+    """
+    surroundings = Surroundings(reference, sorted(reference.images), reference.views)
+    found = []
+    for frame, photos in frames:
+        pose = poses.get(frame)
+        likely = pose.rig_from_world if pose and pose.may_gain else None
+        if likely is None or surroundings.is_far(likely):
+            continue
+        more = []
+        for photo in photos:
+            near = surroundings.guess(photo.cam_from_rig * likely, None, photo.camera).images
+            more.append(photo._replace(retrieved=[*dict.fromkeys([*photo.retrieved, *near])]))
+        if more != photos:
+            found.append((frame, more))
+    return found
+
+
 def localize_frames(
     settings: Settings,
     features: Path,
     matches: Path,
     frames: Sequence[tuple[str, Sequence[RigPhoto]]],
-) -> Iterator[tuple[str, str | None, dict[str, dict]]]:
-    """Yield of each frame its name, why its pose is not trusted, None if it is, and records.
+) -> Iterator[SolvedFrame]:
+    """Yield of each frame its name, pose and records.
 
     Args:
         settings: how they are localized.
@@ -99,7 +134,7 @@ def _localize_chunk(
     features: Path,
     matches: Path,
     frames: Iterable[tuple[str, Sequence[RigPhoto]]],
-) -> Generator[tuple[str, str | None, dict[str, dict]], None, None]:
+) -> Generator[SolvedFrame, None, None]:
     reference, gate = settings.load_reference(), settings.gate
 
     def read(photo: RigPhoto) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -108,7 +143,7 @@ def _localize_chunk(
         least = settings.skip_matches
         return keypoints, {name: pairs for name, pairs in found.items() if len(pairs) >= least}
 
-    def solve(task: tuple) -> tuple[str, str | None, dict[str, dict]]:
+    def solve(task: tuple) -> SolvedFrame:
         frame, seen = task
         names = dict.fromkeys(name for *_, found in seen for name in found)
         floors = reference.floors([*names]) if names else [[]]
@@ -117,7 +152,7 @@ def _localize_chunk(
         verdict = gates.verdict(pose.measures, gate) | {"reason": pose.refusal}
         told = solved[number][1]
         records = {one[0].name: _record(reference, pose, verdict, *one) for one in told}
-        return frame, pose.refusal, records
+        return frame, pose, records
 
     def on_floor(seen: list, floor: list[str]) -> tuple[rig_pose.RigPose, list[tuple]]:
         sights, infos = [], []

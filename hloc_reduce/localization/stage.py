@@ -37,14 +37,24 @@ from .records import (
     to_record,
     with_mirror_image,
 )
-from .references import Reference
-from .rig_stage import localize_frames, open_frames, report_frames
+from .references import Reference, SfmMap
+from .rig_pose import RigPose
+from .rig_stage import (
+    RigPhoto,
+    SolvedFrame,
+    localize_frames,
+    open_frames,
+    report_frames,
+    with_images_about,
+)
 from .rigs import Frames, written
 
 CHUNK = 8  # queries
 SHOWN = 3  # queries whose reasons a message gives
 
 Task = tuple[str, pycolmap.Camera | None, list[str]]  # a query, and the images retrieved for it
+# matches pairs of queries and map images by the matcher of a try; returns the match file
+MatchRigs = Callable[[int, Sequence[tuple[str, str]]], Path]
 
 
 class Matched(NamedTuple):
@@ -98,6 +108,7 @@ def main(
     mirror_images: MirrorImages | None = None,
     again: Sequence[Try] = (),
     rigs: Frames = MappingProxyType({}),
+    match_rigs: MatchRigs | None = None,
 ) -> dict[str, dict]:
     """Localize queries by the files of their features and matches.
 
@@ -124,6 +135,8 @@ def main(
         again: how queries that are not localized are matched once more, one after the other.
         rigs: queries of which one pose is estimated together; their intrinsics are exact. If it is
             trusted, it replaces their own ones.
+        match_rigs: matches photos of rigs with map images about an uncertain pose of the rig, in a
+            COLMAP model; None: they are not.
 
     Returns:
         A record for each query, of the try that localized it or else came nearest: `localized`;
@@ -139,7 +152,7 @@ def main(
         as above. The measures, but not the numbers, of such a pose are those of all photos.
     """
     header = {"records": RECORDS, "gate": asdict(gate), **made_from}
-    header |= {"rigs": written(rigs)} if rigs else {}
+    header |= {"rigs": written(rigs), "match_rigs": bool(match_rigs)} if rigs else {}
     header |= {"mirror_images": True} if mirror_images else {}
     header |= {"again": [one.made_from for one in again]} if again else {}
     with Log(log_file(results), header, overwrite) as log:
@@ -152,7 +165,7 @@ def main(
         if any(name not in log.records for name, _, _ in tasks):
             _check_some_matched(matches, [name for name, _ in queries], retrieved)
         settings = Settings(load_reference, config, skip_matches, gate, executor)
-        localizing = _Localizing(log, settings)
+        localizing = _Localizing(log, settings, match_rigs)
         matched = Matched(features, matches)
         tries = [Try(lambda _: matched, {}, mirror_images, told=FIRST), *again]
         for number, one in enumerate(tries):
@@ -177,6 +190,7 @@ class _Localizing:
 
     log: Log
     settings: Settings
+    match_rigs: MatchRigs | None
 
     def run(self, number: int, given: Try, tasks: list[Task]) -> None:
         """Localize queries by the first try, number 0, or those not localized by a further one.
@@ -222,18 +236,52 @@ class _Localizing:
 
     def run_rigs(self, number: int, given: Try, rigs: Frames, tasks: list[Task]) -> None:
         """Localize the frames of rigs by a try, unless an earlier one found a trusted pose."""
-        records = self.log.records
-        frames = open_frames(number, rigs, tasks, records)
+        frames = open_frames(number, rigs, tasks, self.log.records)
         if not frames:
             return
         matched = given.match([photo.name for _, photos in frames for photo in photos])
-        found = localize_frames(self.settings, matched.features, matched.matches, frames)
-        for frame, reason, of_photos in found:
-            rig = {"frame": frame, "reason": reason, "tried": number}
-            for name, record in of_photos.items():
-                before = records[name]
-                told = {**FIRST, **given.told, "try": number, "tried": before["tried"]}
-                self.log.add(name, {**(before if reason else record | told), "rig": rig})
+        uncertain: dict[str, SolvedFrame] = {}
+        for solved in localize_frames(self.settings, matched.features, matched.matches, frames):
+            if self.match_rigs and solved[1].may_gain:
+                uncertain[solved[0]] = solved
+            else:
+                self._log_frame(number, given, *solved)
+        for solved in self._match_again(number, matched.features, frames, uncertain):
+            uncertain[solved[0]] = solved
+        for solved in uncertain.values():
+            self._log_frame(number, given, *solved)
+
+    def _match_again(
+        self,
+        number: int,
+        features: Path,
+        frames: list[tuple[str, list[RigPhoto]]],
+        uncertain: Mapping[str, SolvedFrame],
+    ) -> Iterator[SolvedFrame]:
+        """Localize the frames of uncertain poses with map images about these, too."""
+        if not self.match_rigs or not uncertain:
+            return
+        reference = self.settings.load_reference()
+        assert isinstance(reference, SfmMap)
+        poses = {frame: pose for frame, pose, _ in uncertain.values()}
+        wider = with_images_about(reference, frames, poses)
+        if wider:
+            pairs = [
+                (one.name, other) for _, seen in wider for one in seen for other in one.retrieved
+            ]
+            matches = self.match_rigs(number, pairs)
+            yield from localize_frames(self.settings, features, matches, wider)
+
+    def _log_frame(
+        self, number: int, given: Try, frame: str, pose: RigPose, of_photos: dict[str, dict]
+    ) -> None:
+        """Log the records of the photos of a frame by a try."""
+        records, reason = self.log.records, pose.refusal
+        rig = {"frame": frame, "reason": reason, "tried": number}
+        for name, record in of_photos.items():
+            before = records[name]
+            told = {**FIRST, **given.told, "try": number, "tried": before["tried"]}
+            self.log.add(name, {**(before if reason else record | told), "rig": rig})
 
     def _try_mirror_images(
         self, mirror_images: MirrorImages, files: tuple[Path, Path], tasks: list[Task]

@@ -10,7 +10,6 @@ import pycolmap
 
 from ..localization import gate as gates
 from ..localization import intrinsics, mirrored, panoramas, query, rig_pose, stage, views
-from ..localization.absolute_pose import CERTAIN
 from ..localization.gate import DEFAULT_GATE, Gate
 from ..localization.near import Guess, Surroundings
 from ..localization.query import merged, ransac_options
@@ -380,9 +379,8 @@ class Localizer:
         laps.end("matching")
         found = self._estimate_rig(photos, matches, rig, gate)
         laps.end("pose")
-        pose, likely = found[0], found[0].rig_from_world
-        is_certain = pose.refusal is None and pose.measures.confidence >= CERTAIN
-        if is_certain or likely is None or self.is_far(likely):
+        likely = found[0].rig_from_world
+        if likely is None or not found[0].may_gain or self.is_far(likely):
             return found
         more: list[dict[str, np.ndarray]] = []
         for photo, known, (_, camera, cam_from_rig) in zip(photos, matches, rig, strict=True):

@@ -100,6 +100,7 @@ def main(
                 gate=run.options.gate,
                 again=part.again(pairs, features, built.features),
                 rigs=run.rigs,
+                match_rigs=part.match_rigs(pairs, features, built.features),
             )
         files = run.files(built.features, built.sfm, pairs, matches)
         summary = run.summary(

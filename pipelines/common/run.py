@@ -1,7 +1,7 @@
 """A run of a pipeline: its outputs folder, matching, and the summary at its end."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import MappingProxyType
@@ -20,7 +20,7 @@ from hloc_reduce.evaluation.summaries import (
 from hloc_reduce.localization import rig_stage
 from hloc_reduce.localization.frame import UNKNOWN, Frame
 from hloc_reduce.localization.mirrored import MirrorImages
-from hloc_reduce.localization.stage import Matched, Try
+from hloc_reduce.localization.stage import Matched, MatchRigs, Try
 from hloc_reduce.maps.mirror_images import mirror_images
 from hloc_reduce.runtime.executors import SERIAL, Executor
 from hloc_reduce.runtime.group_writer import failures
@@ -30,7 +30,7 @@ from hloc_reduce.utils.files import write_csv
 from hloc_reduce.utils.h5 import get_conf, open_h5
 from hloc_reduce.utils.images import list_images, with_reasons
 from hloc_reduce.utils.match_files import check_distinct
-from hloc_reduce.utils.parsers import parse_pairs, write_pairs_of
+from hloc_reduce.utils.parsers import parse_pairs, write_pairs, write_pairs_of
 
 Thresholds = Mapping[str, tuple[tuple[float, float], ...]]  # of each query list, metres and degrees
 
@@ -152,6 +152,18 @@ class Run:
         with open_h5(features) as file:
             made_from = {"model": model, **matchers_confs.provenance(model, get_conf(file))}
         return Try(match, made_from, mirror_images(matcher) if mirror_images else None)
+
+    def match_rigs(
+        self, pairs: Path, features: Path, features_ref: Path | None = None
+    ) -> MatchRigs:
+        """Return what matches photos of rigs once more; the arguments are those of `again`."""
+
+        def match(number: int, listed: Sequence[tuple[str, str]]) -> Path:
+            wider = pairs.with_stem(f"{pairs.stem}-rigs{number or ''}")
+            write_pairs(listed, wider)
+            return self.match_pairs(self.steps[number], wider, features, features_ref)
+
+        return match
 
     def mirror_images(
         self,

@@ -80,8 +80,8 @@ def localized(folder, right):
     gate = Gate(match_kind="mutual")
     settings = Settings(lambda: reference, lambda *_: options, 0, gate, SERIAL)
     files = folder / "features.h5", folder / "matches-NN-mutual_.h5"
-    [(_, reason, records)] = rig_stage.localize_frames(settings, *files, [("front/1.jpg", frames)])
-    return reason, records
+    [(_, pose, records)] = rig_stage.localize_frames(settings, *files, [("front/1.jpg", frames)])
+    return pose.refusal, records
 
 
 @pytest.mark.parametrize("floor", [UPSTAIRS, DOWNSTAIRS])

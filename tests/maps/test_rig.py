@@ -9,8 +9,8 @@ import pytest
 
 from hloc_reduce import Localizer, compact
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.localization import rig_pose
 from hloc_reduce.localization.gate import Gate
-from hloc_reduce.maps import localizer
 from hloc_reduce.utils.cli import InputError
 
 
@@ -63,7 +63,7 @@ def test_an_uncertain_rig_is_matched_with_the_images_about_it(is_trusted, rig, m
     assert [len(one["retrieved"]) for one in info["cameras"]] == [1, 1]  # it is certain
     number = info["num_inliers"]
     gate = Gate(min_inliers=8 if is_trusted else number + 1)
-    monkeypatch.setattr(localizer, "CERTAIN", np.inf if is_trusted else 0.0)
+    monkeypatch.setattr(rig_pose, "CERTAIN", np.inf if is_trusted else 0.0)
     given = photos, cameras, cams_from_rig
     pose, more = Localizer(path, num_loc=1, gate=gate).localize_rig(*given)
     assert more["reason"] is None and more["num_inliers"] > number

@@ -11,8 +11,10 @@ from command import outcome, state
 
 from hloc_reduce import maps
 from hloc_reduce.evaluation.poses import pose_error
+from hloc_reduce.localization import rig_pose
 from hloc_reduce.localization.records import pose_of, read_records
 from hloc_reduce.utils.cli import InputError
+from hloc_reduce.utils.parsers import parse_pairs
 from pipelines import localize
 
 PIPELINE = localize
@@ -100,6 +102,28 @@ def test_photos_of_a_moment_get_one_pose(rig, tmp_path, run):
     assert records["left/1.png"]["qvec"] and rows["left/1.png"]["frame"] == ""
     run(*given[:6])  # without a rig
     assert records_of(outputs)["left/1.png"]["rig"] is None
+
+
+def test_an_uncertain_rig_is_matched_with_the_images_about_it(rig, tmp_path, monkeypatch, run):
+    """Each camera retrieves one image, and no pose is certain."""
+    folder, rigs, true, outputs = rig
+    given = "--map", outputs / "map", "--query_images", folder, "--num_loc", 1
+    given += "--rigs", write(rigs, tmp_path)
+    run(*given, "--outputs", outputs)
+    assert not [*(outputs / "queries-drive").glob("*-rigs.txt")]  # it is certain
+    monkeypatch.setattr(rig_pose, "CERTAIN", np.inf)
+    again = tmp_path / "again"
+    run(*given, "--outputs", again)
+    [pairs] = (again / "queries-drive").glob("*-rigs.txt")
+    listed = list(parse_pairs(pairs))
+    assert {name for name, _ in listed} == {"left/1.png", "right/1.png"}
+    assert len(listed) == len({*listed}) > 2
+    once, twice = records_of(outputs)["left/1.png"], records_of(again)["left/1.png"]
+    assert twice["measures"]["num_inliers"] > once["measures"]["num_inliers"]
+    assert twice["rig"]["reason"] is None and pose_error(pose_of(twice), true)[0] < 0.02
+    before = state(again / "queries-drive")
+    run(*given, "--outputs", again)
+    assert state(again / "queries-drive") == before
 
 
 def without(rigs, *keys):
