@@ -161,7 +161,8 @@ def write(
         if limit is not None and sum(parts.values()) > limit:
             reliability = selection.reliabilities(everything, features)
             sights = selection.Sights(everything, source.model, reliability)
-            ranking = rank(everything, source.model) if rank else sights.ranked()
+            fitting = int(limit * len(everything) / parts["descriptors"])  # at most
+            ranking = rank(everything, source.model) if rank else sights.ranked(fitting)
             kept = thinned(sights, ranking, parts, limit)
             ranking = ranking[np.isin(ranking, np.concatenate(kept.visible))]
             encode = partial(_encode, temporary, source, kept)

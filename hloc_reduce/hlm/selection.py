@@ -47,23 +47,27 @@ class Sights:
         self._numbers = np.bincount(point, minlength=len(points))
         self._starts = np.cumsum(self._numbers) - self._numbers
 
-    def ranked(self) -> np.ndarray:
+    def ranked(self, most: int | None = None) -> np.ndarray:
         """Rank points by how much more images learn with them, greedily.
 
         All images get points, spread over their parts and depths, and points that many images share
         come first.
 
+        Args:
+            most: stop at about this number of points; default: rank all.
+
         Returns:
-            Their indices (P,) int64, those that are needed most first; the same for the same
+            Their indices (K,) int64, those that are needed most first; the same for the same
             arguments.
         """
         information = self._unknown()
         number = len(self.points)
+        most = number if most is None else min(most, number)
         parts = np.array_split(np.arange(number), 1 + number // POINTS_PER_CHUNK)
         gains = np.concatenate([self._gains(part, np.linalg.inv(information)) for part in parts])
         ranking = np.zeros(0, np.int64)
-        while left := number - len(ranking):
-            covariances = np.linalg.inv(information)
+        while len(ranking) < most:
+            covariances, left = np.linalg.inv(information), number - len(ranking)
             more = min(max(1, int(AT_ONCE * len(ranking))), left)
             is_fresh = np.zeros(number, bool)
             while True:  # gains only shrink: points whose old gains are too small need no new ones

@@ -63,6 +63,8 @@ def test_all_points_are_ranked_once_and_always_the_same(cloud, monkeypatch):
     monkeypatch.setattr(selection, "SPARE", 0)
     monkeypatch.setattr(selection, "POINTS_PER_CHUNK", 7)
     assert np.array_equal(rank(cloud, shown), ranking)
+    sights = selection.Sights(points_of(cloud, shown), row({})[0], np.ones(60))
+    assert np.array_equal(sights.ranked(17), ranking[:17])
 
 
 def test_images_learn_from_the_points_that_they_share_with_the_one_they_are_matched_with(cloud):
