@@ -8,9 +8,6 @@ import numpy as np
 from .points import Points
 from .selection import Sights
 
-# parts of a file that grow with the number of points, and of images
-OF_POINTS, OF_IMAGES = ("coordinates", "descriptors"), ("poses", "retrieval", "names")
-
 
 def thinned(sights: Sights, ranking: np.ndarray, parts: dict[str, int], limit: float) -> Points:
     """Keep as many images of a map as is best for photos like all of them, in a limited file.
@@ -30,22 +27,19 @@ def thinned(sights: Sights, ranking: np.ndarray, parts: dict[str, int], limit: f
     points = sights.points
     shares = shares_of(points)
     order = ordered(shares)
-    per_point, per_image, per_sight = (
-        sum(parts[part] for part in of) / number
-        for of, number in (
-            (OF_POINTS, len(points)),
-            (OF_IMAGES, len(order)),
-            (("visible",), sum(map(len, points.visible))),
-        )
+    per_point = (parts["coordinates"] + parts["descriptors"]) / len(points)
+    per_image = (parts["poses"] + parts["retrieval"] + parts["names"]) / len(order)
+    per_sight = parts["visible"] / sum(map(len, points.visible))
+    others = (
+        sum(parts.values()) - parts["visible"] - per_point * len(points) - per_image * len(order)
     )
-    fixed = sum(parts.values()) - sum(parts[part] for part in (*OF_POINTS, *OF_IMAGES, "visible"))
     best, most, number = points, -np.inf, len(order)
     while number:
         chosen = np.sort(order[:number])
         kept = _only(points, chosen)
         shown = np.bincount(np.concatenate(kept.visible), minlength=len(points))
         seen = ranking[shown[ranking] > 0]
-        sizes = fixed + per_image * number + np.cumsum(per_point + per_sight * shown[seen])
+        sizes = others + per_image * number + np.cumsum(per_point + per_sight * shown[seen])
         fitting = seen[: np.searchsorted(sizes, limit)]
         learned = sights.learned(fitting, chosen[shares[:, chosen].argmax(axis=1)])
         if learned < most:
