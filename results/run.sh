@@ -77,9 +77,10 @@ small_maps() { # PLACE, FEATURE, STORAGE and sizes
 small_maps herz-jesus colmap_sift_sv32 uint4 0.006 0.0075 0.01 0.015 0.02 0.03 0.06 0.1 "$@"
 small_maps herz-jesus xfeat_sv32 uint2 0.006 0.0075 0.01 0.015 0.02 0.03 0.06 0.1 "$@"
 small_maps herz-jesus mini32 uint2 0.006 0.0075 0.01 0.015 0.02 0.03 0.06 0.1 "$@"
-for feature in mini32 xfeat_sv32; do # LightGlue finds fewer points than nearest neighbours of more keypoints
-    small_maps herz-jesus $feature uint2 0.0075 0.03 0.1 --matcher lightglue "$@"
+for storage in uint1 uint2 uint4; do # how many bytes a point, for LightGlue?
+    small_maps herz-jesus mini32 $storage 0.0075 0.03 --matcher lightglue "$@"
 done
+small_maps herz-jesus xfeat_sv32 uint2 0.03 0.1 --matcher lightglue "$@"
 small_maps demo_town-400 colmap_sift_sv32 uint4 0.083 0.1 0.125 0.17 0.25 0.5 1 "$@"
 small_maps day-south-building colmap_sift_sv32 uint4 0.006 0.0075 0.01 0.0175 0.02 0.025 "$@"
 small_maps sparse-redkitchen colmap_sift_sv32 uint4 0.006 0.0075 0.01 0.015 0.03 "$@"
@@ -183,6 +184,7 @@ run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 64 "$@"
 run aachen_scale --data $data/aachen_v1.1 --share 0.004 0.01 --dim 32 --storage uint4 "$@"
 run triangulation_scale --data $data/aachen_v1.1 --share 0.05 0.1 "$@"
 run compact_scale --data $data/aachen_v1.1 --share 0.1 1 10 30 100 "$@" # the last one writes 5 GB
+run compact_scale --data $data/aachen_v1.1 --share 1 --max_mb 10 "$@"
 if "$python" -c "import hloc" 2> /dev/null; then
     for place in herz-jesus day-fountain-P11; do
         run against_hloc --dataset $data/$place --keypoints adaptive hloc fast "$@" \
