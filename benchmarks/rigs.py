@@ -1,11 +1,11 @@
 """Localize rigs: one to four cameras in the demo town at night, or the halves of dark photos.
 
 A rig stands where a query by night is taken in towns of seed 0 with 320 photos or more; its cameras
-look ahead, to the left, back and to the right, and are 20 cm apart. Adds rows to
-results/rigs.csv, leaving out what has rows unless --again is given: the first one to four cameras,
-and the one of these that is localized with the most inliers by itself; each camera by itself; rigs
-whose last camera took its photo elsewhere in the town. Position errors are those of the rig;
-`wrong` counts those above 1 m.
+look ahead, to the left, back and to the right, and are 20 cm apart. Adds rows to results/rigs.csv,
+leaving out what has rows unless --again is given: the first one to four cameras as a rig; the photo
+of these that has the most inliers when it is localized alone; all photos alone; and rigs whose last
+camera took its photo elsewhere in the town. Position errors are those of the rig; `wrong` counts
+those above 1 m.
 
 With --strangers, rigs are of successive photos of other places, and none may be localized.
 

@@ -101,7 +101,7 @@ class Sights:
         return np.tile(np.eye(6) / UNKNOWN**2, (len(self.points.names), 1, 1))
 
     def _gains(self, chosen: np.ndarray, covariances: np.ndarray) -> np.ndarray:
-        """Return how much more images learn, in sum, with each of points (K,) by itself.
+        """Return how much more all images would learn with one more point, for each of some (K,).
 
         Args:
             chosen: the points.
