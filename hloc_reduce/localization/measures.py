@@ -281,13 +281,28 @@ def uncertainty(
         independent: more inliers do not make the pose more precise.
     """
     found = covariance(points2D, points3D, cam_from_world, camera, degrees_of_freedom)
-    if found is None:
-        return UNDETERMINED
-    variance, bent = np.diag(found), max(1, len(points2D) / independent)
-    rotation, position, focal_length = variance[:3], variance[3:POSE], variance[POSE:FOCAL]
     depths = points3D @ cam_from_world.rotation.matrix()[2] + cam_from_world.translation[2]
+    depth = float(np.median(depths)) if len(depths) else 1.0
+    return standard_deviations(found, depth, len(points2D), independent)
+
+
+def standard_deviations(
+    covariance: np.ndarray | None, depth: float, number: int, independent: int = INDEPENDENT
+) -> Uncertainty:
+    """Return the `uncertainty` of a pose.
+
+    Args:
+        covariance: (F, F) of the pose, see `covariance`; None if it is not determined.
+        depth: median depth of the inliers.
+        number: of the inliers.
+        independent: more of them do not make the pose more precise.
+    """
+    if covariance is None:
+        return UNDETERMINED
+    variance, bent = np.diag(covariance), max(1, number / independent)
+    rotation, position, focal_length = variance[:3], variance[3:POSE], variance[POSE:FOCAL]
     return Uncertainty(
-        position=float(np.sqrt(bent * position.sum()) / abs(np.median(depths))),
+        position=float(np.sqrt(bent * position.sum()) / abs(depth)),
         rotation=float(np.degrees(np.sqrt(bent * rotation.sum()))),
         focal_length=float(np.sqrt(focal_length.sum())),
     )

@@ -13,16 +13,14 @@ from . import gate as gates
 from .absolute_pose import CERTAIN
 from .gate import Gate
 from .measures import (
-    INDEPENDENT,
     MIN_MATCHES,
-    UNDETERMINED,
     Alternative,
     Measures,
     Seen,
-    Uncertainty,
     agreement,
     joint_confidence,
     rig_covariance,
+    standard_deviations,
     without_most_telling,
 )
 from .pose import MAX_ERROR, Pose, motion
@@ -317,7 +315,7 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         best.measures,
         num_matches=start,
         agreement=agreement(np.concatenate(best.inliers), images),
-        uncertainty=_uncertainty(others_covariance, depth, best.measures.num_inliers),
+        uncertainty=standard_deviations(others_covariance, depth, best.measures.num_inliers),
         is_camera_given=True,
         focal_range=(0.0, np.inf),
         alternatives={"rival": max(rivals)} if rivals else {},
@@ -346,15 +344,6 @@ def _median_depth(photos: Sequence[Seen]) -> float:
     ]
     together = np.concatenate(depths)
     return float(np.median(together)) if len(together) else 1.0
-
-
-def _uncertainty(covariance: np.ndarray | None, depth: float, number: int) -> Uncertainty:
-    """Return standard deviations, see `measures.uncertainty`."""
-    if covariance is None:
-        return UNDETERMINED
-    variance = np.diag(covariance) * max(1, number / INDEPENDENT)
-    rotation, position = variance[:3].sum(), variance[3:].sum()
-    return Uncertainty(float(np.sqrt(position) / depth), float(np.degrees(np.sqrt(rotation))), 0.0)
 
 
 def _rival(best: RigPose, other: RigPose, depth: float) -> Alternative | None:
