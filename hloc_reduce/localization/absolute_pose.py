@@ -18,10 +18,12 @@ from .measures import (
     Seen,
     agreement,
     confidence,
+    covariance,
+    most_telling,
     uncertainty,
     uncertainty_without_one,
 )
-from .pose import Matches, Pose, quality
+from .pose import Matches, Pose, apart, quality
 from .projection import ALL, FOCAL, POSE, photo_scale, reprojection_errors
 
 SEED = 0
@@ -29,6 +31,7 @@ SAMPLE = 500  # matches, at most, from which a pose is tried before all, or a ri
 # confidence of a pose at which no other matches are tried, one and a half times the highest of
 # photos of other places in results/trials
 CERTAIN = 85.0
+DEVIATIONS = 3.0  # of what all other matches say of a pose, from which on one contradicts them
 STRICT = 1 / 2  # of an inlier threshold, the next one with which a pose is estimated again
 LEAST_SCALE = 0.1  # pixels, the least error from which on a match counts less
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
@@ -87,7 +90,7 @@ def estimate(
     with ThreadPoolExecutor(workers) as pool:
         if likely is None:
             poses = _found_anew(matches, images, thorough, pool)
-            first = _unbent(matches, max(poses, key=quality))
+            first = _agreed(matches, _unbent(matches, max(poses, key=quality)))
         else:
             poses = [first := _near(matches, images, likely)]
         outliers = pool.submit(_of_outliers, matches, first) if workers > 1 else None
@@ -136,17 +139,22 @@ def _refined(matches: Matches, pose: Pose, max_error: float) -> Pose:
     """Refine a pose by the matches that agree within a number of pixels."""
     if pose.cam_from_world is None:
         return pose
-    view = pose.cam_from_world, copy.deepcopy(pose.camera)
+    view = pose.cam_from_world, pose.camera
     errors, _ = reprojection_errors(matches.points2D, matches.points3D, *view)
-    agree = errors <= max_error
+    return _refined_by(matches, pose, errors <= max_error)
+
+
+def _refined_by(matches: Matches, pose: Pose, agree: np.ndarray) -> Pose:
+    """Refine a pose by some matches (M,) bool."""
+    assert pose.cam_from_world is not None
+    camera, points = copy.deepcopy(pose.camera), (matches.points2D, matches.points3D)
+    errors, _ = reprojection_errors(*points, pose.cam_from_world, camera)
     refinement = loss_options(errors[agree]) | matches.config.get("refinement", {})
-    found = colmap.refine_pose(
-        view[0], matches.points2D, matches.points3D, agree, view[1], refinement
-    )
+    found = colmap.refine_pose(pose.cam_from_world, *points, agree, camera, refinement)
     if found is None:
         return pose
-    errors, _ = reprojection_errors(matches.points2D, matches.points3D, found, view[1])
-    return _judged(matches, Pose(found, view[1], errors <= matches.max_error))
+    errors, _ = reprojection_errors(*points, found, camera)
+    return _judged(matches, Pose(found, camera, errors <= matches.max_error))
 
 
 def loss_options(errors: np.ndarray) -> dict[str, float]:
@@ -237,7 +245,7 @@ def _with_typical_lens(matches: Matches, pose: Pose) -> Pose:
     known = matches.with_typical_lens()
     if known is None or pose.cam_from_world is None or pose.measures.may_be_cropped:
         return pose
-    typical = _unbent(known, _estimate(known, np.flatnonzero(pose.inliers)))
+    typical = _agreed(known, _unbent(known, _estimate(known, np.flatnonzero(pose.inliers))))
     if typical.cam_from_world is None:
         return pose
     if pose.degrees_of_freedom == ALL:
@@ -341,3 +349,34 @@ def _unbent(matches: Matches, pose: Pose) -> Pose:
     refined = _refined(matches, best, matches.max_error)
     # intrinsics that few matches determine may leave them all behind
     return refined if 2 * refined.num_inliers > best.num_inliers else best
+
+
+def _agreed(matches: Matches, pose: Pose) -> Pose:
+    """Leave out the matches that tell most about a pose, as long as they contradict all others.
+
+    One wrong match far from the others may bend a pose until it fits, too, and the others hardly
+    worse: but refined by them alone, the pose is another one.
+    """
+    for _ in range(REESTIMATIONS):
+        if pose.cam_from_world is None:
+            break
+        inliers = matches.inliers(pose)
+        seen = Seen(*inliers, pose.cam_from_world, pose.camera, matches.max_error)
+        if covariance(*seen[:4], pose.degrees_of_freedom) is None:
+            break
+        _, telling = most_telling([seen], [pycolmap.Rigid3d()])
+        agree = pose.inliers.copy()
+        agree[agree] = ~telling
+        others = _refined_by(matches, pose, agree)
+        if others is pose or not 2 * others.num_inliers > pose.num_inliers:
+            break
+        assert others.cam_from_world is not None
+        view = others.cam_from_world, others.camera
+        given = matches.points2D[agree], matches.points3D[agree], *view
+        expected = uncertainty(*given, others.degrees_of_freedom)
+        position, rotation = apart(others, pose, matches.points3D)
+        near = position <= DEVIATIONS * expected.position
+        if near and rotation <= DEVIATIONS * expected.rotation:
+            break
+        pose = others
+    return pose

@@ -268,7 +268,7 @@ def uncertainty(
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
     degrees_of_freedom: int = POSE,
-    independent: int = INDEPENDENT,
+    independent: float = INDEPENDENT,
 ) -> Uncertainty:
     """Estimate how precisely inliers determine a pose, from its `covariance`.
 
@@ -287,7 +287,7 @@ def uncertainty(
 
 
 def standard_deviations(
-    covariance: np.ndarray | None, depth: float, number: int, independent: int = INDEPENDENT
+    covariance: np.ndarray | None, depth: float, number: int, independent: float = INDEPENDENT
 ) -> Uncertainty:
     """Return the `uncertainty` of a pose.
 
@@ -308,55 +308,76 @@ def standard_deviations(
     )
 
 
-def without_most_telling(
-    photos: Sequence[Seen], cams_from_rig: Sequence[pycolmap.Rigid3d], covariance: np.ndarray
-) -> list[Seen]:
-    """Leave out the keypoint that tells most about a pose, and those within SAME_PLACE of it.
+def most_telling(
+    photos: Sequence[Seen], cams_from_rig: Sequence[pycolmap.Rigid3d]
+) -> tuple[int, np.ndarray]:
+    """Find the place in a photo without whose keypoints a pose would be least certain.
 
-    A wrong match far from all others may fit as well as they do, and what it alone determines looks
-    certain: so a pose is only as certain as the others make it.
+    That is, without which the determinant of the inverse of its covariance is the smallest part.
 
     Args:
-        photos: the inliers of each camera.
+        photos: the inliers of each camera, which determine the pose.
         cams_from_rig: the pose of each camera in the rig.
-        covariance: (F, F) of the pose, see `covariance`; only that of its motion (6, 6) counts.
+
+    Returns:
+        The index of the camera, and which inliers (M,) bool of that are within SAME_PLACE.
     """
-    telling = []
+    of_places, total = [], np.zeros((POSE, POSE))
     for seen, cam_from_rig in zip(photos, cams_from_rig, strict=True):
         pose = seen.cam_from_world
         local = seen.points3D @ pose.rotation.matrix().T + pose.translation
         sides = project(local)[1][:, :POSE].transpose(2, 0, 1) @ cam_from_rig.adjoint()
-        lengths = seen.camera.mean_focal_length() ** 2
-        each = np.einsum("mif,fg,mig->m", sides, covariance[:POSE, :POSE], sides) * lengths
-        telling.append(_sums_of_places(seen, each))
-    most = int(np.argmax([each.max(initial=-np.inf) for each in telling]))
-    left = list(photos)
-    seen, place = photos[most], photos[most].points2D[telling[most].argmax()]
+        each = seen.camera.mean_focal_length() ** 2 * sides.swapaxes(1, 2) @ sides
+        sums = _at_places(seen) @ each.reshape(len(each), POSE**2)
+        of_places.append(sums.reshape(each.shape))
+        total += each.sum(axis=0)
+    left = [np.linalg.det(np.eye(POSE) - np.linalg.solve(total, places)) for places in of_places]
+    most = int(np.argmin([part.min(initial=np.inf) for part in left]))
+    seen, place = photos[most], photos[most].points2D[left[most].argmin()]
     apart = np.linalg.norm(seen.points2D - place, axis=1)
-    others = apart > SAME_PLACE * photo_scale(seen.camera)
-    left[most] = seen._replace(points2D=seen.points2D[others], points3D=seen.points3D[others])
+    return most, apart <= SAME_PLACE * photo_scale(seen.camera)
+
+
+def without_most_telling(
+    photos: Sequence[Seen], cams_from_rig: Sequence[pycolmap.Rigid3d]
+) -> list[Seen]:
+    """Leave out what is `most_telling`.
+
+    A wrong match far from all others may fit as well as they do, and what it alone determines looks
+    certain: so a pose is only as certain as the others make it.
+    """
+    most, telling = most_telling(photos, cams_from_rig)
+    left, seen = list(photos), photos[most]
+    left[most] = seen._replace(points2D=seen.points2D[~telling], points3D=seen.points3D[~telling])
     return left
 
 
-def _sums_of_places(seen: Seen, values: np.ndarray) -> np.ndarray:
-    """Return for each match (M,) the sum of its value and of those within SAME_PLACE of it."""
+def _at_places(seen: Seen):  # type: ignore[no-untyped-def]
+    """Return a sparse matrix (M, M): 1 where one match is within SAME_PLACE of another, or it."""
+    from scipy.sparse import coo_array, eye_array
     from scipy.spatial import cKDTree
 
     near = SAME_PLACE * photo_scale(seen.camera)
     pairs = cKDTree(seen.points2D).query_pairs(near, output_type="ndarray")
-    sums = values.copy()
-    for one, other in (pairs.T, pairs.T[::-1]):
-        sums += np.bincount(one, values[other], minlength=len(values))
-    return sums
+    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    number = len(seen.points2D)
+    return eye_array(number, format="csr") + coo_array(
+        (np.ones(len(one)), (one, other)), shape=(number, number)
+    )
+
+
+def independent_of(photos: Sequence[Seen]) -> float:
+    """Return how many matches count as independent: each place once, INDEPENDENT at most."""
+    places = sum((1 / _at_places(seen).sum(axis=1)).sum() for seen in photos)
+    return min(INDEPENDENT, float(places))
 
 
 def uncertainty_without_one(seen: Seen, degrees_of_freedom: int = POSE) -> Uncertainty:
     """Estimate the `uncertainty` of a pose by its inliers, `without_most_telling`."""
-    found = covariance(*seen[:4], degrees_of_freedom)
-    if found is None:
+    if covariance(*seen[:4], degrees_of_freedom) is None:
         return UNDETERMINED
-    (others,) = without_most_telling([seen], [pycolmap.Rigid3d()], found)
-    return uncertainty(*others[:4], degrees_of_freedom)
+    others = without_most_telling([seen], [pycolmap.Rigid3d()])
+    return uncertainty(*others[0][:4], degrees_of_freedom, independent_of(others))
 
 
 def agreement(inliers: np.ndarray, images: list[np.ndarray]) -> float:

@@ -14,10 +14,12 @@ from .absolute_pose import CERTAIN
 from .gate import Gate
 from .measures import (
     MIN_MATCHES,
+    UNDETERMINED,
     Alternative,
     Measures,
     Seen,
     agreement,
+    independent_of,
     joint_confidence,
     rig_covariance,
     standard_deviations,
@@ -300,11 +302,13 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         for seen, chosen in zip(photos, best.inliers, strict=True)
     ]
     cams_from_rig = [one.cam_from_rig for one in sights]
-    covariance = others_covariance = rig_covariance(agreeing, cams_from_rig)
-    if covariance is not None:
-        most = without_most_telling(agreeing, cams_from_rig, covariance)
-        others_covariance = rig_covariance(most, cams_from_rig)
+    covariance, uncertainty = rig_covariance(agreeing, cams_from_rig), UNDETERMINED
     depth = _median_depth(agreeing)
+    if covariance is not None:
+        left = without_most_telling(agreeing, cams_from_rig)
+        number, independent = sum(len(seen.points2D) for seen in left), independent_of(left)
+        its_covariance = rig_covariance(left, cams_from_rig)
+        uncertainty = standard_deviations(its_covariance, depth, number, independent)
     start, images = 0, []
     for one in sights:
         images += [start + chosen for chosen in one.images]
@@ -315,7 +319,7 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         best.measures,
         num_matches=start,
         agreement=agreement(np.concatenate(best.inliers), images),
-        uncertainty=standard_deviations(others_covariance, depth, best.measures.num_inliers),
+        uncertainty=uncertainty,
         is_camera_given=True,
         focal_range=(0.0, np.inf),
         alternatives={"rival": max(rivals)} if rivals else {},
