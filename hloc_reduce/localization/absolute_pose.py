@@ -16,6 +16,7 @@ from .measures import (
     MIN_MATCHES,
     Measures,
     Seen,
+    Uncertainty,
     agreement,
     confidence,
     covariance,
@@ -222,9 +223,9 @@ def _measures(
     )
     if pose.cam_from_world is None:
         return measures
-    seen = Seen(*matches.inliers(pose), pose.cam_from_world, pose.camera, matches.max_error)
-    precision = uncertainty_without_one(seen, pose.degrees_of_freedom)
-    return replace(measures, uncertainty=precision, uncropped=uncertainty(*seen[:4], ALL))
+    view = pose.cam_from_world, pose.camera
+    uncropped = uncertainty(*matches.inliers(pose), *view, ALL)
+    return replace(measures, uncertainty=_precision(matches, pose), uncropped=uncropped)
 
 
 def _off_centre(camera: pycolmap.Camera, x: float, y: float) -> float:
@@ -358,25 +359,47 @@ def _agreed(matches: Matches, pose: Pose) -> Pose:
     worse: but refined by them alone, the pose is another one.
     """
     for _ in range(REESTIMATIONS):
-        if pose.cam_from_world is None:
+        if (others := _by_others(matches, pose)) is None:
             break
-        inliers = matches.inliers(pose)
-        seen = Seen(*inliers, pose.cam_from_world, pose.camera, matches.max_error)
-        if covariance(*seen[:4], pose.degrees_of_freedom) is None:
-            break
-        _, telling = most_telling([seen], [pycolmap.Rigid3d()])
-        agree = pose.inliers.copy()
-        agree[agree] = ~telling
-        others = _refined_by(matches, pose, agree)
-        if others is pose or not 2 * others.num_inliers > pose.num_inliers:
-            break
+        agree = others.inliers & pose.inliers
+        given = matches.points2D[agree], matches.points3D[agree]
         assert others.cam_from_world is not None
         view = others.cam_from_world, others.camera
-        given = matches.points2D[agree], matches.points3D[agree], *view
-        expected = uncertainty(*given, others.degrees_of_freedom)
+        expected = uncertainty(*given, *view, others.degrees_of_freedom)
         position, rotation = apart(others, pose, matches.points3D)
         near = position <= DEVIATIONS * expected.position
         if near and rotation <= DEVIATIONS * expected.rotation:
             break
         pose = others
     return pose
+
+
+def _by_others(matches: Matches, pose: Pose) -> Pose | None:
+    """Refine a pose without the matches that tell most about it, None if the others are too few."""
+    if pose.cam_from_world is None:
+        return None
+    inliers = matches.inliers(pose)
+    seen = Seen(*inliers, pose.cam_from_world, pose.camera, matches.max_error)
+    if covariance(*seen[:4], pose.degrees_of_freedom) is None:
+        return None
+    _, telling = most_telling([seen], [pycolmap.Rigid3d()])
+    agree = pose.inliers.copy()
+    agree[agree] = ~telling
+    others = _refined_by(matches, pose, agree)
+    return others if others is not pose and 2 * others.num_inliers > pose.num_inliers else None
+
+
+def _precision(matches: Matches, pose: Pose) -> Uncertainty:
+    """Return how precisely the inliers of a pose fix it, even without those that tell most.
+
+    That is the `uncertainty_without_one`, or how far the pose moves without them if that is more.
+    """
+    assert pose.cam_from_world is not None
+    seen = Seen(*matches.inliers(pose), pose.cam_from_world, pose.camera, matches.max_error)
+    found = uncertainty_without_one(seen, pose.degrees_of_freedom)
+    if (others := _by_others(matches, pose)) is None:
+        return found
+    position, rotation = apart(pose, others, matches.points3D)
+    return found._replace(
+        position=max(found.position, position), rotation=max(found.rotation, rotation)
+    )
