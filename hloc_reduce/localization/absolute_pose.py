@@ -392,12 +392,14 @@ def _by_others(matches: Matches, pose: Pose) -> Pose | None:
 def _precision(matches: Matches, pose: Pose) -> Uncertainty:
     """Return how precisely the inliers of a pose fix it, even without those that tell most.
 
-    That is the `uncertainty_without_one`, or how far the pose moves without them if that is more.
+    That is the `uncertainty_without_one`, or how far the pose moves without them if that is more
+    and its focal length is known: an estimated one makes up for motions along the optical axis.
     """
     assert pose.cam_from_world is not None
     seen = Seen(*matches.inliers(pose), pose.cam_from_world, pose.camera, matches.max_error)
     found = uncertainty_without_one(seen, pose.degrees_of_freedom)
-    if (others := _by_others(matches, pose)) is None:
+    others = None if pose.degrees_of_freedom > POSE else _by_others(matches, pose)
+    if others is None:
         return found
     position, rotation = apart(pose, others, matches.points3D)
     return found._replace(
