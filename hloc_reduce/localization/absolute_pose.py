@@ -142,20 +142,21 @@ def _refined(matches: Matches, pose: Pose, max_error: float) -> Pose:
         return pose
     view = pose.cam_from_world, pose.camera
     errors, _ = reprojection_errors(matches.points2D, matches.points3D, *view)
-    return _refined_by(matches, pose, errors <= max_error)
+    found = _refined_by(matches, pose, errors <= max_error)
+    return pose if found is None else _judged(matches, found)
 
 
-def _refined_by(matches: Matches, pose: Pose, agree: np.ndarray) -> Pose:
-    """Refine a pose by some matches (M,) bool."""
+def _refined_by(matches: Matches, pose: Pose, agree: np.ndarray) -> Pose | None:
+    """Refine a pose by some matches (M,) bool, without its confidence; None if that fails."""
     assert pose.cam_from_world is not None
     camera, points = copy.deepcopy(pose.camera), (matches.points2D, matches.points3D)
     errors, _ = reprojection_errors(*points, pose.cam_from_world, camera)
     refinement = loss_options(errors[agree]) | matches.config.get("refinement", {})
     found = colmap.refine_pose(pose.cam_from_world, *points, agree, camera, refinement)
     if found is None:
-        return pose
+        return None
     errors, _ = reprojection_errors(*points, found, camera)
-    return _judged(matches, Pose(found, camera, errors <= matches.max_error))
+    return Pose(found, camera, errors <= matches.max_error)
 
 
 def loss_options(errors: np.ndarray) -> dict[str, float]:
@@ -365,12 +366,12 @@ def _agreed(matches: Matches, pose: Pose) -> Pose:
         given = matches.points2D[agree], matches.points3D[agree]
         assert others.cam_from_world is not None
         view = others.cam_from_world, others.camera
-        expected = uncertainty(*given, *view, others.degrees_of_freedom)
+        expected = uncertainty(*given, *view, pose.degrees_of_freedom)
         position, rotation = apart(others, pose, matches.points3D)
         near = position <= DEVIATIONS * expected.position
         if near and rotation <= DEVIATIONS * expected.rotation:
-            break
-        pose = others
+            return replace(pose, by_others=others.cam_from_world)
+        pose = _judged(matches, others)
     return pose
 
 
@@ -386,7 +387,7 @@ def _by_others(matches: Matches, pose: Pose) -> Pose | None:
     agree = pose.inliers.copy()
     agree[agree] = ~telling
     others = _refined_by(matches, pose, agree)
-    return others if others is not pose and 2 * others.num_inliers > pose.num_inliers else None
+    return others if others and 2 * others.num_inliers > pose.num_inliers else None
 
 
 def _precision(matches: Matches, pose: Pose) -> Uncertainty:
@@ -398,10 +399,9 @@ def _precision(matches: Matches, pose: Pose) -> Uncertainty:
     assert pose.cam_from_world is not None
     seen = Seen(*matches.inliers(pose), pose.cam_from_world, pose.camera, matches.max_error)
     found = uncertainty_without_one(seen, pose.degrees_of_freedom)
-    others = None if pose.degrees_of_freedom > POSE else _by_others(matches, pose)
-    if others is None:
+    if pose.degrees_of_freedom > POSE or pose.by_others is None:
         return found
-    position, rotation = apart(pose, others, matches.points3D)
+    position, rotation = apart(pose, replace(pose, cam_from_world=pose.by_others), matches.points3D)
     return found._replace(
         position=max(found.position, position), rotation=max(found.rotation, rotation)
     )
