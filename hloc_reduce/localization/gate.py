@@ -431,9 +431,9 @@ RULES = (
     ),
     Rule(
         _imprecise,
-        "be fixed by its inliers even without the one that tells most; at most "
-        f"{INDEPENDENT} count, because neighbours err alike",
-        f"standard deviations of at most {_words(PRECISE)}",
+        "be fixed by its inliers even without the keypoint that tells most; at most "
+        f"{INDEPENDENT} keypoints count, because neighbours err alike",
+        f"standard deviations, and moves without it, of at most {_words(PRECISE)}",
         (
             (
                 "... also with all intrinsics free, if the photo may be cropped or its listed "
