@@ -161,7 +161,7 @@ def write(
         if limit is not None and sum(parts.values()) > limit:
             reliability = selection.reliabilities(everything, features)
             sights = selection.Sights(everything, source.model, reliability)
-            fitting = int(limit * len(everything) / parts["descriptors"])  # at most
+            fitting = 1 + int(limit * len(everything) / parts["descriptors"])  # at most
             ranking = rank(everything, source.model) if rank else sights.ranked(fitting)
             kept = thinned(sights, ranking, parts, limit)
             ranking = ranking[np.isin(ranking, np.concatenate(kept.visible))]

@@ -41,7 +41,8 @@ def thinned(sights: Sights, ranking: np.ndarray, parts: dict[str, int], limit: f
         seen = ranking[shown[ranking] > 0]
         sizes = others + per_image * number + np.cumsum(per_point + per_sight * shown[seen])
         fitting = seen[: np.searchsorted(sizes, limit)]
-        learned = sights.learned(fitting, chosen[shares[:, chosen].argmax(axis=1)])
+        nearest = np.asarray(shares[:, chosen].argmax(axis=1)).ravel()  # (I, 1) before SciPy 1.14
+        learned = sights.learned(fitting, chosen[nearest])
         if learned < most:
             break
         best, most, number = kept, learned, int(number / sqrt(2))

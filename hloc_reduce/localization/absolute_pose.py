@@ -91,9 +91,10 @@ def estimate(
     with ThreadPoolExecutor(workers) as pool:
         if likely is None:
             poses = _found_anew(matches, images, thorough, pool)
-            first = _agreed(matches, _unbent(matches, max(poses, key=quality)))
+            first = _unbent(matches, max(poses, key=quality))
         else:
             poses = [first := _near(matches, images, likely)]
+        first = _agreed(matches, first)
         outliers = pool.submit(_of_outliers, matches, first) if workers > 1 else None
         best, others = with_other_intrinsics(matches, first)
         poses += outliers.result() if outliers and best is first else _of_outliers(matches, best)
@@ -359,24 +360,29 @@ def _agreed(matches: Matches, pose: Pose) -> Pose:
     One wrong match far from the others may bend a pose until it fits, too, and the others hardly
     worse: but refined by them alone, the pose is another one.
     """
+    before: Pose | None = None
     for _ in range(REESTIMATIONS):
-        if (others := _by_others(matches, pose)) is None:
-            break
+        if (others := _by_others(matches, pose)) is None or others.cam_from_world is None:
+            return pose
         agree = others.inliers & pose.inliers
         given = matches.points2D[agree], matches.points3D[agree]
-        assert others.cam_from_world is not None
         view = others.cam_from_world, others.camera
         expected = uncertainty(*given, *view, pose.degrees_of_freedom)
-        position, rotation = apart(others, pose, matches.points3D)
+        position, rotation = apart(pose, others, matches.points3D)
         near = position <= DEVIATIONS * expected.position
-        if near and rotation <= DEVIATIONS * expected.rotation:
+        near &= rotation <= DEVIATIONS * expected.rotation
+        # nothing is left out if few of the others agree among themselves
+        if near or not 2 * others.num_inliers > pose.num_inliers:
             return replace(pose, by_others=others.cam_from_world)
-        pose = _judged(matches, others)
-    return pose
+        before, pose = pose, _judged(matches, others)
+    return replace(pose, by_others=before.cam_from_world if before else None)
 
 
 def _by_others(matches: Matches, pose: Pose) -> Pose | None:
-    """Refine a pose without the matches that tell most about it, None if the others are too few."""
+    """Refine a pose without the matches that tell most about it, None if the others do not fix it.
+
+    It has no confidence.
+    """
     if pose.cam_from_world is None:
         return None
     inliers = matches.inliers(pose)
@@ -386,8 +392,7 @@ def _by_others(matches: Matches, pose: Pose) -> Pose | None:
     _, telling = most_telling([seen], [pycolmap.Rigid3d()])
     agree = pose.inliers.copy()
     agree[agree] = ~telling
-    others = _refined_by(matches, pose, agree)
-    return others if others and 2 * others.num_inliers > pose.num_inliers else None
+    return _refined_by(matches, pose, agree)
 
 
 def _precision(matches: Matches, pose: Pose) -> Uncertainty:

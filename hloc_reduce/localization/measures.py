@@ -331,7 +331,10 @@ def most_telling(
         sums = _at_places(seen) @ each.reshape(len(each), POSE**2)
         of_places.append(sums.reshape(each.shape))
         total += each.sum(axis=0)
-    left = [np.linalg.det(np.eye(POSE) - np.linalg.solve(total, places)) for places in of_places]
+    inverse = np.linalg.pinv(
+        total, hermitian=True
+    )  # of matches that do not determine the pose, too
+    left = [np.linalg.det(np.eye(POSE) - inverse @ places) for places in of_places]
     most = int(np.argmin([part.min(initial=np.inf) for part in left]))
     seen, place = photos[most], photos[most].points2D[left[most].argmin()]
     apart = np.linalg.norm(seen.points2D - place, axis=1)
@@ -428,7 +431,8 @@ class Measures:
         num_inliers: number of RANSAC's inliers.
         confidence: see `confidence`; minus infinity without a pose.
         agreement: see `agreement`.
-        uncertainty: see `uncertainty_without_one`, with the degrees of freedom of the estimation.
+        uncertainty: see `uncertainty_without_one`, with the degrees of freedom of the estimation;
+            if the focal length is known, at least how far the pose of a photo moves without it.
         uncropped: see `uncertainty`, with all intrinsics unknown, as those of a photo that was
             cropped.
         degrees_of_freedom: of the estimation, see `projection`.

@@ -25,8 +25,8 @@ class Pose:
         degrees_of_freedom: the number of estimated parameters, see `projection`.
         measures: all that `gate` needs.
         refusal: why it is not trusted, None if it is.
-        by_others: the pose that its inliers give without those that tell most about it, None if
-            that is not known.
+        by_others: the pose that its inliers give without those that tell most about it, in the
+            frame of the matches; None if that is not known.
     """
 
     cam_from_world: pycolmap.Rigid3d | None

@@ -20,6 +20,7 @@ from hloc_reduce.localization.measures import (
     confidence,
     covariance,
     independent_of,
+    most_telling,
     uncertainty,
     uncertainty_without_one,
     without_most_telling,
@@ -300,6 +301,16 @@ def test_a_pose_is_as_certain_as_it_is_without_the_keypoint_that_tells_most():
     ]
     left = without_most_telling(photos, cams_from_rig)
     assert [len(photo.points2D) for photo in left] == [18, 0]
+
+
+def test_matches_that_determine_no_pose_have_no_precision():
+    """On two points, so that the matrix of their derivatives is singular."""
+    points = np.array([[-1.0, 0, 3]] * 4 + [[-1, -2, 5]] * 2)
+    keypoints = CAMERA.img_from_cam(points)
+    seen = Seen(keypoints, points, pycolmap.Rigid3d(), CAMERA, 12.0)
+    most, telling = most_telling([seen], [pycolmap.Rigid3d()])
+    assert most == 0 and telling.any()
+    assert uncertainty_without_one(seen) == measures.UNDETERMINED
 
 
 def test_matches_of_a_keypoint_count_once_in_how_certain_a_pose_is():
