@@ -1,7 +1,7 @@
 """Search the signs of global descriptors in up to a million images, by this project and by faiss.
 
 A compact map keeps 1,024 signs of an image's global descriptor, 128 bytes; of more than 100,000
-images, queries are compared with 384 of all, and with all of the most similar ones. The descriptors
+images, queries are compared with 512 of all, and with all of the most similar ones. The descriptors
 are those of a map's images, drawn again and again with noise. Queries are noisy, too. Adds rows to
 results/retrieval.csv: milliseconds of a query on one core, seconds to build an index, and how many
 of the first 20 images are of the image that a query is of. Needs faiss (pip install faiss-cpu).
