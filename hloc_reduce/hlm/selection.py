@@ -81,8 +81,8 @@ class Sights:
             ranking = np.concatenate([ranking, best])
         return ranking
 
-    def learned(self, chosen: np.ndarray, nearest: np.ndarray) -> float:
-        """Return how much images learn, on average, if each is matched with another one alone.
+    def learned(self, chosen: np.ndarray, nearest: np.ndarray) -> np.ndarray:
+        """Return how much each image learns (I,) if it is matched with another one alone.
 
         Args:
             chosen: the points (K,) that are kept.
@@ -94,7 +94,7 @@ class Sights:
         is_matched = np.isin(nearest[self._image[rows]] * len(self.points) + point, shown)
         information = self._unknown()
         self._add(rows[is_matched], information)
-        return float(np.linalg.slogdet(information)[1].mean())
+        return np.linalg.slogdet(information)[1]
 
     def _unknown(self) -> np.ndarray:
         """Return the matrices (I, 6, 6) of images without points."""

@@ -8,12 +8,15 @@ import numpy as np
 from .points import Points
 from .selection import Sights
 
+FEW = 0.1  # share of the photos that may learn less than what counts
+
 
 def thinned(sights: Sights, ranking: np.ndarray, parts: dict[str, int], limit: float) -> Points:
     """Keep as many images of a map as is best for photos like all of them, in a limited file.
 
     With fewer images there is room for more points, but a photo may be unlike any. Each photo is
-    supposed to be matched with the image that shows most of its points.
+    supposed to be matched with the image that shows most of its points; what counts is how much
+    nearly all of them learn about their poses.
 
     Args:
         sights: what the points tell.
@@ -42,10 +45,10 @@ def thinned(sights: Sights, ranking: np.ndarray, parts: dict[str, int], limit: f
         sizes = others + per_image * number + np.cumsum(per_point + per_sight * shown[seen])
         fitting = seen[: np.searchsorted(sizes, limit)]
         nearest = np.asarray(shares[:, chosen].argmax(axis=1)).ravel()  # (I, 1) before SciPy 1.14
-        learned = sights.learned(fitting, chosen[nearest])
-        if learned < most:
-            break
-        best, most, number = kept, learned, int(number / sqrt(2))
+        learned = np.quantile(sights.learned(fitting, chosen[nearest]), FEW)
+        if learned >= most:  # with as few images as will do
+            best, most = kept, learned
+        number = int(number / sqrt(2))
     return best
 
 
