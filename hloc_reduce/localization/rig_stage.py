@@ -78,23 +78,21 @@ def open_frames(
 def with_images_about(
     reference: SfmMap,
     frames: Sequence[tuple[str, list[RigPhoto]]],
-    poses: Mapping[str, rig_pose.RigPose],
+    poses: Mapping[str, pycolmap.Rigid3d | None],
 ) -> list[tuple[str, list[RigPhoto]]]:
-    """Return the frames whose poses may gain by map images about them, with these.
+    """Return the frames with likely poses that have other map images about them, with these.
 
     A camera in the dark may retrieve other places.
 
     Args:
         reference: the map.
         frames: names of frames and their photos.
-        poses: of some frames.
+        poses: of some frames, rig from world, None without one.
     """
     surroundings = Surroundings(reference, sorted(reference.images), reference.views)
     found = []
     for frame, photos in frames:
-        pose = poses.get(frame)
-        likely = pose.rig_from_world if pose and pose.may_gain else None
-        if likely is None or surroundings.is_far(likely):
+        if (likely := poses.get(frame)) is None or surroundings.is_far(likely):
             continue
         more = []
         for photo in photos:

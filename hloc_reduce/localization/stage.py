@@ -263,7 +263,7 @@ class _Localizing:
             return
         reference = self.settings.load_reference()
         assert isinstance(reference, SfmMap)
-        poses = {frame: pose for frame, pose, _ in uncertain.values()}
+        poses = {frame: pose.rig_from_world for frame, pose, _ in uncertain.values()}
         wider = with_images_about(reference, frames, poses)
         if wider:
             pairs = [
