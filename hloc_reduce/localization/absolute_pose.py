@@ -336,18 +336,22 @@ def _judged(matches: Matches, pose: Pose) -> Pose:
 
 
 def _unbent(matches: Matches, pose: Pose) -> Pose:
-    """Refine a pose; unless it is certain, estimate it with stricter thresholds first.
+    """Refine a pose, estimated with stricter thresholds first: if it is certain, with the last one.
 
     Wrong matches may have bent it until they agree, above all one of few. What a threshold finds
     that few matches meet is refined by all that meet the first. The likeliest pose is returned.
     """
     poses, first = [pose], STRICT * matches.max_error
-    max_error = 0.0 if pose.confidence >= CERTAIN else first
+    thresholds, max_error = list[float](), first
     while max_error >= FINEST * photo_scale(pose.camera):
-        strict = matches.with_max_error(max_error)
-        found = _found(strict, np.flatnonzero(pose.inliers), LEAST_RATIO, 0)
-        poses.append(_refined(matches, found, first))
+        thresholds.append(max_error)
         max_error *= STRICT
+    is_certain = pose.confidence >= CERTAIN
+    for max_error in thresholds[-1:] if is_certain else thresholds:
+        strict = matches.with_max_error(max_error)
+        rounds = 1 if is_certain else REESTIMATIONS
+        found = _found(strict, np.flatnonzero(pose.inliers), LEAST_RATIO, 0, rounds)
+        poses.append(_refined(matches, found, first))
     best = max(poses, key=quality)
     refined = _refined(matches, best, matches.max_error)
     # intrinsics that few matches determine may leave them all behind

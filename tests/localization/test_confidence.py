@@ -271,6 +271,26 @@ def test_a_match_that_contradicts_all_others_does_not_bend_a_certain_pose():
     assert len(errors) > 38 and max(errors) < 0.03 * 8
 
 
+def test_a_few_wrong_matches_together_do_not_bend_a_certain_pose():
+    """Four of a nearer object, on several places, agree with another pose, which fits the rest."""
+    true, errors = pose_of(35, (0, 0, 36)), []
+    for seed in range(10):
+        generator = np.random.default_rng(seed)
+        bent = pose_of(35 + generator.choice([-1, 1]) * generator.uniform(1, 2), (0, 0, 36))
+        facade = generator.uniform([-6, -4, 0], [6, 4, 1], (130, 3))
+        nearer = generator.uniform([-9, -4, -24], [9, 4, -22], (1, 3))
+        nearer = nearer + generator.uniform(-0.4, 0.4, (4, 3))
+        points = np.concatenate([facade, nearer])
+        _, keypoints = reprojection_errors(np.zeros((130, 2)), facade, true, CAMERA)
+        _, wrong = reprojection_errors(np.zeros((4, 2)), nearer, bent, CAMERA)
+        keypoints = np.concatenate([keypoints, wrong])
+        keypoints += 0.4 * generator.standard_normal(keypoints.shape)
+        found = solve(keypoints, points)
+        assert found.refusal is None and found.confidence > absolute_pose.CERTAIN
+        errors.append(motion(found.cam_from_world, true)[0])
+    assert max(errors) < 0.01 * 36
+
+
 def test_a_pose_is_as_certain_as_it_is_without_the_keypoint_that_tells_most():
     """One of them is much nearer than the others, and has another scale at the same place."""
     generator = np.random.default_rng(0)
