@@ -14,13 +14,13 @@ from .hypotheses import Alternatives, alternative, rival, with_other_intrinsics
 from .measures import (
     FINEST,
     MIN_MATCHES,
+    UNDETERMINED,
     Measures,
     Seen,
     Uncertainty,
     agreement,
+    all_but_most_telling,
     confidence,
-    covariance,
-    most_telling,
     uncertainty,
     uncertainty_without_one,
 )
@@ -227,7 +227,10 @@ def _measures(
         return measures
     view = pose.cam_from_world, pose.camera
     uncropped = uncertainty(*matches.inliers(pose), *view, ALL)
-    return replace(measures, uncertainty=_precision(matches, pose), uncropped=uncropped)
+    precision = pose.precision
+    if precision is None:
+        precision = _precision(matches, pose, _all_but_most_telling(matches, pose))
+    return replace(measures, uncertainty=precision, uncropped=uncropped)
 
 
 def _off_centre(camera: pycolmap.Camera, x: float, y: float) -> float:
@@ -366,8 +369,10 @@ def _agreed(matches: Matches, pose: Pose) -> Pose:
     """
     before: Pose | None = None
     for _ in range(REESTIMATIONS):
-        if (others := _by_others(matches, pose)) is None or others.cam_from_world is None:
+        which = _all_but_most_telling(matches, pose)
+        if which is None or (others := _refined_by(matches, pose, which)) is None:
             return pose
+        assert others.cam_from_world is not None
         agree = others.inliers & pose.inliers
         given = matches.points2D[agree], matches.points3D[agree]
         view = others.cam_from_world, others.camera
@@ -377,40 +382,55 @@ def _agreed(matches: Matches, pose: Pose) -> Pose:
         near &= rotation <= DEVIATIONS * expected.rotation
         # nothing is left out if few of the others agree among themselves
         if near or not 2 * others.num_inliers > pose.num_inliers:
-            return replace(pose, by_others=others.cam_from_world)
+            return replace(pose, precision=_precision(matches, pose, which, others))
         before, pose = pose, _judged(matches, others)
-    return replace(pose, by_others=before.cam_from_world if before else None)
+    which = _all_but_most_telling(matches, pose)
+    return replace(pose, precision=_precision(matches, pose, which, before))
 
 
-def _by_others(matches: Matches, pose: Pose) -> Pose | None:
-    """Refine a pose without the matches that tell most about it, None if the others do not fix it.
+def _all_but_most_telling(matches: Matches, pose: Pose) -> np.ndarray | None:
+    """Return the inliers (M,) bool of a pose without those that tell most about it.
 
-    It has no confidence.
+    Returns:
+        None without a pose, or if its inliers do not determine it.
     """
     if pose.cam_from_world is None:
         return None
-    inliers = matches.inliers(pose)
-    seen = Seen(*inliers, pose.cam_from_world, pose.camera, matches.max_error)
-    if covariance(*seen[:4], pose.degrees_of_freedom) is None:
+    others = all_but_most_telling(_seen(matches, pose), pose.degrees_of_freedom)
+    if others is None:
         return None
-    _, telling = most_telling([seen], [pycolmap.Rigid3d()])
-    agree = pose.inliers.copy()
-    agree[agree] = ~telling
-    return _refined_by(matches, pose, agree)
+    which = pose.inliers.copy()
+    which[which] = others
+    return which
 
 
-def _precision(matches: Matches, pose: Pose) -> Uncertainty:
+def _precision(
+    matches: Matches, pose: Pose, which: np.ndarray | None, others: Pose | None = None
+) -> Uncertainty:
     """Return how precisely the inliers of a pose fix it, even without those that tell most.
 
     That is the `uncertainty_without_one`, or how far the pose moves without them if that is more
     and its focal length is known: an estimated one makes up for motions along the optical axis.
+
+    Args:
+        matches: of the query.
+        pose: the pose.
+        which: `_all_but_most_telling`.
+        others: the pose that these give, None if it is not known.
     """
-    assert pose.cam_from_world is not None
-    seen = Seen(*matches.inliers(pose), pose.cam_from_world, pose.camera, matches.max_error)
-    found = uncertainty_without_one(seen, pose.degrees_of_freedom)
-    if pose.degrees_of_freedom > POSE or pose.by_others is None:
+    if which is None:
+        return UNDETERMINED
+    seen, freedom = _seen(matches, pose), pose.degrees_of_freedom
+    found = uncertainty_without_one(seen, freedom, which[pose.inliers])
+    if freedom > POSE or others is None:
         return found
-    position, rotation = apart(pose, replace(pose, cam_from_world=pose.by_others), matches.points3D)
+    position, rotation = apart(pose, others, matches.points3D)
     return found._replace(
         position=max(found.position, position), rotation=max(found.rotation, rotation)
     )
+
+
+def _seen(matches: Matches, pose: Pose) -> Seen:
+    """Return the inliers of a pose as what it is judged by."""
+    assert pose.cam_from_world is not None
+    return Seen(*matches.inliers(pose), pose.cam_from_world, pose.camera, matches.max_error)

@@ -375,12 +375,27 @@ def independent_of(photos: Sequence[Seen]) -> float:
     return min(INDEPENDENT, float(places))
 
 
-def uncertainty_without_one(seen: Seen, degrees_of_freedom: int = POSE) -> Uncertainty:
-    """Estimate the `uncertainty` of a pose by its inliers, `without_most_telling`."""
+def all_but_most_telling(seen: Seen, degrees_of_freedom: int = POSE) -> np.ndarray | None:
+    """Return which inliers (M,) bool are not `most_telling`, None if they do not fix a pose."""
     if covariance(*seen[:4], degrees_of_freedom) is None:
+        return None
+    return ~most_telling([seen], [pycolmap.Rigid3d()])[1]
+
+
+def uncertainty_without_one(
+    seen: Seen, degrees_of_freedom: int = POSE, others: np.ndarray | None = None
+) -> Uncertainty:
+    """Estimate the `uncertainty` of a pose by its inliers, `all_but_most_telling`.
+
+    Args:
+        seen: the inliers.
+        degrees_of_freedom: the number of unknown parameters, see `projection`.
+        others: (M,) bool, `all_but_most_telling` if they are known.
+    """
+    if others is None and (others := all_but_most_telling(seen, degrees_of_freedom)) is None:
         return UNDETERMINED
-    others = without_most_telling([seen], [pycolmap.Rigid3d()])
-    return uncertainty(*others[0][:4], degrees_of_freedom, independent_of(others))
+    left = seen._replace(points2D=seen.points2D[others], points3D=seen.points3D[others])
+    return uncertainty(*left[:4], degrees_of_freedom, independent_of([left]))
 
 
 def agreement(inliers: np.ndarray, images: list[np.ndarray]) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 
 from . import gate
-from .measures import Measures
+from .measures import Measures, Uncertainty
 from .projection import POSE
 
 MAX_ERROR = 12.0  # pixels, pycolmap's default
@@ -25,8 +25,8 @@ class Pose:
         degrees_of_freedom: the number of estimated parameters, see `projection`.
         measures: all that `gate` needs.
         refusal: why it is not trusted, None if it is.
-        by_others: the pose that its inliers give without those that tell most about it, in the
-            frame of the matches; None if that is not known.
+        precision: how precisely its inliers fix it, even without those that tell most about it;
+            None if that is not known.
     """
 
     cam_from_world: pycolmap.Rigid3d | None
@@ -36,7 +36,7 @@ class Pose:
     degrees_of_freedom: int = POSE
     measures: Measures = Measures()
     refusal: str | None = None
-    by_others: pycolmap.Rigid3d | None = None
+    precision: Uncertainty | None = None
 
     @property
     def num_inliers(self) -> int:

@@ -1,5 +1,7 @@
 """Mutual nearest neighbours of descriptors that are rounded to integers."""
 
+from functools import partial
+
 import numpy as np
 
 from ..runtime import parallel
@@ -216,6 +218,10 @@ def match_images_of_points(
         matched = matches >= 0
         return most_similar_first(matches[matched], own[matched], similar[matched])
 
-    if len(query) > 1:
-        list(parallel.ordered("match", search, blocks))
-    return list(parallel.ordered("match", match, images))
+    # one block takes less time than its threads
+    in_threads = len(blocks) > 1
+    with parallel.one_thread():
+        apply = partial(parallel.ordered, "match") if in_threads else map
+        if len(query) > 1:
+            list(apply(search, blocks))
+        return list(apply(match, images))

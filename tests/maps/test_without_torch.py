@@ -159,9 +159,10 @@ def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
 
 @pytest.mark.parametrize("ratio_threshold", [None, 0.8])
 @pytest.mark.parametrize("number", [0, 1, 2, 300])
-def test_images_of_points_are_matched_one_by_one(ratio_threshold, number, monkeypatch):
-    """What images share is searched once, in parts."""
-    monkeypatch.setattr(integers, "DESCRIPTORS_PER_BLOCK", 7)
+@pytest.mark.parametrize("per_block", [7, 100])
+def test_images_of_points_are_matched_one_by_one(ratio_threshold, number, per_block, monkeypatch):
+    """What images share is searched once, in parts, or at once where that is faster."""
+    monkeypatch.setattr(integers, "DESCRIPTORS_PER_BLOCK", per_block)
     generator = np.random.default_rng(0)
     drawn = generator.standard_normal((100 + number, 16)).astype(np.float32)
     drawn[100 : 100 + number // 2] = drawn[: number // 2] + 0.02 * drawn[-(number // 2) or 100 :]
