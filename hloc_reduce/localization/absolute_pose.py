@@ -32,7 +32,6 @@ SAMPLE = 500  # matches, at most, from which a pose is tried before all, or a ri
 # confidence of a pose at which no other matches are tried, one and a half times the highest of
 # photos of other places in results/trials
 CERTAIN = 85.0
-DEVIATIONS = 3.0  # of what all other matches say of a pose, from which on one contradicts them
 STRICT = 1 / 2  # of an inlier threshold, the next one with which a pose is estimated again
 LEAST_SCALE = 0.1  # pixels, the least error from which on a match counts less
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default
@@ -377,11 +376,9 @@ def _agreed(matches: Matches, pose: Pose) -> Pose:
         given = matches.points2D[agree], matches.points3D[agree]
         view = others.cam_from_world, others.camera
         expected = uncertainty(*given, *view, pose.degrees_of_freedom)
-        position, rotation = apart(pose, others, matches.points3D)
-        near = position <= DEVIATIONS * expected.position
-        near &= rotation <= DEVIATIONS * expected.rotation
+        is_near = expected.allows(*apart(pose, others, matches.points3D))
         # nothing is left out if few of the others agree among themselves
-        if near or not 2 * others.num_inliers > pose.num_inliers:
+        if is_near or not 2 * others.num_inliers > pose.num_inliers:
             return replace(pose, precision=_precision(matches, pose, which, others))
         before, pose = pose, _judged(matches, others)
     which = _all_but_most_telling(matches, pose)
@@ -424,10 +421,7 @@ def _precision(
     found = uncertainty_without_one(seen, freedom, which[pose.inliers])
     if freedom > POSE or others is None:
         return found
-    position, rotation = apart(pose, others, matches.points3D)
-    return found._replace(
-        position=max(found.position, position), rotation=max(found.rotation, rotation)
-    )
+    return found.at_least(*apart(pose, others, matches.points3D))
 
 
 def _seen(matches: Matches, pose: Pose) -> Seen:

@@ -21,6 +21,7 @@ LEAST_NOISE = 0.5  # pixels, the least standard deviation of a keypoint
 INDEPENDENT = 100  # inliers with independent errors: neighbors err alike
 # the same where other intrinsics may make up for errors of the map, which are alike in a bent one
 INDEPENDENT_IF_BENT = 30
+DEVIATIONS = 3.0  # of a pose by all other matches, from which on one contradicts them
 MIN_MATCHES = 6  # of an image whose matches may tell whether a pose is right
 
 
@@ -173,6 +174,17 @@ class Uncertainty(NamedTuple):
     rotation: float
     focal_length: float
 
+    def allows(self, position: float, rotation: float) -> bool:
+        """Return whether a pose that is so uncertain may be so far from the right one."""
+        near = position <= DEVIATIONS * self.position
+        return bool(near and rotation <= DEVIATIONS * self.rotation)
+
+    def at_least(self, position: float, rotation: float) -> "Uncertainty":
+        """Return it, but no less than what a pose is known to be off by."""
+        return self._replace(
+            position=max(self.position, position), rotation=max(self.rotation, rotation)
+        )
+
 
 UNDETERMINED = Uncertainty(np.inf, np.inf, np.inf)
 
@@ -314,6 +326,8 @@ def most_telling(
     """Find the place in a photo without whose keypoints a pose would be least certain.
 
     That is, without which the determinant of the inverse of its covariance is the smallest part.
+    A wrong match far from all others may fit as well as they do, and what it alone determines looks
+    certain: so a pose is only as certain as the others make it.
 
     Args:
         photos: the inliers of each camera, which determine the pose.
@@ -339,20 +353,6 @@ def most_telling(
     seen, place = photos[most], photos[most].points2D[left[most].argmin()]
     apart = np.linalg.norm(seen.points2D - place, axis=1)
     return most, apart <= SAME_PLACE * photo_scale(seen.camera)
-
-
-def without_most_telling(
-    photos: Sequence[Seen], cams_from_rig: Sequence[pycolmap.Rigid3d]
-) -> list[Seen]:
-    """Leave out what is `most_telling`.
-
-    A wrong match far from all others may fit as well as they do, and what it alone determines looks
-    certain: so a pose is only as certain as the others make it.
-    """
-    most, telling = most_telling(photos, cams_from_rig)
-    left, seen = list(photos), photos[most]
-    left[most] = seen._replace(points2D=seen.points2D[~telling], points3D=seen.points3D[~telling])
-    return left
 
 
 def _at_places(seen: Seen):  # type: ignore[no-untyped-def]
@@ -447,7 +447,7 @@ class Measures:
         confidence: see `confidence`; minus infinity without a pose.
         agreement: see `agreement`.
         uncertainty: see `uncertainty_without_one`, with the degrees of freedom of the estimation;
-            if the focal length is known, at least how far the pose of a photo moves without it.
+            if the focal length is known, at least how far the pose moves without it.
         uncropped: see `uncertainty`, with all intrinsics unknown, as those of a photo that was
             cropped.
         degrees_of_freedom: of the estimation, see `projection`.

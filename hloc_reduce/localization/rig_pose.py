@@ -13,17 +13,18 @@ from . import gate as gates
 from .absolute_pose import CERTAIN
 from .gate import Gate
 from .measures import (
+    INDEPENDENT,
     MIN_MATCHES,
-    UNDETERMINED,
     Alternative,
     Measures,
     Seen,
+    Uncertainty,
     agreement,
     independent_of,
     joint_confidence,
+    most_telling,
     rig_covariance,
     standard_deviations,
-    without_most_telling,
 )
 from .pose import MAX_ERROR, Pose, motion
 from .projection import reprojection_errors
@@ -148,7 +149,7 @@ def estimate(sights: Sequence[Sight], gate: Gate) -> RigPose:
     found = [_judged(near, _refined(near, start)) for start in starts]
     if not found:
         return RigPose(None, [~chosen for chosen in everything], refusal=_none(near, gate))
-    best = max(found, key=_quality)
+    best = _agreed(near, max(found, key=_quality))
     outliers = [~chosen for chosen in best.inliers]
     found += [_judged(near, _refined(near, start)) for start in _sampled(near, outliers)]
     best = _measured(near, best, found)
@@ -247,6 +248,17 @@ def _errors(sights: Sequence[Sight], rig_from_world: pycolmap.Rigid3d) -> list[n
     return [reprojection_errors(*one.seen(rig_from_world)[:4])[0] for one in sights]
 
 
+def _chosen(
+    sights: Sequence[Sight], rig_from_world: pycolmap.Rigid3d, chosen: Sequence[np.ndarray]
+) -> list[Seen]:
+    """Return chosen matches (M,) bool of each camera with the pose that the rig gives it."""
+    photos = [one.seen(rig_from_world) for one in sights]
+    return [
+        seen._replace(points2D=seen.points2D[which], points3D=seen.points3D[which])
+        for seen, which in zip(photos, chosen, strict=True)
+    ]
+
+
 def _refined(sights: Sequence[Sight], start: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
     """Refine a pose by the matches of all cameras that agree with it, as long as more do.
 
@@ -276,11 +288,123 @@ def _refined(sights: Sequence[Sight], start: pycolmap.Rigid3d) -> pycolmap.Rigid
 
 def _judged(sights: Sequence[Sight], pose: pycolmap.Rigid3d) -> RigPose:
     """Return a pose with its inliers and confidence."""
+    found = _with_inliers(sights, pose)
+    value = joint_confidence([one.seen(pose) for one in sights])
+    return replace(found, measures=replace(found.measures, confidence=value))
+
+
+def _with_inliers(sights: Sequence[Sight], pose: pycolmap.Rigid3d) -> RigPose:
+    """Return a pose with its inliers."""
     errors = _errors(sights, pose)
     inliers = [its <= one.max_error for its, one in zip(errors, sights, strict=True)]
-    value = joint_confidence([one.seen(pose) for one in sights])
     number = int(sum(map(np.sum, inliers)))
-    return RigPose(pose, inliers, Measures(num_inliers=number, confidence=value))
+    return RigPose(pose, inliers, Measures(num_inliers=number))
+
+
+def _agreed(sights: Sequence[Sight], found: RigPose) -> RigPose:
+    """Leave out the place that tells most about a pose, as long as it contradicts all others.
+
+    As `absolute_pose.estimate` does with that of a photo. How precisely the others fix the pose is
+    its uncertainty, or how far it moves without that place if that is more.
+    """
+    before: RigPose | None = None
+    for _ in range(absolute_pose.REESTIMATIONS):
+        left = _all_but_most_telling(sights, found)
+        if left is None or (others := _refined_by(sights, found, left)) is None:
+            return found
+        agree = [a & b for a, b in zip(others.inliers, found.inliers, strict=True)]
+        expected = _uncertainty(sights, others, agree, INDEPENDENT)
+        is_near = expected.allows(*_apart(sights, found, others))
+        if is_near or not 2 * others.measures.num_inliers > found.measures.num_inliers:
+            return _with_uncertainty(sights, found, left, others)
+        assert others.rig_from_world is not None
+        before, found = found, _judged(sights, others.rig_from_world)
+    left = _all_but_most_telling(sights, found)
+    return found if left is None else _with_uncertainty(sights, found, left, before)
+
+
+def _all_but_most_telling(sights: Sequence[Sight], found: RigPose) -> list[np.ndarray] | None:
+    """Return of each camera the inliers (M,) bool without those that tell most about a pose.
+
+    Returns:
+        None if the inliers do not determine it.
+    """
+    assert found.rig_from_world is not None
+    cams_from_rig = [one.cam_from_rig for one in sights]
+    agreeing = _chosen(sights, found.rig_from_world, found.inliers)
+    if rig_covariance(agreeing, cams_from_rig) is None:
+        return None
+    camera, telling = most_telling(agreeing, cams_from_rig)
+    left = [inliers.copy() for inliers in found.inliers]
+    left[camera][found.inliers[camera]] = ~telling
+    return left
+
+
+def _refined_by(
+    sights: Sequence[Sight], found: RigPose, chosen: Sequence[np.ndarray]
+) -> RigPose | None:
+    """Refine a pose by chosen matches (M,) bool of each camera, without judging it.
+
+    Returns:
+        None if that fails.
+    """
+    assert found.rig_from_world is not None
+    everything = [np.ones(len(one.points2D), bool) for one in sights]
+    points2D, points3D, cameras = _together(sights, everything)
+    mask = np.concatenate(chosen)
+    if mask.sum() < colmap.MIN_OF_POSE:
+        return None
+    errors = np.concatenate(_errors(sights, found.rig_from_world))
+    options = absolute_pose.loss_options(errors[mask])
+    start = found.rig_from_world
+    refined = colmap.refine_rig_pose(start, points2D, points3D, mask, *cameras, options)
+    return None if refined is None else _with_inliers(sights, refined)
+
+
+def _apart(sights: Sequence[Sight], found: RigPose, other: RigPose) -> tuple[float, float]:
+    """Return how far apart two poses are, as `pose.apart` does for those of a photo."""
+    assert found.rig_from_world is not None and other.rig_from_world is not None
+    moved, degrees = motion(found.rig_from_world, other.rig_from_world)
+    return moved / _median_depth(_chosen(sights, found.rig_from_world, found.inliers)), degrees
+
+
+def _uncertainty(
+    sights: Sequence[Sight],
+    found: RigPose,
+    chosen: Sequence[np.ndarray],
+    independent: float | None = None,
+) -> Uncertainty:
+    """Return how precisely chosen matches (M,) bool of each camera fix a pose.
+
+    Args:
+        sights: what each camera sees.
+        found: the pose.
+        chosen: the matches.
+        independent: more of them do not make the pose more precise; default: `independent_of` them.
+    """
+    assert found.rig_from_world is not None
+    photos = _chosen(sights, found.rig_from_world, chosen)
+    covariance = rig_covariance(photos, [one.cam_from_rig for one in sights])
+    number = sum(len(seen.points2D) for seen in photos)
+    most = independent_of(photos) if independent is None else independent
+    return standard_deviations(covariance, _median_depth(photos), number, most)
+
+
+def _with_uncertainty(
+    sights: Sequence[Sight], found: RigPose, left: list[np.ndarray], others: RigPose | None
+) -> RigPose:
+    """Return a pose with its uncertainty.
+
+    Args:
+        sights: what each camera sees.
+        found: the pose.
+        left: of each camera the inliers (M,) bool, `_all_but_most_telling`.
+        others: the pose that these give, None if it is not known.
+    """
+    value = _uncertainty(sights, found, left)
+    if others is not None:
+        value = value.at_least(*_apart(sights, found, others))
+    return replace(found, measures=replace(found.measures, uncertainty=value))
 
 
 def _quality(found: RigPose) -> tuple[float, int]:
@@ -296,19 +420,9 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         found: all poses, that one included.
     """
     assert best.rig_from_world is not None
-    photos = [one.seen(best.rig_from_world) for one in sights]
-    agreeing = [
-        seen._replace(points2D=seen.points2D[chosen], points3D=seen.points3D[chosen])
-        for seen, chosen in zip(photos, best.inliers, strict=True)
-    ]
-    cams_from_rig = [one.cam_from_rig for one in sights]
-    covariance, uncertainty = rig_covariance(agreeing, cams_from_rig), UNDETERMINED
+    agreeing = _chosen(sights, best.rig_from_world, best.inliers)
+    covariance = rig_covariance(agreeing, [one.cam_from_rig for one in sights])
     depth = _median_depth(agreeing)
-    if covariance is not None:
-        left = without_most_telling(agreeing, cams_from_rig)
-        number, independent = sum(len(seen.points2D) for seen in left), independent_of(left)
-        its_covariance = rig_covariance(left, cams_from_rig)
-        uncertainty = standard_deviations(its_covariance, depth, number, independent)
     start, images = 0, []
     for one in sights:
         images += [start + chosen for chosen in one.images]
@@ -319,7 +433,6 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         best.measures,
         num_matches=start,
         agreement=agreement(np.concatenate(best.inliers), images),
-        uncertainty=uncertainty,
         is_camera_given=True,
         focal_range=(0.0, np.inf),
         alternatives={"rival": max(rivals)} if rivals else {},

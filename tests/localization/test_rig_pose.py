@@ -187,3 +187,34 @@ def test_wrong_intrinsics_of_one_camera_give_no_wrong_pose(right):
 def test_right_intrinsics_do_not_contradict():
     sights = [sight(i, 150, 30) for i in range(3)]
     assert rig_pose.estimate(sights, GATE).refusal is None
+
+
+def test_a_wrong_match_does_not_bend_the_pose_of_a_rig():
+    """One of a nearer point, of one of two cameras that see a small, distant facade."""
+    true, errors = about_y(35, (0, 0, 8)), []
+    cams_from_rig = about_y(0), about_y(0, (-0.3, 0, 0))
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=1600, height=1200, params=[1400, 1400, 800, 600]
+    )
+    for seed in range(60):
+        generator = np.random.default_rng(seed)
+        bent = about_y(35 + generator.choice([-1, 1]) * generator.uniform(3, 9), (0, 0, 8))
+        sights = []
+        for wrong, cam_from_rig in zip((1, 0), cams_from_rig, strict=True):
+            facade = generator.uniform([-1, -0.7, 0], [1, 0.7, 0.02], (8, 3))
+            nearer = generator.uniform([-3, -2, -4], [3, 2, -1.5], (wrong, 3))
+            points3D = np.concatenate([facade, nearer, generator.uniform(-3, 3, (10, 3))])
+            there = [cam_from_rig * true * facade, cam_from_rig * bent * nearer]
+            points2D = camera.img_from_cam(np.concatenate(there))
+            points2D += 1.5 * generator.standard_normal(points2D.shape)
+            points2D = np.concatenate([points2D, generator.uniform(0, [1600, 1200], (10, 2))])
+            images = np.split(np.arange(len(points3D)), [8 + wrong])
+            config = {"estimation": {"ransac": {"max_error": 12.0}}}
+            given = points2D, points3D, images, camera, cam_from_rig, config, GATE
+            sights.append(Sight(str(wrong), *given))
+        found = rig_pose.estimate(sights, GATE)
+        if not found.refusal:
+            relative = found.rig_from_world * true.inverse()
+            errors.append(np.linalg.norm(relative.translation) / 8)
+    # the noise alone moves some by 4 % of the distance
+    assert len(errors) > 50 and np.sum(np.array(errors) > 0.03) < 8
