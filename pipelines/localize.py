@@ -158,8 +158,9 @@ def open_map(
                 raise InputError(f"Panoramas are not masked: leave out --masks {masks}.")
             if rigs:
                 raise InputError(panorama_files.NO_RIGS.format(rigs))
-            if camera_model:
-                raise InputError("The lens of panoramas is known: leave out --camera_model.")
+            if camera_model or camera_mode:
+                option = "--camera_model" if camera_model else "--camera_mode"
+                raise InputError(f"The lens of panoramas is known: leave out {option}.")
             map_images, rigs = views
         elif rigs:
             map_photos.check_camera_mode(map_images, rigs, camera_mode)

@@ -333,6 +333,7 @@ def test_options_of_panoramas(panorama, place, plane, tmp_path, refused):
     of_queries = "--map", outputs / "map", "--query_images", folder, "--outputs", outputs
     assert said in refused(*of_queries, "--panoramas", "--rigs", rigs)
     assert "The lens of panoramas is known" in refused(*one, "--camera_model", "OPENCV")
+    assert "leave out --camera_mode" in refused(*one, "--camera_mode", "single")
     assert "COLMAP could not reconstruct" in refused(*one)
     assert len([*(new / "map-views/images").rglob("*.jpg")]) == panoramas.NUM_VIEWS
     assert (new / "map-views/rig_config.json").exists()
